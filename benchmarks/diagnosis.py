@@ -36,7 +36,7 @@ import hidden_effects as hidden
 from jaximu import LocalGravity, calibrate, read_recording
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.evidence import limit_noncentrality
-from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE
 from jaximu.noise.at_rest import fit_noise
@@ -59,7 +59,7 @@ def sized(case, folder, noise, multiples):
     plain = read_recording(bare.write(folder / "bare", ("fit",))["fit"])
     calibration = calibrate(plain, GRAVITY)
     (part,) = calibration.segmentations
-    experiment = HandHeld((part,), observe(part, GRAVITY.value, noise=noise), calibration.imu)
+    experiment = HandHeldExperiment((part,), observe(part, GRAVITY.value, noise=noise), calibration.imu)
     state = experiment.fit()
     scales = {}
     for effect, multiple in zip(case.hidden, multiples, strict=True):

@@ -34,7 +34,7 @@ from jaximu.calibration import fit_hand_held, nominal_imu
 from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
-from jaximu.fleets import Settings, Unit, find_jobs, fit_units, run_fleet
+from jaximu.fleets import FleetUnit, Settings, find_jobs, fit_units, run_fleet
 from jaximu.ground import stored
 from jaximu.recordings import write_recording
 from jaximu.recordings.segmentation import observe, segment
@@ -44,7 +44,7 @@ from jaximu.simulation.protocols import HandHeld
 jax.config.update("jax_enable_x64", True)
 
 
-def units(count: int) -> list[Unit]:
+def units(count: int) -> list[FleetUnit]:
     found = []
     for seed in range(count):
         imu, poses = draw_imu(seed), 40 - seed % 5
@@ -53,7 +53,7 @@ def units(count: int) -> list[Unit]:
             values = recording.accelerometer.values.copy()
             values[len(values) // 2 : len(values) // 2 + 150] += 0.05
             recording = replace(recording, accelerometer=replace(recording.accelerometer, values=values))
-        found.append(Unit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True))
+        found.append(FleetUnit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True))
     return found
 
 
@@ -99,7 +99,7 @@ def end_to_end(files: int, workers: int, folder: Path) -> dict[str, float]:
             "steady": (at_last - at_first) / max(last - first, 1e-9)}  # fmt: skip
 
 
-def agreement(made: list[Unit]) -> float:
+def agreement(made: list[FleetUnit]) -> float:
     """Largest step, in standard deviations, of the exact path from the fleet's answers."""
     worst = 0.0
     for unit, fitted in zip(made, fit_units(made), strict=True):
@@ -110,7 +110,7 @@ def agreement(made: list[Unit]) -> float:
     return worst
 
 
-def against_scipy(made: list[Unit], repetitions: int) -> dict[str, float]:
+def against_scipy(made: list[FleetUnit], repetitions: int) -> dict[str, float]:
     problems = [
         numpy_problems(unit.observations, two_step_weights(fitted.imu, unit.observations, fitted.excess))
         for unit, fitted in zip(made, fit_units(made), strict=True)
@@ -192,10 +192,10 @@ def devices(small: bool) -> None:
     finish("fleet_devices", [table], {"load": load, "seconds": seconds}, keep=not small, script="fleet")
 
 
-def of_the_core(made: list[Unit]) -> dict[str, float]:
+def of_the_core(made: list[FleetUnit]) -> dict[str, float]:
     """Seconds a unit of the core's fit, for units of one shape: one after the other, and as a batch."""
 
-    def shapes(unit: Unit) -> list[tuple[int, ...]]:
+    def shapes(unit: FleetUnit) -> list[tuple[int, ...]]:
         return [np.shape(leaf) for leaf in jax.tree.leaves(unit.observations)]
 
     alike = [unit for unit in made if shapes(unit) == shapes(made[0])][:64]

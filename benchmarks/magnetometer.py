@@ -20,7 +20,7 @@ from jaximu.calibration import FieldStrength, MagneticLog, calibrate_magnetomete
 from jaximu.calibration.magnetometer import carried_headings, ellipsoid
 from jaximu.data.field import windows_of
 from jaximu.diagnosis import diagnose_magnetometer
-from jaximu.fleets import Unit, fit_units
+from jaximu.fleets import FleetUnit, fit_units
 from jaximu.fleets.field import field_unit
 from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes import make_ready
@@ -298,7 +298,9 @@ def fleet(small: bool) -> None:
         found = segment(recording)
         alone = replace(found, recording=replace(recording, gyroscope=None, magnetometer=None))
         ways = {
-            "accelerometers": lambda part=alone: Unit(observe(part, 9.80665), nominal_imu(part.recording)[0], False),
+            "accelerometers": lambda part=alone: FleetUnit(
+                observe(part, 9.80665), nominal_imu(part.recording)[0], False
+            ),
             "magnetometers": lambda one=recording.magnetometer, part=found: field_unit(one, part, None, "").unit,
         }
         for name, way in ways.items():

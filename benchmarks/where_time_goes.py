@@ -26,7 +26,7 @@ import numpy as np
 from common import Table, arguments, finish, least
 
 from jaximu.data.carried import carry, compress, matmul, moved, rotate_samples, transpose
-from jaximu.fleets import Unit, fit_units
+from jaximu.fleets import FleetUnit, fit_units
 from jaximu.fleets import lanes as fleet_lanes
 from jaximu.fleets.fit import parameter_set
 from jaximu.model.sensor import Imu
@@ -124,7 +124,7 @@ def main() -> None:
     measured("step and covariance of the parameters", newton, 1, square, np.zeros((LANES, len(z))), z)
     measured("a whole pass without integration", passed, 1, lanes, carried, at, z, np.ones((3, LANES)))
 
-    unit = Unit(seen, jax.tree.map(np.asarray, Imu.nominal()), True)
+    unit = FleetUnit(seen, jax.tree.map(np.asarray, Imu.nominal()), True)
     whole = least(lambda: fit_units([unit] * LANES), repetitions) / LANES
 
     table = Table(

@@ -10,7 +10,7 @@ import synthetic
 from jaximu import LocalGravity, calibrate
 from jaximu.diagnosis.checks import checks_of
 from jaximu.diagnosis.evidence import Evidence
-from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observe
@@ -22,7 +22,7 @@ GRAVITY = LocalGravity(synthetic.GRAVITY, 0.0)
 def fitted(recording: Recording):
     calibration = calibrate(recording, GRAVITY, static=NOISE)
     observations = observe(calibration.segmentations, GRAVITY.value, noise=NOISE)
-    experiment = HandHeld(calibration.segmentations, observations, calibration.imu)
+    experiment = HandHeldExperiment(calibration.segmentations, observations, calibration.imu)
     return experiment.fit(), experiment
 
 

@@ -18,7 +18,7 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.readers.kalibr import read_noise
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.report.export import WRITERS, Parameters, Range, export, losses
+from jaximu.report.export import WRITERS, ExportedUnit, Range, export, losses
 from jaximu.report.export.catalogue import writer
 
 G = 9.80665
@@ -77,7 +77,7 @@ def both(calibration: Calibration) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
 
 
 def text(to: str, calibration: Calibration, **more) -> str:
-    return writer(to).write(Parameters.of(calibration, **more)).files[""].decode()
+    return writer(to).write(ExportedUnit.of(calibration, **more)).files[""].decode()
 
 
 def yaml(content: str) -> dict:
@@ -118,7 +118,7 @@ def test_kalibr(gain):
 def test_imu_tk(tmp_path, gain):
     """unbiasNormalize: u = mis_mat · scale_mat · (y − bias); the file is three blocks of 3×3, 3×3 and 3×1 numbers."""
     calibration = unit(gain)
-    _, paths = export(Parameters.of(calibration), "imu_tk", tmp_path / "unit.calib")
+    _, paths = export(ExportedUnit.of(calibration), "imu_tk", tmp_path / "unit.calib")
     assert [each.name for each in paths] == ["unit_acc.calib", "unit_gyro.calib"]
     y_a, y_g, f, w = both(calibration)
     for path, output, wanted in zip(paths, (y_a, y_g), (f, w), strict=True):
@@ -197,7 +197,7 @@ def test_ardupilot(tmp_path, instance):
     """_rotate_and_correct_accel: accel −= offset; accel ∘= scale; read by pymavlink, which MAVProxy loads with."""
     mavparm = pytest.importorskip("pymavlink.mavparm")
     calibration = unit()
-    export(Parameters.of(calibration, instance=instance), "ardupilot", tmp_path / "unit.param")
+    export(ExportedUnit.of(calibration, instance=instance), "ardupilot", tmp_path / "unit.param")
     values = mavparm.MAVParmDict()
     values.load(str(tmp_path / "unit.param"), check=False)
     number = str(instance + 1) if instance else ""
@@ -211,7 +211,7 @@ def test_ardupilot(tmp_path, instance):
 def within_the_loss(calibration: Calibration, to: str, accelerometer, gyroscope) -> None:
     """What a tool makes of outputs within the range differs from `compensate` by no more than was said, and by some."""
     extent = Range.of(calibration)
-    parameters = Parameters.of(calibration)
+    parameters = ExportedUnit.of(calibration)
     said = losses(parameters, writer(to).write(parameters), extent)[0]
     directions = np.random.default_rng(1).normal(size=(4000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -262,7 +262,7 @@ def test_csv_and_npz(tmp_path):
     for name, output, wanted in (("accelerometer", y_a, f), ("gyroscope", y_g, w)):
         close((output - table[name, "bias"][:, 0]) @ table[name, "inverse_gain"].T, wanted)
     assert table["accelerometer", "accel.quadratic"][:, 0].tolist() == pytest.approx([1e-4, 2e-4, 3e-4])
-    export(Parameters.of(calibration), "npz", tmp_path / "unit.npz")
+    export(ExportedUnit.of(calibration), "npz", tmp_path / "unit.npz")
     with np.load(tmp_path / "unit.npz", allow_pickle=False) as arrays:
         close((y_g - arrays["gyroscope_bias"]) @ arrays["gyroscope_inverse_gain"].T, w)
         assert arrays["covariance"].shape == (24, 24) and tuple(arrays["parameters"]) == NAMES
@@ -272,7 +272,7 @@ def test_csv_and_npz(tmp_path):
 @pytest.mark.parametrize("counts", [False, True])
 def test_c_header_is_compiled_and_run(tmp_path, counts):
     calibration = unit(FULL_A, counts=counts)
-    export(Parameters.of(calibration), "c-header", tmp_path / "calibration.h")
+    export(ExportedUnit.of(calibration), "c-header", tmp_path / "calibration.h")
     body = "".join(
         f"""
         for (k = 0; k < {{n}}; k++) {{{{
@@ -310,7 +310,7 @@ def test_c_header_is_compiled_and_run(tmp_path, counts):
 
 
 def _convention(to: str, calibration: Calibration) -> str:
-    return writer(to).write(Parameters.of(calibration)).convention
+    return writer(to).write(ExportedUnit.of(calibration)).convention
 
 
 # --- losses
@@ -320,7 +320,7 @@ def test_a_loss_is_what_it_says():
     """A quadratic accelerometer effect, by hand: c f² through K⁻¹ is greatest with gravity along the axis."""
     effect = CATALOGUE["accel.quadratic"].make([3e-4, 0.0, 0.0])
     calibration = unit(np.eye(3), effect)
-    parameters = Parameters.of(calibration)
+    parameters = ExportedUnit.of(calibration)
     found = losses(parameters, writer("imu_tk").write(parameters), Range.of(calibration))
     assert found[0].what == "the effect accel.quadratic"
     assert found[0].worst["accelerometer"] == pytest.approx(3e-4 * G**2, rel=1e-3)
@@ -331,7 +331,7 @@ def test_a_loss_is_what_it_says():
 
 def test_temperature_counts_over_the_stated_range():
     calibration = unit(np.eye(3), CATALOGUE["gyro.temperature"].make(2e-4))
-    parameters = Parameters.of(calibration)
+    parameters = ExportedUnit.of(calibration)
     written = writer("ros-yaml").write(parameters)
     for low, high in ((15.0, 35.0), (-20.0, 60.0)):
         (loss, *_) = losses(parameters, written, Range.of(calibration, temperature=(low, high)))
@@ -351,7 +351,7 @@ SOME = ["accel.misalignment_temperature", "accel.size_effect", "gyro.dead_band",
 @pytest.mark.parametrize("names", [SOME, pytest.param(DEVICE, marks=pytest.mark.slow)], ids=["some", "all"])
 def test_every_effect_of_a_device_has_a_cost(names):
     calibration = unit(GAIN_A, *(CATALOGUE[name].make(CATALOGUE[name].typical) for name in names))
-    parameters = Parameters.of(calibration)
+    parameters = ExportedUnit.of(calibration)
     found = losses(parameters, writer("npz").write(parameters), Range.of(calibration))
     assert all(np.isfinite(list(each.worst.values())).all() for each in found)
     assert set(names) <= {each.what.removeprefix("the effect ") for each in found}
@@ -366,7 +366,7 @@ def test_axes_are_undone():
     for name, output, wanted in (("accelerometer", y_a, f), ("gyroscope", y_g, w)):
         matrix = np.reshape(found[name]["matrix"], (3, 3))
         close((output @ turn - found[name]["bias"]) @ matrix.T, wanted @ turn)
-    parameters = Parameters.of(calibration, axes="FRD")
+    parameters = ExportedUnit.of(calibration, axes="FRD")
     (only,) = losses(parameters, writer("ros-yaml").write(parameters), Range.of(calibration))
     assert "uncertainty" in only.what
 
@@ -393,7 +393,7 @@ def test_export_prints_the_equation_and_writes(tmp_path, capsys, to):
 
 @pytest.mark.parametrize("to", sorted(WRITERS))
 def test_an_accelerometer_alone(tmp_path, to):
-    export(Parameters.of(unit(gyroscope=False), noise=NOISE), to, tmp_path / "unit.txt")
+    export(ExportedUnit.of(unit(gyroscope=False), noise=NOISE), to, tmp_path / "unit.txt")
 
 
 @pytest.mark.parametrize("to", ["px4", "ardupilot", "realsense", "openvins", "vins"])
@@ -470,7 +470,7 @@ def test_px4_magnetometer(axes, alone):
     symmetric = np.array([[1.05, 0.03, -0.02], [0.03, 0.97, 0.01], [-0.02, 0.01, 1.01]])
     for gain, worst in ((symmetric @ axes.T, 1e-9), (GAIN_M @ axes.T, None)):
         calibration = compass(gain, alone)
-        written = writer("px4").write(Parameters.of(calibration, instance=2, device=7))
+        written = writer("px4").write(ExportedUnit.of(calibration, instance=2, device=7))
         values = qgroundcontrol(written.files[""].decode())
         assert values["CAL_MAG2_ID" if alone else "CAL_ACC2_ID"] == 7 and ("CAL_ACC2_XOFF" in values) != alone
         assert ("CAL_MAG2_ID are the sensor's" in written.convention) != alone  # another device than the IMU
@@ -479,7 +479,7 @@ def test_px4_magnetometer(axes, alone):
         field, output = seen(gain)
         made = 100 * ((0.01 * output - offset) @ matrix.T) @ axes.T
         off = np.linalg.norm(made - field, axis=1).max()
-        said = losses(Parameters.of(calibration), written, Range.of(calibration))[0]
+        said = losses(ExportedUnit.of(calibration), written, Range.of(calibration))[0]
         assert off < worst if worst else off == pytest.approx(said.worst["magnetometer"], rel=0.1)
         assert ("CAL_MAG2_ROT" in written.convention) == (not np.array_equal(axes, np.eye(3)))
 
@@ -506,7 +506,7 @@ def test_a_magnetometer_is_exported(tmp_path, capsys, to, alone):
     printed = capsys.readouterr().out
     assert "h [" in printed and ("magnetometer" in printed or to in ("px4", "ardupilot"))
     field, output = seen(GAIN_M)
-    exact = writer(to).write(Parameters.of(compass(alone=alone))).corrections["magnetometer"]
+    exact = writer(to).write(ExportedUnit.of(compass(alone=alone))).corrections["magnetometer"]
     if to not in ("px4", "ardupilot"):
         close(exact.apply(output), field)
 
@@ -521,7 +521,7 @@ typedef union { float array[3][3]; struct { float xx, xy, xz, yx, yy, yz, zx, zy
 def test_fusion_makes_of_its_constants_what_the_calibration_does(tmp_path, counts):
     """FusionCalibrationInertial: misalignment · (sensitivity ∘ (y − offset)), in g and deg/s."""
     calibration = unit(FULL_A, counts=counts)
-    export(Parameters.of(calibration), "fusion", tmp_path / "calibration.h")
+    export(ExportedUnit.of(calibration), "fusion", tmp_path / "calibration.h")
     if gcc := shutil.which("gcc"):
         (tmp_path / "Fusion.h").write_text(FUSION_TYPES)
         flags = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-Wno-unused-variable", "-Wno-unused-const-variable"]

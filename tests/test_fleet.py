@@ -21,7 +21,7 @@ from jaximu.cli import main
 from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
-from jaximu.fleets import Job, Settings, Unit, find_jobs, fit_units, rows_of, run_fleet
+from jaximu.fleets import FleetUnit, Job, Settings, find_jobs, fit_units, rows_of, run_fleet
 from jaximu.fleets import engines as engines_module
 from jaximu.fleets.store import Store
 from jaximu.ground.errors import InputError
@@ -133,7 +133,7 @@ def test_preintegrated_answer_is_the_exact_one(folder):
     It integrates every sample with its derivatives; the fleet's derivatives are of blocks of four samples.
     """
     recording = read_recording(folder / "unit005.parquet")
-    unit = Unit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True)
+    unit = FleetUnit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True)
     (fitted,) = fit_units([unit])
     observations = PosesAndTurns(jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.observations))
     exact = fit(fitted.imu, observations, without_equipment, excess=fitted.excess, estimate_excess=False, max_passes=1)

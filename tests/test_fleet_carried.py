@@ -14,11 +14,11 @@ from synthetic import simulated
 
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.data import joint_conditions
-from jaximu.data.carried import Blocks, carry, compress, matmul, moved, rotate_samples, rotate_through, transpose
+from jaximu.data.carried import SampleBlocks, carry, compress, matmul, moved, rotate_samples, rotate_through, transpose
 from jaximu.data.gravity_direction import turn_rotations
 from jaximu.data.poses_covariance import condition_covariance, integrate_turns
 from jaximu.estimation.problem import names_of
-from jaximu.fleets import Unit, fit_units
+from jaximu.fleets import FleetUnit, fit_units
 from jaximu.fleets.fit import parameter_set
 from jaximu.fleets.lanes import _linearise, _seen, _triads, _whiten
 from jaximu.ground.rotation import conjugate, logarithm, multiply
@@ -38,13 +38,13 @@ def linear(imu: Imu):
     return [list(row) for row in inverse], list(-inverse @ np.asarray(imu.gyroscope.bias))
 
 
-def by_sample(turns, share: float = 1.0) -> Blocks:
+def by_sample(turns, share: float = 1.0) -> SampleBlocks:
     interval = np.asarray(turns.interval).T * share
     return compress([*(interval * np.asarray(turns.output)[..., i].T for i in range(3)), interval], 1)
 
 
 @partial(jax.jit, static_argnums=1)
-def blocks_of(single: Blocks, size: int):
+def blocks_of(single: SampleBlocks, size: int):
     return compress(single.moments, size)
 
 
@@ -220,7 +220,7 @@ def test_units_alone_and_together_are_as_the_exact_path_has_them(gyroscope):
     cases = [simulated(seed) for seed in range(5)]
     method = "joint" if gyroscope else "accelerometer"
     nominal = jax.tree.map(np.asarray, Imu.nominal())
-    units = [Unit(jax.tree.map(np.asarray, case.observations), nominal, gyroscope) for case in cases]
+    units = [FleetUnit(jax.tree.map(np.asarray, case.observations), nominal, gyroscope) for case in cases]
     together = fit_units(units)
     exactly = fit_hand_held(
         jax.tree.map(lambda leaf: np.stack([leaf] * 5), nominal),
@@ -271,6 +271,6 @@ def test_two_devices_give_the_same_units(tmp_path, threads, used):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     nominal = jax.tree.map(np.asarray, Imu.nominal())
-    units = [Unit(jax.tree.map(np.asarray, simulated(seed).observations), nominal, False) for seed in range(11)]
+    units = [FleetUnit(jax.tree.map(np.asarray, simulated(seed).observations), nominal, False) for seed in range(11)]
     here = [fitted.numbers for fitted in fit_units(units)]
     np.testing.assert_allclose(np.load(path), here, rtol=1e-9, atol=1e-12)

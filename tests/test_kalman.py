@@ -18,7 +18,7 @@ from jaximu.calibration import FilterInUse, calibrate_by_filter, followed_in_use
 from jaximu.calibration.attitude import mounted_on
 from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
-from jaximu.data.motion import Disturbances, IntervalsOfMotion, Path, carried, cut, first_field, interval_rows
+from jaximu.data.motion import Disturbances, IntervalsOfMotion, MotionPath, carried, cut, first_field, interval_rows
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
 from jaximu.estimation.problem import unflatten, without_equipment
@@ -104,10 +104,10 @@ def test_transition_has_the_derivatives_that_automatic_differentiation_gives(rec
     place = int(np.flatnonzero((np.asarray(intervals.rest) == 0) & (np.asarray(intervals.real) > 0))[1])
     part = jax.tree.map(lambda leaf: jnp.asarray(leaf)[place], intervals)
     errors, numbers = disturbed(1), ravel_pytree(imu)[0]
-    before = Path(exponential(jnp.array([0.3, -0.8, 0.5])), jnp.array([0.2, -0.1, 0.3]))
+    before = MotionPath(exponential(jnp.array([0.3, -0.8, 0.5])), jnp.array([0.2, -0.1, 0.3]))
 
     def onward(change):
-        start = Path(multiply(before.attitude, exponential(change[:3])), before.velocity + change[3:6])
+        start = MotionPath(multiply(before.attitude, exponential(change[:3])), before.velocity + change[3:6])
         return carried(imu, numbers + change[6:-1], 9.8 + change[-1], part, start)
 
     @jax.jit
@@ -361,7 +361,7 @@ def test_what_is_measured_from_outside_has_the_derivatives_of_what_it_means(reco
     numbers, (seen, speed) = np.asarray(ravel_pytree(imu)[0]), part.sightings
     sigmas = {"reference": 2e-3, "velocity": 3e-2}
     errors = replace(disturbed(1), **{name: np.float64(each) for name, each in sigmas.items()})
-    after = Path(exponential(jnp.array([0.3, -0.8, 0.5])), jnp.array([0.2, -0.4, 0.3]))
+    after = MotionPath(exponential(jnp.array([0.3, -0.8, 0.5])), jnp.array([0.2, -0.4, 0.3]))
     rows = jax.jit(lambda: interval_rows(imu, numbers, jnp.asarray(9.8), part, errors, after, after))()
     last = int(np.sum(np.asarray(part.length) > 0)) - 1
 
@@ -564,7 +564,7 @@ def test_a_measured_field_has_the_derivatives_of_what_it_means(recorded):
     (seen,) = intervals.sightings
     assert np.sum(seen.measured) == len(rests)
     part = jax.tree.map(lambda leaf: np.asarray(leaf)[int(np.argmax(seen.measured))], intervals)
-    after, errors = Path(exponential(jnp.array([0.3, -0.8, 0.5])), jnp.zeros(3)), disturbed(1)
+    after, errors = MotionPath(exponential(jnp.array([0.3, -0.8, 0.5])), jnp.zeros(3)), disturbed(1)
     numbers = ravel_pytree(unit)[0]
     rows = jax.jit(lambda: interval_rows(unit, numbers, jnp.asarray(9.8), part, errors, after, after))()
 

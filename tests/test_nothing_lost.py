@@ -18,7 +18,7 @@ from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli.app import main
 from jaximu.cli.streams import _letter
 from jaximu.diagnosis import diagnose
-from jaximu.diagnosis.hand_held import HandHeld as Experiment
+from jaximu.diagnosis.hand_held import HandHeldExperiment as Experiment
 from jaximu.estimation.problem import flatten, names_of, typical_sizes
 from jaximu.estimation.uncertainty import weak_directions
 from jaximu.ground.gravity import LocalGravity

@@ -23,7 +23,7 @@ from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import ReadOptions, read_magnetometer, read_recording
 from jaximu.recordings.recording import Reading, Recording, Signal, apply_axes, axis_matrix, parse_axes, spelled_axes
-from jaximu.report.export import Parameters, Range, export, losses
+from jaximu.report.export import ExportedUnit, Range, export, losses
 from jaximu.report.export.catalogue import writer
 from jaximu.report.export.thermal_autopilot import px4_parameters
 from jaximu.simulation import consumer_noise, simulate
@@ -219,7 +219,7 @@ AUTOPILOTS = {"px4": px4, "ardupilot": ardupilot}
 
 
 def answers(to: str, calibration: Calibration, *outputs: np.ndarray) -> list[np.ndarray]:
-    parameters = Parameters.of(calibration)
+    parameters = ExportedUnit.of(calibration)
     written = writer(to).write(parameters)
     lost = losses(parameters, written, Range.of(calibration))  # reckoned in the same axes, it finds nothing but these
     assert all("uncertainty" in each.what for each in lost) or (
@@ -281,7 +281,7 @@ def test_mirrored_loggers_are_expressed_by_most_tools():
         made = 0
         for axes in MIRRORED:
             try:
-                made += bool(writer(to).write(Parameters.of(unit(axes))).files)
+                made += bool(writer(to).write(ExportedUnit.of(unit(axes))).files)
             except NotPossibleError:
                 continue
         assert made == fewest, to
@@ -354,11 +354,11 @@ def test_a_file_without_reading_is_exported_as_before(tmp_path, to):
     assert old.reading is None
     for axes in (None, "FRD", "y,-x,z"):
         force, rate, *outputs = logged(old, axes)
-        written = writer(to).write(Parameters.of(old, axes))
+        written = writer(to).write(ExportedUnit.of(old, axes))
         made = (TOOLS | AUTOPILOTS)[to](written.files, *outputs)
         close(made[0], force @ axis_matrix(axes or "FLU"))
         close(made[1], rate @ axis_matrix(axes or "FLU"))
-    assert "does not say" in Parameters.of(old).axes
+    assert "does not say" in ExportedUnit.of(old).axes
 
 
 def test_a_cubic_for_px4_is_in_its_axes():
@@ -496,7 +496,7 @@ def test_columns_rate_scales_and_axes_are_kept(counts, recordings, tmp_path, cap
 
 def test_an_export_of_counts_turns_the_sense_of_a_logger_of_minus_specific_force(counts, recordings):
     path, log, _ = counts
-    written = writer("c-header").write(Parameters.of(load_calibration(path)))
+    written = writer("c-header").write(ExportedUnit.of(load_calibration(path)))
     rows = np.loadtxt(log, delimiter=",")
     force, rate = c_header(written.files, rows[:, 3:], rows[:, :3])
     truth, turn = recordings[0][1].stimulus, axis_matrix("y,-x,z")
@@ -646,7 +646,7 @@ def test_standard_deviations_go_with_their_parameters():
     """A gain's row is the output's, as the logger has its axes, and its column the answer's, here in body axes."""
     calibration = unit("accel=-y,x,z;gyro=x,-y,-z")
     found = {}
-    for line in writer("csv").write(Parameters.of(calibration)).files[""].decode().splitlines()[1:]:
+    for line in writer("csv").write(ExportedUnit.of(calibration)).files[""].decode().splitlines()[1:]:
         triad, name, row, column, _, sigma, _ = line.split(",")
         found[triad, name, row, column] = sigma
     gain, bias = calibration.sigma("accelerometer")
@@ -661,7 +661,7 @@ def test_exports_of_one_triad_alone(tmp_path):
     calibration = replace(
         calibration, names=names_of(calibration.imu), covariance=np.eye(len(names_of(calibration.imu)))
     )
-    export(Parameters.of(calibration), "ros-yaml", tmp_path / "unit.yaml")
+    export(ExportedUnit.of(calibration), "ros-yaml", tmp_path / "unit.yaml")
     _, _, y_a, _ = logged(unit("FRD;-f"), "FRD;-f")
     accel = yaml((tmp_path / "unit.yaml").read_bytes())["/**"]["ros__parameters"]["imu_calibration"]["accelerometer"]
     force = (y_a - accel["bias"]) @ np.reshape(accel["matrix"], (3, 3)).T

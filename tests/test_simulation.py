@@ -30,10 +30,10 @@ from jaximu.simulation.artefacts import (
     Dropped,
     Gap,
     Jitter,
+    LoggedRows,
     Periodic,
     Quantisation,
     Repeated,
-    Samples,
     StuckAxis,
     SwappedAxes,
 )
@@ -175,10 +175,10 @@ def test_time_errors_of_the_set_up_shift_what_is_sensed(name):
 # --- artefacts ------------------------------------------------------------------------------------------------------
 
 
-def rows(count=200, seed=0) -> Samples:
+def rows(count=200, seed=0) -> LoggedRows:
     rng = np.random.default_rng(seed)
     time = np.arange(count) / 100.0
-    return Samples(
+    return LoggedRows(
         np.arange(count), time,
         {"accelerometer": rng.standard_normal((count, 3)), "gyroscope": rng.standard_normal((count, 3)),
          "temperature": 25 + rng.standard_normal((count, 1))},

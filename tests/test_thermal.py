@@ -23,7 +23,7 @@ from jaximu.recordings import write_recording
 from jaximu.recordings.flags import without_flagged
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Signal
-from jaximu.report.export import Parameters
+from jaximu.report.export import ExportedUnit
 from jaximu.report.export.catalogue import writer
 from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
 from jaximu.simulation import simulate
@@ -309,7 +309,7 @@ def test_px4_with_both_files_subtracts_the_bias_once(found):
     px4 = px4_parameters(calibration)
     p, q = (
         read_parameters(px4.text),
-        read_parameters(writer("px4").write(Parameters.of(calibration)).files[""].decode()),
+        read_parameters(writer("px4").write(ExportedUnit.of(calibration)).files[""].decode()),
     )
     for name, stem, cal in (("accelerometer", "TC_A0", "CAL_ACC0"), ("gyroscope", "TC_G0", "CAL_GYRO0")):
         offset = np.array([q[f"{cal}_{axis}OFF"] for axis in "XYZ"])

@@ -15,7 +15,7 @@ from jaximu import InputError, LocalGravity, NotPossibleError, Recording, calibr
 from jaximu.cli.app import main
 from jaximu.diagnosis import check
 from jaximu.diagnosis.comparison import Fresh, Old, Question
-from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.estimation.fitting import About, Conditions, effect_numbers
 from jaximu.estimation.problem import Parameters, without_equipment
 from jaximu.estimation.uncertainty import label
@@ -77,7 +77,7 @@ class LinearConditions(Conditions):
         return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
 
 
-class Drawn(HandHeld):
+class Drawn(HandHeldExperiment):
     """A recording whose conditions are linear and drawn; their covariance is one for all units."""
 
     beside: About
@@ -85,7 +85,7 @@ class Drawn(HandHeld):
     drawn: np.ndarray
 
     @classmethod
-    def of(cls, real: HandHeld, imu: Imu) -> "Drawn":
+    def of(cls, real: HandHeldExperiment, imu: Imu) -> "Drawn":
         """Linearise a recording at a unit."""
         found = cls(real.segmentations, real.observations, real.start)
         found.beside = real.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu))

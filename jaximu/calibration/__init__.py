@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jaximu.calibration.compensation import compensate
     from jaximu.calibration.hand_held import Method, fit_hand_held
     from jaximu.calibration.identifiability import Identifiability
-    from jaximu.calibration.in_use import FilterInUse, Known, followed_in_use
+    from jaximu.calibration.in_use import FilterInUse, FilterState, followed_in_use
     from jaximu.calibration.magnetometer import FieldStrength, Heading, MagneticLog, calibrate_magnetometer
     from jaximu.calibration.means import calibrate_means
     from jaximu.calibration.nominal import nominal_imu
@@ -32,10 +32,10 @@ __all__ = [
     "Calibration",
     "FieldStrength",
     "FilterInUse",
+    "FilterState",
     "Heading",
     "History",
     "Identifiability",
-    "Known",
     "LeftOutTurns",
     "MagneticLog",
     "Method",

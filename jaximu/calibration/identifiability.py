@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaximu.calibration.thermal_shapes import ThermalShapes
-from jaximu.calibration.thermal_terms import HISTORY, LEARNED, POWERS, RATES, SCALE, Term, history
+from jaximu.calibration.thermal_terms import HISTORY, LEARNED, POWERS, RATES, SCALE, ThermalTerm, history
 from jaximu.data.rest_blocks import Leg, RestBlocks
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.ground.array_types import FloatArray
@@ -66,7 +66,7 @@ def separated(shapes: ThermalShapes) -> dict[str, Separation]:
         orthonormal(root * levels),
         orthonormal(root * np.concatenate([levels, drift, shapes.smooth()], axis=1)),
     )
-    grids: dict[str, list[Term]] = {name: [Term(name)] for name in RATES}
+    grids: dict[str, list[ThermalTerm]] = {name: [ThermalTerm(name)] for name in RATES}
     grids |= {name: [history(name, value) for value in values] for name, values in shapes.grids.items()}
     columns = {name: [root[:, 0] * shapes.column(term)[0] for term in grid] for name, grid in grids.items()}
     middle = {name: found[len(found) // 2] for name, found in columns.items()}
@@ -127,7 +127,7 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
         words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
     base = orthonormal(np.concatenate([np.eye(blocks.levels)[blocks.level], shapes.smooth()], axis=1))
     mean = orthonormal(np.eye(blocks.levels)[blocks.level])
-    scale = max(_length(_off(base, each)) / _length(_off(mean, each)) for each in shapes.column(Term(SCALE)))
+    scale = max(_length(_off(base, each)) / _length(_off(mean, each)) for each in shapes.column(ThermalTerm(SCALE)))
     if scale > _TOLD and blocks.several_poses:
         told.append(SCALE)
     else:

@@ -26,8 +26,8 @@ from jaximu.data.motion import (
     FARTHEST_UNSEEN,
     LONGEST_MOTION,
     Disturbances,
-    Interval,
-    Path,
+    MotionIntervals,
+    MotionPath,
     carried,
     first_knowledge,
     interval_rows,
@@ -64,7 +64,7 @@ from jaximu.recordings.observations import POWER_ON
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import segment
 
-__all__ = ["FilterInUse", "Known", "follow", "followed_in_use"]
+__all__ = ["FilterInUse", "FilterState", "follow", "followed_in_use"]
 
 INTERVAL = 0.5
 """Seconds of an interval."""
@@ -90,7 +90,7 @@ class _Sample(NamedTuple):
     field: FloatArray
 
 
-class Known(NamedTuple):
+class FilterState(NamedTuple):
     """What the filter knows at the end of an interval. time: s; rest: whether the unit rested.
 
     values, sigmas (p,): of the numbers that are followed, bias with its drift; innovation: normalised, squared, of
@@ -175,7 +175,7 @@ class FilterInUse:
         self._numbers = flatten(self.imu)
         self.begun = self._numbers[self._index]
         self._known: Knowledge | None = None
-        self._path = Path(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))  # pyright: ignore[reportArgumentType]
+        self._path = MotionPath(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))  # pyright: ignore[reportArgumentType]
         self._waiting: list[_Sample] = []
         self._last: float | None = None
         self._quiet, self._resting, self._mean, self._moving, self._unseen = False, False, np.zeros(6), 0.0, 0.0
@@ -185,7 +185,7 @@ class FilterInUse:
     def update(
         self, time: FloatArray, accelerometer: FloatArray, gyroscope: FloatArray, attitude: Attitude | None = None,
         field: FloatArray | None = None,
-    ) -> list[Known]:  # fmt: skip
+    ) -> list[FilterState]:  # fmt: skip
         """Take n samples, time (n,) in s rising, outputs (n, 3) in the calibration's units; return what was learnt.
 
         **Arguments:** `attitude`: what the reference said since the last call, by its own clock. What it says of a
@@ -283,15 +283,15 @@ class FilterInUse:
             found.append(VelocitySeen(np.float64(stamp), np.float64(end), np.float64(counts), moved))  # pyright: ignore
         return tuple(found)
 
-    def _upright(self, force: FloatArray, sightings: tuple[Sighting, ...]) -> Path:
+    def _upright(self, force: FloatArray, sightings: tuple[Sighting, ...]) -> MotionPath:
         """Return the path's beginning at rest: upright as the force has it, and as was measured."""
         unit = unflatten(self.imu, self._numbers)
         attitude = level(self._path.attitude, unit.with_effects().accelerometer.recover(force.mean(axis=0)))
         for each in sightings:
             attitude = each.placed(attitude, Outside.of(outside_numbers(unit)))
-        return Path(attitude, np.zeros(3))  # pyright: ignore[reportArgumentType]
+        return MotionPath(attitude, np.zeros(3))  # pyright: ignore[reportArgumentType]
 
-    def _interval(self) -> list[Known]:
+    def _interval(self) -> list[FilterState]:
         time = np.array([each.time for each in self._waiting])
         force, rate = (np.stack(each) for each in list(zip(*self._waiting, strict=True))[1:3])
         period = 1 / self._rate
@@ -337,7 +337,7 @@ class FilterInUse:
         if arrival or lost_track:
             sightings = tuple(replace(each, measured=np.float64(0.0)) for each in sightings)
         missing = self._padded - len(time)
-        part = Interval(
+        part = MotionIntervals(
             np.pad(force, [(0, missing), (0, 0)], "edge"), np.pad(rate, [(0, missing), (0, 0)], "edge"),
             np.pad(step, (0, missing)), np.pad(time, (0, missing), "edge"),
             np.float64(rest), np.float64(arrival), np.float64(lost_track), np.float64(lost), np.float64(1.0),
@@ -364,7 +364,7 @@ class FilterInUse:
         moved[6:states] = 0.0  # drift is no part of the path
         self._known = known._replace(right=known.right - known.root @ moved)
         attitude = np.asarray(turned(attitude, found[:3]))
-        self._path = Path(attitude, velocity + found[3:6])  # pyright: ignore[reportArgumentType]
+        self._path = MotionPath(attitude, velocity + found[3:6])  # pyright: ignore[reportArgumentType]
         self._numbers = self._numbers.copy()
         self._numbers[self._index] += found[states:-1]
         self.gravity += float(found[-1])
@@ -374,7 +374,7 @@ class FilterInUse:
         freedom = 6 * rest + 3 * arrival + 3 * sum(int(each.measured > 0) for each in sightings)
         if freedom:
             self._recent.append((innovation, freedom))
-        return [Known(float(time[-1]), rest, self._numbers[self._index], sigmas, innovation, freedom, attitude,
+        return [FilterState(float(time[-1]), rest, self._numbers[self._index], sigmas, innovation, freedom, attitude,
                       drift, deviation)]  # fmt: skip
 
     @property
@@ -393,7 +393,7 @@ class FilterInUse:
         return unflatten(self.imu, self._numbers).without(GyroEarthRotation, SetupMagneticField)
 
 
-def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[Path, Rows]:
+def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[MotionPath, Rows]:
     """Return the path's end after an interval, and its white rows about it."""
     after = carried(imu, numbers, gravity, part, path)
     return after, interval_rows(imu, numbers, gravity, part, errors, path, after)

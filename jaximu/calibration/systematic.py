@@ -19,7 +19,7 @@ from jaximu.calibration.refusals import refuse_undetermined, require_solved
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.motion import (
     Disturbances,
-    Followed,
+    FilterPass,
     IntervalsOfMotion,
     cut,
     first_field,
@@ -338,7 +338,7 @@ def _scaled_noise(errors: Disturbances, noise: NoiseModel, excess: float) -> dic
 
 def _followed(
     measurement: IntervalsOfMotion, imu: Imu, prior: Prior, gravity: LocalGravity, start: Calibration
-) -> tuple[Followed, tuple[Name, ...]]:
+) -> tuple[FilterPass, tuple[Name, ...]]:
     """Return how a filter that begins with the data sheet comes to know the free numbers."""
     free = Parameters.select(imu, without_equipment_or_effects)
     assert start.nominal is not None
@@ -354,7 +354,7 @@ def _followed(
     return measurement.followed(imu, index, known), free.names
 
 
-def _matched(measurement: IntervalsOfMotion, followed: Followed) -> IntervalsOfMotion | None:
+def _matched(measurement: IntervalsOfMotion, followed: FilterPass) -> IntervalsOfMotion | None:
     """Return the measurement with the noise that innovations show, in rests, where motion ends, and from outside; or
     None.
 
@@ -376,7 +376,7 @@ def _matched(measurement: IntervalsOfMotion, followed: Followed) -> IntervalsOfM
     return replace(measurement, errors=scaled)
 
 
-def _history(measurement: IntervalsOfMotion, followed: Followed, names: tuple[Name, ...], imu: Imu) -> History:
+def _history(measurement: IntervalsOfMotion, followed: FilterPass, names: tuple[Name, ...], imu: Imu) -> History:
     intervals = measurement.intervals
     real = np.asarray(intervals.real) > 0
     inside = np.asarray(intervals.length) > 0

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.thermal_shapes import ThermalShapes
-from jaximu.calibration.thermal_terms import Model, Net, Term
+from jaximu.calibration.thermal_terms import Model, Net, ThermalTerm
 from jaximu.data.rest_blocks import RestBlocks
 from jaximu.estimation.leave_out import LeftOut, leave_out
 from jaximu.ground.array_types import FloatArray
@@ -46,15 +46,15 @@ class Whitened:
         self.root = np.linalg.inv(np.linalg.cholesky(self.covariance))  # (3, n, n)
         self.levels = self.root @ np.eye(blocks.levels)[blocks.level]
         self.output = (self.root @ self.means.T[:, :, None])[..., 0]
-        self._columns: dict[Term, FloatArray] = {}
+        self._columns: dict[ThermalTerm, FloatArray] = {}
 
-    def column(self, term: Term) -> FloatArray:
+    def column(self, term: ThermalTerm) -> FloatArray:
         """Return the whitened shape (3, n) of a term."""
         if term not in self._columns:
             self._columns[term] = (self.root @ self.shapes.column(term)[:, :, None])[..., 0]
         return self._columns[term]
 
-    def design(self, axis: int, terms: Sequence[Term]) -> FloatArray:
+    def design(self, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
         """Return an axis's whitened levels and shapes (n + p, L + k): then a row for each weight known before."""
         data = np.column_stack([self.levels[axis], *(self.column(term)[axis] for term in terms)])
         known = [(k, term) for k, term in enumerate(terms, self.blocks.levels) if term.net is not None]
@@ -64,7 +64,7 @@ class Whitened:
             rows[row, k] = 1 / np.reshape(term.net.prior, (3, WEIGHTS))[axis, term.shape]
         return np.concatenate([data, rows])
 
-    def target(self, axis: int, terms: Sequence[Term]) -> FloatArray:
+    def target(self, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
         """Return what the design times levels and coefficients should be (n + p,)."""
         known = sum(term.net is not None for term in terms)
         output = self.output[axis]
@@ -72,16 +72,16 @@ class Whitened:
             output = output - self.root[axis] @ self.shapes.offset(terms)[axis]
         return np.pad(output, (0, known))
 
-    def solve(self, axis: int, terms: Sequence[Term]) -> tuple[FloatArray, FloatArray]:
+    def solve(self, axis: int, terms: Sequence[ThermalTerm]) -> tuple[FloatArray, FloatArray]:
         """Return an axis's levels and coefficients (L + k,) and whitened residuals (n,)."""
         return self._solve(self.design(axis, terms), self.target(axis, terms))
 
-    def solve_beside(self, axis: int, terms: Sequence[Term], net: Net) -> tuple[FloatArray, FloatArray]:
+    def solve_beside(self, axis: int, terms: Sequence[ThermalTerm], net: Net) -> tuple[FloatArray, FloatArray]:
         """Return the same of terms beside a network whose weights stay."""
         network = self.root[axis] @ self.shapes.network(net)[0][axis]
         return self._solve(self.design(axis, terms), self.output[axis] - network)
 
-    def coefficients(self, axis: int, terms: Sequence[Term]) -> FloatArray:
+    def coefficients(self, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
         """Return an axis's coefficients (k,); the weights of a network are those about which it is linear."""
         net = next((term.net for term in terms if term.net is not None), None)
         if net is None:
@@ -89,7 +89,7 @@ class Whitened:
         beside = self.solve_beside(axis, terms[:-WEIGHTS], net)[0][self.blocks.levels :]
         return np.concatenate([beside, np.reshape(net.weights, (3, WEIGHTS))[axis]])
 
-    def misfit(self, axis: int, terms: Sequence[Term]) -> float:
+    def misfit(self, axis: int, terms: Sequence[ThermalTerm]) -> float:
         """Return the sum of squares that least squares leaves of an axis."""
         return float(np.sum(self.solve(axis, terms)[1] ** 2))
 
@@ -119,7 +119,9 @@ class Whitened:
                 errors[:, own] -= np.nanmean(errors[:, own], axis=1)[:, None]
         return Held(np.sqrt(np.nanmean(errors**2, axis=1)), likelihood)
 
-    def left_out(self, axis: int, terms: Sequence[Term], folds: Sequence[NDArray[np.int64]]) -> Iterator[LeftOut]:
+    def left_out(
+        self, axis: int, terms: Sequence[ThermalTerm], folds: Sequence[NDArray[np.int64]]
+    ) -> Iterator[LeftOut]:
         """Yield how all other blocks predict each fold; numbers: levels, then coefficients."""
         return leave_out(self.root[axis], self.design(axis, terms), self.target(axis, terms), folds)
 
@@ -127,7 +129,7 @@ class Whitened:
 class ReducedTerms:
     """Many terms' columns, reduced to a triangle: what any subset of them leaves is found from a few dozen numbers."""
 
-    def __init__(self, data: Whitened, terms: Sequence[Term]):
+    def __init__(self, data: Whitened, terms: Sequence[ThermalTerm]):
         unique = list(dict.fromkeys(terms))
         self.levels = data.blocks.levels
         self.place = {term: self.levels + k for k, term in enumerate(unique)}
@@ -140,7 +142,7 @@ class ReducedTerms:
             self.target.append(product)
             self.rest.append(float(np.sum((data.output[axis] - q @ product) ** 2)))
 
-    def misfit(self, axis: int, terms: Sequence[Term]) -> float:
+    def misfit(self, axis: int, terms: Sequence[ThermalTerm]) -> float:
         """Return the sum of squares that least squares leaves of an axis."""
         inside = [*range(self.levels), *(self.place[term] for term in terms)]
         columns = self.factor[axis][:, inside]

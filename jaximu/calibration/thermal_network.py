@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.thermal_linear import Whitened
 from jaximu.calibration.thermal_selection import Candidate, candidate_of
-from jaximu.calibration.thermal_terms import NETWORK, POWERS, Model, Net, Term
+from jaximu.calibration.thermal_terms import NETWORK, POWERS, Model, Net, ThermalTerm
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.estimation.solver import solve
 from jaximu.ground import stored
@@ -67,7 +67,7 @@ def with_network(
 
     Returns with it the scale of the noise's variance, where the network explains more than what `scales` came from.
     """
-    plain = (Term(POWERS[0]), *(Term(name) for name in more))
+    plain = (ThermalTerm(POWERS[0]), *(ThermalTerm(name) for name in more))
     scale, left, freedom = float(np.mean(scales)), np.zeros(3), 1.0
     for _ in range(_ROUNDS):
         net, told = _fitted(data, plain, scale, rated)
@@ -81,11 +81,11 @@ def with_network(
     return candidate_of(data, "network", model, folds, scales, len(plain) + told / 3), scales
 
 
-def _about(plain: Sequence[Term], net: Net) -> tuple[Term, ...]:
-    return (*plain, *(Term(NETWORK, (), k, net) for k in range(WEIGHTS)))
+def _about(plain: Sequence[ThermalTerm], net: Net) -> tuple[ThermalTerm, ...]:
+    return (*plain, *(ThermalTerm(NETWORK, (), k, net) for k in range(WEIGHTS)))
 
 
-def _functions(data: Whitened, axis: int, terms: Sequence[Term]) -> FloatArray:
+def _functions(data: Whitened, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
     """Return what levels and terms leave of smooth functions of temperature and its rate, whitened, orthonormal."""
     first, second = (chebvander(data.shapes.inputs[:, k], order) for k, order in enumerate(_ORDERS))
     both = [first[:, i] * second[:, j] for i in range(_ORDERS[0] + 1) for j in range(_ORDERS[1] + 1)
@@ -123,7 +123,7 @@ def _solved(matrix, target, prior, start, inputs, origin):
     return jax.lax.map(one, (matrix, target, prior, start))
 
 
-def _fitted(data: Whitened, plain: Sequence[Term], scale: float, rated: bool) -> tuple[Net, float]:
+def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: bool) -> tuple[Net, float]:
     """Fit a network to each axis beside plain terms: from several starts to smooth functions, as stiff as the evidence
     says, then from the best to all of the data.
 

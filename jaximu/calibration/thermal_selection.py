@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 from jaximu.calibration.identifiability import Identifiability
 from jaximu.calibration.thermal_linear import Held, ReducedTerms, Whitened
 from jaximu.calibration.thermal_shapes import GRID, ThermalShapes
-from jaximu.calibration.thermal_terms import HISTORY, LEARNED, POWERS, RATES, SCALE, SPLINES, Model, Term, history
+from jaximu.calibration.thermal_terms import (
+    HISTORY,
+    LEARNED,
+    POWERS,
+    RATES,
+    SCALE,
+    SPLINES,
+    Model,
+    ThermalTerm,
+    history,
+)
 from jaximu.data.rest_blocks import Leg, RestBlocks
 from jaximu.ground.array_types import FloatArray
 
@@ -48,7 +58,7 @@ class Candidate:
     held: Held
 
     @property
-    def terms(self) -> tuple[Term, ...]:
+    def terms(self) -> tuple[ThermalTerm, ...]:
         """The terms that any axis has."""
         return tuple(dict.fromkeys(term for terms in self.model for term in terms))
 
@@ -83,7 +93,7 @@ def folds_of(blocks: RestBlocks, legs: Sequence[Leg]) -> list[NDArray[np.int64]]
     return parts
 
 
-def parameters_of(terms: Sequence[Term]) -> float:
+def parameters_of(terms: Sequence[ThermalTerm]) -> float:
     """Coefficients of an axis and its inner parameters; that pieces of a curve were picked from all counts as well."""
     pieces = sum(term.name == LEARNED for term in terms)
     return len(terms) + sum(term.name in HISTORY for term in terms) + _PICKED * log(comb(SPLINES, pieces))
@@ -99,10 +109,10 @@ def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArr
     found = []
     for axis, full in enumerate(model):
 
-        def criterion(chosen: Sequence[Term], axis: int = axis) -> float:
+        def criterion(chosen: Sequence[ThermalTerm], axis: int = axis) -> float:
             return offered.misfit(axis, chosen) / scale[axis] + penalty * parameters_of(chosen)
 
-        def stays(term: Term, kept: Sequence[Term]) -> bool:
+        def stays(term: ThermalTerm, kept: Sequence[ThermalTerm]) -> bool:
             return term.name in fixed or (term.name in _AT_ONCE and any(each.name in HISTORY for each in kept))
 
         found.append(tuple(exchanged(full, criterion, stays)))
@@ -135,7 +145,7 @@ def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
     spacing = {name: float(grid[1] / grid[0]) for name, grid in shapes.grids.items()}
     touched = [axis for axis, terms in enumerate(model) if any(term.name in names for term in terms)]
     plain = [term for axis in touched for term in model[axis] if term.name not in HISTORY]
-    best: tuple[Term, ...] = ()
+    best: tuple[ThermalTerm, ...] = ()
     for zoom in range(_ZOOMS):
         if zoom:
             tried = {}
@@ -146,7 +156,7 @@ def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
             options = shapes.prepare(tried)
         offered = ReducedTerms(data, [*plain, *(term for terms in options.values() for term in terms)])
 
-        def cost(chosen: tuple[Term, ...], offered: ReducedTerms = offered) -> float:
+        def cost(chosen: tuple[ThermalTerm, ...], offered: ReducedTerms = offered) -> float:
             own = {term.name: term for term in chosen}
             return sum(
                 offered.misfit(axis, [own.get(term.name, term) for term in model[axis]]) / scale[axis]
@@ -179,14 +189,14 @@ def families_of(told: Sequence[str], more: Sequence[str]) -> dict[str, tuple[lis
     return found
 
 
-def terms_of(names: Sequence[str], shapes: ThermalShapes) -> tuple[Term, ...]:
+def terms_of(names: Sequence[str], shapes: ThermalShapes) -> tuple[ThermalTerm, ...]:
     """Return the terms of effects, those with memory at a typical inner parameter."""
-    found: list[Term] = []
+    found: list[ThermalTerm] = []
     for name in names:
         if name == LEARNED:
-            found += [Term(LEARNED, (), k) for k in range(SPLINES)]
+            found += [ThermalTerm(LEARNED, (), k) for k in range(SPLINES)]
         else:
-            found.append(history(name, shapes.grids[name][GRID // 2]) if name in HISTORY else Term(name))
+            found.append(history(name, shapes.grids[name][GRID // 2]) if name in HISTORY else ThermalTerm(name))
     return tuple(found)
 
 

@@ -18,7 +18,7 @@ from jaximu.calibration.thermal_terms import (
     SCALE,
     SPLINES,
     Net,
-    Term,
+    ThermalTerm,
     history,
 )
 from jaximu.data.rest import block_means, mean_terms, rows_of
@@ -81,7 +81,7 @@ class ThermalShapes:
         self.bounds = {"low": low + ZERO_CELSIUS, "high": high + ZERO_CELSIUS, "reach": reach}
         self.force = blocks.by_rest(blocks.means["accelerometer"])
         self.paths = blocks.stimuli(self.force, reference)
-        self._columns: dict[Term, FloatArray] = {}
+        self._columns: dict[ThermalTerm, FloatArray] = {}
         none, curve = np.zeros((1, 0)), np.array([[self.bounds["low"], self.bounds["high"]]])
         self._add(dict.fromkeys((*POWERS, *RATES, SCALE), none) | {LEARNED: curve})
         self.prepare({})
@@ -91,7 +91,7 @@ class ThermalShapes:
         self.inputs, self.origin = inputs[:-1], inputs[-1]
         self._nets: dict[Net, tuple[FloatArray, FloatArray]] = {}
 
-    def prepare(self, tried: Mapping[str, FloatArray]) -> dict[str, list[Term]]:
+    def prepare(self, tried: Mapping[str, FloatArray]) -> dict[str, list[ThermalTerm]]:
         """Return terms of effects with memory at values (12,) of their inner parameters."""
         self._add({name: values[:, None] for name, values in {**self.grids, **tried}.items()})
         return {name: [history(name, value) for value in values] for name, values in tried.items()}
@@ -104,11 +104,11 @@ class ThermalShapes:
                  for path in self.paths]  # fmt: skip
         for name, grid, *parts in zip(names, asked.values(), *found, strict=True):
             for values, own in zip(grid, np.sum([np.asarray(part)[:, :count] for part in parts], axis=0), strict=True):
-                term = history(name, values[0]) if name in HISTORY else Term(name)
+                term = history(name, values[0]) if name in HISTORY else ThermalTerm(name)
                 for shape, column in enumerate(own.T):  # (3, n)
                     self._columns[term._replace(shape=shape) if name == LEARNED else term] = column
 
-    def column(self, term: Term) -> FloatArray:
+    def column(self, term: ThermalTerm) -> FloatArray:
         """Return the shape (3, n) of a term, axis by axis."""
         if term.net is not None:
             return self.network(term.net)[1][:, :, term.shape]
@@ -128,7 +128,7 @@ class ThermalShapes:
             self._nets[net] = value.T, np.stack(own)
         return self._nets[net]
 
-    def offset(self, terms: Sequence[Term]) -> FloatArray:
+    def offset(self, terms: Sequence[ThermalTerm]) -> FloatArray:
         """Return what a network linearised among the terms is beside weights times shapes, (3, n), SI."""
         net = next((term.net for term in terms if term.net is not None), None)
         if net is None:
@@ -138,14 +138,14 @@ class ThermalShapes:
 
     def smooth(self) -> FloatArray:
         """Return what a smooth function of temperature may be (n, 9)."""
-        return np.stack([self.column(Term(LEARNED, (), k))[0] for k in range(SPLINES)], axis=1)
+        return np.stack([self.column(ThermalTerm(LEARNED, (), k))[0] for k in range(SPLINES)], axis=1)
 
     def generous(self) -> FloatArray:
         """Return what temperature may plausibly do (n, 15), to tell noise from it.
 
         Not more: over a cycle or two some thirty shapes would swallow all slow noise there is.
         """
-        few = [Term(name) for name in RATES]
+        few = [ThermalTerm(name) for name in RATES]
         few += [history("thermal_lag", self.grids["thermal_lag"][k]) for k in (GRID // 3, 2 * GRID // 3)]
         few.append(history("thermal_hysteresis", self.grids["thermal_hysteresis"][GRID // 2]))
         return np.column_stack([self.smooth(), *(self.column(term)[0] for term in few)])

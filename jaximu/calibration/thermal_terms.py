@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from jaximu.model.effects.learned import SHAPES
 
-__all__ = ["HISTORY", "LEARNED", "NETWORK", "POWERS", "RATES", "SCALE", "SPLINES", "Model", "Net", "Term",
+__all__ = ["HISTORY", "LEARNED", "NETWORK", "POWERS", "RATES", "SCALE", "SPLINES", "Model", "Net", "ThermalTerm",
            "history"]  # fmt: skip
 
 POWERS = ("temperature", "temperature_squared", "temperature_cubed")
@@ -25,7 +25,7 @@ class Net(NamedTuple):
     prior: tuple[float, ...]
 
 
-class Term(NamedTuple):
+class ThermalTerm(NamedTuple):
     """A column group of the fit: a catalogue effect without its prefix, inner parameters, and which of its shapes."""
 
     name: str
@@ -34,10 +34,10 @@ class Term(NamedTuple):
     net: Net | None = None  # about which the network is linear
 
 
-Model = tuple[tuple[Term, ...], ...]
+Model = tuple[tuple[ThermalTerm, ...], ...]
 """The terms of each of three axes."""
 
 
-def history(name: str, value: float) -> Term:
+def history(name: str, value: float) -> ThermalTerm:
     """Return the term of an effect with memory at a value of its inner parameter."""
-    return Term(name, ((HISTORY[name], float(value)),))
+    return ThermalTerm(name, ((HISTORY[name], float(value)),))

@@ -56,7 +56,7 @@ def run(
     rate, temperatures = _rate(rate_range), _temperatures(temperature_range)
     from jaximu.calibration import load_calibration
     from jaximu.recordings.readers.kalibr import read_noise
-    from jaximu.report.export import Parameters, Range, export, losses
+    from jaximu.report.export import ExportedUnit, Range, export, losses
 
     model = load_calibration(calibration)
     if noise is not None and not getattr(writer(to), "NOISE", False):
@@ -65,7 +65,7 @@ def run(
     if not getattr(writer(to), "MAGNETIC", False):
         model = model.inertial()
     extent = Range.of(model, rate, temperatures)
-    parameters = Parameters.of(model, axes, None if noise is None else read_noise(noise), instance, device)
+    parameters = ExportedUnit.of(model, axes, None if noise is None else read_noise(noise), instance, device)
     path = output or calibration.with_name(f"{calibration.stem}_{to}{writer(to).SUFFIX}")
     written, paths = export(parameters, to, path)
     lost = losses(parameters, written, extent)

@@ -15,7 +15,7 @@ from jaximu.cli.messages import progress, say
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
-    from jaximu.planning.guide import Goal, Guide, Moment
+    from jaximu.planning.guide import GoalProgress, Guide, Moment
     from jaximu.recordings.readers.stream import Lines
     from jaximu.recordings.recording import Recording
 
@@ -146,7 +146,7 @@ def _tell(moment: Moment, last: Moment | None, rest: float) -> None:
         say(f"Not long enough: {moment.short:.1f} s at rest, {rest:g} s are needed.")
 
 
-def _goal_words(goal: Goal) -> str:
+def _goal_words(goal: GoalProgress) -> str:
     import math
 
     if goal.now == math.inf:

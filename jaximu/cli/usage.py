@@ -16,7 +16,7 @@ from types import UnionType
 
 from jaximu.ground.errors import InputError
 
-__all__ = ["COMMON", "EXIT_STATUS", "Option", "check_options", "completion", "help_text", "listed", "options_of",
+__all__ = ["COMMON", "EXIT_STATUS", "OptionHelp", "check_options", "completion", "help_text", "listed", "options_of",
            "usage_mistake"]  # fmt: skip
 
 EXIT_STATUS = (
@@ -28,7 +28,7 @@ _KINDS = {str: "TEXT", int: "NUMBER", float: "NUMBER", Path: "PATH"}
 
 
 @dataclass(frozen=True)
-class Option:
+class OptionHelp:
     """An option, or with no names starting in a hyphen a positional argument, as its help shows it."""
 
     names: tuple[str, ...]
@@ -44,18 +44,20 @@ class Option:
 
 
 COMMON = (
-    Option(("--quiet", "-q"), "", "Say nothing on stderr but errors.", "Output"),
-    Option(("--verbose", "-v"), "", "Show how long every stage takes, and where an unexpected error arose.", "Output"),
-    Option(("--no-color",), "", "No colours and no bold type (as NO_COLOR=1).", "Output"),
-    Option(("--help", "-h"), "", "Show this help.", "Output"),
+    OptionHelp(("--quiet", "-q"), "", "Say nothing on stderr but errors.", "Output"),
+    OptionHelp(
+        ("--verbose", "-v"), "", "Show how long every stage takes, and where an unexpected error arose.", "Output"
+    ),
+    OptionHelp(("--no-color",), "", "No colours and no bold type (as NO_COLOR=1).", "Output"),
+    OptionHelp(("--help", "-h"), "", "Show this help.", "Output"),
 )
 """What every verb takes."""
 
 
-def options_of(run: Callable[..., None]) -> list[Option]:
+def options_of(run: Callable[..., None]) -> list[OptionHelp]:
     """Return what a verb takes, in the order of its signature."""
     hints = typing.get_type_hints(run, include_extras=True)
-    found: list[Option] = []
+    found: list[OptionHelp] = []
     for name, parameter in inspect.signature(run).parameters.items():
         default = parameter.default
         if is_dataclass(default):
@@ -69,7 +71,7 @@ def options_of(run: Callable[..., None]) -> list[Option]:
     return found
 
 
-def _option(name: str, hint: object, default: object, group: str, positional: bool = False) -> Option:
+def _option(name: str, hint: object, default: object, group: str, positional: bool = False) -> OptionHelp:
     arguments = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
     said = next((each for each in arguments[1:] if hasattr(each, "metavar")), None)
     positional |= any(
@@ -79,7 +81,7 @@ def _option(name: str, hint: object, default: object, group: str, positional: bo
     metavar = getattr(said, "metavar", None) or ("" if arguments[0] is bool else _metavariable(arguments[0]))
     aliases = tuple(getattr(said, "aliases", None) or ())
     names = () if positional else (*aliases, option)
-    return Option(names, metavar, getattr(said, "help", None) or "", group, default)
+    return OptionHelp(names, metavar, getattr(said, "help", None) or "", group, default)
 
 
 def _metavariable(hint: object) -> str:

@@ -27,9 +27,9 @@ from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import MEAN_RATES
 
 __all__ = [
-    "Blocks",
     "Carried",
     "Matrix",
+    "SampleBlocks",
     "Vector",
     "carry",
     "compress",
@@ -50,7 +50,7 @@ Vector = list[Array]
 Matrix = list[list[Array]]
 
 
-class Blocks(NamedTuple):
+class SampleBlocks(NamedTuple):
     """Samples, or sums over blocks of samples; no parameter enters. Every array is (B, ...), the rest turns."""
 
     moments: Vector  # Σ y dt (three), Σ dt
@@ -96,7 +96,7 @@ def cross(first: Vector, second: Vector) -> Vector:
     return [b * z - c * y, c * x - a * z, a * y - b * x]
 
 
-def compress(moments: Vector, size: int) -> Blocks:
+def compress(moments: Vector, size: int) -> SampleBlocks:
     """Sum samples, y dt and dt of each (S, ...), up in blocks of `size`, which divides S."""
     p, q = (2 * each for each in MEAN_RATES)
 
@@ -113,7 +113,7 @@ def compress(moments: Vector, size: int) -> Blocks:
                 first = [a + b * r - s * c for a, b, c in zip(first, x, y, strict=True)]
             total = [*u, t] if total is None else [a + b for a, b in zip(total, sample, strict=True)]
         assert total is not None
-        return None, Blocks(total, coning, first)
+        return None, SampleBlocks(total, coning, first)
 
     def with_neighbours(each):  # (B, size + 2, ...)
         blocks = each.reshape(-1, size, *each.shape[1:])
@@ -190,7 +190,7 @@ def _cofactors(matrix: Matrix) -> Matrix:
     return [cross(b, c), cross(c, a), cross(a, b)]
 
 
-def _advance(inverse: Matrix, offset: Vector, cofactors: Matrix, quaternion: Vector, block: Blocks):
+def _advance(inverse: Matrix, offset: Vector, cofactors: Matrix, quaternion: Vector, block: SampleBlocks):
     """Return the rotation after a block, and the block's rotation vector."""
     *u, t = block.moments
     vector = [each + c * t for each, c in zip(matvec(inverse, u), offset, strict=True)]
@@ -200,7 +200,7 @@ def _advance(inverse: Matrix, offset: Vector, cofactors: Matrix, quaternion: Vec
     return turn(quaternion, vector), vector
 
 
-def _identity(blocks: Blocks) -> Vector:
+def _identity(blocks: SampleBlocks) -> Vector:
     one = jnp.ones_like(blocks.moments[0][0])
     return [one, *[jnp.zeros_like(one)] * 3]
 
@@ -210,7 +210,7 @@ def _normalised(quaternion: Vector) -> Vector:
     return [each / length for each in quaternion]
 
 
-def rotate_through(inverse: Matrix, offset: Vector, blocks: Blocks) -> Vector:
+def rotate_through(inverse: Matrix, offset: Vector, blocks: SampleBlocks) -> Vector:
     """Return the rotation of each turn, a unit quaternion from the last body frame to the first."""
     cofactors = _cofactors(inverse)
 
@@ -240,7 +240,7 @@ def rotate_samples(inverse: Matrix, offset: Vector, moments: Vector) -> Vector:
     return _normalised(quaternion)
 
 
-def carry(inverse: Matrix, offset: Vector, blocks: Blocks, density: Matrix, size: int = 1) -> Carried:
+def carry(inverse: Matrix, offset: Vector, blocks: SampleBlocks, density: Matrix, size: int = 1) -> Carried:
     """Integrate turns at A and c: rotation, its derivatives, and its noise.
 
     `density` is of the rate's white noise, A N Aᵀ in (rad/s)² s, which every sample adds rotated as at its end; over a

@@ -19,7 +19,7 @@ import scipy
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu.estimation.covariance import Blocks, Covariance
+from jaximu.estimation.covariance import BlockFactor, Covariance
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -405,13 +405,13 @@ class MagneticField(Measurement):
         used, places = used[:rows], places[:, kinds]
         values = values[:, kinds] * used[places][..., None]
         inverse = np.linalg.inv(np.asarray(imu.magnetometer.gain))
-        shaken = Blocks(places, values * (windows.noise / np.sqrt(windows.count))[:, None, None] @ inverse)  # pyright: ignore
+        shaken = BlockFactor(places, values * (windows.noise / np.sqrt(windows.count))[:, None, None] @ inverse)  # pyright: ignore
         turned = _UNITS[1] * (1 + _TURN_SHARE / _UNITS[1] * windows.angle) * length
         sizes = np.concatenate([np.full(n, _UNITS[0]), np.repeat(turned, 2), _UNITS[2] + windows.off])[:rows] * used
         group = np.repeat([0, 1, 2], [n, 2 * n, n])[:rows]
         level = np.where(group == 2, used, 0.0)
         own = [np.where(group == k, sizes, 0.0) for k in range(3)]  # independent: the roots alone
-        factors = own if windows.alone else [Blocks(places, _UNITS[0] * values), *own[1:]]  # pyright: ignore
+        factors = own if windows.alone else [BlockFactor(places, _UNITS[0] * values), *own[1:]]  # pyright: ignore
         measured = shaken.component(rows) + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
         if not windows.alone:
             bent = windows.bent(field) * windows.level[:, None]

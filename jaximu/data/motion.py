@@ -63,9 +63,24 @@ from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["FARTHEST_UNSEEN", "LONGEST_MOTION", "Disturbances", "Interval", "IntervalsOfMotion", "Path",
-           "carried", "cut", "first_field", "first_knowledge", "interval_rows", "level", "longest_rest", "merged_drift",
-           "sees_earth", "turned"]  # fmt: skip
+__all__ = [
+    "FARTHEST_UNSEEN",
+    "LONGEST_MOTION",
+    "Disturbances",
+    "IntervalsOfMotion",
+    "MotionIntervals",
+    "MotionPath",
+    "carried",
+    "cut",
+    "first_field",
+    "first_knowledge",
+    "interval_rows",
+    "level",
+    "longest_rest",
+    "merged_drift",
+    "sees_earth",
+    "turned",
+]  # fmt: skip
 
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
@@ -97,7 +112,7 @@ _PARTS, _SHARE = 8, 0.1
 """Intervals in a rest, at least, so that they show its noise; and what drift may add to the noise of one's mean."""
 
 
-class Interval(eqx.Module):
+class MotionIntervals(eqx.Module):
     """Intervals of a recording, padded to S samples of length zero; leading axes.
 
     accelerometer, gyroscope: outputs, in the unit's output units; B samples before the interval precede them, for
@@ -144,7 +159,7 @@ class Disturbances(eqx.Module):
         return 6 + self.variance.size
 
 
-class Path(eqx.Module):
+class MotionPath(eqx.Module):
     """Attitudes (N + 1, 4), body to level, and velocities (N + 1, 3), m/s, at the ends of N intervals."""
 
     attitude: Float[Array, "... 4"]
@@ -203,7 +218,7 @@ def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
     )
 
 
-def _seen(like: Imu, numbers: Array, part: Interval):
+def _seen(like: Imu, numbers: Array, part: MotionIntervals):
     """Return rates and forces (S, 6) of an interval's samples, the Earth's rotation (3,) and the numbers of `Outside`.
 
     Errors of the set-up are undone by iteration: what they would make of the rates is taken off the rates.
@@ -244,12 +259,12 @@ class _Means(eqx.Module):
     duration: Array
 
 
-def _condensed(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
+def _condensed(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> _Means:
     both = (kind(like, numbers, part, white) for kind in (_of_rest, _of_motion))
     return jax.tree.map(partial(jnp.where, part.rest > 0), *both)
 
 
-def _of_motion(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
+def _of_motion(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> _Means:
     samples, earth, outside = _seen(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     reaction = whole.reaction[:, :6]
@@ -276,7 +291,7 @@ def _of_motion(like: Imu, numbers: Array, part: Interval, white: Array) -> _Mean
     )  # fmt: skip
 
 
-def _of_rest(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
+def _of_rest(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> _Means:
     before = part.time.shape[-1] - part.length.shape[-1]
     few = 2 * before + 1
     share = part.length / _duration(part)
@@ -297,13 +312,19 @@ def _of_rest(like: Imu, numbers: Array, part: Interval, white: Array) -> _Means:
     )  # fmt: skip
 
 
-def _duration(part: Interval) -> Array:
+def _duration(part: MotionIntervals) -> Array:
     return jnp.maximum(part.length.sum(), 1e-9)
 
 
 def _rows(
-    means: _Means, part: Interval, errors: Disturbances, gravity: Array, before: Path, after: Path, anchor: Array
-) -> Rows:  # fmt: skip
+    means: _Means,
+    part: MotionIntervals,
+    errors: Disturbances,
+    gravity: Array,
+    before: MotionPath,
+    after: MotionPath,
+    anchor: Array,
+) -> Rows:
     """Return the white rows of an interval about a path: 6 of attitude and velocity, the drift's, what is measured.
 
     anchor (4,): the attitude at the end as first reckoned, about which one that begins anew is known.
@@ -381,7 +402,9 @@ def _rows(
     return jax.tree.map(lambda *each: jnp.concatenate(each), *rows)
 
 
-def _measured(means: _Means, part: Interval, errors: Disturbances, gravity: Array, after: Path, size: int) -> Rows:
+def _measured(
+    means: _Means, part: MotionIntervals, errors: Disturbances, gravity: Array, after: MotionPath, size: int
+) -> Rows:
     """Return 6 rows measured at the end: rate and force of a rest, the velocity where motion ends, or nothing."""
 
     def still(change):  # attitude, earth, gravity
@@ -409,8 +432,14 @@ def _measured(means: _Means, part: Interval, errors: Disturbances, gravity: Arra
 
 
 def _sighted(
-    means: _Means, part: Interval, sighting: Sighting, errors: Disturbances, gravity: Array, after: Path, size: int
-) -> Rows:  # fmt: skip
+    means: _Means,
+    part: MotionIntervals,
+    sighting: Sighting,
+    errors: Disturbances,
+    gravity: Array,
+    after: MotionPath,
+    size: int,
+) -> Rows:
     """Return the rows of what was measured from outside at the end, or nothing."""
 
     def off(change):  # attitude and velocity, the end, gravity, what is outside
@@ -432,8 +461,8 @@ def _sighted(
 
 
 def interval_rows(
-    like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: Interval, errors: Disturbances,
-    before: Path, after: Path,
+    like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: MotionIntervals, errors: Disturbances,
+    before: MotionPath, after: MotionPath,
 ) -> Rows:  # fmt: skip
     """Return the white rows of one interval, linearised about a unit and the path's two ends.
 
@@ -446,8 +475,8 @@ def interval_rows(
 
 
 def carried(
-    like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: Interval, before: Path
-) -> Path:  # fmt: skip
+    like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: MotionIntervals, before: MotionPath
+) -> MotionPath:  # fmt: skip
     """Return the path's end after an interval, as a unit's numbers have it: the same attitude in a rest or restart."""
     samples, earth, _ = _seen(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
@@ -455,10 +484,10 @@ def carried(
         before.attitude, before.velocity, whole.rotation, whole.velocity, whole.duration, earth, gravity
     )  # fmt: skip
     resting = (part.rest > 0) | (part.restart > 0)
-    return Path(jnp.where(resting, before.attitude, attitude), jnp.where(resting, 0.0, velocity))
+    return MotionPath(jnp.where(resting, before.attitude, attitude), jnp.where(resting, 0.0, velocity))
 
 
-def first_field(intervals: Interval, imu: Imu) -> FloatArray:
+def first_field(intervals: MotionIntervals, imu: Imu) -> FloatArray:
     """Return the magnetic field (3,) in the level frame, µT, as the first rest in which it is measured has it."""
     (sighting,) = (each for each in intervals.sightings if isinstance(each, FieldSeen))
     at = int(np.argmax(np.asarray(sighting.measured) > 0))
@@ -513,7 +542,7 @@ def longest_rest(errors: Disturbances) -> float:
 def cut(
     recording: Recording, rests: FloatArray, still: float = _LONGEST, beyond: int = 0,
     attitude: Attitude | None = None, clock: tuple[float, float] = (0.0, 0.0), field: Signal | None = None,
-) -> tuple[Interval, list[str]]:  # fmt: skip
+) -> tuple[MotionIntervals, list[str]]:  # fmt: skip
     """Cut a recording into intervals, from its first rest to its last, padded in number and length; and notes.
 
     **Arguments:** `rests` (P, 2): start and stop, s; `still`: s, the longest interval of a rest, of which each has
@@ -602,7 +631,7 @@ def cut(
         sightings.append(AttitudeSeen(*at, said))
         if (velocity := attitude.velocities()) is not None:
             sightings.append(VelocitySeen(*at, whole(velocity[latest])))
-    return Interval(
+    return MotionIntervals(
         np.concatenate([force[around], np.repeat(force[around][-1:], padded, axis=0)]),
         np.concatenate([gyroscope.values[around], np.repeat(gyroscope.values[around][-1:], padded, axis=0)]),
         whole(np.where(inside, length[place], 0.0)), whole(time[around]), whole(rest),
@@ -683,13 +712,13 @@ class Filtered:
     """
 
     last: Knowledge
-    path: Path
+    path: MotionPath
     misfit: float
     rows: Rows = field(repr=False)
 
 
 @dataclass(frozen=True)
-class Followed:
+class FilterPass:
     """How a filter came to know the free numbers and gravity, interval after interval, and the smoothed states.
 
     innovations (N, 1 + k): normalised, squared, of rests and ends of motion, and of each kind of sighting given them;
@@ -712,10 +741,10 @@ class IntervalsOfMotion(Measurement):
     The path about which it is linearised is kept from one evaluation to the next, and its first attitudes, `anchor`.
     """
 
-    intervals: Interval
+    intervals: MotionIntervals
     errors: Disturbances
     gravity: float
-    path: Path | None = field(default=None, repr=False)
+    path: MotionPath | None = field(default=None, repr=False)
     anchor: FloatArray | None = field(default=None, repr=False)
 
     effects_inside = True
@@ -735,7 +764,7 @@ class IntervalsOfMotion(Measurement):
         """Return the intervals filtered about one unit, along the path that fits it best."""
         means = self._means(imu)
         if self.path is None:
-            self.path = Path(*stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity))
+            self.path = MotionPath(*stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity))
             self.anchor = np.asarray(self.path.attitude)[1:]
         states, seen = self.errors.states, self._absolute
         for number in range(_ROUNDS):
@@ -754,7 +783,7 @@ class IntervalsOfMotion(Measurement):
             change = _change(self.path, moved, seen)
             if change < _UNMOVED or number + 1 == _ROUNDS:
                 break
-            self.path = Path(*(np.asarray(each) for each in stored.call(_moved, "moved path", self.path, moved)))
+            self.path = MotionPath(*(np.asarray(each) for each in stored.call(_moved, "moved path", self.path, moved)))
         return Filtered(last, self.path, float(innovations.sum()), rows)
 
     @property
@@ -781,7 +810,7 @@ class IntervalsOfMotion(Measurement):
         assert merged is not None
         return _Means(*merged)
 
-    def _part(self, place: NDArray[np.int64]) -> Interval:
+    def _part(self, place: NDArray[np.int64]) -> MotionIntervals:
         """Return some of the intervals, without the samples that none of them has."""
         part = jax.tree.map(lambda leaf: np.asarray(leaf)[place], self.intervals)
         before = part.time.shape[1] - part.length.shape[1]
@@ -798,7 +827,7 @@ class IntervalsOfMotion(Measurement):
         )
         return Rows(*(np.asarray(leaf) for leaf in leaves))
 
-    def followed(self, imu: Imu, index: Sequence[int], prior: Knowledge) -> Followed:
+    def followed(self, imu: Imu, index: Sequence[int], prior: Knowledge) -> FilterPass:
         """Return how a filter would have come to know free numbers, linearised about a unit and its path.
 
         **Arguments:** `index`: places of the free numbers; `prior`: of them and of gravity, less the unit's.
@@ -816,7 +845,7 @@ class IntervalsOfMotion(Measurement):
         smoothed = smooth(eliminated, final[:states], final[states:])
         variances = smoothed_variances(eliminated, covariance)
         sigmas = np.sqrt(np.diagonal(np.array(covariances), axis1=-2, axis2=-1))
-        return Followed(innovations, self.freedom, np.array(values), sigmas, smoothed, np.sqrt(variances))
+        return FilterPass(innovations, self.freedom, np.array(values), sigmas, smoothed, np.sqrt(variances))
 
     def about(self, imu: Imu) -> About:
         """Return the triangular system about one unit, the leading axis of length one."""
@@ -833,12 +862,12 @@ class IntervalsOfMotion(Measurement):
         return About(jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions), covariance, none, found)
 
 
-def _all_means(kind: Callable[..., _Means], imu: Imu, intervals: Interval, errors: Disturbances) -> _Means:
+def _all_means(kind: Callable[..., _Means], imu: Imu, intervals: MotionIntervals, errors: Disturbances) -> _Means:
     numbers = ravel_pytree(imu)[0]
     return jax.lax.map(lambda part: kind(imu, numbers, part, errors.white), intervals, batch_size=_TOGETHER)
 
 
-def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
+def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) -> MotionPath:
     """Return a first path: carried through motion, turned as a reference has it, levelled at every rest."""
 
     def step(sighted, attitude, part):
@@ -864,11 +893,11 @@ def _dead_reckoned(means: _Means, intervals: Interval, gravity: Array) -> Path:
         heading = multiply(sighting.placed(now, Outside.of(outside)), conjugate(now)) * jnp.array([1.0, 0.0, 0.0, 1.0])
         start = multiply(heading / jnp.linalg.norm(heading), start)
     attitudes = jnp.concatenate([start[None], reckoned(start, True)])
-    return Path(attitudes, jnp.zeros((len(attitudes), 3)))
+    return MotionPath(attitudes, jnp.zeros((len(attitudes), 3)))
 
 
 def _along(
-    means: _Means, intervals: Interval, errors: Disturbances, gravity: Array, path: Path, anchor: Array
+    means: _Means, intervals: MotionIntervals, errors: Disturbances, gravity: Array, path: MotionPath, anchor: Array
 ) -> Rows:  # fmt: skip
     before, after = (jax.tree.map(lambda leaf, part=part: leaf[part], path) for part in (slice(-1), slice(1, None)))
 
@@ -879,16 +908,16 @@ def _along(
     return jax.lax.map(rows, (means, intervals, before, after, anchor), batch_size=_TOGETHER)
 
 
-def _change(path: Path, moved: FloatArray, seen: bool) -> float:
+def _change(path: MotionPath, moved: FloatArray, seen: bool) -> float:
     """Return how far attitudes move, rad, but for the heading of all unless it is measured: it is held, and creeps."""
     turned = np.array(rotate(path.attitude, moved[:, :3]))  # pyright: ignore[reportArgumentType]
     turned[:, 2] -= 0.0 if seen else turned[0, 2]
     return float(np.max(np.abs(turned)))
 
 
-def _moved(path: Path, moved: Array) -> Path:
+def _moved(path: MotionPath, moved: Array) -> MotionPath:
     """Return a path whose ends turn and speed up by moved (N + 1, 6)."""
-    return Path(turned(path.attitude, moved[:, :3]), path.velocity + moved[:, 3:])
+    return MotionPath(turned(path.attitude, moved[:, :3]), path.velocity + moved[:, 3:])
 
 
 def turned(attitude: Float[Array, "... 4"], vector: Float[Array, "... 3"]) -> Float[Array, "... 4"]:

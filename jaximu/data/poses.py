@@ -29,7 +29,7 @@ from jaximu.data.poses_covariance import (
     integrate_turns,
     sensitivities,
 )
-from jaximu.estimation.covariance import Blocks, Covariance, component_covariance
+from jaximu.estimation.covariance import BlockFactor, Covariance, component_covariance
 from jaximu.estimation.fitting import About, Conditions, Measurement
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -173,7 +173,7 @@ def condensed(
     fields = len(HandHeldConditions.__dataclass_fields__)
     conditions = HandHeldConditions(*leaves[:fields])
     measured, *blocks, used, group, force, angle = leaves[fields : fields + 11]
-    factors = tuple(Blocks(*each) for each in zip(blocks[::2], blocks[1::2], strict=True))
+    factors = tuple(BlockFactor(*each) for each in zip(blocks[::2], blocks[1::2], strict=True))
     covariance = Covariance(measured, factors, used, group)
     if count > 1:
         return Condensed(conditions, covariance, force, angle, None, None)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from jaximu.data.gravity_direction import unit_vectors
 from jaximu.data.gravity_norm import recover_specific_force, recovery_jacobian
 from jaximu.data.preintegration import turned_by_rates
-from jaximu.estimation.covariance import Blocks, Covariance, mean_root
+from jaximu.estimation.covariance import BlockFactor, Covariance, mean_root
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import (
     conjugate,
@@ -125,16 +125,16 @@ def condition_covariance(imu: Imu, observations: Observations, integrated: Integ
     # what a pose reaches: its norm, the turn before it and the turn after it, of which the ends have one alone
     before_it, after_it = ((1, 0), (0, 0)), ((0, 1), (0, 0))
     no_axis = ((0, 0),)
-    reached = Blocks(
+    reached = BlockFactor(
         jnp.concatenate([pose[:, None], jnp.pad(rows, before_it), jnp.pad(rows, after_it)], axis=1),
         jnp.concatenate(
             [norm[:, None], jnp.pad(after, (*before_it, *no_axis)), jnp.pad(before, (*after_it, *no_axis))], axis=1
         ),
     ).of_rows(used)
-    turned = Blocks(rows, lever).of_rows(used)
-    means = Blocks(at_rest, jnp.broadcast_to(jnp.eye(3), (count, 3, 3))).of_rows(used)
+    turned = BlockFactor(rows, lever).of_rows(used)
+    means = BlockFactor(at_rest, jnp.broadcast_to(jnp.eye(3), (count, 3, 3))).of_rows(used)
     factors = tuple(
-        Blocks(each.rows, each.values @ mean_root(covariance, mask))
+        BlockFactor(each.rows, each.values @ mean_root(covariance, mask))
         for each, covariance, mask in (
             (reached, poses.accelerometer_covariance, poses.mask), (turned, integrated.noise, turns.mask),
             (means, poses.gyroscope_covariance, poses.mask),

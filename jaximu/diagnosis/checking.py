@@ -13,8 +13,8 @@ from jaximu.calibration.calibration import provenance, require_calibration
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.systematic import History, noise_at_rest
 from jaximu.data.drift import with_usual_drift
-from jaximu.diagnosis.comparison import Followed, Fresh, Old, Question, candidates, scatter_about_a_fit
-from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.comparison import FollowedUnit, Fresh, Old, Question, candidates, scatter_about_a_fit
+from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
 from jaximu.diagnosis.validity import Cause, OutputError, Shift, Validity
@@ -117,8 +117,8 @@ def _checked(
         return _followed(calibration, old, recordings, gravity, noise, level, why)
     notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]
 
-    def made(known: NoiseModel) -> HandHeld:
-        return HandHeld(parts, observe(parts, gravity.value, noise=known), old.imu.with_effects())
+    def made(known: NoiseModel) -> HandHeldExperiment:
+        return HandHeldExperiment(parts, observe(parts, gravity.value, noise=known), old.imu.with_effects())
 
     if noise is None:
         own = own_noise(replace(calibration, segmentations=parts))
@@ -265,7 +265,7 @@ def _followed(
     )  # fmt: skip
 
 
-def _told(follower: FilterInUse, old: Old, updates: int) -> tuple[Followed, float]:
+def _told(follower: FilterInUse, old: Old, updates: int) -> tuple[FollowedUnit, float]:
     """Return what a recording says of the old calibration's numbers, and how much of the innovations they explain.
 
     What a gain is multiplied by is measured, with noise that is the residual's, too. Where nothing but that noise
@@ -291,7 +291,7 @@ def _told(follower: FilterInUse, old: Old, updates: int) -> tuple[Followed, floa
     columns[:, places] = lengths[:, None] * vectors[:, told].T / size
     conditions = -(vectors[:, told].T @ (pull * size)) / lengths
     spread = np.eye(len(lengths)) + columns @ _beforehand(follower, old, kept, places) @ columns.T
-    return Followed(conditions, columns), float(conditions @ np.linalg.solve(spread, conditions))
+    return FollowedUnit(conditions, columns), float(conditions @ np.linalg.solve(spread, conditions))
 
 
 def _beforehand(follower: FilterInUse, old: Old, kept: list[int], places: list[int]) -> FloatArray:
@@ -347,7 +347,7 @@ def _same_sensors(calibration: Calibration, recordings: Sequence[Recording]) -> 
         )
 
 
-def _same_unit(experiment: HandHeld, conditions: FloatArray, name: str) -> None:
+def _same_unit(experiment: HandHeldExperiment, conditions: FloatArray, name: str) -> None:
     values, kinds = experiment.in_si(conditions), experiment.kinds
     for place, (kind, limit) in enumerate(zip(experiment.residual_kinds, _FAR_OFF, strict=False)):
         own = values[kinds == place].reshape(-1, kind.components)
@@ -371,7 +371,7 @@ def _same_gains(old: Old, fresh: Fresh, name: str) -> None:
             )
 
 
-def _temperatures(calibration: Calibration, old: Old, experiment: HandHeld) -> list[str]:
+def _temperatures(calibration: Calibration, old: Old, experiment: HandHeldExperiment) -> list[str]:
     """Say where temperatures differ and the calibration has nothing that depends on them."""
     before = calibration.data.get("temperature")
     if before is None or any("temperature" in " ".join(effect.needs) for effect in old.imu.all_effects().values()):
@@ -443,7 +443,7 @@ def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
     return tuple(found)
 
 
-def _output_errors(old: Old, fresh: Fresh, experiment: HandHeld) -> dict[str, OutputError]:
+def _output_errors(old: Old, fresh: Fresh, experiment: HandHeldExperiment) -> dict[str, OutputError]:
     """The largest difference of the outputs in the recording, gyroscope bias apart, and of the turns' rotations."""
     found = {}
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import Block, Evidence
+from jaximu.diagnosis.evidence import Evidence, TestedBlock
 from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, kolmogorov_sf
@@ -65,7 +65,7 @@ def checks_of(state: State, experiment: Experiment) -> tuple[Check, ...]:
     if freedom:
         text = f"what no candidate can explain: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom"
         found.append(Check("outside the catalogue", statistic / freedom, p_value, text))
-    if isinstance(experiment, HandHeld):
+    if isinstance(experiment, HandHeldExperiment):
         found += _dependences(state, experiment)
     found += [_distribution(state), _odd_even(state, experiment)]
     order = sorted(range(len(found)), key=lambda k: found[k].p_value)
@@ -99,7 +99,7 @@ def _by_kind(state: State, experiment: Experiment) -> list[Check]:
     return found
 
 
-def _dependences(state: State, experiment: HandHeld) -> list[Check]:
+def _dependences(state: State, experiment: HandHeldExperiment) -> list[Check]:
     """Whether a kind of residual depends on time, temperature, specific force, or on a turn's angle, rate, duration.
 
     A score test of a few polynomials of the covariate: of the norms and of each axis of the means at rest by
@@ -124,7 +124,7 @@ def _dependences(state: State, experiment: HandHeld) -> list[Check]:
         basis = np.polynomial.legendre.legvander(2 * (used - used.min()) / np.ptp(used) - 1, degree)[:, 1:]
         columns = np.zeros((len(rows), degree * shapes.shape[1]))
         columns[rows] = (basis[:, :, None] * shapes[rows, None, :]).reshape(len(used), -1)
-        blocks.append(Block(f"{names[kind]} against {name}", state.weights @ columns, np.ones(columns.shape[1])))
+        blocks.append(TestedBlock(f"{names[kind]} against {name}", state.weights @ columns, np.ones(columns.shape[1])))
 
     axes = np.zeros((len(kinds), 3))
     axes[kinds == 2] = np.tile(np.eye(3), (int(np.sum(kinds == 2)) // 3, 1))
@@ -146,7 +146,7 @@ def _dependences(state: State, experiment: HandHeld) -> list[Check]:
     return found
 
 
-def _covariates(state: State, experiment: HandHeld) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+def _covariates(state: State, experiment: HandHeldExperiment) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """What errors of poses (P,) and of turns (T,) may depend on, by name, padding included."""
     poses, turns = experiment.observations.poses, experiment.observations.turns
     accelerometer, gyroscope = state.imu.accelerometer, state.imu.gyroscope

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
-from jaximu.diagnosis.evidence import Block, Evidence
-from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.evidence import Evidence, TestedBlock
+from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.estimation.fitting import About, Measurement, Prior, effect_numbers, fit
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
 from jaximu.estimation.uncertainty import label
@@ -21,7 +21,7 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 
-__all__ = ["Candidate", "Followed", "Fresh", "Old", "Question", "Widened", "candidates", "scatter_about_a_fit"]
+__all__ = ["Explanation", "FollowedUnit", "Fresh", "Old", "Question", "Widened", "candidates", "scatter_about_a_fit"]
 
 _COMPARABLE = 0.1
 """Uncertainty, in typical sizes (10 % of a scale, 1 m/s²), beyond which a recording tells nothing of a parameter."""
@@ -102,7 +102,7 @@ class Old:
         """Return the places of a triad's gain, bias or both, without what is allowed to change."""
         return [k for k in self.tested if self.names[k].owner == owner and self.names[k].part in parts]
 
-    def rested(self, experiment: HandHeld) -> Old:
+    def rested(self, experiment: HandHeldExperiment) -> Old:
         """Return the calibration with the gyroscope's bias of the start taken anew at rest.
 
         Turns under a bias that is off by degrees a second are not linear in it.
@@ -122,7 +122,7 @@ def _without(covariance: FloatArray, slope: FloatArray, sigma: float) -> FloatAr
 
 
 @dataclass(frozen=True)
-class Followed:
+class FollowedUnit:
     """What a recording without poses says of a unit, as a filter in use has it: conditions (n,), linear in its numbers.
 
     They are white, of variance one, at the old calibration; columns (n, p): their derivatives by its numbers.
@@ -153,10 +153,12 @@ class Widened(Measurement):
     numbers that are solved for at once with all others; as nobody asks for them, they stand in the covariance.
     """
 
-    excess_names = HandHeld.excess_names
-    coarse = HandHeld.coarse
+    excess_names = HandHeldExperiment.excess_names
+    coarse = HandHeldExperiment.coarse
 
-    def __init__(self, experiment: HandHeld | Followed, scatter: FloatArray, causes: Sequence[FloatArray] = ()):
+    def __init__(
+        self, experiment: HandHeldExperiment | FollowedUnit, scatter: FloatArray, causes: Sequence[FloatArray] = ()
+    ):
         self.experiment, self.used = experiment, experiment.used
         self.wide = scatter[experiment.kinds]
         self.causes = np.concatenate([np.zeros((len(self.wide), 0)), *causes], axis=1)
@@ -167,7 +169,7 @@ class Widened(Measurement):
 
     def about(self, imu: Imu) -> About:
         """Return the recording about the unit."""
-        assert isinstance(self.experiment, HandHeld)
+        assert isinstance(self.experiment, HandHeldExperiment)
         found, real = self.experiment.about(imu), np.ix_(self.used, self.used)
         measured = np.array(found.covariance.measured)
         measured[0][real] = self.widen(measured[0][real])
@@ -198,7 +200,7 @@ class Fresh:
 
     @classmethod
     def fit(
-        cls, old: Old, experiment: HandHeld, scatter: FloatArray, causes: Sequence[FloatArray] = (),
+        cls, old: Old, experiment: HandHeldExperiment, scatter: FloatArray, causes: Sequence[FloatArray] = (),
         begin: Imu | None = None,
     ) -> Fresh:  # fmt: skip
         """Fit all parameters, known beforehand about the old ones, in a recording with `causes`; begin at a unit."""
@@ -218,7 +220,7 @@ class Fresh:
         return cls(imu, difference, new, new + old.covariance, share @ conditions, left, bool(found.converged))
 
     @classmethod
-    def of_linear(cls, old: Old, followed: Followed, scatter: float) -> Fresh:
+    def of_linear(cls, old: Old, followed: FollowedUnit, scatter: float) -> Fresh:
         """Solve for all parameters at once, which linear conditions allow; their noise is wider by `scatter`."""
         slope, right = followed.columns / scatter, followed.conditions / scatter
         scaled = slope * old.sizes
@@ -234,7 +236,7 @@ class Fresh:
         return np.sqrt(np.diag(self.covariance)) < _COMPARABLE * old.sizes
 
 
-def scatter_about_a_fit(old: Old, experiment: HandHeld, fresh: Fresh) -> FloatArray:
+def scatter_about_a_fit(old: Old, experiment: HandHeldExperiment, fresh: Fresh) -> FloatArray:
     """Return factors (kinds,), one at least, by which each kind of condition scatters about a fresh calibration.
 
     `fresh`: the calibration with factors of one.
@@ -252,13 +254,13 @@ def scatter_about_a_fit(old: Old, experiment: HandHeld, fresh: Fresh) -> FloatAr
 
 
 @dataclass(frozen=True)
-class Candidate:
+class Explanation:
     """What may explain that a prediction fails, its columns (n, q) not whitened.
 
     scope: as in `Cause`. places: of the parameters that would have moved.
     """
 
-    block: Block
+    block: TestedBlock
     scope: str
     places: tuple[int, ...] = ()
 
@@ -268,12 +270,12 @@ class Candidate:
         return self.block.columns * (1.0 if self.scope == "fixture" else _FREE)
 
 
-def candidates(old: Old, experiment: HandHeld) -> list[Candidate]:
+def candidates(old: Old, experiment: HandHeldExperiment) -> list[Explanation]:
     """Return what else a diagnosis asks the recording for: effects, shapes without a cause, poses that were bumped."""
     state = experiment.fit(tuple(old.imu.all_effects().values()), old.imu.with_effects())
     root = np.linalg.inv(state.weights)
     return [
-        Candidate(replace(block, columns=root @ block.columns),
+        Explanation(replace(block, columns=root @ block.columns),
                   CATALOGUE[block.name].scope if block.kind == "effect" else block.kind)
         for block in state.evidence.blocks
     ]  # fmt: skip
@@ -287,11 +289,15 @@ class Question:
     """
 
     evidence: Evidence
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Explanation, ...]
 
     @classmethod
     def ask(
-        cls, old: Old, experiment: HandHeld | Followed, scatter: FloatArray, others: Sequence[Candidate] = ()
+        cls,
+        old: Old,
+        experiment: HandHeldExperiment | FollowedUnit,
+        scatter: FloatArray,
+        others: Sequence[Explanation] = (),
     ) -> Question:
         """Predict the recording, and gather what may explain it: parameters, another gravity, and `others`."""
         conditions, columns, whole = Widened(experiment, scatter).predict(old.imu)
@@ -302,15 +308,15 @@ class Question:
         weights = np.linalg.inv(np.linalg.cholesky(whole))
         bias = columns[:, old.allowed]
 
-        def evidence(of: Sequence[Candidate]) -> Evidence:
+        def evidence(of: Sequence[Explanation]) -> Evidence:
             blocks = [replace(each.block, columns=weights @ each.block.columns) for each in of]
             return Evidence(weights @ conditions, weights @ bias, blocks)
 
-        found = [Candidate(Block(name, -columns[:, places] * old.sizes[places], old.sizes[places]), "parameter",
+        found = [Explanation(TestedBlock(name, -columns[:, places] * old.sizes[places], old.sizes[places]), "parameter",
                            tuple(places)) for name, places in _groups(old)]  # fmt: skip
         if old.shared > 0:  # unless the place was another one
             sigma = np.sqrt(2) * old.shared  # between two places
-            gravity = Candidate(Block("setup.gravity", sigma * reach[:, None], np.full(1, sigma)), "fixture")
+            gravity = Explanation(TestedBlock("setup.gravity", sigma * reach[:, None], np.full(1, sigma)), "fixture")
             if abs(evidence([gravity]).coefficients([0])[0]) < 3:
                 found.append(gravity)
         found += others

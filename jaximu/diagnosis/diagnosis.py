@@ -16,13 +16,13 @@ from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.poses import RecordedByHand
 from jaximu.diagnosis.checks import Check, checks_of
-from jaximu.diagnosis.drift import Drift, drifted, estimate_drift, hands_of
+from jaximu.diagnosis.drift import DriftComponents, drifted, estimate_drift, hands_of
 from jaximu.diagnosis.evidence import LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
-from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
-from jaximu.diagnosis.learned import Learned, learn, left_out_likelihood
+from jaximu.diagnosis.learned import LearnedTerm, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
 from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.estimation.fitting import fit
@@ -214,7 +214,7 @@ class Diagnosis(Described, Document):
     base: State
     extended: State
     gain: Gain | None = None
-    learned: Learned | None = None
+    learned: LearnedTerm | None = None
     options: tuple[Option, ...] = ()
     shape: str | None = None
 
@@ -630,7 +630,7 @@ def _with_hands(
     raise AssertionError
 
 
-def _moved(remade: Callable[[NoiseModel], Experiment], drift: Drift | None, noise: NoiseModel) -> Experiment:
+def _moved(remade: Callable[[NoiseModel], Experiment], drift: DriftComponents | None, noise: NoiseModel) -> Experiment:
     """Return the experiment with a noise model, and what drift and hands add."""
     return replace(remade(noise), drift=drift)  # pyright: ignore[reportArgumentType]
 
@@ -659,13 +659,13 @@ def _without_effects(found: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis
     )
 
 
-def _experiment(calibration: Calibration, noise: NoiseModel, start: Calibration | None = None) -> HandHeld:
+def _experiment(calibration: Calibration, noise: NoiseModel, start: Calibration | None = None) -> HandHeldExperiment:
     observations = observe(calibration.segmentations, calibration.gravity.value, noise=noise)
     known = tuple(calibration.imu.all_effects().values())
     if known:  # the Earth's rotation, where the latitude is known
         whole = RecordedByHand(calibration.segmentations, observations)
         observations = whole.along(calibration.imu, known).observations
-    return HandHeld(calibration.segmentations, observations, (start or calibration).imu.with_effects())
+    return HandHeldExperiment(calibration.segmentations, observations, (start or calibration).imu.with_effects())
 
 
 def same_device(first: Calibration, other: Calibration) -> list[str]:
@@ -712,8 +712,12 @@ def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None
 
 
 def _suggestion(
-    verdict: str, effects: Sequence[Named], noises: Sequence[NoiseFinding], learned: Learned | None, shape: str | None
-) -> str:  # fmt: skip
+    verdict: str,
+    effects: Sequence[Named],
+    noises: Sequence[NoiseFinding],
+    learned: LearnedTerm | None,
+    shape: str | None,
+) -> str:
     tied = [each for each in effects if each.rivals]
     if tied:
         kinds = [CATALOGUE[name] for name in (tied[0].name, *tied[0].rivals) if name in CATALOGUE]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from jaximu.diagnosis.experiment import Experiment
     from jaximu.model.sensor import Imu
 
-__all__ = ["DRAWS", "Drift", "drifted", "estimate_drift", "hands_of"]
+__all__ = ["DRAWS", "DriftComponents", "drifted", "estimate_drift", "hands_of"]
 
 _USUAL = {**USUAL_DRIFT, "poses that move": (1.0, 0.5), "turns undersampled": (0.1, 1.0)}
 """Median of each kind's standard deviation and the spread of its logarithm. What hands do is relative to what the
@@ -43,7 +43,7 @@ DRAWS = 1000
 
 
 @dataclass(frozen=True)
-class Drift:
+class DriftComponents:
     """Variance components of the conditions, padding included, their log sizes (k,) and these' covariance (k, k).
 
     names: "gyroscope bias instability", …. components (k, n, n): covariances at a size of one, which the noise `units`
@@ -120,7 +120,7 @@ class Drift:
         return drifting + power_on_text(dict(zip(self.names, self.units, strict=False)), sizes)
 
 
-def drifted(noise: NoiseModel, drift: Drift) -> NoiseModel:
+def drifted(noise: NoiseModel, drift: DriftComponents) -> NoiseModel:
     """Return a noise model with the drift that was estimated."""
     for name, unit, size in zip(drift.names, drift.units, np.exp(drift.log_size), strict=False):
         noise = with_noise(noise, name.partition(" ")[0], replace(unit, variance=size * unit.variance))
@@ -129,7 +129,7 @@ def drifted(noise: NoiseModel, drift: Drift) -> NoiseModel:
 
 def estimate_drift(
     experiment: Experiment, imu: Imu, noise: NoiseModel, columns: FloatArray, drifting: bool = True
-) -> Drift:
+) -> DriftComponents:
     """Estimate what a recording shows beyond `noise`: drift, of which that knows nothing, and what hands add.
 
     **Arguments:** `experiment`: made with `noise`; `imu`: a unit close to the recording's; `columns` (n, q):
@@ -151,21 +151,21 @@ def estimate_drift(
     )  # fmt: skip
     beside = np.zeros((len(used), columns.shape[1]))
     beside[used] = columns
-    return Drift(tuple(names), tuple(units.values()), components, hands, log_size, uncertainty, beside)
+    return DriftComponents(tuple(names), tuple(units.values()), components, hands, log_size, uncertainty, beside)
 
 
 def _by_hand(hands: Handling) -> tuple[FloatArray, FloatArray]:
     return np.asarray(np.diag(hands.moving), np.float64), np.asarray(np.diag(hands.sampling), np.float64)
 
 
-def hands_of(experiment: Experiment, imu: Imu, noise: NoiseModel, drift: Drift) -> Drift:
+def hands_of(experiment: Experiment, imu: Imu, noise: NoiseModel, drift: DriftComponents) -> DriftComponents:
     """Return what hands added to another recording, at the sizes that were estimated; its drift is in the noise."""
     hands = experiment.handling(imu, noise)
     first = len(drift.units)
     components = np.zeros((0, *drift.components.shape[1:]))
     if hands is not None:
         components = np.stack(_by_hand(hands))
-    return Drift(
+    return DriftComponents(
         drift.names[first:], (), components, hands, drift.log_size[first:], drift.uncertainty[first:, first:],
         np.zeros((len(experiment.used), 0)),
     )  # fmt: skip

@@ -13,8 +13,8 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.data.path import Path, terms
-from jaximu.diagnosis.drift import Drift
-from jaximu.diagnosis.evidence import Block, Evidence
+from jaximu.diagnosis.drift import DriftComponents
+from jaximu.diagnosis.evidence import Evidence, TestedBlock
 from jaximu.diagnosis.handling import Handling
 from jaximu.estimation.fitting import Linear, Measurement, Prior, fit, linearise
 from jaximu.estimation.problem import Name
@@ -95,7 +95,7 @@ class Experiment(Measurement):
     """
 
     start: Imu
-    drift: Drift | None = None  # that was estimated from this very recording
+    drift: DriftComponents | None = None  # that was estimated from this very recording
     reference: dict[str, Any] | None = None  # what is known of a measured attitude, as `calibration.json` has it
     residual_kinds: ClassVar[tuple[ResidualKind, ...]]
     advice: ClassVar[Callable[..., str]] = staticmethod(pose_advice)
@@ -111,10 +111,10 @@ class Experiment(Measurement):
         """Return whether a number is free."""
 
     @abstractmethod
-    def generic(self, imu: Imu, linear: Linear) -> list[Block]:
+    def generic(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
         """Return shapes without a cause and defects of single observations, not whitened, padding included."""
 
-    def nearly(self, imu: Imu, linear: Linear) -> list[Block]:
+    def nearly(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
         """Return shapes, as `generic` does, that named causes may be taken for: asked of what these leave."""
         return []
 
@@ -346,7 +346,7 @@ class Experiment(Measurement):
 
     def _blocks(
         self, imu: Imu, linear: Linear, weights: FloatArray, fitted: set[str], asking: Container[str] | None
-    ) -> tuple[list[Block], dict[str, str]]:
+    ) -> tuple[list[TestedBlock], dict[str, str]]:
         asked, refused = self.askable(linear)
         if asking is not None:
             asked = {name: kind for name, kind in asked.items() if kind.plain in asking}
@@ -360,7 +360,7 @@ class Experiment(Measurement):
             for given, columns in zip(grids[kind], found[kind], strict=True):
                 placed = kind.beginning() in given
                 blocks.append(
-                    Block(name, weights @ (columns * size)[used], size, "effect", given, placed, kind.curved())
+                    TestedBlock(name, weights @ (columns * size)[used], size, "effect", given, placed, kind.curved())
                 )
         generic = [replace(b, columns=weights @ b.columns[used]) for b in self.generic(imu, linear)]
         return blocks + generic, refused

@@ -8,10 +8,10 @@ from itertools import combinations
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import Block, Evidence, strength
+from jaximu.diagnosis.evidence import Evidence, TestedBlock, strength
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import on_held_out
-from jaximu.diagnosis.selection import BESIDE, Cause, Selection, causes_of, one_curve, select
+from jaximu.diagnosis.selection import BESIDE, SelectedCause, Selection, causes_of, one_curve, select
 from jaximu.mistakes import Finding
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
@@ -160,13 +160,13 @@ def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str
     return replace(extension, found=found, state=state), notes
 
 
-def _beside(evidence: Evidence, name: str, others: Sequence[str]) -> Cause | None:
+def _beside(evidence: Evidence, name: str, others: Sequence[str]) -> SelectedCause | None:
     """Return an effect as a cause beside others, if it can be told from them."""
     causes = causes_of(evidence, [*others, name])
     return next((each for each in causes if evidence.blocks[each.block].name == name), None)
 
 
-def _fitted(extension: Extension, state: State, name: str, cause: Cause) -> State:
+def _fitted(extension: Extension, state: State, name: str, cause: SelectedCause) -> State:
     """Return a fit with a cause in the place of the effect of this name."""
     evidence = extension.base.evidence
     block = evidence.blocks[cause.block]
@@ -175,7 +175,7 @@ def _fitted(extension: Extension, state: State, name: str, cause: Cause) -> Stat
     return extension.experiment.fit([*others, CATALOGUE[block.name].make(coefficients, **block.inner)], state.imu)
 
 
-def _named(blocks: Sequence[Block], cause: Cause) -> Found:
+def _named(blocks: Sequence[TestedBlock], cause: SelectedCause) -> Found:
     name = blocks[cause.block].name
     rivals = tuple(sorted({blocks[k].name for k in cause.rivals} - {name}))
     return Found(name, rivals, cause.p_value, cause.statistic, cause.freedom)

@@ -15,8 +15,8 @@ from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
 from jaximu.data.drift import drift_components, mean_output_reactions
 from jaximu.data.path import Path
 from jaximu.data.poses import RecordedByHand, extent_of
-from jaximu.diagnosis.drift import Drift
-from jaximu.diagnosis.evidence import Block
+from jaximu.diagnosis.drift import DriftComponents
+from jaximu.diagnosis.evidence import TestedBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
 from jaximu.diagnosis.twin import twin_recordings
@@ -30,15 +30,15 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observe
 
-__all__ = ["HandHeld", "harmonics"]
+__all__ = ["HandHeldExperiment", "harmonics"]
 
 
 @dataclass
-class HandHeld(RecordedByHand, Experiment):
+class HandHeldExperiment(RecordedByHand, Experiment):
     """Poses and turns of one unit, their noise known (`observations.slow`), and where they were cut from."""
 
     start: Imu  # a calibration without effects
-    drift: Drift | None = None
+    drift: DriftComponents | None = None
 
     by_hand = True
     residual_kinds = (
@@ -114,7 +114,7 @@ class HandHeld(RecordedByHand, Experiment):
         last = np.concatenate([poses, np.repeat(turns + 1, 2), np.repeat(poses, 3)])
         return np.stack([first, last], axis=1)[self.used]
 
-    def without(self, pose: int) -> HandHeld:
+    def without(self, pose: int) -> HandHeldExperiment:
         """Return the recording with a pose, and the turns to and from it, left out."""
         poses, turns = np.array(self.observations.poses.mask), np.array(self.observations.turns.mask)
         poses[pose] = False
@@ -130,7 +130,7 @@ class HandHeld(RecordedByHand, Experiment):
         """Return whether a fit shows the gyroscope's samples to be rates at instants, and not means."""
         return instants(self, state)
 
-    def averaged(self) -> HandHeld:
+    def averaged(self) -> HandHeldExperiment:
         """Return the recording with the gyroscope's samples of instants turned into means."""
         return averaged(self)
 
@@ -140,11 +140,11 @@ class HandHeld(RecordedByHand, Experiment):
         start, stop = float(np.asarray(poses.start)[pose]), float(np.asarray(poses.stop)[pose])
         return f"the pose from {start:.1f} to {stop:.1f} s"
 
-    def twin(self, state: State, noise: NoiseModel, seed: int) -> HandHeld:
+    def twin(self, state: State, noise: NoiseModel, seed: int) -> HandHeldExperiment:
         """Return the recording as a fit without effects would have it, along the same motion, noise included."""
         made = twin_recordings(self.segmentations, self.observations, self.shifts, state, noise, seed)
         parts = tuple(replace(part, recording=each) for part, each in zip(self.segmentations, made, strict=True))
-        return HandHeld(parts, observe(parts, float(self.observations.gravity), noise=noise), state.imu)
+        return HandHeldExperiment(parts, observe(parts, float(self.observations.gravity), noise=noise), state.imu)
 
     def covariates(self, kind: int) -> dict[str, FloatArray]:
         """Return what errors of a kind may depend on: for each of its vectors (v,), by name with unit, time first."""
@@ -190,7 +190,7 @@ class HandHeld(RecordedByHand, Experiment):
         poses, turns = np.asarray(self.observations.poses.mask), np.asarray(self.observations.turns.mask)
         return np.concatenate([poses, np.repeat(turns, 2), np.repeat(poses, 3)])
 
-    def generic(self, imu: Imu, linear: Linear) -> list[Block]:
+    def generic(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
         """Return shapes without a cause, and poses that were bumped."""
         poses = self.observations.poses
         real = np.flatnonzero(poses.mask)
@@ -214,11 +214,11 @@ class HandHeld(RecordedByHand, Experiment):
             found.append(rate("the gyroscope's bias swings to and fro", wave, period=period))
         by_force, _ = mean_output_reactions(linear.details.reaction)
         for pose in real:
-            found.append(Block("data.bumped_pose", by_force[:, pose] * _FORCE, np.full(3, _FORCE), "data",
+            found.append(TestedBlock("data.bumped_pose", by_force[:, pose] * _FORCE, np.full(3, _FORCE), "data",
                                {"pose": int(pose)}, True))  # fmt: skip
         return found
 
-    def nearly(self, imu: Imu, linear: Linear) -> list[Block]:
+    def nearly(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
         """Return shapes that a cause may be taken for: higher harmonics, a heading, curves of an axis's own force."""
         poses = self.observations.poses
         real = np.asarray(poses.mask)
@@ -232,17 +232,17 @@ class HandHeld(RecordedByHand, Experiment):
             force("the accelerometer's axes are curved (odd powers)", curves[..., 1::2]),
         ]
 
-    def _shaper(self, linear: Linear) -> tuple[Callable[..., Block], Callable[..., Block]]:
+    def _shaper(self, linear: Linear) -> tuple[Callable[..., TestedBlock], Callable[..., TestedBlock]]:
         """Return what makes a block of a shape in the poses of accelerometer and gyroscope.
 
         A shape (poses, k) is each axis's, or (poses, 3, k) to each its own.
         """
         real = np.asarray(self.observations.poses.mask)
 
-        def block(reach: FloatArray, size: float, name: str, shape: FloatArray, **inner: float) -> Block:
+        def block(reach: FloatArray, size: float, name: str, shape: FloatArray, **inner: float) -> TestedBlock:
             columns = np.einsum("npi,pk->nki" if shape.ndim == 2 else "npi,pik->nik", reach[:, real], shape)
             columns = columns.reshape(len(reach), -1)
-            return Block(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner))
+            return TestedBlock(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner))
 
         by_force, by_rate = mean_output_reactions(linear.details.reaction)
         return partial(block, by_force, _FORCE), partial(block, by_rate, _RATE)

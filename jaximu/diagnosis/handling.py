@@ -19,7 +19,7 @@ from jaximu.model.sensor import Imu
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.experiment import State
-    from jaximu.diagnosis.hand_held import HandHeld
+    from jaximu.diagnosis.hand_held import HandHeldExperiment
 
 __all__ = ["Handling", "averaged", "findings", "handling", "instants", "sway"]
 
@@ -40,7 +40,7 @@ class Handling(NamedTuple):
     turned: FloatArray
 
 
-def handling(experiment: HandHeld, imu: Imu, noise: NoiseModel) -> Handling:
+def handling(experiment: HandHeldExperiment, imu: Imu, noise: NoiseModel) -> Handling:
     """Measure how still the poses of a recording are, and how well its turns are sampled, at a unit close to it.
 
     A pose whose specific force turns from direction u₁ in its first half to u₂ in its second tilts by Δu × u per half
@@ -77,7 +77,7 @@ def handling(experiment: HandHeld, imu: Imu, noise: NoiseModel) -> Handling:
     return Handling(moving, sampling, np.sqrt(excess), spread, np.sqrt(missed), np.sqrt(known))
 
 
-def sway(experiment: HandHeld, noise: NoiseModel) -> list[Finding]:
+def sway(experiment: HandHeldExperiment, noise: NoiseModel) -> list[Finding]:
     """Return whether hands turn the unit in its poses: both sensors agree on it, whose noises are independent.
 
     A pose's second half is turned against its first by the rates, weighted by a triangle, and the accelerometer sees
@@ -110,7 +110,7 @@ def sway(experiment: HandHeld, noise: NoiseModel) -> list[Finding]:
     )]  # fmt: skip
 
 
-def instants(experiment: HandHeld, state: State) -> bool:
+def instants(experiment: HandHeldExperiment, state: State) -> bool:
     """Return whether the gyroscope's samples are those of instants, where they are taken for means over an interval.
 
     The mean over an interval h is the rate in its middle and h²/24 of its second derivative, which over a turn about a
@@ -128,14 +128,14 @@ def instants(experiment: HandHeld, state: State) -> bool:
     return told > _SURE**2 and abs(float(white @ state.evidence.residual) / told - 1) < 0.5
 
 
-def averaged(experiment: HandHeld) -> HandHeld:
+def averaged(experiment: HandHeldExperiment) -> HandHeldExperiment:
     """Return the recording with samples of instants turned into means over their intervals."""
     turns = experiment.observations.turns
     output = np.asarray(turns.output) + _bend(experiment)
     return replace(experiment, observations=replace(experiment.observations, turns=replace(turns, output=output)))
 
 
-def _bend(experiment: HandHeld) -> FloatArray:
+def _bend(experiment: HandHeldExperiment) -> FloatArray:
     """Return a 24th of the second differences (T, S, 3) of the turns' samples: what means have over instants."""
     turns = experiment.observations.turns
     output, inside = np.asarray(turns.output), np.asarray(turns.interval) > 0
@@ -144,7 +144,7 @@ def _bend(experiment: HandHeld) -> FloatArray:
     return bend
 
 
-def findings(experiment: HandHeld, hands: Handling, sizes: dict[str, tuple[float, float]]) -> list[Finding]:
+def findings(experiment: HandHeldExperiment, hands: Handling, sizes: dict[str, tuple[float, float]]) -> list[Finding]:
     """Return the poses that move, and the turns that are too quick, as findings; `sizes` as the drift has them."""
     found = []
     poses = experiment.observations.poses

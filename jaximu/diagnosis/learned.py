@@ -25,7 +25,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import Learned as Curve
 
-__all__ = ["Learned", "curves", "learn", "left_out", "left_out_likelihood"]
+__all__ = ["LearnedTerm", "curves", "learn", "left_out", "left_out_likelihood"]
 
 _STRENGTHS = 10.0 ** np.arange(7)
 """Prior variances tried, of what the data tells best, in variances that the data tells it with."""
@@ -36,7 +36,7 @@ _POINTS = 101
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedTerm:
     """A smooth term that the misfit depends on: it says on what, and not why.
 
     effect: the curve. gain: on data that was not fitted; where that is parts of the recording left out, the noise of
@@ -98,7 +98,7 @@ class Learned:
         }
 
 
-def learn(experiment: Experiment, state: State, held: Experiment | None = None) -> Learned | None:
+def learn(experiment: Experiment, state: State, held: Experiment | None = None) -> LearnedTerm | None:
     """Return the smooth term of one covariate, on one triad, that predicts best what was left out; None if none pays.
 
     **Arguments:** `state`: a fit that leaves something unexplained; `held`: another recording of the unit, on which
@@ -123,7 +123,7 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
         gain = on_held_out(held, state, fitted)
         if gain.log_likelihood <= 0:
             return None
-    return Learned(curve_of(fitted), gain, *_curve(fitted), fitted, found[0])
+    return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, found[0])
 
 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.data.field import FieldWindows, MagneticField
-from jaximu.diagnosis.evidence import Block, Evidence
+from jaximu.diagnosis.evidence import Evidence, TestedBlock
 from jaximu.diagnosis.selection import select
 from jaximu.estimation.fitting import linearise
 from jaximu.estimation.leave_out import leave_out
@@ -120,8 +120,10 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
     blocks = []
     for kind, slopes in measurement.dormant_columns(bare, linear.details, grids).items():
         size = np.asarray(kind.dormant().typical_sizes(scale).coefficients)
-        blocks += [Block(kind.name, weights @ (each * size)[rows], size, "effect", inner, kind.beginning() in inner)
-                   for inner, each in zip(grids[kind], slopes, strict=True)]  # fmt: skip
+        blocks += [
+            TestedBlock(kind.name, weights @ (each * size)[rows], size, "effect", inner, kind.beginning() in inner)
+            for inner, each in zip(grids[kind], slopes, strict=True)
+        ]
     if not blocks:
         return MagneticDiagnosis((), 1.0, refused)
     evidence = Evidence(residual, jacobian, blocks)

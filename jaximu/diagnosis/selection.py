@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import FAMILY_LEVEL, Block, Evidence, Scores
+from jaximu.diagnosis.evidence import FAMILY_LEVEL, Evidence, Scores, TestedBlock
 
-__all__ = ["BESIDE", "LEVEL", "Cause", "Selection", "causes_of", "one_curve", "select", "shape_of"]
+__all__ = ["BESIDE", "LEVEL", "SelectedCause", "Selection", "causes_of", "one_curve", "select", "shape_of"]
 
 LEVEL = FAMILY_LEVEL
 """Rate of false alarms over all tests together."""
@@ -35,7 +35,7 @@ _TRIED = 40
 
 
 @dataclass(frozen=True)
-class Cause:
+class SelectedCause:
     """A block that is taken for present, and the rivals (blocks of other names) that explain the data as well."""
 
     block: int
@@ -53,7 +53,7 @@ class Selection:
     scores: before any cause is taken in.
     """
 
-    causes: tuple[Cause, ...]
+    causes: tuple[SelectedCause, ...]
     complete: bool
     p_value: float
     scores: Scores
@@ -103,7 +103,7 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     return Selection((_cause(evidence, named + rivals, scores),) if named else (), False, p_value, scores)
 
 
-def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[Block, float] | None:
+def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[TestedBlock, float] | None:
     """Return the shape without a cause that explains a misfit by itself, and what it gains, nats.
 
     If need be it lies between two places of a grid.
@@ -121,7 +121,7 @@ def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[Block, float] | 
     return None
 
 
-def causes_of(evidence: Evidence, names: Sequence[str]) -> list[Cause]:
+def causes_of(evidence: Evidence, names: Sequence[str]) -> list[SelectedCause]:
     """Return effects that were chosen otherwise as causes: each beside the others, with the rivals it has there."""
     best: dict[str, int] = {}
     for _ in range(2):  # an inner parameter is another beside the other causes
@@ -170,13 +170,13 @@ def _leaders(evidence: Evidence, scores: Scores) -> list[int]:
     return sorted(leaders.values(), key=lambda k: -criterion(evidence, scores, k))
 
 
-def _cause(evidence: Evidence, explaining: Sequence[int], scores: Scores) -> Cause:
+def _cause(evidence: Evidence, explaining: Sequence[int], scores: Scores) -> SelectedCause:
     first = explaining[0]
     top = criterion(evidence, scores, first)
     rivals = tuple(k for k in explaining[1:] if criterion(evidence, scores, k) > top - _TIE)
     asked = sum(block.name == evidence.blocks[first].name for block in evidence.blocks)
     p_value = float(-np.expm1(asked * np.log1p(-min(scores.p_value[first], 1 - 1e-16))))  # Šidák over its grid
-    return Cause(first, rivals, float(scores.statistic[first]), int(scores.freedom[first]), p_value)
+    return SelectedCause(first, rivals, float(scores.statistic[first]), int(scores.freedom[first]), p_value)
 
 
 def one_curve(evidence: Evidence, one: int, other: int) -> bool:

@@ -19,7 +19,7 @@ from jaximu.data.drift import with_usual_drift
 from jaximu.data.rest_blocks import LEAST_RANGE
 from jaximu.diagnosis.diagnosis import extended
 from jaximu.diagnosis.experiment import State
-from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.diagnosis.learned import left_out_likelihood
 from jaximu.diagnosis.noise import own_noise
 from jaximu.ground.document import Document
@@ -41,7 +41,7 @@ _FIRST = {"temperature_squared": "temperature", "temperature_cubed": "temperatur
 _POSES, _LONG = 9, 300.0  # fewest poses by hand; s, of rests that are longer than a hand is still
 
 
-class _Thermal(HandHeld):
+class _Thermal(HandHeldExperiment):
     """A hand-held recording that is asked for what temperature does only."""
 
     def askable(self, linear):
@@ -62,7 +62,7 @@ class HandHeldThermal(Document):
     calibration: Calibration
     base: State
     state: State
-    experiment: HandHeld
+    experiment: HandHeldExperiment
     range: tuple[float, float]
     steps: tuple[tuple[str, float, float], ...]
     limits: dict[str, tuple[float, str]]

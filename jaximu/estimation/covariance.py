@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from jaximu.ground.array_types import Array
 
 __all__ = [
-    "Blocks",
+    "BlockFactor",
     "Covariance",
     "component_covariance",
     "inverse_cholesky",
@@ -27,7 +27,7 @@ _SMALL = 6
 """Size of a matrix up to which it is factorised by plain operations."""
 
 
-class Blocks(eqx.Module):
+class BlockFactor(eqx.Module):
     """A factor F (n, B c) of which a block of c columns reaches m rows alone; a row that is not reached is named twice.
 
     rows: of each block; values: of them.
@@ -50,12 +50,12 @@ class Blocks(eqx.Module):
             return whole  # pyright: ignore[reportReturnType]
         return jnp.zeros((size, size)).at[at].add(own)
 
-    def of_rows(self, used: Float[Array, " n"]) -> "Blocks":
+    def of_rows(self, used: Float[Array, " n"]) -> "BlockFactor":
         """Return the factor of the rows that are used alone."""
-        return Blocks(self.rows, self.values * used[self.rows][..., None])
+        return BlockFactor(self.rows, self.values * used[self.rows][..., None])
 
 
-Factor = Float[Array, "... n _"] | Float[Array, "... n"] | Blocks
+Factor = Float[Array, "... n _"] | Float[Array, "... n"] | BlockFactor
 
 
 class Covariance(eqx.Module):
@@ -89,15 +89,15 @@ class Covariance(eqx.Module):
 
 def component_covariance(factor: Factor, size: int) -> Float[Array, "n n"]:
     """Return the covariance of a variance component at a size of one, of so many rows."""
-    if isinstance(factor, Blocks):
+    if isinstance(factor, BlockFactor):
         return factor.component(size)
     return jnp.diag(factor**2) if factor.ndim == 1 else factor @ factor.T  # pyright: ignore[reportReturnType]
 
 
-def placed(factor: Factor, first: int, size: int) -> Float[Array, "_ ..."] | Blocks:
+def placed(factor: Factor, first: int, size: int) -> Float[Array, "_ ..."] | BlockFactor:
     """Return a factor of some of the rows, the first of which has a place, among so many."""
-    if isinstance(factor, Blocks):
-        return Blocks(factor.rows + first, factor.values)
+    if isinstance(factor, BlockFactor):
+        return BlockFactor(factor.rows + first, factor.values)
     return jnp.zeros((size, *factor.shape[1:])).at[first : first + len(factor)].set(factor)
 
 
@@ -156,7 +156,7 @@ def update_excess(
     """
     basis = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(information), jacobian.T, lower=True)
     left = residual - basis.T @ (basis @ residual)
-    roots = [factor for factor in factors if not isinstance(factor, Blocks) and factor.ndim == 1]
+    roots = [factor for factor in factors if not isinstance(factor, BlockFactor) and factor.ndim == 1]
     if weights.ndim == 1:  # no matrix of all conditions: P = W² − SᵀS
         squares, seen = jnp.stack(roots) ** 2 * weights**2, basis
         within = jnp.einsum("kn,pn,qn->kpq", squares, seen, seen)
@@ -175,7 +175,7 @@ def update_excess(
 
     def transposed(factor, matrix):
         """Return Fᵀ times a matrix (n, q)."""
-        return factor.transposed(matrix) if isinstance(factor, Blocks) else whitened(factor.T, matrix)
+        return factor.transposed(matrix) if isinstance(factor, BlockFactor) else whitened(factor.T, matrix)
 
     pulled = [transposed(factor, pull[:, None]) for factor in factors]
     beside = [transposed(factor, inverse).T for factor in factors]  # P F_i

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
-    from jaximu.fleets.fit import Fitted, Unit, fit_units
+    from jaximu.fleets.fit import Fitted, FleetUnit, fit_units
     from jaximu.fleets.jobs import Job, Settings, find_jobs
     from jaximu.fleets.rows import PARAMETERS, SCHEMA, rows_of
     from jaximu.fleets.run import run_fleet
@@ -14,9 +14,9 @@ __all__ = [
     "PARAMETERS",
     "SCHEMA",
     "Fitted",
+    "FleetUnit",
     "Job",
     "Settings",
-    "Unit",
     "find_jobs",
     "fit_units",
     "rows_of",

@@ -39,7 +39,7 @@ def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, work
         stored.prepare_process(folder)
         return {"place": item["place"], "prepared": pickle.dumps(prepare(pickle.loads(item["job"]), settings))}
 
-    class Fit:
+    class FittingActor:
         """Fits batches of prepared recordings, and keeps its compiled programs."""
 
         def __init__(self) -> None:
@@ -54,7 +54,7 @@ def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, work
     items = [{"place": place, "job": pickle.dumps(jobs[place])} for place in places]
     try:
         rows = ray.data.from_items(items, override_num_blocks=len(cut)).map(read, num_cpus=1).map_batches(
-            Fit, batch_size=len(cut[0]), num_cpus=1, num_gpus=1 if graphics else 0,
+            FittingActor, batch_size=len(cut[0]), num_cpus=1, num_gpus=1 if graphics else 0,
             compute=ray.data.ActorPoolStrategy(size=graphics or workers),
         )  # fmt: skip
         for batch in rows.iter_batches(batch_size=None, batch_format="numpy"):

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from jaximu.calibration.magnetometer import FieldStrength, field_start
-from jaximu.fleets.fit import Fitted, Unit
+from jaximu.fleets.fit import Fitted, FleetUnit
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
@@ -33,7 +33,7 @@ _FEWEST = 2
 class FieldUnit:
     """A magnetometer to be fitted as an accelerometer in a field of gravity's size, and the field's true strength."""
 
-    unit: Unit
+    unit: FleetUnit
     field: FieldStrength
     output_unit: str
     poses: int
@@ -54,7 +54,7 @@ def field_unit(signal: Signal, found: Segmentation, strength: FieldStrength | No
     per_gravity = np.full(3, scale * field.value / STANDARD_GRAVITY)
     observations = observe(replace(found, recording=Recording(signal), intervals=rests), STANDARD_GRAVITY)
     nominal = Imu.nominal(tuple(per_gravity), tuple(centre), signal.unit)
-    return FieldUnit(Unit(observations, nominal, False), field, signal.unit, len(rests))
+    return FieldUnit(FleetUnit(observations, nominal, False), field, signal.unit, len(rests))
 
 
 def field_row(own: FieldUnit, fitted: Fitted) -> dict[str, Any]:

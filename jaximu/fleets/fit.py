@@ -28,7 +28,7 @@ from jaximu.ground.precision import require_float64
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.observations import Observations, Poses, Turns
 
-__all__ = ["Fitted", "Unit", "fit_units", "parameter_set", "shape_of"]
+__all__ = ["Fitted", "FleetUnit", "fit_units", "parameter_set", "shape_of"]
 
 _CHUNKS = {True: (8, 32), False: (8, 64)}
 """Units that one call of a compiled program takes, with a gyroscope and without: a handful, or as many as lie in the
@@ -44,7 +44,7 @@ _get = object.__getattribute__  # equinox looks at every access to an attribute,
 
 
 @dataclass(frozen=True)
-class Unit:
+class FleetUnit:
     """One unit to be fitted: its observations in output units, and the data sheet's scales and offsets.
 
     gyroscope: whether it has one; its observations are then used.
@@ -113,7 +113,7 @@ class Shape(NamedTuple):
     block: int  # samples that slopes of turns take together
 
 
-def shape_of(unit: Unit) -> Shape:
+def shape_of(unit: FleetUnit) -> Shape:
     """Return a unit's shape."""
     mask = _get(_get(unit.observations, "poses"), "mask")
     poses = _padded(len(mask) - int(mask[::-1].argmax()), 8)
@@ -137,7 +137,7 @@ def _padded(count: int, least: int) -> int:
     return size
 
 
-def fit_units(units: Sequence[Unit]) -> list[Fitted]:
+def fit_units(units: Sequence[FleetUnit]) -> list[Fitted]:
     """Fit units of any shapes; those of one shape are fitted together, and none changes another's result.
 
     Failures do not raise: look at `converged` and `finite`. A unit that many passes do not settle, or whose noise is a
@@ -185,7 +185,7 @@ class _Stacked:
         return np.stack([*arrays, *[arrays[-1]] * (size - len(arrays))], out=self.buffers[key])
 
 
-def _fit_chunk(units: Sequence[Unit], shape: Shape, passes: int, stacked: _Stacked) -> list[Fitted]:
+def _fit_chunk(units: Sequence[FleetUnit], shape: Shape, passes: int, stacked: _Stacked) -> list[Fitted]:
     gyroscope, poses, samples, block = shape
     devices = len(_devices())
     size = devices * next(size for size in _CHUNKS[gyroscope] if devices * size >= len(units))
@@ -268,7 +268,7 @@ def _program(gyroscope: bool, block: int, passes, scales, batch) -> Lanes:
     return fit_lanes(gyroscope, block, parameter_set(gyroscope)[1], seen, passes)
 
 
-def _fit_by_recipe(unit: Unit) -> Fitted:
+def _fit_by_recipe(unit: FleetUnit) -> Fitted:
     """Fit one unit by `fit_hand_held`, which integrates every sample in every step and knows of slow noise."""
     fit = fit_hand_held(unit.nominal, unit.observations, "joint" if unit.gyroscope else "accelerometer")
     kinds = ("gravity_norm", "gravity_direction", "static_gyroscope")
@@ -334,7 +334,7 @@ def _in_si(observations: Observations, scale_a, offset_a, scale_g, offset_g) -> 
     )
 
 
-def _fitted(lanes: Lanes, scales: Sequence[np.ndarray], units: Sequence[Unit]) -> list[Fitted]:
+def _fitted(lanes: Lanes, scales: Sequence[np.ndarray], units: Sequence[FleetUnit]) -> list[Fitted]:
     """Bring what a program found back into output units: row i of a gain, entry i of a bias by the scale of axis i."""
     scale_a, offset_a, scale_g, offset_g = scales
     _, parameters = parameter_set(units[0].gyroscope)

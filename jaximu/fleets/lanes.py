@@ -234,7 +234,7 @@ def _earlier(values: Array) -> Array:
     return jnp.concatenate([values, jnp.zeros_like(values[:1])])
 
 
-class _Whitened(NamedTuple):
+class _WhitenedLanes(NamedTuple):
     """C = L Lᵀ of the conditions: L⁻¹ rows, C⁻¹ rows, and the blocks (k, k) and (k, k − 1) of C⁻¹."""
 
     rows: Array  # (P, 3, p + 1, U)
@@ -243,7 +243,7 @@ class _Whitened(NamedTuple):
     last: Matrix
 
 
-def _whiten(linear: _Linear, poses: Matrix, turns: Matrix, used: tuple[Array, Array]) -> _Whitened:
+def _whiten(linear: _Linear, poses: Matrix, turns: Matrix, used: tuple[Array, Array]) -> _WhitenedLanes:
     """Factorise and solve; `poses` and `turns` are covariances of mean outputs and of turns (rad²)."""
     mask_pose, mask_turn = used
     spread = [matvec(poses, row) for row in (linear.norm, *_shifted(linear.before, _earlier))]
@@ -296,7 +296,7 @@ def _whiten(linear: _Linear, poses: Matrix, turns: Matrix, used: tuple[Array, Ar
     nothing = [[zero] * 3 for _ in range(3)]
     start = ([[zero] * 2 for _ in range(3)], jnp.zeros_like(linear.rows[0]), nothing)
     _, (solved, own, next_by_own) = jax.lax.scan(backward, start, (inverse, below, rows), reverse=True)
-    return _Whitened(rows, solved, own, [[_later(each[:-1]) for each in row] for row in next_by_own])
+    return _WhitenedLanes(rows, solved, own, [[_later(each[:-1]) for each in row] for row in next_by_own])
 
 
 def _shifted(matrix: Matrix, shift) -> Matrix:
@@ -317,7 +317,7 @@ class _Part(NamedTuple):
     information: Array
 
 
-def _accelerometer_part(linear: _Linear, white: _Whitened, factor: Matrix) -> tuple[_Part, Matrix]:
+def _accelerometer_part(linear: _Linear, white: _WhitenedLanes, factor: Matrix) -> tuple[_Part, Matrix]:
     """The excess of accelerometer means, of which each pose has the covariance F Fᵀ, and its reactions times F.
 
     The information leaves out what far poses have to do with each other; it only sets the length of a step.
@@ -336,7 +336,7 @@ def _accelerometer_part(linear: _Linear, white: _Whitened, factor: Matrix) -> tu
     return _Part(_gram(through), trace, jnp.sum(_trace(inner, inner), axis=0)), matmul(local, reaction)  # pyright: ignore[reportArgumentType]
 
 
-def _local(white: _Whitened) -> Matrix:
+def _local(white: _WhitenedLanes) -> Matrix:
     """Blocks of C⁻¹ of a pose's norm, its turn and the turn before: (5, 5)."""
     own, last = white.own, white.last
     before = [[_later(own[i][j][:-1]) for j in (1, 2)] for i in (1, 2)]
@@ -344,7 +344,7 @@ def _local(white: _Whitened) -> Matrix:
     return rows + [[last[0][j], last[1][j], last[2][j], *before[j - 1]] for j in (1, 2)]
 
 
-def _turn_part(linear: _Linear, white: _Whitened, factor: Matrix, reached: Matrix) -> tuple[_Part, Array]:
+def _turn_part(linear: _Linear, white: _WhitenedLanes, factor: Matrix, reached: Matrix) -> tuple[_Part, Array]:
     """The excess of turns, of which each has the covariance F Fᵀ; and its information with the accelerometer's."""
     reaction = matmul(linear.lever, factor)
     through = jnp.stack(
@@ -361,7 +361,7 @@ def _turn_part(linear: _Linear, white: _Whitened, factor: Matrix, reached: Matri
     return _Part(_gram(through), trace, jnp.sum(_trace(inner, inner), axis=0)), shared  # pyright: ignore[reportArgumentType]
 
 
-class _Pass(NamedTuple):
+class _LanesPass(NamedTuple):
     z: Array  # (p, U)
     excess: Array  # (3, U)
     information: Array  # (U, p, p)
@@ -371,7 +371,7 @@ class _Pass(NamedTuple):
     step: Array  # largest of a parameter's, standard deviations (U,)
 
 
-def _joint_pass(parameters: Parameters, seen: _Seen, carried: Carried, at: _Triads, z, excess, tolerance) -> _Pass:
+def _joint_pass(parameters: Parameters, seen: _Seen, carried: Carried, at: _Triads, z, excess, tolerance) -> _LanesPass:
     linear = _linearise(parameters, seen, at, carried)
     unit_a, unit_t = _mean(seen.covariance_a, seen.pose), _mean(carried.covariance, seen.turn)
     unit_g = _mean(seen.covariance_g, seen.pose)
@@ -400,7 +400,7 @@ def _joint_pass(parameters: Parameters, seen: _Seen, carried: Carried, at: _Tria
     static = sum((s * d - e) ** 2 for e, s, d in zip(error, size, step[-3:], strict=True))
     scale = jnp.sqrt(sum(each**2 for row in _inverse(at.inverse_g) for each in row) / 3)
     rms = jnp.stack([_norm_rms(linear, seen, step), turned, jnp.sqrt(_average(static, seen.pose)) / scale])
-    return _Pass(z + step, better, square, covariance, reach, rms, _in_sigmas(step, covariance))
+    return _LanesPass(z + step, better, square, covariance, reach, rms, _in_sigmas(step, covariance))
 
 
 def _scored(linear, white, units, weight, error, size, step, covariance, excess) -> Array:
@@ -430,7 +430,7 @@ def _scored(linear, white, units, weight, error, size, step, covariance, excess)
     return jnp.where(jnp.isfinite(changes), jnp.maximum(excess + changes, 0.0), excess)
 
 
-def _accelerometer_pass(parameters: Parameters, seen: _Seen, at: _Triads, z, excess, tolerance) -> _Pass:
+def _accelerometer_pass(parameters: Parameters, seen: _Seen, at: _Triads, z, excess, tolerance) -> _LanesPass:
     """The accelerometer alone: poses are independent, and each has one condition."""
     linear = _linearise(parameters, seen, at, None)
     unit = _mean(seen.covariance_a, seen.pose)
@@ -453,7 +453,7 @@ def _accelerometer_pass(parameters: Parameters, seen: _Seen, at: _Triads, z, exc
     reach = _gravity_reach(solved[:, :-1], linear, seen, covariance)
     none = jnp.zeros_like(change)
     rms = jnp.stack([_norm_rms(linear, seen, step), none, none])
-    return _Pass(z + step, excess.at[0].set(better), square, covariance, reach, rms, _in_sigmas(step, covariance))
+    return _LanesPass(z + step, excess.at[0].set(better), square, covariance, reach, rms, _in_sigmas(step, covariance))
 
 
 def _newton(square: Array, slope: Array, z: Array, tolerance: Array) -> tuple[Array, Array]:
@@ -579,7 +579,7 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
             shape[axis] = count
             return jnp.where(again.reshape(shape), new, old)
 
-        last = _Pass(
+        last = _LanesPass(
             kept(out.z, last.z, 1), kept(out.excess, last.excess, 1), kept(out.information, last.information, 0),
             kept(out.covariance, last.covariance, 0), kept(out.gravity, last.gravity, 0), kept(out.rms, last.rms, 1),
             kept(out.step, last.step, 0),
@@ -594,7 +594,7 @@ def fit_lanes(gyroscope: bool, block: int, parameters: Parameters, batch: Observ
     line = jnp.zeros((seen.turn.shape[0], count))
     carried = Carried([line] * 4, [[[line] * 4] * 3] * 3, [[line] * 3] * 3, [[zero[0]] * 4] * 3)
     square = jnp.zeros((count, len(zero), len(zero)))
-    nothing = _Pass(zero, coarse, square, square, zero.T, jnp.zeros((3, count)), jnp.zeros(count))
+    nothing = _LanesPass(zero, coarse, square, square, zero.T, jnp.zeros((3, count)), jnp.zeros(count))
     all_lanes = jnp.ones(count, bool)
     state = jnp.asarray(0), all_lanes, ~all_lanes, carried, nothing, coarse, jnp.zeros(count, int), (coarse, coarse)
     *_, converged, carried, last, excess, passes, _ = jax.lax.while_loop(

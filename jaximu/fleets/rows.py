@@ -19,7 +19,7 @@ from jaximu.estimation.problem import TOLERANCE, names_of, without_equipment
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import weak_directions
 from jaximu.fleets.field import FieldUnit, field_row, field_unit
-from jaximu.fleets.fit import Fitted, Unit, fit_units, parameter_set
+from jaximu.fleets.fit import Fitted, FleetUnit, fit_units, parameter_set
 from jaximu.fleets.jobs import Job, Settings
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.model.noise_model import NoiseModel
@@ -109,7 +109,7 @@ class Prepared:
     """
 
     row: dict[str, Any]
-    unit: Unit | None
+    unit: FleetUnit | None
     field: FieldUnit | None = None
 
 
@@ -152,14 +152,14 @@ def _noise(path: str, options: ReadOptions) -> NoiseModel:
 
 def _unit(
     recording: Recording, found: Segmentation, settings: Settings, noise: NoiseModel | None
-) -> tuple[Unit, tuple[str, ...]]:
+) -> tuple[FleetUnit, tuple[str, ...]]:
     observations = observe(found, settings.gravity.value, noise=noise)
     nominal, notes = nominal_imu(recording)
     notes += () if noise is None else noise.notes
-    return Unit(observations, nominal, recording.gyroscope is not None), notes
+    return FleetUnit(observations, nominal, recording.gyroscope is not None), notes
 
 
-def _facts(recording: Recording, unit: Unit, notes: Sequence[str]) -> dict[str, Any]:
+def _facts(recording: Recording, unit: FleetUnit, notes: Sequence[str]) -> dict[str, Any]:
     poses, turns = unit.observations.poses, unit.observations.turns
     row: dict[str, Any] = {
         "poses": int(np.sum(poses.mask)),

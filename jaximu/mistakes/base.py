@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.recordings.alignment import Blocks, gravity_turning
+from jaximu.recordings.alignment import BlockMeans, gravity_turning
 from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["BRIDGED", "TITLES", "Finding", "Samples", "Sensor", "coarse_step", "runs_of"]
@@ -230,7 +230,7 @@ class Samples:
         return other.quiet[nearest]
 
     @cached_property
-    def turning(self) -> Blocks | None:
+    def turning(self) -> BlockMeans | None:
         """How gravity turns beside the gyroscope's angle; None without a gyroscope or in a short recording."""
         force, rate = self.accelerometer, self.gyroscope
         if force is None or rate is None:

@@ -523,7 +523,7 @@ def nees(
     return _nees(part, multipliers, {triad: _walk(at, triad) for triad in INERTIAL_QUANTITIES})
 
 
-class _Part(NamedTuple):
+class _Length(NamedTuple):
     """Of the stretches of one length: covariances (n, 9, 9), and what their errors are.
 
     noise: by triad and term N, B and K as stated by axis; "white": N alike on all axes; "1": a walk of one. moment: by
@@ -546,7 +546,7 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: float) -> _Part:
+def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: float) -> _Length:
     stretches = source.over(length)
     if len(stretches.start) < _FEWEST:
         raise NotPossibleError(f"only {len(stretches.start)} stretches of {length:g} s without gaps are there.")
@@ -578,7 +578,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
         assert errors is not None
         moments = {"gyroscope": errors[:, :3], "accelerometer": own}
         squares = {name: None if each is None else each[:, :, None] * each[:, None] for name, each in moments.items()}
-        return _Part(stretches, spread, squares, dict.fromkeys(squares), errors[:, :, None] * errors[:, None], None,
+        return _Length(stretches, spread, squares, dict.fromkeys(squares), errors[:, :, None] * errors[:, None], None,
                      {triad: {} for triad in _OWN}, block)  # fmt: skip
     moved, pushed = np.asarray(moved), None if pushed is None else np.asarray(pushed)
     power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in INERTIAL_QUANTITIES})
@@ -602,7 +602,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
                 chosen = covariance[np.ix_(own, own)]
                 parts[kind] = np.einsum("nip,pq,njq->nij", moved[..., own], chosen, moved[..., own], optimize=True)
         terms[triad] = {name: each[:, rows, rows] for name, each in parts.items()}
-    return _Part(stretches, spread, moment, roots, np.asarray(whole), moved @ _root(covariance), terms, block)
+    return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ _root(covariance), terms, block)
 
 
 def _root(covariance: FloatArray) -> FloatArray:
@@ -621,7 +621,7 @@ def _stamp_errors(stretches: Stretches) -> FloatArray:
     return np.diff(samples, axis=1, prepend=samples[:, :1]) / np.maximum(stretches.held, 1e-12)[..., None]
 
 
-def _walk(part: _Part, triad: str) -> float:
+def _walk(part: _Length, triad: str) -> float:
     """Return the random walk that departs from its start as far as K and B do, over this length."""
     rows = _OWN[triad]
     one = part.noise[triad, "1"][:, rows, rows]
@@ -634,14 +634,14 @@ def _multiples(unit: FloatArray, moment: FloatArray) -> float:
     return float(np.mean(np.trace(np.linalg.solve(unit, moment), axis1=1, axis2=2)) / 3)
 
 
-def _terms(part: _Part, triad: str) -> dict[str, float]:
+def _terms(part: _Length, triad: str) -> dict[str, float]:
     """Return what a triad's error is made of, each as a multiple of its white noise."""
     white = part.noise[triad, "white"][:, _OWN[triad], _OWN[triad]]
     return {name: float(np.sqrt(_multiples(white, each))) for name, each in part.terms[triad].items()}
 
 
 def _multiplier(
-    part: _Part, triad: str, walks: Mapping[str, float], turned: float, draws: int, rng: np.random.Generator
+    part: _Length, triad: str, walks: Mapping[str, float], turned: float, draws: int, rng: np.random.Generator
 ) -> tuple[float, float, float] | None:  # fmt: skip
     """Return the multiplier of N and its 95 % interval; None where nothing measures the error.
 
@@ -698,7 +698,7 @@ def _solved(square: FloatArray, share: FloatArray) -> FloatArray:
     return high
 
 
-def _nees(part: _Part, multipliers: Mapping[str, float], walks: Mapping[str, float]) -> dict[str, float]:
+def _nees(part: _Length, multipliers: Mapping[str, float], walks: Mapping[str, float]) -> dict[str, float]:
     """Return the mean NEES of each increment over its three degrees of freedom."""
     assumed = np.sum([multipliers[triad] ** 2 * part.noise[triad, "white"] + walks[triad] ** 2 * part.noise[triad, "1"]
                       for triad in INERTIAL_QUANTITIES], axis=0)  # fmt: skip

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
-    from jaximu.noise.cleaning import Line
+    from jaximu.noise.cleaning import PeriodicLine
     from jaximu.noise.deviations import Deviation, averaging_factors, deviation
     from jaximu.noise.identification import GaussMarkov, Identified, Term, WarmUp, identify
 
@@ -13,7 +13,7 @@ __all__ = [
     "Deviation",
     "GaussMarkov",
     "Identified",
-    "Line",
+    "PeriodicLine",
     "Term",
     "WarmUp",
     "averaging_factors",

@@ -18,7 +18,7 @@ from jaximu.ground.quantities import number, size, unit_text
 from jaximu.ground.summary import Block, Described, Summary
 from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
-from jaximu.noise.cleaning import Line, without_outliers
+from jaximu.noise.cleaning import PeriodicLine, without_outliers
 from jaximu.noise.identification import Identified, identify
 from jaximu.recordings.recording import Recording, Signal, recordings_of
 
@@ -53,7 +53,7 @@ class NoiseAnalysis(Described):
     notes: tuple[str, ...] = ()
 
     @property
-    def lines(self) -> dict[str, list[tuple[Line, ...]]]:
+    def lines(self) -> dict[str, list[tuple[PeriodicLine, ...]]]:
         """The periodic lines found, by triad and axis: frequency (Hz) and amplitude (SI)."""
         return {name: [each.lines for each in found] for name, found in self.axes.items()}
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["BRIDGED", "Line", "filled", "lowest", "periodic_lines", "without_outliers"]
+__all__ = ["BRIDGED", "PeriodicLine", "filled", "lowest", "periodic_lines", "without_outliers"]
 
 BRIDGED = 5
 """Samples missing in a row that are filled in: a few in a thousand change no term, but would break long averages."""
@@ -25,7 +25,7 @@ _MOST_LINES = 20
 
 
 @dataclass(frozen=True)
-class Line:
+class PeriodicLine:
     """A periodic part of the signal that was taken out: frequency (Hz, after aliasing) and amplitude (signal unit)."""
 
     frequency: float
@@ -94,7 +94,7 @@ def filled(values: FloatArray, longest: int | None = None) -> FloatArray:
 
 def periodic_lines(
     values: FloatArray, rate: float
-) -> tuple[tuple[Line, ...], list[tuple[float, float]], FloatArray | None]:
+) -> tuple[tuple[PeriodicLine, ...], list[tuple[float, float]], FloatArray | None]:
     """Return the periodic lines, the bands of frequency (Hz) around them, and their sum over time (n,).
 
     Ordinates of the Hann-tapered periodogram of noise are exponential about its spectrum, and the median of those
@@ -103,7 +103,7 @@ def periodic_lines(
     Trans. Inf. Theory 20, 1974), and what remains is searched again.
     """
     samples = len(values)
-    lines: list[Line] = []
+    lines: list[PeriodicLine] = []
     spans: list[tuple[int, int]] = []
     periodic = None
     place = np.arange(samples)
@@ -194,7 +194,7 @@ def lowest(function: Callable[[float], float], bounds: tuple[float, float], tole
     return float(found["x"])  # pyright: ignore[reportIndexIssue]
 
 
-def _wave(values: FloatArray, peak: int, rate: float) -> tuple[Line, FloatArray]:
+def _wave(values: FloatArray, peak: int, rate: float) -> tuple[PeriodicLine, FloatArray]:
     """Return the line near ordinate `peak`, and its samples."""
     samples = len(values)
     turn = np.exp(-2j * np.pi * peak / samples * np.arange(samples))
@@ -211,4 +211,4 @@ def _wave(values: FloatArray, peak: int, rate: float) -> tuple[Line, FloatArray]
     turn = turn * np.exp(-2j * np.pi * shift / samples * np.arange(samples))
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(samples) + 0.5) / samples)
     phasor = 2 * np.sum(values * turn * taper) / np.sum(taper)
-    return Line((peak + shift) * rate / samples, float(np.abs(phasor))), np.asarray((phasor * turn.conj()).real)
+    return PeriodicLine((peak + shift) * rate / samples, float(np.abs(phasor))), np.asarray((phasor * turn.conj()).real)

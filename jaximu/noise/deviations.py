@@ -44,7 +44,7 @@ RESOLUTIONS = ("full", "multi")
 
 
 @dataclass(frozen=True)
-class _Kind:
+class _DeviationKind:
     order: int  # of the phase difference
     overlapping: bool = True
     modified: bool = False
@@ -52,12 +52,12 @@ class _Kind:
 
 
 KINDS = {
-    "allan": _Kind(2, overlapping=False),
-    "overlapping": _Kind(2),
-    "modified": _Kind(2, modified=True),
-    "hadamard": _Kind(3, overlapping=False),
-    "overlapping-hadamard": _Kind(3),
-    "total": _Kind(2, total=True),
+    "allan": _DeviationKind(2, overlapping=False),
+    "overlapping": _DeviationKind(2),
+    "modified": _DeviationKind(2, modified=True),
+    "hadamard": _DeviationKind(3, overlapping=False),
+    "overlapping-hadamard": _DeviationKind(3),
+    "total": _DeviationKind(2, total=True),
 }
 """Deviations by name: `overlapping` is the overlapping Allan deviation."""
 
@@ -109,7 +109,7 @@ def _longest(samples: int, kind: str) -> int:
     return (samples - 1) // (each.order + each.modified) if each.overlapping else samples // (each.order + 1)
 
 
-def _kind(kind: str) -> _Kind:
+def _kind(kind: str) -> _DeviationKind:
     if kind not in KINDS:
         raise InputError(f"the deviation must be one of {', '.join(KINDS)}, found {kind!r}.")
     return KINDS[kind]
@@ -237,7 +237,7 @@ class _Grid:
     places: tuple[int, ...]
 
 
-def _grid(factors: NDArray[np.int64], samples: int, kind: _Kind, multi: bool) -> _Grid:
+def _grid(factors: NDArray[np.int64], samples: int, kind: _DeviationKind, multi: bool) -> _Grid:
     if not multi:
         level = np.zeros_like(factors)
         length = 3 * samples - 1 if kind.total else samples + 1 + kind.modified
@@ -260,7 +260,7 @@ def _grid(factors: NDArray[np.int64], samples: int, kind: _Kind, multi: bool) ->
     return _Grid(factor, lag, level, places[level], count, tuple(map(int, places)))
 
 
-def _full_count(samples: int, factors: NDArray[np.int64], kind: _Kind) -> NDArray[np.int64]:
+def _full_count(samples: int, factors: NDArray[np.int64], kind: _DeviationKind) -> NDArray[np.int64]:
     """Differences there are without gaps."""
     if kind.total:
         return np.full(len(factors), samples - 1)
@@ -273,7 +273,7 @@ def _mean_squares(
     rows: FloatArray,
     sums: FloatArray,
     grid: _Grid,
-    kind: _Kind,
+    kind: _DeviationKind,
     phase: bool,
     gaps: bool,
     exponent: int | None,
@@ -378,7 +378,7 @@ def _padded(length: int, kind: type) -> np.ndarray:
     return room[skipped : skipped + size]
 
 
-def _transform(points: FloatArray, count: int, kind: _Kind) -> None:
+def _transform(points: FloatArray, count: int, kind: _DeviationKind) -> None:
     """Make of `count` phase points, in place, those whose differences are the deviation's."""
     inner = points[:count]
     if kind.modified:  # a difference averaged over m places is one of the next order of the running sum, over m
@@ -392,7 +392,7 @@ def _transform(points: FloatArray, count: int, kind: _Kind) -> None:
 
 
 def _strided(
-    points: FloatArray, spoiled: NDArray[np.int32] | None, grid: _Grid, kind: _Kind
+    points: FloatArray, spoiled: NDArray[np.int32] | None, grid: _Grid, kind: _DeviationKind
 ) -> tuple[FloatArray, NDArray[np.int64]]:
     """Sums (T,) of squared differences that do not overlap, of points (n + 1,), and their number."""
     square, count = np.zeros(len(grid.factor)), grid.count.copy()

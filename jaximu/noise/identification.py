@@ -27,7 +27,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov
-from jaximu.noise.cleaning import BRIDGED, Line, filled, lowest, periodic_lines, without_outliers
+from jaximu.noise.cleaning import BRIDGED, PeriodicLine, filled, lowest, periodic_lines, without_outliers
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation
 
 __all__ = ["TERMS", "GaussMarkov", "Identified", "Term", "WarmUp", "identify"]
@@ -93,7 +93,7 @@ class Identified:
     misfit: tuple[float, int]
     limits: dict[str, float]
     excess: float = 0.0
-    lines: tuple[Line, ...] = ()
+    lines: tuple[PeriodicLine, ...] = ()
     warm_up: WarmUp | None = None
     outliers: int = 0
     gauss_markov: tuple[GaussMarkov, ...] = ()

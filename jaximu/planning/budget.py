@@ -71,8 +71,8 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.planning.goals import goal_of, per_si, unit_of
 from jaximu.planning.setup_errors import (
-    Scheme,
-    Source,
+    ErrorScheme,
+    ErrorSource,
     Task,
     read_task,
     scheme_and_sources,
@@ -81,7 +81,7 @@ from jaximu.planning.setup_errors import (
 )
 from jaximu.recordings.observations import Stations
 
-__all__ = ["SCHEMA", "Budget", "Check", "Goal", "Need", "Task", "budget", "read_task", "task"]
+__all__ = ["SCHEMA", "Budget", "Goal", "MonteCarlo", "Need", "Task", "budget", "read_task", "task"]
 
 SCHEMA = "jaximu.budget/1"
 _OFF = 0.05  # of a total: a source whose linear share is wrong by more is said to be
@@ -118,7 +118,7 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class Check:
+class MonteCarlo:
     """Monte Carlo through the whole estimator. rms (p,): root mean square error of each parameter, in its unit."""
 
     draws: int
@@ -141,7 +141,7 @@ class Budget(Document):
     imu: Imu
     names: tuple[Name, ...]
     units: tuple[str, ...]
-    sources: tuple[Source, ...]
+    sources: tuple[ErrorSource, ...]
     sigma: FloatArray
     actual: FloatArray
     determined: NDArray[np.bool_]
@@ -149,7 +149,7 @@ class Budget(Document):
     open: tuple[str, ...]
     goals: tuple[Goal, ...]
     notes: tuple[str, ...]
-    check: Check | None = None
+    check: MonteCarlo | None = None
 
     @property
     def total(self) -> FloatArray:
@@ -308,7 +308,7 @@ def _lanes(stations: Stations, start: Imu, parameters: Parameters, excess, means
     return jax.lax.map(lambda each: _solution(start, parameters, stations, weights, each), means)
 
 
-def _sessions(scheme: Scheme, both):
+def _sessions(scheme: ErrorScheme, both):
     """Mean outputs at some errors, and their change along others: one compiled function for draws and derivatives."""
     return jax.lax.map(lambda each: jnp.stack(jax.jvp(scheme.means, (each[0],), (each[1],))), both)
 
@@ -323,7 +323,7 @@ def _chunks(function: Callable[[FloatArray], Any], values: FloatArray) -> FloatA
     return np.concatenate(found)
 
 
-def _paired(source: Source) -> FloatArray:
+def _paired(source: ErrorSource) -> FloatArray:
     """Draws of a source and their negatives: what is odd in them then averages out of what is even."""
     half = source.draw(np.random.default_rng(0), _DRAWS // 2)
     return np.concatenate([half, -half])
@@ -359,8 +359,8 @@ def _expected_excess(
 
 
 def _check(
-    task: Task, found: Budget, scheme: Scheme, per: FloatArray, truth: FloatArray, draws: int, seed: int
-) -> Check:
+    task: Task, found: Budget, scheme: ErrorScheme, per: FloatArray, truth: FloatArray, draws: int, seed: int
+) -> MonteCarlo:
     """Put sessions with all errors at once through `fit_turntable`, from the data sheet on."""
     rng = np.random.default_rng([seed, 1])
     errors = np.sum([source.draw(rng, draws) for source in found.sources], axis=0)
@@ -385,10 +385,12 @@ def _check(
     start = Imu(sheet(unit.accelerometer), None if unit.gyroscope is None else sheet(unit.gyroscope), unit.setup)
     *off, good = _chunks(fitted, _recorded(scheme, errors)).T
     fine = good > 0
-    return Check(draws, np.sqrt(_mean_square((np.stack(off, axis=1) - errors @ truth.T)[fine])), int(np.sum(~fine)))
+    return MonteCarlo(
+        draws, np.sqrt(_mean_square((np.stack(off, axis=1) - errors @ truth.T)[fine])), int(np.sum(~fine))
+    )
 
 
-def _truth(scheme: Scheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
+def _truth(scheme: ErrorScheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
     """How the true values of the parameters (p) depend on the errors (n): an effect that is fitted is to follow."""
     truth, place = np.zeros((len(names), sum(scheme.sizes))), sum(scheme.sizes[:2])
     for effect in scheme.effects:
@@ -400,21 +402,21 @@ def _truth(scheme: Scheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
     return truth
 
 
-def _recorded(scheme: Scheme, errors: FloatArray) -> FloatArray:
+def _recorded(scheme: ErrorScheme, errors: FloatArray) -> FloatArray:
     """Return the mean outputs (N, 2, S, 3) of sessions with these errors (N, n)."""
     small = scheme.simulated
     wrong = errors[:, :small]
     return _simulated(scheme, np.stack([wrong, np.zeros_like(wrong)], axis=1))[:, 0] + _added(errors[:, small:])
 
 
-def _reaction(scheme: Scheme) -> FloatArray:
+def _reaction(scheme: ErrorScheme) -> FloatArray:
     """Return the derivatives (2, S, 3, n) of the mean outputs by all errors, where there are none."""
     single = np.eye(scheme.simulated)
     changes = _simulated(scheme, np.stack([np.zeros_like(single), single], axis=1))[:, 1]
     return np.moveaxis(np.concatenate([changes, _added(np.eye(scheme.sizes[3]))]), 0, -1)
 
 
-def _simulated(scheme: Scheme, both: FloatArray) -> FloatArray:
+def _simulated(scheme: ErrorScheme, both: FloatArray) -> FloatArray:
     return _chunks(lambda rows: stored.call(_sessions, "budget sessions", scheme, rows)[0], both)
 
 

@@ -26,7 +26,7 @@ from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.model.sensor import Imu
 from jaximu.planning.goals import goal_of, parse_goal, per_si
 from jaximu.planning.information import Design, hand_held_information
-from jaximu.planning.optimisation import Question
+from jaximu.planning.optimisation import DesignQuestion
 from jaximu.planning.plan import EQUIPMENT, Known, question_of
 from jaximu.planning.poses import box_words
 from jaximu.recordings.recording import Recording
@@ -34,7 +34,7 @@ from jaximu.recordings.segmentation import SegmentationOptions, segment
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.positions import directions
 
-__all__ = ["Goal", "Guide", "Moment"]
+__all__ = ["GoalProgress", "Guide", "Moment"]
 
 _BOX = np.array([up for up, _ in directions(26)])
 _FEWEST, _MOST = 9, 60  # poses that a calibration needs; poses after which a goal is given up
@@ -45,7 +45,7 @@ _NEXT = np.radians(30.0)
 
 
 @dataclass(frozen=True)
-class Goal:
+class GoalProgress:
     """A standard deviation that is wanted, and what it is now (inf: not determined), both in the stated unit's SI."""
 
     text: str
@@ -73,7 +73,7 @@ class Moment:
     short: float
     up: FloatArray | None
     words: str
-    goals: tuple[Goal, ...]
+    goals: tuple[GoalProgress, ...]
     done: bool
     calibration: Calibration | None
 
@@ -157,7 +157,7 @@ class Guide:
         force = np.linalg.solve(np.asarray(accelerometer.gain), (means - np.asarray(accelerometer.bias)).T).T
         return force / np.linalg.norm(force, axis=1, keepdims=True)
 
-    def _left(self, question: Question, information: FloatArray, cosine: float) -> float:
+    def _left(self, question: DesignQuestion, information: FloatArray, cosine: float) -> float:
         """Return how much is left to know with this information, as a logarithm; inf for a turn that cannot be made."""
         if not np.cos(float(question.turn_limit)) < cosine < np.cos(_NEXT):
             return np.inf
@@ -174,20 +174,20 @@ class Guide:
         # the largest counts most, and where it cannot be helped at once, the others do
         return float(np.log(np.sum(np.array(over) ** 4)))
 
-    def _goals(self, recording: Recording) -> list[Goal]:
+    def _goals(self, recording: Recording) -> list[GoalProgress]:
         found, calibration = [], self._calibration
         for text, what, size in self.goals:
             if calibration is None:
-                found.append(Goal(text, 0.0, np.inf))
+                found.append(GoalProgress(text, 0.0, np.inf))
                 continue
             names, imu = calibration.names, calibration.imu
             places, wanted = goal_of(what, size, names, imu)
             sigma = np.sqrt(np.diagonal(calibration.covariance))
-            found.append(Goal(text, wanted, max(float(sigma[k]) / per_si(names[k], imu) for k in places)))
+            found.append(GoalProgress(text, wanted, max(float(sigma[k]) / per_si(names[k], imu) for k in places)))
         return found
 
 
-def _told(question: Question, before: FloatArray, after: FloatArray) -> FloatArray:
+def _told(question: DesignQuestion, before: FloatArray, after: FloatArray) -> FloatArray:
     """Return the information (n, p, p) of a rest in each direction `after` (n, 3) and of the turn to it."""
     pairs = np.array([_turned(before, each) for each in _padded(after)])
 

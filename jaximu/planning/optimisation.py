@@ -34,7 +34,7 @@ from jaximu.planning.information import (
     up_vectors,
 )
 
-__all__ = ["CRITERIA", "FEW_STEPS", "STEPS", "Question", "Step", "covariance", "objective", "optimise", "score"]
+__all__ = ["CRITERIA", "FEW_STEPS", "STEPS", "DesignQuestion", "Step", "covariance", "objective", "optimise", "score"]
 
 
 CRITERIA: dict[str, Callable[[Array, Array], Array]] = {
@@ -51,7 +51,7 @@ _CLOSE = 1e-7
 """Change of the criterion's logarithm at which a search ends."""
 
 
-class Question(eqx.Module):
+class DesignQuestion(eqx.Module):
     """What a design is asked for, all but the design.
 
     imu, parameters: what may be unknown, effects included. prior: information about the parameters (in typical sizes)
@@ -93,24 +93,24 @@ class Step(NamedTuple):
     rate: Float[Array, " M"]
 
 
-class Covariance(NamedTuple):
+class DesignCovariance(NamedTuple):
     """Of the parameters in typical sizes, with a design; and the design's own information."""
 
     covariance: Float[Array, "p p"]
     information: Float[Array, "p p"]
 
 
-def _covariance(question: Question, design: Design) -> Covariance:
+def _covariance(question: DesignQuestion, design: Design) -> DesignCovariance:
     known = question.imu, question.parameters, design, question.accuracy, question.gravity
     if question.duration is not None:
         information = robot_information(*known, COARSE if question.coarse else INTERVALS, question.duration)
     else:
         information = (hand_held_information if question.by_hand else table_information)(*known)
     total = jnp.linalg.inv(question.prior + information) + jnp.outer(question.reach, question.reach)
-    return Covariance(total, information)
+    return DesignCovariance(total, information)
 
 
-def _limits(question: Question, design: Design) -> Float[Array, " c"]:
+def _limits(question: DesignQuestion, design: Design) -> Float[Array, " c"]:
     """What the equipment cannot do, as numbers that must not be negative."""
     found = []
     if question.chained:
@@ -126,12 +126,12 @@ def _moved(design: Design, step: Step) -> Design:
     )
 
 
-def covariance(question: Question, design: Design) -> Covariance:
+def covariance(question: DesignQuestion, design: Design) -> DesignCovariance:
     """Return the covariance that a design leaves, and its own information, both in typical sizes (NumPy)."""
-    return Covariance(*stored.call(_covariance, f"{question.key} covariance", question, design))
+    return DesignCovariance(*stored.call(_covariance, f"{question.key} covariance", question, design))
 
 
-def score(question: Question, covariance: Float[Array, "p p"]) -> float:
+def score(question: DesignQuestion, covariance: Float[Array, "p p"]) -> float:
     """Return the criterion of a covariance in typical sizes, as a standard deviation."""
 
     def value(question, covariance):
@@ -140,7 +140,7 @@ def score(question: Question, covariance: Float[Array, "p p"]) -> float:
     return float(np.exp(stored.call(value, f"{question.key} score", question, np.asarray(covariance))[0]))
 
 
-def objective(question: Question, design: Design, step: Step) -> tuple[float, Step]:
+def objective(question: DesignQuestion, design: Design, step: Step) -> tuple[float, Step]:
     """Return the logarithm of the criterion after a step, and its gradient by the step."""
 
     def value(question, design, step):
@@ -151,7 +151,7 @@ def objective(question: Question, design: Design, step: Step) -> tuple[float, St
     return float(found), Step(*(np.asarray(each) for each in gradient))
 
 
-def _limited(question: Question, design: Design, step: Step) -> tuple[FloatArray, FloatArray]:
+def _limited(question: DesignQuestion, design: Design, step: Step) -> tuple[FloatArray, FloatArray]:
     """The limits (c,) after a step, and their derivatives (c, n) by all its numbers."""
 
     def of(question, design, step):
@@ -163,7 +163,7 @@ def _limited(question: Question, design: Design, step: Step) -> tuple[FloatArray
     return np.asarray(found), np.concatenate([np.asarray(each).reshape(len(found), -1) for each in parts], axis=1)
 
 
-def _descend(question: Question, design: Design, fastest: float, iterations: int) -> tuple[float, Design]:
+def _descend(question: DesignQuestion, design: Design, fastest: float, iterations: int) -> tuple[float, Design]:
     """Minimise from one start, in the chart about it."""
     poses, turns = len(design.attitude), len(design.rate)
     ends = 3 * poses, 3 * (poses + turns)
@@ -188,7 +188,7 @@ def _descend(question: Question, design: Design, fastest: float, iterations: int
 
 
 def optimise(
-    question: Question, starts: Sequence[Design], fastest: float, report: Callable[[str], None] = lambda _: None,
+    question: DesignQuestion, starts: Sequence[Design], fastest: float, report: Callable[[str], None] = lambda _: None,
     steps: tuple[int, int] = STEPS,
 ) -> Design:  # fmt: skip
     """Return the best design that is reached from the starts.

@@ -22,7 +22,7 @@ from jaximu.ground.precision import require_float64
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.planning.information import COARSE, RAMP, STIMULI, Accuracy, Design, turn_vectors
-from jaximu.planning.optimisation import CRITERIA, FEW_STEPS, STEPS, Question, covariance, optimise, score
+from jaximu.planning.optimisation import CRITERIA, FEW_STEPS, STEPS, DesignQuestion, covariance, optimise, score
 from jaximu.planning.poses import (
     attitude_words,
     first_heading,
@@ -345,7 +345,7 @@ def propose(
 
 def question_of(
     known: Known, equipment: Equipment, criterion: str, parameter: str | None, poses: int = 12
-) -> tuple[Question, tuple[str, ...]]:
+) -> tuple[DesignQuestion, tuple[str, ...]]:
     """Return what a design is asked for, and notes on what had to be assumed; arguments as in [`propose`]."""
     robot = equipment.accuracy is not None
     for name in ("rest", "turn", "step"):
@@ -386,7 +386,7 @@ def question_of(
             "in the prediction.",
         )  # fmt: skip
     accuracy, more = _accuracy(known, imu, equipment)
-    question = Question(
+    question = DesignQuestion(
         imu, parameters, _prior(known, imu, parameters, reach), reach, weights, accuracy,
         np.asarray(known.gravity.value), np.asarray(equipment.largest_turn),
         equipment.by_hand, equipment.z_up, criterion,
@@ -395,7 +395,7 @@ def question_of(
     return question, (*notes, *more)
 
 
-def _coarsened(question: Question) -> Question:
+def _coarsened(question: DesignQuestion) -> DesignQuestion:
     """The question that a design is sought for: a robot's attitude at fewer stamps, each as good as those it is for."""
     if question.duration is None:
         return question

@@ -19,7 +19,7 @@ from jaximu.data.observe_stations import observe_stations
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, Option
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment
-from jaximu.diagnosis.hand_held import HandHeld
+from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.diagnosis.turntable import Turntable
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.ground.array_types import FloatArray
@@ -32,7 +32,7 @@ from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Positions, Protocol, RateTable
-from jaximu.simulation.protocols import HandHeld as TurnedByHand
+from jaximu.simulation.protocols import HandHeldExperiment as TurnedByHand
 
 __all__ = ["advised", "options", "suggestion"]
 
@@ -149,7 +149,7 @@ def _experiment(diagnosis: Diagnosis, protocol: Protocol, environment: Environme
         stations, _ = observe_stations(recording, truth.schedule, gravity, noise)
         return Turntable(recording, stations, imu)
     part = segment(recording)
-    return HandHeld((part,), observe((part,), gravity, noise=noise), imu)
+    return HandHeldExperiment((part,), observe((part,), gravity, noise=noise), imu)
 
 
 def _noisy(recording: Recording, noise: NoiseModel) -> Recording:

@@ -37,7 +37,7 @@ from jaximu.simulation import Case, Specification
 from jaximu.simulation.protocols import Environment, Interval, Motion
 from jaximu.simulation.specification import Draw
 
-__all__ = ["Scheme", "Source", "Task", "quantity", "read_task", "scheme_and_sources", "task", "white_density",
+__all__ = ["ErrorScheme", "ErrorSource", "Task", "quantity", "read_task", "scheme_and_sources", "task", "white_density",
            "with_effects"]  # fmt: skip
 
 _TURN_ONLY = ("rate-table", "single-axis-table")  # their angle about the vertical is all that is set
@@ -46,7 +46,7 @@ _FLICKER_INTERVAL = 0.01  # s; flicker noise faster than this averages out like 
 
 
 @dataclass(frozen=True)
-class Source:
+class ErrorSource:
     """One error of the set-up, or of the unit.
 
     size: as it was stated. value, unit: its standard deviation in SI where one number says it, else None. root (n, k):
@@ -195,7 +195,7 @@ def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
 # --- the set-up and what its errors do --------------------------------------------------------------------------------
 
 
-class Scheme(eqx.Module):
+class ErrorScheme(eqx.Module):
     """What the stations go through, and the n errors that may be in it.
 
     Errors are, one after the other: how late the schedule is against the log (s); how far the unit's attitude is off at
@@ -353,7 +353,7 @@ def _mean_covariances(noise: tuple[processes.Process, ...], density: FloatArray,
     return fast, slow, ramp
 
 
-def scheme_and_sources(task: Task) -> tuple[Scheme, tuple[Source, ...], tuple[str, ...]]:
+def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...], tuple[str, ...]]:
     """Return the scheme, its sources of error, and notes on what was assumed.
 
     Raises `NotPossibleError` for a protocol whose poses and turns are not known.
@@ -407,10 +407,10 @@ def scheme_and_sources(task: Task) -> tuple[Scheme, tuple[Source, ...], tuple[st
         values, vectors = np.linalg.eigh(covariances)
         add(name, np.asarray(block_diag(*vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])), added)
 
-    def source(name: str, root: FloatArray) -> Source:
+    def source(name: str, root: FloatArray) -> ErrorSource:
         value, text = errors.get(name, (None, "by the noise"))
         single = value if name in _SINGLE else None
-        return Source(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), root)
+        return ErrorSource(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), root)
 
     return scheme, tuple(source(name, root) for name, root in roots.items() if root.size), notes
 
@@ -489,7 +489,7 @@ def _effects_by_source(errors: Mapping[str, tuple[Any, str]], unit: Imu, ramps: 
 def _scheme(
     unit: Imu, motion: Motion, effects: tuple[Effect, ...], stations: Stations, intervals: Sequence[Interval],
     stops: _Stops, errors: Mapping[str, tuple[Any, str]],
-) -> Scheme:  # fmt: skip
+) -> ErrorScheme:  # fmt: skip
     count, size = len(intervals), stations.turn.shape[0]
     ends, axis, angle = np.zeros((size, 2), np.int64), np.zeros((size, 3)), np.full(size, np.inf)
     ends[:count], axis[:count] = stops.ends, [each.vector for each in intervals]
@@ -498,4 +498,4 @@ def _scheme(
     done = (np.cumsum(pace, axis=1) - pace / 2) * (_durations(stations) / pace.shape[1])[:, None]
     rms = errors.get("vibration", ({}, ""))[0].get("rms", 0.0)
     power = np.where(np.asarray(stations.turn)[:, None], rms**2, np.zeros_like(pace))
-    return Scheme(unit, effects, stations, motion, ends, done, pace, power, len(stops.up))
+    return ErrorScheme(unit, effects, stations, motion, ends, done, pace, power, len(stops.up))

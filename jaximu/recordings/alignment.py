@@ -15,7 +15,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 
 __all__ = [
-    "Blocks",
+    "BlockMeans",
     "Clocks",
     "Turning",
     "angle_of",
@@ -87,7 +87,7 @@ def angle_of(rotation: FloatArray) -> float:
     return float(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1.0, 1.0)))
 
 
-class Blocks(NamedTuple):
+class BlockMeans(NamedTuple):
     """Means over n + 1 blocks of the specific force, and the angle (m, 3) that the gyroscope has turned by `time` (m,).
 
     centre: (n + 1,), of the blocks, s. Of n neighbours, force: their mean (n, 3); change: from one to the next (n, 3);
@@ -112,7 +112,7 @@ class Blocks(NamedTuple):
 
 def gravity_turning(
     force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray
-) -> Blocks | None:
+) -> BlockMeans | None:
     """Return how the specific force (n, 3) turns in blocks, beside the rate (m, 3); None in a short recording."""
     if min(len(force), len(rate)) < 2:
         return None
@@ -139,7 +139,7 @@ def gravity_turning(
     for place in np.flatnonzero(step > max(_BLOCK, 2.5 * float(np.median(step)))):
         first, last = np.searchsorted(centre, rate_time[place : place + 2])
         weight[max(first - 1, 0) : last] = 0.0
-    return Blocks(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
+    return BlockMeans(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
 
 
 _TURNED = 0.1
@@ -214,7 +214,7 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     return bool(np.mean(better > 0) > 0.9 and np.median(better) > np.log(1.5))
 
 
-def _levers(blocks: Blocks) -> FloatArray:
+def _levers(blocks: BlockMeans) -> FloatArray:
     """The weighted f × e_k (n, 3, 3), k the last index."""
     weighted = blocks.weight[:, None] * blocks.force
     return np.asarray(np.cross(weighted[:, None], np.eye(3)).swapaxes(1, 2), np.float64)

@@ -14,7 +14,7 @@ from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import number, size
 from jaximu.planning.budget import Budget, Goal
-from jaximu.planning.setup_errors import Source
+from jaximu.planning.setup_errors import ErrorSource
 from jaximu.report import figures
 from jaximu.report.figures import OTHERS, PALETTE, dressed
 from jaximu.report.html import write_page
@@ -162,7 +162,7 @@ def goal_words(budget: Budget, goal: Goal) -> str:
     return said + f"No single source is enough. Improve together: {'; '.join(both)}."
 
 
-def _smaller(source: Source, times: float) -> str:
+def _smaller(source: ErrorSource, times: float) -> str:
     """How good a source must become, in the unit it was stated in."""
     stated = re.fullmatch(r"\s*([+\d.eE-]+)(.*)", source.size)
     if source.value is None or stated is None:

@@ -13,7 +13,7 @@ import numpy as np
 from jaximu.diagnosis import Diagnosis, twin_of
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import Experiment
-from jaximu.diagnosis.learned import Learned
+from jaximu.diagnosis.learned import LearnedTerm
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import probability, readable, size
 from jaximu.ground.summary import sentence
@@ -176,7 +176,7 @@ def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure
     return figure
 
 
-def _learned(learned: Learned) -> Figure:
+def _learned(learned: LearnedTerm) -> Figure:
     unit, factor, shift = learned.effect.covariate_unit, 1.0, 0.0
     if learned.effect.words == "temperature":
         unit, shift = "°C", ZERO_CELSIUS

@@ -11,11 +11,11 @@ from jaximu.calibration import Calibration, forces_and_angles
 from jaximu.ground.array_types import FloatArray
 from jaximu.simulation.protocols.positions import spiral
 
-__all__ = ["Evidence", "evidence", "largest_gap", "nearest_angles"]
+__all__ = ["PoseAndTurnErrors", "evidence", "largest_gap", "nearest_angles"]
 
 
 @dataclass(frozen=True)
-class Evidence:
+class PoseAndTurnErrors:
     """Errors of P poses and T turns, padding removed; turns are numbered by the pose they start from.
 
     directions: (P, 3) unit vectors of the specific force ("up") in the body. norm_before, norm_after: (P,) magnitude of
@@ -36,7 +36,7 @@ class Evidence:
     angle_limit: FloatArray
 
 
-def evidence(calibration: Calibration) -> Evidence | None:
+def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
     """Return the errors by pose and turn; None for a calibration that was loaded without its working."""
     fit, nominal, observations = calibration.fit, calibration.nominal, calibration.observations
     if fit is None or nominal is None or observations is None:
@@ -73,7 +73,7 @@ def evidence(calibration: Calibration) -> Evidence | None:
         # two components of equal variance: 95 % of the angles lie below sqrt(5.99) of one's sigma
         return np.degrees(np.sqrt(5.991 * variance[used]))
 
-    return Evidence(
+    return PoseAndTurnErrors(
         directions=directions[poses],
         norm_before=np.linalg.norm(force_before[poses], axis=1) - gravity,
         norm_after=length[poses] - gravity,

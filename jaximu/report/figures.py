@@ -19,7 +19,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import number, raised, readable, size, unit_text
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.report.evidence import Evidence, evidence, largest_gap, nearest_angles
+from jaximu.report.evidence import PoseAndTurnErrors, evidence, largest_gap, nearest_angles
 from jaximu.report.tables import short_name
 from jaximu.report.vector import named
 from jaximu.report.words import how_much_smaller
@@ -211,7 +211,7 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def residual_figure(found: Evidence) -> Figure:
+def residual_figure(found: PoseAndTurnErrors) -> Figure:
     """Draw the errors by pose and by turn, before and after, with what the noise explains."""
     rows = 3 if len(found.turn) else 2
     figure = new_figure(2.35 * rows)
@@ -356,7 +356,7 @@ def hemispheres(
     return panels, grid
 
 
-def orientation_figure(found: Evidence) -> Figure:
+def orientation_figure(found: PoseAndTurnErrors) -> Figure:
     """Draw which way was up in each pose, and where no pose was."""
     figure = new_figure(5.4)
     errors, label = 1000 * found.norm_after, "error of gravity's magnitude after calibration (mm/s²)"

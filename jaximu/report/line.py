@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.acceptance.line import Followed, Line, write_verdicts
+from jaximu.acceptance.line import FollowedQuantity, Line, write_verdicts
 from jaximu.acceptance.words import amount, between, in_shown_unit, si_unit, spoken
 from jaximu.ground.atomic import write_files
 from jaximu.ground.quantities import number
@@ -85,7 +85,7 @@ def _page(line: Line) -> bytes:
     )[0]  # fmt: skip
 
 
-def _capability(each: Followed) -> tuple[str, str, str, str, str, str, bool]:
+def _capability(each: FollowedQuantity) -> tuple[str, str, str, str, str, str, bool]:
     found, limit, unit = each.capability, each.limit, si_unit(each.name)
     assert found is not None and limit is not None
 
@@ -106,7 +106,7 @@ def _capability(each: Followed) -> tuple[str, str, str, str, str, str, bool]:
     )
 
 
-def _gauge(each: Followed, questions: int) -> tuple[str, str, str, str, str, str, bool]:
+def _gauge(each: FollowedQuantity, questions: int) -> tuple[str, str, str, str, str, str, bool]:
     found, unit = each.gauge, si_unit(each.name)
     assert found is not None
     shown, factor = in_shown_unit(unit)
@@ -117,18 +117,18 @@ def _gauge(each: Followed, questions: int) -> tuple[str, str, str, str, str, str
             str(found.categories), f"{found.explained:.2f}{mark}", found.categories < _CATEGORIES)  # fmt: skip
 
 
-def _to_draw(line: Line) -> list[tuple[Followed, str]]:
+def _to_draw(line: Line) -> list[tuple[FollowedQuantity, str]]:
     """Return the charts that show most: those with alarms, else the first ones."""
     charts = [(each, station) for each in line.followed for station in each.charts]
 
-    def shows(entry: tuple[Followed, str]) -> int:
+    def shows(entry: tuple[FollowedQuantity, str]) -> int:
         chart, _ = entry[0].charts[entry[1]]
         return len(chart.drifting) + len(chart.beyond) + len(chart.jumps)
 
     return sorted(charts, key=shows, reverse=True)[:_CHARTS]
 
 
-def _chart_figure(line: Line, drawn: list[tuple[Followed, str]]) -> Figure:
+def _chart_figure(line: Line, drawn: list[tuple[FollowedQuantity, str]]) -> Figure:
     """Draw control charts: values and moving average above, moving ranges below."""
     drawing = figures.new_figure(0.3 + 3.0 * len(drawn))
     rows = drawing.subplots(2 * len(drawn), 1, height_ratios=[2.2, 1] * len(drawn), squeeze=False)[:, 0]

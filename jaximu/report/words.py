@@ -11,7 +11,7 @@ from jaximu.calibration import Calibration
 from jaximu.estimation.uncertainty import WeakDirection
 from jaximu.ground.quantities import Z95, listed, number, readable, size
 from jaximu.ground.summary import sentence
-from jaximu.report.evidence import Evidence, largest_gap
+from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
 __all__ = ["Lead", "Statement", "gravity_statement", "how_much_smaller", "lead", "limits", "scatter_statements",
            "trust", "weak_statements"]  # fmt: skip
@@ -180,7 +180,7 @@ def weak_statements(weak: Sequence[WeakDirection], *otherwise: str) -> list[Stat
     ] or [Statement("Parameters", text) for text in otherwise]
 
 
-def limits(calibration: Calibration, found: Evidence | None) -> list[Statement]:
+def limits(calibration: Calibration, found: PoseAndTurnErrors | None) -> list[Statement]:
     """Say what the data cannot tell."""
     said = weak_statements(
         calibration.weak,

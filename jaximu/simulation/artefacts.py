@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaximu.ground.errors import InputError
 from jaximu.recordings.recording import axis_matrix
 
-__all__ = ["ARTEFACTS", "Artefact", "Samples"]
+__all__ = ["ARTEFACTS", "Artefact", "LoggedRows"]
 
 _COLUMNS = {
     f"{prefix}_{axis}": (sensor, place)
@@ -25,7 +25,7 @@ _COLUMNS = {
 
 
 @dataclass
-class Samples:
+class LoggedRows:
     """A block of rows: number (n,) of each row in the whole recording, time (n,) s, values by signal (n, m)."""
 
     row: NDArray[np.int64]
@@ -45,7 +45,7 @@ class Artefact:
     name: ClassVar[str]  # in a specification
     catalogue: ClassVar[str]  # the `data.*` name under which a pre-flight check reports it
 
-    def apply(self, samples: Samples, rng: np.random.Generator, kept: Any) -> Any:
+    def apply(self, samples: LoggedRows, rng: np.random.Generator, kept: Any) -> Any:
         """Change a block; `kept` is None for the first and else what the block before returned."""
         raise NotImplementedError
 

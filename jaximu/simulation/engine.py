@@ -26,7 +26,7 @@ from jaximu.model.stimulus import Stimulus
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.write import write_parts
-from jaximu.simulation.artefacts import ARTEFACTS, Artefact, Samples
+from jaximu.simulation.artefacts import ARTEFACTS, Artefact, LoggedRows
 from jaximu.simulation.protocols import Environment, Interval, Motion, Plan, Protocol, block_length
 
 __all__ = ["Case", "Stream", "Truth", "simulate", "simulate_cases", "write_case"]
@@ -239,7 +239,7 @@ class Stream:
         )
         self._halo = 0 if reach is None else -(-(round(reach * self.rate) + 3) // _HALO_STEP) * _HALO_STEP
 
-    def __iter__(self) -> Iterator[list[Samples]]:
+    def __iter__(self) -> Iterator[list[LoggedRows]]:
         cases = self.cases
         imus, motions = _stack([case.imu for case in cases]), _stack([case.plan.motion for case in cases])
         noises = [
@@ -276,7 +276,7 @@ class Stream:
                 values = {name: np.array(column[unit])[: len(rows)] for name, column in columns.items()}
                 for name, noise in noises[unit].items():
                     values[name] += _per_output(case.imu, name) * noise.take(self.length)[: len(rows)]
-                samples = Samples(rows, rows / self.rate, values)
+                samples = LoggedRows(rows, rows / self.rate, values)
                 for place, artefact in enumerate(case.artefacts):
                     kept[unit][place] = artefact.apply(samples, draws[unit][place], kept[unit][place])
                 block.append(samples)
@@ -296,7 +296,7 @@ def _per_output(imu: Imu, name: str) -> FloatArray | float:
 _UNITS = {"temperature": "degC", "ambient_temperature": "degC", "current": "A", "attitude": "1", "table_rate": "rad/s"}
 
 
-def _recording(case: Case, parts: Sequence[Samples]) -> Recording:
+def _recording(case: Case, parts: Sequence[LoggedRows]) -> Recording:
     time = np.concatenate([part.time for part in parts])
 
     def signal(name: str) -> Signal | None:

@@ -16,7 +16,7 @@ __all__ = ["known_names", "whole_stamps"]
 
 
 @dataclass(frozen=True)
-class _Layout:
+class _KnownLayout:
     """The names of a program's columns, lower case, without units, and what each is, with its unit."""
 
     program: str
@@ -24,7 +24,7 @@ class _Layout:
     optional: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, program: str, text: str) -> _Layout:
+    def of(cls, program: str, text: str) -> _KnownLayout:
         """Read "name=what it is, …": * stands for x, y, z (and w of an attitude), ? says that it may be missing."""
         columns: dict[str, str] = {}
         optional: set[str] = set()
@@ -40,7 +40,7 @@ class _Layout:
 
 
 _LAYOUTS = [
-    _Layout.of(program, columns)
+    _KnownLayout.of(program, columns)
     for program, columns in (
         ("EuRoC (ASL dataset format: ns, rad/s, m/s^2)",
          "timestamp=time [ns], w_rs_s_*=gyro_* [rad/s], a_rs_s_*=accel_* [m/s^2]"),
@@ -94,7 +94,7 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
         if "gyro" in file or "accel" in file:
             title = "gyro_{} [rad/s]" if "gyro" in file else "accel_{} [m/s^2]"
             columns = _SENSOR_LOGGER | {axis: title.format(axis) for axis in "xyz"}
-            layout = _Layout(f"Sensor Logger (ns, rad/s, m/s^2; {file})", columns)
+            layout = _KnownLayout(f"Sensor Logger (ns, rad/s, m/s^2; {file})", columns)
     if layout is None and "accelerometeraccelerationx" in names:
         return table.names, (
             "names as SensorLog for iOS has them: Apple's accelerometer reads -1 g on the axis that points up; add "

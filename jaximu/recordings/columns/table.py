@@ -19,7 +19,7 @@ _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
 
 
 @dataclass(frozen=True)
-class Selection:
+class MessageSelection:
     """What to take from a file that holds more than one sensor of a kind, or more than one stamp of a sample.
 
     topic: name of the message or topic; two of them, "accelerometer,gyroscope", where they are apart. instance: which

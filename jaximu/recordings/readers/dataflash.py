@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import Selection, Table
+from jaximu.recordings.columns.table import MessageSelection, Table
 from jaximu.recordings.recording import Source
 
 _ACCEL = {f"Acc{axis.upper()}": f"accel_{axis} [m/s^2]" for axis in "xyz"}
@@ -28,7 +28,7 @@ _LATEST = 2.0**53  # us: beyond it a double is no exact stamp
 _KINDS = {"IMU": _ACCEL | _GYRO | {"T": "temperature [degC]"}, "ACC": _ACCEL, "GYR": _GYRO}
 
 
-def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
+def read(path: Path, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
     """The tables in a DataFlash log. Raises InputError for a message or an instance that it does not have."""
     from pymavlink.DFReader import DFReader_binary, DFReader_text
 

@@ -22,7 +22,7 @@ from jaximu.recordings.columns.choose import choose_columns, choose_pair, column
 from jaximu.recordings.columns.guess import Advice, advise
 from jaximu.recordings.columns.known import known_names, whole_stamps
 from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns
-from jaximu.recordings.columns.table import Selection, Table, from_arrow, mapped_axes, named_with_units
+from jaximu.recordings.columns.table import MessageSelection, Table, from_arrow, mapped_axes, named_with_units
 from jaximu.recordings.readers.records import apart
 from jaximu.recordings.recording import (
     Defect,
@@ -60,7 +60,7 @@ def read_recording(
     is in raw counts whose scale is not given and cannot be found.
     """
     options = _sound(options)
-    selection = Selection(options.topic, options.instance, options.stamp)
+    selection = MessageSelection(options.topic, options.instance, options.stamp)
     tables = read_tables(path, selection)
     if tables[0].messages and options.columns is not None:
         raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
@@ -141,7 +141,9 @@ def _counts(options: ReadOptions, name: str) -> tuple[Stated | None, Stated | No
     return like.scales.get(name) if scale is None else scale, like.offsets.get(name) if offset is None else offset
 
 
-def _read_as(options: ReadOptions, table: Table, parts: "Sequence[_Part]", signals: Mapping[str, Signal]) -> Reading:
+def _read_as(
+    options: ReadOptions, table: Table, parts: "Sequence[_FilePart]", signals: Mapping[str, Signal]
+) -> Reading:
     """Return how signals, in the log's axes still, were read; `table` is the file's first."""
     counts = [name for name in INERTIAL_QUANTITIES if name in signals and signals[name].unit == "count"]
     # a gyroscope's offset changes with every power-on: where it is not stated, each log shows its own
@@ -171,7 +173,7 @@ def _stamped(table: Table, columns: str | Sequence[str] | None) -> Table:
     return table if columns else whole_stamps(table)
 
 
-def _parts(tables: Sequence[Table], options: ReadOptions) -> "list[_Part]":
+def _parts(tables: Sequence[Table], options: ReadOptions) -> "list[_FilePart]":
     """Return the signals of one file's tables."""
     first = _stamped(tables[0], options.columns)
     named = {each.name for each in header_columns(first) or ()}
@@ -181,7 +183,7 @@ def _parts(tables: Sequence[Table], options: ReadOptions) -> "list[_Part]":
     return parts + [extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
 
 
-def _finished(parts: "Sequence[_Part]", table: Table, options: ReadOptions) -> Recording:
+def _finished(parts: "Sequence[_FilePart]", table: Table, options: ReadOptions) -> Recording:
     """Return the recording of all parts in body axes, checked; `table` is the file's first."""
     recording = _assemble(parts, table, options)
     if options.axes:
@@ -199,7 +201,7 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     """
     options = _sound(options)
     parts = []
-    for place, table in enumerate(read_tables(path, Selection(options.topic, options.instance, options.stamp))):
+    for place, table in enumerate(read_tables(path, MessageSelection(options.topic, options.instance, options.stamp))):
         options = options if place else _alike(options, table)
         table = _stamped(table, options.columns)
         columns = choose_columns(table, options.columns, "mag") if not table.messages else header_columns(table) or ()
@@ -338,7 +340,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     return first
 
 
-def read_tables(path: str | os.PathLike[str], selection: Selection | None = None) -> tuple[Table, ...]:
+def read_tables(path: str | os.PathLike[str], selection: MessageSelection | None = None) -> tuple[Table, ...]:
     """The tables of a file, the accelerometer's first; the format is found from the content.
 
     Raises InputError naming the file, and the package to install where one is missing.
@@ -347,7 +349,7 @@ def read_tables(path: str | os.PathLike[str], selection: Selection | None = None
     with readable(given):
         found = _recognise(given)
         data = given if found.by_path else given.read_bytes()
-    more = (selection or Selection(),) if found.needs or found is _TAGGED else ()
+    more = (selection or MessageSelection(),) if found.needs or found is _TAGGED else ()
     try:
         with ThreadPoolExecutor(1) as beside:
             # a thread costs a small file more than it saves
@@ -408,7 +410,7 @@ def _hash(path: Path) -> str:
 
 
 @dataclass(frozen=True)
-class _Part:
+class _FilePart:
     """The signals of one file by group, time in seconds since its own first stamp `origin`, seconds."""
 
     source: Source
@@ -420,7 +422,7 @@ class _Part:
 
 def extract(
     table: Table, columns: Sequence[Column], options: ReadOptions, groups: set[str], option: str = "--columns"
-) -> _Part:
+) -> _FilePart:
     """The signals of the wanted groups in a table, checked sample by sample."""
     group_of = {name: key for key, group in GROUPS.items() for name in group.columns}
     wanted = [
@@ -449,7 +451,7 @@ def extract(
     if unused and table.names and options.columns is None and not table.messages:
         notes.append(f"columns not used: {', '.join(unused)}.")
     units = {GROUPS[key].field: found[GROUPS[key].columns[0]][1].name for key in signals}
-    return _Part(table.source, signals, origin, tuple(notes), units)
+    return _FilePart(table.source, signals, origin, tuple(notes), units)
 
 
 _INCREMENTS = {("accel", "velocity increment"): "acceleration", ("gyro", "angle"): "angular rate"}
@@ -655,7 +657,7 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
     return Signal(stamps, values, columns[0][2].base), rows - len(kept)
 
 
-def _assemble(parts: Sequence[_Part], table: Table, options: ReadOptions) -> Recording:
+def _assemble(parts: Sequence[_FilePart], table: Table, options: ReadOptions) -> Recording:
     """One recording from the signals of its files, on a common start; counts get their nominal scales."""
     start = min(part.origin for part in parts)
     notes = [note for part in parts for note in part.notes]

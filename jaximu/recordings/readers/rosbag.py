@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import Selection, Table, Unpacking
+from jaximu.recordings.columns.table import MessageSelection, Table, Unpacking
 from jaximu.recordings.recording import Source
 
 _BLOCK = 1 << 12  # messages held undecoded
@@ -74,7 +74,7 @@ class _File(io.BufferedReader):
         return super().read(size if size is None else min(size, self.size))
 
 
-def read_ros1(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
+def read_ros1(path: Path, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
     """The tables in a ROS 1 bag. Raises InputError where topics are missing or to be chosen."""
     from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag1 import Reader
@@ -103,7 +103,7 @@ def read_ros1(path: Path, source: Source, selection: Selection) -> tuple[Table, 
         return _read(bag, bag.messages, source, selection, cdr=False)
 
 
-def read_ros2(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
+def read_ros2(path: Path, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
     """The tables in a ROS 2 bag: its folder, or one .db3 or .mcap file."""
     import apsw
     from lz4.frame import LZ4FrameDecompressor
@@ -155,7 +155,7 @@ def _check_packed(path: Path, zstd: Any, unpacking: Unpacking) -> None:
 
 
 def _read(
-    bag: Any, iterate: Callable[[Sequence[Any]], Iterator[Any]], source: Source, selection: Selection, cdr: bool
+    bag: Any, iterate: Callable[[Sequence[Any]], Iterator[Any]], source: Source, selection: MessageSelection, cdr: bool
 ) -> tuple[Table, ...]:
     wanted = _wanted(bag.connections, source, selection)
     kinds = {topic: kind for topic, kind, _ in wanted}
@@ -189,7 +189,7 @@ def _named(path: Path) -> Iterator[Path]:
 
 
 def _wanted(
-    connections: Sequence[Any], source: Source, selection: Selection
+    connections: Sequence[Any], source: Source, selection: MessageSelection
 ) -> list[tuple[str, str, dict[str, int]]]:  # fmt: skip
     """Topic, type and columns of each table: of the one topic of `sensor_msgs/Imu`, or of those asked for, of which
     the first has the accelerometer and the second the gyroscope; and of what goes with them.

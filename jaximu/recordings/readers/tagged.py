@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import Selection, Table, from_arrow
+from jaximu.recordings.columns.table import MessageSelection, Table, from_arrow
 from jaximu.recordings.recording import Source
 
 _LOOKED_AT = 1 << 18
@@ -56,7 +56,7 @@ def dialect(data: bytes) -> _Dialect | None:
     return next((each for each in _DIALECTS if each.sign.search(data[:_LOOKED_AT])), None)
 
 
-def read(data: bytes, source: Source, selection: Selection) -> tuple[Table, ...]:
+def read(data: bytes, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
     """The tables in a tagged text, one a sensor. Raises InputError where no row of a sensor is there."""
     found = dialect(data)
     assert found is not None

@@ -18,7 +18,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import counted
-from jaximu.recordings.columns.table import Selection, Table
+from jaximu.recordings.columns.table import MessageSelection, Table
 from jaximu.recordings.recording import Source
 
 _Fields = Mapping[str, np.ndarray]
@@ -83,7 +83,7 @@ _SOURCES = {
 """By `--topic`: the messages of accelerometer and gyroscope, the raw ones first."""
 
 
-def read(path: Path, source: Source, selection: Selection) -> tuple[Table, ...]:
+def read(path: Path, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
     """The tables in a ULog. Raises InputError for a topic or an instance that it does not have."""
     from pyulog import ULog
 

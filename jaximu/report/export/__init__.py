@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
-    from jaximu.report.export.base import Correction, Parameters, Written
+    from jaximu.report.export.base import Correction, ExportedUnit, Written
     from jaximu.report.export.catalogue import WRITERS, export
     from jaximu.report.export.cost import Loss, Range, losses
     from jaximu.report.export.messages import is_messages, write_messages
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 __all__ = [
     "WRITERS",
     "Correction",
+    "ExportedUnit",
     "Loss",
-    "Parameters",
     "Range",
     "Written",
     "export",

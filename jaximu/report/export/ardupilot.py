@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from jaximu.ground.errors import InputError
 from jaximu.report.export.autopilot import Autopilot
-from jaximu.report.export.base import Parameters, Written, comments, text_file
+from jaximu.report.export.base import ExportedUnit, Written, comments, text_file
 
 SUFFIX = ".param"
 SUMMARY = "ArduPilot: INS_ACC*, INS_GYR* (offset; scale of the accelerometer), COMPASS_*"
 MAGNETIC = True
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write offsets and scales of sensor `instance` (0, 1 or 2)."""
     parameters = parameters.for_autopilot("ArduPilot")
     parameters.require_si("ArduPilot")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from jaximu.report.export.base import Correction, Linear, Parameters, matrix_text, vector_text
+from jaximu.report.export.base import Correction, ExportedUnit, LinearTriad, matrix_text, vector_text
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Autopilot:
     unit: tuple[str, float]
     rotated: bool
 
-    def values(self, parameters: Parameters) -> tuple[list[tuple[str, float]], str, dict[str, Correction], str]:
+    def values(self, parameters: ExportedUnit) -> tuple[list[tuple[str, float]], str, dict[str, Correction], str]:
         """The named values, the equation that applies them, what is left of the correction, and words on the rotation.
 
         accelerometer: u = (y − offset) ∘ scale; gyroscope: u = y − offset; magnetometer: h = S (y − offset).
@@ -67,12 +67,12 @@ class Autopilot:
         return values, "\n".join(equation), corrections, words
 
 
-def diagonal_scale(triad: Linear) -> np.ndarray:
+def diagonal_scale(triad: LinearTriad) -> np.ndarray:
     """(3,) the scale s that leaves the least mean square error of s ∘ K u against u, u in every direction alike."""
     return np.diag(triad.gain) / np.sum(triad.gain**2, axis=1)
 
 
-def signed_axes(triad: Linear) -> np.ndarray:
+def signed_axes(triad: LinearTriad) -> np.ndarray:
     """(3, 3) the signed permutation P that is nearest to the direction of the axes: a field u is seen as about Pᵀu."""
     share = (triad.gain / np.linalg.norm(triad.gain, axis=1, keepdims=True)).T
     rows, columns = scipy.optimize.linear_sum_assignment(-np.abs(share))
@@ -81,7 +81,7 @@ def signed_axes(triad: Linear) -> np.ndarray:
     return axes
 
 
-def symmetric_matrix(triad: Linear, axes: np.ndarray) -> np.ndarray:
+def symmetric_matrix(triad: LinearTriad, axes: np.ndarray) -> np.ndarray:
     """(3, 3) the symmetric S with the least mean square error of S K u against axesᵀ u, u in every direction alike.
 
     Its normal equation is S A + A S = axesᵀ Kᵀ + K axes with A = K Kᵀ.

@@ -16,13 +16,22 @@ from jaximu.model.conventions import Kalibr
 from jaximu.model.effects.g_sensitivity import GyroGSensitivity
 from jaximu.recordings.recording import Reading
 
-__all__ = ["Correction", "Linear", "Parameters", "Written", "matrix_text", "text_file", "vector_text", "yaml_matrices"]
+__all__ = [
+    "Correction",
+    "ExportedUnit",
+    "LinearTriad",
+    "Written",
+    "matrix_text",
+    "text_file",
+    "vector_text",
+    "yaml_matrices",
+]
 
 SYMBOLS = {"accelerometer": "f", "gyroscope": "w", "magnetometer": "h"}
 
 
 @dataclass(frozen=True)
-class Linear:
+class LinearTriad:
     """The linear part of a triad, y = gain·u + bias (+ g_sensitivity·f): gain (3, 3), bias (3,), unit of y.
 
     g_sensitivity: (3, 3) y per m/s² of true specific force; zero where the calibration has none.
@@ -74,11 +83,11 @@ class Written:
     corrections: Mapping[str, Correction]
     carried: frozenset[str] = frozenset()
     uncertainty: bool = False
-    parameters: Parameters | None = None
+    parameters: ExportedUnit | None = None
 
 
 @dataclass(frozen=True)
-class Parameters:
+class ExportedUnit:
     """What a writer is given: the linear parts of a calibration, and what the user adds to them.
 
     maps: (3, 3) from the axes of the outputs, the logger's, to the body's, by triad; frames: the same of the answers.
@@ -88,7 +97,7 @@ class Parameters:
     """
 
     calibration: Calibration
-    triads: Mapping[str, Linear]
+    triads: Mapping[str, LinearTriad]
     maps: Mapping[str, FloatArray]
     frames: Mapping[str, FloatArray]
     axes: str
@@ -100,7 +109,7 @@ class Parameters:
     def of(
         cls, calibration: Calibration, axes: str | None = None, noise: Mapping[str, float] | None = None,
         instance: int = 0, device: int | None = None,
-    ) -> Parameters:  # fmt: skip
+    ) -> ExportedUnit:  # fmt: skip
         """Take the linear parts out of a calibration, for the outputs as the logger has them.
 
         Answers are in the logger's axes, too, where its sensors share right-handed ones but for the sign of an
@@ -126,11 +135,11 @@ class Parameters:
     @classmethod
     def _in(
         cls, calibration: Calibration, maps: Mapping[str, FloatArray], frames: Mapping[str, FloatArray], *more: Any
-    ) -> Parameters:
+    ) -> ExportedUnit:
         """Make them for outputs and answers in these axes: y = Aᵀ y_body and u = Fᵀ u_body, so the gain is AᵀKF."""
         sensitivity = np.asarray(calibration.imu.coefficients(GyroGSensitivity), np.float64).reshape(3, 3)
         triads = {
-            name: Linear(
+            name: LinearTriad(
                 maps[name].T @ np.asarray(triad.gain, np.float64) @ frames[name],
                 maps[name].T @ np.asarray(triad.bias, np.float64),
                 triad.output_unit,
@@ -140,7 +149,7 @@ class Parameters:
         }
         return cls(calibration, triads, maps, frames, *more)
 
-    def for_autopilot(self, name: str) -> Parameters:
+    def for_autopilot(self, name: str) -> ExportedUnit:
         """Return the same in the axes of an autopilot: forward, right, down; as in its own log, if it is of that."""
         reading = self.calibration.reading
         if reading is None:  # as the log was, then
@@ -154,26 +163,26 @@ class Parameters:
         return self._in(self.calibration, maps, maps, words, self.noise, self.instance, self.device)
 
     @property
-    def accelerometer(self) -> Linear:
+    def accelerometer(self) -> LinearTriad:
         """The accelerometer's linear part. Raises `InputError` where a magnetometer was calibrated alone."""
         if "accelerometer" not in self.triads:
             raise InputError("this calibration holds a magnetometer alone, and no accelerometer or gyroscope.")
         return self.triads["accelerometer"]
 
     @property
-    def magnetometer(self) -> Linear | None:
+    def magnetometer(self) -> LinearTriad | None:
         """The magnetometer's, or None."""
         return self.triads.get("magnetometer")
 
     @property
-    def gyroscope(self) -> Linear | None:
+    def gyroscope(self) -> LinearTriad | None:
         """The gyroscope's, or None."""
         return self.triads.get("gyroscope")
 
     def kalibr(self) -> dict[str, FloatArray]:
         """The fields of `conventions.Kalibr` on the host; an accelerometer alone gets a perfect gyroscope."""
         self._require("rotations alone", lambda turn: np.linalg.det(turn) > 0)
-        gyroscope = self.gyroscope or Linear(np.eye(3), np.zeros(3), "rad/s")
+        gyroscope = self.gyroscope or LinearTriad(np.eye(3), np.zeros(3), "rad/s")
         view = Kalibr.from_gains(
             self.accelerometer.gain, self.accelerometer.bias, gyroscope.gain, gyroscope.bias, gyroscope.g_sensitivity
         )
@@ -246,7 +255,7 @@ def yaml_matrices(named: Mapping[str, FloatArray], indent: int, rows: int) -> li
             for line in (f"{' ' * indent}{name}:", *(f"{' ' * rows}- {vector_text(row)}" for row in each))]  # fmt: skip
 
 
-def comments(parameters: Parameters, sign: str = "#") -> str:
+def comments(parameters: ExportedUnit, sign: str = "#") -> str:
     """Where the numbers come from and what axes they are for, for the head of a file."""
     calibration = parameters.calibration
     files = [str(each["file"]) for each in calibration.data.get("files", ())]

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from jaximu.ground.units import SENSOR_UNITS
-from jaximu.report.export.base import Linear, Parameters, Written, comments
+from jaximu.report.export.base import ExportedUnit, LinearTriad, Written, comments
 
 SUFFIX = ".h"
 SUMMARY = "C header: apply in double, float and fixed point"
@@ -23,7 +23,7 @@ _OFFSET_BITS = 5
 _MATRIX_BITS = 24
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write three functions a triad: `jaximu_<triad>`, `…_float`, `…_fixed`, each (const y[3], u[3])."""
     body, remarks = [], []
     for name, triad in parameters.triads.items():
@@ -42,11 +42,11 @@ def write(parameters: Parameters) -> Written:
     return Written({"": text.encode()}, convention, parameters.equation(), parameters.corrections())
 
 
-def _extent(parameters: Parameters, name: str) -> float:
+def _extent(parameters: ExportedUnit, name: str) -> float:
     return {"accelerometer": parameters.calibration.gravity.value, "gyroscope": math.radians(250.0)}.get(name, 100.0)
 
 
-def _functions(name: str, triad: Linear, extent: float) -> tuple[str, float]:
+def _functions(name: str, triad: LinearTriad, extent: float) -> tuple[str, float]:
     """The three functions of a triad, and the bound of the fixed-point error for inputs up to `extent`, SI."""
     matrix, offset = triad.inverse, triad.bias
     given = 0 if triad.unit == "count" else INPUT_BITS

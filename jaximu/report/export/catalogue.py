@@ -14,7 +14,7 @@ from jaximu.ground.atomic import write_files
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
-    from jaximu.report.export.base import Parameters, Written
+    from jaximu.report.export.base import ExportedUnit, Written
 
 __all__ = ["WRITERS", "export", "writer"]
 
@@ -42,7 +42,7 @@ def writer(name: str) -> ModuleType:
     )
 
 
-def export(parameters: Parameters, to: str, path: str | os.PathLike[str]) -> tuple[Written, tuple[Path, ...]]:
+def export(parameters: ExportedUnit, to: str, path: str | os.PathLike[str]) -> tuple[Written, tuple[Path, ...]]:
     """Write a calibration for another tool, all of its files or none; return what was written, and where.
 
     A format of several files puts its endings before the suffix: `unit.calib` becomes `unit_acc.calib`.

@@ -15,7 +15,7 @@ from jaximu.ground.quantities import size
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
-from jaximu.report.export.base import Parameters, Written
+from jaximu.report.export.base import ExportedUnit, Written
 
 __all__ = ["Loss", "Range", "losses"]
 
@@ -109,7 +109,7 @@ class Loss:
         return f"{self.what}: {'; '.join(costs) or 'costs nothing here'}"
 
 
-def losses(parameters: Parameters, written: Written, extent: Range) -> tuple[Loss, ...]:
+def losses(parameters: ExportedUnit, written: Written, extent: Range) -> tuple[Loss, ...]:
     """What the file leaves out of the calibration, each with its cost, then all of it together, then the uncertainty.
 
     The whole model is simulated over `extent` and corrected as the other tool corrects; the difference from the truth
@@ -158,7 +158,7 @@ def _outputs(imu: Imu, path: Stimulus) -> dict[str, FloatArray]:
 
 
 def _gap(
-    parameters: Parameters, written: Written, name: str, outputs: list[dict[str, FloatArray]], paths: tuple
+    parameters: ExportedUnit, written: Written, name: str, outputs: list[dict[str, FloatArray]], paths: tuple
 ) -> FloatArray:
     """(samples, 3) the tool's answer less the truth, in the tool's frame."""
     gaps = []

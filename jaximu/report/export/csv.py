@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.units import SENSOR_UNITS
-from jaximu.report.export.base import Parameters, Written, text_file
+from jaximu.report.export.base import ExportedUnit, Written, text_file
 
 SUFFIX = ".csv"
 MAGNETIC = True
 SUMMARY = "every parameter with its unit and standard deviation"
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write `triad,parameter,row,column,value,sigma,unit`: gain, bias, the matrix to apply, effects (row: place)."""
     rows = ["triad,parameter,row,column,value,sigma,unit"]
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.report.export.base import Correction, Parameters, Written, comments, matrix_text, text_file, vector_text
+from jaximu.report.export.base import Correction, ExportedUnit, Written, comments, matrix_text, text_file, vector_text
 
 SUFFIX = ".h"
 SUMMARY = "x-io Fusion: misalignment, sensitivity, offset; soft and hard iron"
@@ -21,7 +21,7 @@ MAGNETIC = True
 _FED = {"accelerometer": ("g", 1 / STANDARD_GRAVITY), "gyroscope": ("deg/s", 180 / math.pi)}
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write a constant for each argument, named as Fusion names it."""
     parameters.require_own_axes()
     lines = [comments(parameters, "//"), "#pragma once", '#include "Fusion.h"', ""]

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.model.conventions import ImuTk
-from jaximu.report.export.base import Parameters, Written, matrix_text, vector_text
+from jaximu.report.export.base import ExportedUnit, Written, matrix_text, vector_text
 
 SUFFIX = ".calib"
 SUMMARY = "imu_tk: one .calib a triad (…_acc, …_gyro)"
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write the accelerometer's and the gyroscope's file; no comments, which imu_tk could not read."""
     parameters.require_own_axes()
     files, equation = {}, []

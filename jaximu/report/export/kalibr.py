@@ -12,7 +12,7 @@ import numpy as np
 from jaximu.recordings.readers.kalibr import KALIBR_UNITS
 from jaximu.report.export.base import (
     Correction,
-    Parameters,
+    ExportedUnit,
     Written,
     comments,
     matrix_text,
@@ -26,7 +26,7 @@ NOISE = True
 SUMMARY = "Kalibr: imu.yaml with M, C_gyro_i, A"
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write both triads in kalibr's frame, noise densities as far as they are known."""
     view = parameters.kalibr()
     frame, accel, accel_bias = view["body_rotation"], view["accel_matrix"], vector_text(view["accel_bias"])
@@ -66,7 +66,7 @@ def write(parameters: Parameters) -> Written:
     return Written(text_file(lines), convention, equation, corrections, frozenset({"gyro.g_sensitivity"}))
 
 
-def noise_lines(parameters: Parameters, indent: str) -> list[str]:
+def noise_lines(parameters: ExportedUnit, indent: str) -> list[str]:
     """The four densities and the rate as YAML; a number that is not known is a comment, never made up."""
     rate = parameters.noise.get("update_rate", parameters.calibration.data.get("rate"))
     lines = []

@@ -6,14 +6,14 @@ import io
 
 import numpy as np
 
-from jaximu.report.export.base import Parameters, Written
+from jaximu.report.export.base import ExportedUnit, Written
 
 SUFFIX = ".npz"
 MAGNETIC = True
 SUMMARY = "NumPy arrays, with the covariance"
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write `<triad>_gain`, `_bias`, `_inverse_gain`, `_unit`, and `covariance` with its `parameters` (body axes)."""
     arrays: dict[str, np.ndarray] = {}
     for name, triad in parameters.triads.items():

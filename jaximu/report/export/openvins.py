@@ -12,7 +12,7 @@ import numpy as np
 
 from jaximu.report.export.base import (
     Correction,
-    Parameters,
+    ExportedUnit,
     Written,
     comments,
     matrix_text,
@@ -27,7 +27,7 @@ NOISE = True
 SUMMARY = "OpenVINS: kalibr_imu_chain.yaml with Tw, Ta, Tg and rotations"
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write the intrinsics in OpenVINS's "kalibr" model; its loader needs every key, so an identity stays written."""
     parameters.require_si("OpenVINS")
     view = parameters.kalibr()

@@ -10,7 +10,7 @@ beside it (xy, xz, yz), R the rotation ROT (Magnetometer.hpp, `Correct`).
 from __future__ import annotations
 
 from jaximu.report.export.autopilot import Autopilot
-from jaximu.report.export.base import Parameters, Written, comments, text_file
+from jaximu.report.export.base import ExportedUnit, Written, comments, text_file
 
 SUFFIX = ".params"
 SUMMARY = "PX4: CAL_ACC*, CAL_GYRO* (offset; scale of the accelerometer), CAL_MAG*"
@@ -19,7 +19,7 @@ _REAL, _INTEGER = 9, 6  # MAV_PARAM_TYPE
 _SENSORS = {"accelerometer": "ACC", "gyroscope": "GYRO", "magnetometer": "MAG"}
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write offsets and scales of sensor `instance`; its device's ID only if it was stated."""
     parameters = parameters.for_autopilot("PX4")
     parameters.require_si("PX4")

@@ -11,13 +11,13 @@ import json
 
 import numpy as np
 
-from jaximu.report.export.base import Parameters, Written, matrix_text, vector_text
+from jaximu.report.export.base import ExportedUnit, Written, matrix_text, vector_text
 
 SUFFIX = ".json"
 SUMMARY = "RealSense: motion intrinsics (calibration.json of rs-imu-calibration)"
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write both triads; the identity for a gyroscope that was not calibrated."""
     parameters.require_si("RealSense")
     entry, equation = {}, []

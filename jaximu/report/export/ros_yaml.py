@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.units import SENSOR_UNITS
-from jaximu.report.export.base import Parameters, Written, comments, text_file, vector_text
+from jaximu.report.export.base import ExportedUnit, Written, comments, text_file, vector_text
 
 SUFFIX = ".yaml"
 MAGNETIC = True
 SUMMARY = "ROS 2 parameters: matrix and bias (y in any unit, counts too)"
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write `imu_calibration.<triad>.matrix` (nine numbers), `.bias`, `.g_sensitivity` and what each is in."""
     lines = [
         comments(parameters),

@@ -10,7 +10,7 @@ walk enters once a step, with variance (w Δt)², which is K² Δt for w = K √
 
 from __future__ import annotations
 
-from jaximu.report.export.base import Parameters, Written, comments
+from jaximu.report.export.base import ExportedUnit, Written, comments
 from jaximu.report.export.noise import TARGETS, noise_files, noise_values
 
 SUFFIX = ".yaml"
@@ -18,7 +18,7 @@ NOISE = True
 SUMMARY = "VINS-Mono, VINS-Fusion: noise per sample (no intrinsics)"
 
 
-def write(parameters: Parameters) -> Written:
+def write(parameters: ExportedUnit) -> Written:
     """Write the noise at the recording's rate. Raises `NotPossibleError` without noise densities or a rate."""
     parameters.require_si("VINS")
     rate = parameters.noise.get("update_rate", parameters.calibration.data.get("rate"))
