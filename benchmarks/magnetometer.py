@@ -23,7 +23,7 @@ from jaximu.diagnosis import diagnose_magnetometer
 from jaximu.fleets import FleetUnit, fit_units
 from jaximu.fleets.field import field_unit
 from jaximu.ground.errors import NotPossibleError
-from jaximu.mistakes import make_ready
+from jaximu.mistakes import prepare
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.readers import ReadOptions, read_magnetometer, read_recording
@@ -186,8 +186,8 @@ def compass(folder: Path, name: str) -> MagneticLog:
 
 def mended(log: MagneticLog) -> MagneticLog:
     """Return a log with bursts of stamps and spikes mended, as a calibration sees it."""
-    signal = make_ready(replace(log.recording, magnetometer=log.magnetometer), magnetometer=True).recording.magnetometer
-    return MagneticLog(signal, make_ready(log.recording).recording, log.name)
+    signal = prepare(replace(log.recording, magnetometer=log.magnetometer), magnetometer=True).recording.magnetometer
+    return MagneticLog(signal, prepare(log.recording).recording, log.name)
 
 
 def alignment(calibration) -> tuple[np.ndarray, np.ndarray]:

@@ -34,7 +34,8 @@ from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms
 from jaximu.ground.errors import JaximuError
-from jaximu.mistakes import Finding, inspect, make_ready
+from jaximu.mistakes import inspect, prepare
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import observe, segment
 
@@ -84,7 +85,7 @@ def names(recording: Recording, expected: set[str] | None = None) -> set[str]:
 def of_the_fit(recording: Recording) -> list[Finding]:
     """Return what a fit adds to the findings of the samples."""
     try:
-        return calibrate_ready([make_ready(recording).recording], Choices(GRAVITY))[1]
+        return calibrate_ready([prepare(recording).recording], Choices(GRAVITY))[1]
     except JaximuError:
         return []
 
@@ -183,7 +184,7 @@ def run(scratch: str) -> None:
             if options.parameters and (
                 np.linalg.det(case.accel) > 0 and np.array_equal(np.abs(case.accel), case.accel)
             ):
-                if make_ready(recording, repair=True).spoiling:
+                if prepare(recording, repair=True).spoiling:
                     refused += 1
                     continue
                 fitted += 1

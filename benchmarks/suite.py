@@ -110,7 +110,7 @@ def measure(profiles: Path | None = None) -> dict[str, float]:
     import pyarrow.parquet as pq
 
     from jaximu.fleets import Job, Settings, fit_units
-    from jaximu.fleets.rows import prepare
+    from jaximu.fleets.rows import read_job
     from jaximu.recordings import write_recording
     from jaximu.recordings.segmentation import segment
     from jaximu.simulation import consumer_noise, draw_imu, simulate
@@ -154,7 +154,7 @@ def measure(profiles: Path | None = None) -> dict[str, float]:
         ratio("csv", lambda: formats_benchmark.ours(text), lambda: formats_benchmark.theirs("csv", text), 9)
         job = Job("log", str(log))
         columns = lambda: [column.to_numpy() for column in pq.read_table(log).columns]  # noqa: E731
-        ratio("prepare", lambda: prepare(job, Settings()), columns, 15)
+        ratio("prepare", lambda: read_job(job, Settings()), columns, 15)
 
     made = fleet_benchmark.units(32)
     ratio("batch", lambda: fit_units(made), lambda: [fit_units([unit]) for unit in made], 3)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaximu import calibrate, diagnose
 from jaximu.calibration.arrangement import arrangement
-from jaximu.mistakes import make_ready
+from jaximu.mistakes import prepare
 from jaximu.recordings.alignment import Clocks, angle_of, clocks, rotation_of, signed_permutation, turning
 from jaximu.recordings.readers import read_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
@@ -132,7 +132,7 @@ def test_clocks_that_are_apart_are_measured_and_repaired(long, late, drift):
     assert found.drift == pytest.approx(drift, abs=5e-4)
     gyroscope = replace(recording.gyroscope, time=recording.gyroscope.time * (1 + drift) + late)
     wrong = replace(recording, gyroscope=gyroscope)
-    ready = make_ready(wrong, repair=True)
+    ready = prepare(wrong, repair=True)
     assert [each.name for each in ready.findings] == ["data.clocks" if drift else "setup.time_offset"]
     again = clocks(*arguments(ready.recording))
     assert abs(again.offset) < 0.01
@@ -158,7 +158,7 @@ def test_stamps_of_a_clock_that_drifts_are_put_right_exactly():
 def test_clocks_that_agree_are_not_mentioned(unit_logs):
     for unit in range(8):
         recording = read_recording(unit_logs / f"unit{unit:03d}.parquet")
-        assert make_ready(recording).findings == ()
+        assert prepare(recording).findings == ()
 
 
 def test_a_negated_gyroscope_is_adequate_and_said(recording):

@@ -15,7 +15,7 @@ from jaximu.cli import main
 from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 from jaximu.estimation.fitting import Prior, informed
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.mistakes import make_ready
+from jaximu.mistakes import prepare
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Recording, Signal
@@ -214,7 +214,7 @@ def test_stamps_in_bursts_held_rows_and_spikes_are_mended(cases):
     assert any("magnetometer: the stamps come in bursts" in note for note in found.notes)
     assert any("magnetometer: 30 outliers" in note for note in found.notes)
     held = Signal(np.arange(2 * len(time)) * 0.01, np.repeat(values, 2, axis=0), "uT")
-    ready = make_ready(Recording(held, magnetometer=held), magnetometer=True)
+    ready = prepare(Recording(held, magnetometer=held), magnetometer=True)
     assert len(ready.recording.magnetometer) <= len(time) and "data.resampled" in {f.name for f in ready.findings}
 
 

@@ -19,7 +19,7 @@ from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose
-from jaximu.mistakes import inspect, make_ready
+from jaximu.mistakes import inspect, prepare
 from jaximu.recordings.recording import Recording, Signal
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 1e-6)
@@ -84,7 +84,7 @@ def test_a_turn_of_two_samples_is_no_spike(tmp_path, seed, two_axes):
 def test_rows_are_those_that_were_changed(name):
     for seed, rate in enumerate(RATES):
         case = planted(name, seed, rate)
-        ready = make_ready(case.log.to_recording())
+        ready = prepare(case.log.to_recording())
         rows = [row for finding in ready.findings if finding.name in case.names for row in finding.rows]
         assert rows
         changed = set(case.rows + 1)
@@ -99,7 +99,7 @@ def test_rows_that_are_left_out_are_no_motion_to_start_from(triad):
     log = generator.Log.of(unit(5, 200.0)[0])
     values, start, stop = getattr(log, triad).copy(), log.count // 2, log.count // 2 + round(8.0 / log.period)
     values[start:stop, 2] = values[start - 1, 2]
-    ready = make_ready(replace(log, **{triad: values}).to_recording())
+    ready = prepare(replace(log, **{triad: values}).to_recording())
     gyroscope = nominal_imu(ready.recording)[0].gyroscope
     assert gyroscope is not None
     np.testing.assert_allclose(gyroscope.gain, np.eye(3), atol=0.1)
@@ -218,13 +218,13 @@ def test_an_axis_that_is_level_while_the_others_turn_is_not_dead():
 
 def test_measured_recordings_are_not_spoiled(data_folder):
     for path, options in measured(data_folder):
-        spoiling = make_ready(read_recording(path, options=options)).spoiling
+        spoiling = prepare(read_recording(path, options=options)).spoiling
         assert not spoiling, (path.name, [finding.text for finding in spoiling])
 
 
 def test_bursts_of_a_measured_log_are_put_on_a_clock(data_folder):
     path = data_folder / "mpu6050_hmc5883l/full_sphere.parquet"
-    ready = make_ready(read_recording(path, options=ReadOptions(check=False)))
+    ready = prepare(read_recording(path, options=ReadOptions(check=False)))
     assert "data.bursts" in names(ready.findings)
     interval = np.diff(ready.recording.accelerometer.time)
     assert np.median(interval) == pytest.approx(0.0101, rel=0.01)
@@ -238,7 +238,7 @@ def test_bridging_three_samples_costs_less_than_the_noise():
     for seed, rate in enumerate(RATES):
         case = planted("spikes", seed, rate)
         clean = generator.Log.of(unit(seed, rate)[0])
-        fixed = make_ready(case.log.to_recording()).recording.gyroscope
+        fixed = prepare(case.log.to_recording()).recording.gyroscope
         assert fixed is not None and len(fixed) == clean.count
         error = np.linalg.norm(fixed.values - clean.gyro, axis=1) * clean.period
         assert error.max() < 2e-4  # rad; the noise of a turn is 1e-4
@@ -262,7 +262,7 @@ def test_parameters_are_right_once_repaired(name):
 def test_values_change_with_repair_alone():
     case = planted("wrap_around", 0)
     recording = case.log.to_recording()
-    left, fixed = make_ready(recording), make_ready(recording, repair=True)
+    left, fixed = prepare(recording), prepare(recording, repair=True)
     assert left.recording.gyroscope is not None and fixed.recording.gyroscope is not None
     assert set(left.recording.gyroscope.values.ravel()) <= set(case.log.gyro.ravel())
     assert len(fixed.recording.gyroscope) == case.log.count
@@ -416,7 +416,7 @@ def test_what_lost_nothing_is_not_said_to(hidden_effect):
 
 def test_measured_recordings_that_lost_nothing_are_not_said_to(data_folder):
     for path, options in [*measured(data_folder)][1:-3:6]:
-        told = of_the_fit(make_ready(read_recording(path, options=options)).recording)[1]
+        told = of_the_fit(prepare(read_recording(path, options=options)).recording)[1]
         assert not names(told) & {"data.lost_samples", "data.saturation", "data.clipping"}, path
 
 
@@ -433,7 +433,7 @@ def test_a_soft_limit_shows_in_the_turns(data_folder):
     limit = 0.5 * np.max(np.abs(log.gyro))
     bent = replace(log, gyro=limit * np.tanh(log.gyro / limit)).to_recording()
     assert "data.saturation" not in names(inspect(bent))
-    (told,) = of_the_fit(make_ready(bent).recording)[1]
+    (told,) = of_the_fit(prepare(bent).recording)[1]
     assert told.name == "data.saturation" and told.spoils and told.rivals == ("gyro.cubic",)
     said = re.search(r"limit of about ([\d.]+) °/s", told.text)
     assert said is not None and float(said.group(1)) == pytest.approx(np.degrees(limit), rel=0.1)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from commands import result_of
 
-from jaximu import thermal
+from jaximu import calibration
 from jaximu.calibration import calibrate_thermal, compensate, load_calibration
 from jaximu.calibration.thermal_regression import multifactor
 from jaximu.calibration.thermal_selection import folds_of
@@ -74,7 +74,7 @@ def commanded(chamber, tmp_path_factory):
     folder = tmp_path_factory.mktemp("chamber")
     write_recording(chamber, folder / "chamber.csv")
     line = ["thermal", str(folder / "chamber.csv"), "-o", str(folder / "out"), "--json"]
-    return folder, *result_of([*line, "--to", "px4", "--to", "ardupilot"], thermal, "calibrate_thermal")
+    return folder, *result_of([*line, "--to", "px4", "--to", "ardupilot"], calibration, "calibrate_thermal")
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from commands import result_of
 
-from jaximu import thermal
+from jaximu import calibration
 from jaximu.calibration import calibrate_thermal, compensate, load_calibration
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.stimulus import Stimulus
@@ -55,7 +55,7 @@ def commanded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("network")
     write_recording(chamber(RATES, 4), folder / "log.parquet")
     line = ["thermal", str(folder / "log.parquet"), "--block", "40", "-o", str(folder / "out"), "--json", "--to", "px4"]
-    return folder, *result_of(line, thermal, "calibrate_thermal")
+    return folder, *result_of(line, calibration, "calibrate_thermal")
 
 
 @pytest.fixture(scope="module")

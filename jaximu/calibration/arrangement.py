@@ -12,9 +12,9 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
-from jaximu.mistakes import Finding
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.alignment import angle_of, rotation_of, signed_permutation
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, apply_axes, spelled_axes
 
 __all__ = ["arrangement"]

@@ -30,7 +30,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import right_jacobian
-from jaximu.mistakes import make_ready
+from jaximu.mistakes import prepare
 from jaximu.model.effects.clock_scale import SetupClockScale
 from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.reference_delay import SetupReferenceDelay
@@ -89,7 +89,7 @@ def calibrate_array(
         if each.gyroscope is None:
             raise InputError(f"{each.name} has no gyroscope, by which units on one body are matched.")
     calibrations = [calibrate(each, gravity, static=static, loss=loss, repair=repair) for each in recordings]
-    ready = [make_ready(each, repair) for each in recordings]
+    ready = [prepare(each, repair) for each in recordings]
     recordings = [each.recording for each in ready]
     corrected = [compensate(found, each) for found, each in zip(calibrations, recordings, strict=True)]
     delays = [0.0, *(_coarse_delay(each, corrected[0]) for each in corrected[1:])]

@@ -53,7 +53,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
-from jaximu.mistakes import Ready, prepared
+from jaximu.mistakes import Prepared, prepared
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.magnetic_field import SetupMagneticField
@@ -473,7 +473,7 @@ def follow(
 
 
 def _through(
-    calibration: Calibration, ready: Ready, noise: NoiseModel | None, gravity: LocalGravity | None,
+    calibration: Calibration, ready: Prepared, noise: NoiseModel | None, gravity: LocalGravity | None,
     attitude: Attitude | None, field: Signal | None,
 ) -> tuple[Calibration, History]:  # fmt: skip
     """Return what `followed_in_use` does, of a recording whose mistakes are known."""

@@ -25,7 +25,8 @@ from jaximu.estimation.problem import without_equipment
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import conjugate, multiply, rotate
-from jaximu.mistakes import Finding, without_rows
+from jaximu.mistakes import without_rows
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Turns
 from jaximu.recordings.recording import Recording
 

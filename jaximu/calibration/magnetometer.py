@@ -27,7 +27,7 @@ from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.magnetic_field import HIGHEST, LOWEST, FieldStrength
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
-from jaximu.mistakes import Ready, make_ready, prepared
+from jaximu.mistakes import Prepared, prepare, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.alignment import signed_permutation
@@ -172,9 +172,9 @@ def _chosen(effects: Sequence[str | Effect], logs: Sequence[MagneticLog]) -> lis
     return chosen
 
 
-def _ready(log: MagneticLog, ready: Ready) -> MagneticLog:
+def _ready(log: MagneticLog, ready: Prepared) -> MagneticLog:
     """Return a log without rows that are no measurement, of the magnetometer (`ready`) and of the other sensors."""
-    other = None if log.recording is None else make_ready(log.recording)
+    other = None if log.recording is None else prepare(log.recording)
     signal = ready.recording.magnetometer
     assert signal is not None
     notes = (*log.notes, *(() if other is None else other.notes), *ready.notes)

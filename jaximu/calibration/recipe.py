@@ -23,12 +23,13 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
-from jaximu.mistakes import Finding, prepared
+from jaximu.mistakes import prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, recordings_of, same_outputs
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, observe, segment
@@ -121,7 +122,7 @@ def calibrate(
     - `method`: `"joint"`, `"two-step"`, `"two-step-rk4"` or `"accelerometer"`, see
       [`jaximu.calibration.fit_hand_held`]; a recording without gyroscope always uses the last.
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
-    - `repair`: change what [`jaximu.mistakes.make_ready`][] can put right; rows that are no measurement are left out
+    - `repair`: change what [`jaximu.mistakes.prepare`][] can put right; rows that are no measurement are left out
       in any case. The notes say what was found.
 
     Raises `InputError` where a sensor holds nothing to calibrate, and `NotPossibleError` where poses are missing or do
@@ -151,7 +152,7 @@ def _with_drift(found: Calibration) -> Calibration:
 def calibrate_ready(
     recordings: Sequence[Recording], choices: Choices, repair: bool = False, losses: bool = True
 ) -> tuple[Calibration, list[Finding]]:
-    """Calibrate recordings that [`jaximu.mistakes.make_ready`][] has been over, as [`jaximu.calibrate`] does.
+    """Calibrate recordings that [`jaximu.mistakes.prepare`][] has been over, as [`jaximu.calibrate`] does.
 
     **Returns:** the calibration, without turns that lost time, and what it says of lost time, axes, mounting and
     ranges; with `repair` axes are mapped. `losses`: whether lost time is looked for; turns that miss for another

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.hand_held import fit_hand_held
-from jaximu.mistakes import Finding
+from jaximu.recordings.finding import Finding
 
 __all__ = ["saturation"]
 

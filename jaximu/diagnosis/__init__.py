@@ -19,12 +19,10 @@ if TYPE_CHECKING:
     from jaximu.diagnosis.turntable import diagnose_turntable
     from jaximu.diagnosis.twin import twin_of
     from jaximu.diagnosis.validity import Validity
-    from jaximu.mistakes.base import Finding
 
 __all__ = [
     "Check",
     "Diagnosis",
-    "Finding",
     "MagneticDiagnosis",
     "MagneticShift",
     "Named",

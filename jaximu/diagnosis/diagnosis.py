@@ -32,11 +32,12 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.quantities import Z95, change, listed, probability, size, with_interval, with_intervals
 from jaximu.ground.summary import Block, Described, Summary, sentence
-from jaximu.mistakes import Finding, make_ready, prepared
+from jaximu.mistakes import prepare, prepared
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.noise.at_rest import noise_of
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import SegmentationOptions, observe
 
@@ -382,7 +383,7 @@ def diagnose(
     - `heldout`: another recording of the same unit, to measure the gain on; else parts of the recording are left out in
       turn.
     - `level`: rate of false alarms over all tests together.
-    - `repair`: change what [`jaximu.mistakes.make_ready`][] can put right; rows that are no measurement are left out
+    - `repair`: change what [`jaximu.mistakes.prepare`][] can put right; rows that are no measurement are left out
       in any case.
 
     No effect is named while a mistake in the recording stands that could imitate it. Raises `NotPossibleError` where
@@ -404,7 +405,7 @@ def diagnose(
         spoiling += [finding for finding in unusual if finding.spoils]
         notes, held = list(calibration.notes), None
         if heldout is not None:
-            other, _ = calibrate_ready([make_ready(heldout, repair).recording], choices, repair)
+            other, _ = calibrate_ready([prepare(heldout, repair).recording], choices, repair)
             notes += same_device(calibration, other)
             held = partial(_experiment, other, start=calibration)
         found = examine(Examination(

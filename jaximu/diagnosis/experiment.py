@@ -20,11 +20,11 @@ from jaximu.estimation.fitting import Linear, Measurement, Prior, fit, linearise
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import FloatArray
-from jaximu.mistakes import Finding
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
 __all__ = ["Experiment", "ResidualKind", "State"]

@@ -12,9 +12,9 @@ from jaximu.diagnosis.evidence import Evidence, TestedBlock, strength
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import on_held_out
 from jaximu.diagnosis.selection import BESIDE, SelectedCause, Selection, causes_of, one_curve, select
-from jaximu.mistakes import Finding
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
+from jaximu.recordings.finding import Finding
 
 __all__ = ["Extension", "Found", "extend", "settled"]
 

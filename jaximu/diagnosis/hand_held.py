@@ -23,10 +23,10 @@ from jaximu.diagnosis.twin import twin_recordings
 from jaximu.estimation.fitting import About, Linear
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
-from jaximu.mistakes import Finding
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observe
 

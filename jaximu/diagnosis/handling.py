@@ -13,9 +13,9 @@ import numpy as np
 
 from jaximu.data.poses import missed_by_sampling
 from jaximu.ground.array_types import FloatArray
-from jaximu.mistakes import Finding
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.recordings.finding import Finding
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.experiment import State

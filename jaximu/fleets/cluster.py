@@ -13,7 +13,7 @@ import ray  # pyright: ignore[reportMissingImports]
 import ray.data  # pyright: ignore[reportMissingImports]
 
 from jaximu.fleets.jobs import ONE_THREAD, Job, Rows, Settings, batches
-from jaximu.fleets.rows import finish, prepare
+from jaximu.fleets.rows import finish, read_job
 from jaximu.ground import stored
 
 __all__ = ["compute"]
@@ -37,7 +37,7 @@ def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, work
 
     def read(item: dict[str, Any]) -> dict[str, Any]:
         stored.prepare_process(folder)
-        return {"place": item["place"], "prepared": pickle.dumps(prepare(pickle.loads(item["job"]), settings))}
+        return {"place": item["place"], "prepared": pickle.dumps(read_job(pickle.loads(item["job"]), settings))}
 
     class FittingActor:
         """Fits batches of prepared recordings, and keeps its compiled programs."""

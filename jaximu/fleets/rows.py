@@ -29,7 +29,7 @@ from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observe, segment
 
-__all__ = ["PARAMETERS", "SCHEMA", "Prepared", "covariances", "finish", "free_places", "prepare", "require_table",
+__all__ = ["PARAMETERS", "SCHEMA", "ReadJob", "covariances", "finish", "free_places", "read_job", "require_table",
            "row_begun", "rows_of"]  # fmt: skip
 
 PARAMETERS = names_of(Imu.nominal())
@@ -102,7 +102,7 @@ def covariances(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class ReadJob:
     """A job whose recording is read and segmented; `row` has what is known already, `unit` is None where it failed.
 
     field: the same of its magnetometer, None where there is none.
@@ -119,7 +119,7 @@ def row_begun(job: Job) -> dict[str, Any]:
     return dict.fromkeys(SCHEMA.names) | known
 
 
-def prepare(job: Job, settings: Settings) -> Prepared:
+def read_job(job: Job, settings: Settings) -> ReadJob:
     """Read, segment and, where it is asked for, diagnose one recording. Never raises: a failure is the job's row."""
     row = row_begun(job)
     try:
@@ -129,7 +129,7 @@ def prepare(job: Job, settings: Settings) -> Prepared:
         found = segment(recording, settings.segmentation)
         unit, notes = _unit(recording, found, settings, noise)
     except Exception as error:
-        return Prepared(row | _failure(error), None)
+        return ReadJob(row | _failure(error), None)
     row |= _facts(recording, unit, (*recording.notes, *notes, *found.notes))
     if job.date:
         row["date"] = job.date
@@ -141,7 +141,7 @@ def prepare(job: Job, settings: Settings) -> Prepared:
             field = field_unit(recording.magnetometer, found, settings.field, job.file)
         except Exception as error:
             row["mag_message"] = _sentence(error)
-    return Prepared(row, unit, field)
+    return ReadJob(row, unit, field)
 
 
 @lru_cache(maxsize=4)
@@ -201,7 +201,7 @@ def _sentence(error: Exception) -> str:
     return f"this should not happen ({type(error).__name__}: {error})".splitlines()[0][:500]
 
 
-def finish(prepared: Sequence[Prepared], settings: Settings) -> list[dict[str, Any]]:
+def finish(prepared: Sequence[ReadJob], settings: Settings) -> list[dict[str, Any]]:
     """Fit what was prepared, in one batch, and return its rows in the same order."""
     units = [each.unit for each in prepared if each.unit is not None]
     fits = iter(fit_units([*units, *(each.field.unit for each in prepared if each.field is not None)]))
@@ -212,10 +212,10 @@ def finish(prepared: Sequence[Prepared], settings: Settings) -> list[dict[str, A
 
 def rows_of(jobs: Sequence[Job], settings: Settings) -> list[dict[str, Any]]:
     """Return the rows of jobs: what every engine computes, wherever it does."""
-    return finish([prepare(job, settings) for job in jobs], settings)
+    return finish([read_job(job, settings) for job in jobs], settings)
 
 
-def _row(prepared: Prepared, fitted: Fitted, settings: Settings) -> dict[str, Any]:
+def _row(prepared: ReadJob, fitted: Fitted, settings: Settings) -> dict[str, Any]:
     row, unit = prepared.row, prepared.unit
     assert unit is not None
     like, parameters = parameter_set(unit.gyroscope)

@@ -1,9 +1,9 @@
-"""What a mistake in a recording is (`Finding`), and the views of its samples that all checks share. NumPy alone."""
+"""The views of a recording's samples that all checks share. NumPy alone."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.recordings.alignment import BlockMeans, gravity_turning
+from jaximu.recordings.finding import Rows
 from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["BRIDGED", "TITLES", "Finding", "Samples", "Sensor", "coarse_step", "runs_of"]
+__all__ = ["BRIDGED", "TITLES", "Samples", "Sensor", "coarse_step", "runs_of"]
 
 TITLES = {
     "data.bumped_pose": "bumped pose",
@@ -27,7 +28,6 @@ TITLES = {
 }
 """In English, the mistakes that no file of this folder finds: reading a file shows them, or a fit."""
 
-Rows = NDArray[np.int64]
 BRIDGED = 3
 """Samples in a row that may be missing in a turn: interpolation across them costs less than the noise does."""
 _SHOWN = 5
@@ -36,39 +36,6 @@ _QUIET = 6.0  # times the floor of the variance up to which a block counts as re
 _SHORTEST_REST = 0.75  # s
 _UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 _CURVATURE_NOISE = float(np.sqrt(1 + 34 / 36))  # of a sample's difference from the cubic through its neighbours
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A mistake in a recording, and what can be done about it.
-
-    name: "data.zeros" and so on. rows: the first rows concerned, counted from 1. text: what is wrong and what to do.
-    repair: the option to paste. rivals: mistakes that would look exactly the same. spoils: parameters and effects
-    cannot be trusted while it stands. refuses: nothing can be calibrated from this sensor ("accelerometer" …) at all.
-    partial: a repair cannot find all of it, so that what is left may still look like an effect.
-    apply: changes the recording as the repair does; done without being asked where `repair` is empty. without: rows of
-    each sensor, counted from 0, that are no measurement and are left out.
-    """
-
-    name: str
-    rows: tuple[int, ...]
-    text: str
-    repair: str = ""
-    rivals: tuple[str, ...] = ()
-    spoils: bool = False
-    refuses: str = ""
-    partial: bool = False
-    apply: Callable[[Recording], Recording] | None = field(default=None, compare=False, repr=False)
-    without: Mapping[str, Rows] = field(default_factory=dict, compare=False, repr=False)
-
-    def document(self) -> dict[str, Any]:
-        """Return the finding as `diagnosis.json` has it."""
-        document: dict[str, Any] = {"name": self.name, "rows": list(self.rows), "text": self.text}
-        if self.repair:
-            document["repair"] = self.repair
-        if self.rivals:
-            document["indistinguishable_from"] = list(self.rivals)
-        return document
 
 
 class Sensor:

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
-from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, coarse_step, runs_of
+from jaximu.mistakes.base import Samples, Sensor, coarse_step, runs_of
+from jaximu.recordings.finding import Finding, Rows
 
 __all__ = ["TITLES", "at_limits", "find", "stops"]
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, Samples, with_signal
+from jaximu.mistakes.base import Samples, with_signal
 from jaximu.recordings.alignment import Clocks, clocks
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
 __all__ = ["TITLES", "find"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.quantities import counted
-from jaximu.mistakes.base import Finding, Rows, Samples, runs_of
+from jaximu.mistakes.base import Samples, runs_of
+from jaximu.recordings.finding import Finding, Rows
 
 __all__ = ["TITLES", "find"]
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, with_signal
+from jaximu.mistakes.base import Samples, Sensor, coarse_step, with_signal
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
 __all__ = ["TITLES", "find", "zeroed_at_rest"]

@@ -6,7 +6,8 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.mistakes.base import Finding, Samples, Sensor
+from jaximu.mistakes.base import Samples, Sensor
+from jaximu.recordings.finding import Finding
 
 __all__ = ["TITLES", "find"]
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.mistakes.base import Finding, Rows, Samples, Sensor
+from jaximu.mistakes.base import Samples, Sensor
+from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import Recording
 
 __all__ = ["TITLES", "find", "steps"]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.mistakes.base import Finding, Samples, runs_of
+from jaximu.mistakes.base import Samples, runs_of
 from jaximu.mistakes.lost_samples import steps
 from jaximu.recordings.alignment import clocks
+from jaximu.recordings.finding import Finding
 
 __all__ = ["TITLES", "find"]
 

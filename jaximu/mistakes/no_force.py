@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.mistakes.base import Finding, Samples
+from jaximu.mistakes.base import Samples
+from jaximu.recordings.finding import Finding
 
 __all__ = ["TITLES", "find"]
 

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import gamma_mean_sf
 from jaximu.ground.quantities import size
-from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, runs_of
+from jaximu.mistakes.base import Samples, Sensor, coarse_step, runs_of
 from jaximu.mistakes.resampled import held_at, interpolated_at
+from jaximu.recordings.finding import Finding
 
 __all__ = ["TITLES", "find"]
 

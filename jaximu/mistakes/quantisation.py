@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from jaximu.ground.quantities import size
-from jaximu.mistakes.base import Finding, Samples, coarse_step
+from jaximu.mistakes.base import Samples, coarse_step
 from jaximu.mistakes.held_at_rest import zeroed_at_rest
 from jaximu.mistakes.resampled import held_at
+from jaximu.recordings.finding import Finding
 
 __all__ = ["TITLES", "find"]
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, coarse_step
+from jaximu.mistakes.base import Samples, Sensor, coarse_step
+from jaximu.recordings.finding import Finding, Rows
 
 __all__ = ["TITLES", "find", "held_at", "interpolated_at"]
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted, size
-from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, Sensor, runs_of
+from jaximu.mistakes.base import BRIDGED, Samples, Sensor, runs_of
+from jaximu.recordings.finding import Finding, Rows
 
 __all__ = ["TITLES", "find"]
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.mistakes.base import Finding, Samples, Sensor, coarse_step, runs_of
+from jaximu.mistakes.base import Samples, Sensor, coarse_step, runs_of
 from jaximu.mistakes.clipping import at_limits, stops
 from jaximu.mistakes.resampled import held_at
+from jaximu.recordings.finding import Finding
 
 __all__ = ["TITLES", "find"]
 

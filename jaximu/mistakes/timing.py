@@ -9,7 +9,8 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
-from jaximu.mistakes.base import Finding, Samples, Sensor
+from jaximu.mistakes.base import Samples, Sensor
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["TITLES", "find", "in_bursts", "steady_clock"]

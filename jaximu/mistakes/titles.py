@@ -1,6 +1,6 @@
 """What is named in English: an effect, a mistake in the data, a kind of noise."""
 
-from jaximu.mistakes.prepare import MISTAKES
+from jaximu.mistakes.preparation import MISTAKES
 from jaximu.model.data_sheet import NOISE_KINDS
 from jaximu.model.effects import CATALOGUE
 

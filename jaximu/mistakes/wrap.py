@@ -6,7 +6,8 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
-from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, with_signal
+from jaximu.mistakes.base import Samples, Sensor, with_signal
+from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import Recording
 
 __all__ = ["TITLES", "find"]

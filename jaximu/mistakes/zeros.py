@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.quantities import counted
-from jaximu.mistakes.base import Finding, Rows, Samples, Sensor, runs_of
+from jaximu.mistakes.base import Samples, Sensor, runs_of
 from jaximu.mistakes.held_at_rest import zeroed_at_rest
+from jaximu.recordings.finding import Finding, Rows
 
 __all__ = ["TITLES", "find"]
 

@@ -32,7 +32,7 @@ from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observe, segment
 from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Positions, Protocol, RateTable
-from jaximu.simulation.protocols import HandHeldExperiment as TurnedByHand
+from jaximu.simulation.protocols import HandHeld as TurnedByHand
 
 __all__ = ["advised", "options", "suggestion"]
 

@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
+    from jaximu.recordings.finding import Finding
     from jaximu.recordings.write import arrow_table, write_recording
 
 __all__ = [
+    "Finding",
     "arrow_table",
     "write_recording",
 ]

@@ -30,10 +30,11 @@ from jaximu.mistakes import (
     wrap,
     zeros,
 )
-from jaximu.mistakes.base import BRIDGED, Finding, Rows, Samples, runs_of
+from jaximu.mistakes.base import BRIDGED, Samples, runs_of
+from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import Defect, Recording, Signal
 
-__all__ = ["MISTAKES", "Ready", "inspect", "make_ready", "prepared", "without_rows"]
+__all__ = ["MISTAKES", "Prepared", "inspect", "prepare", "prepared", "without_rows"]
 
 _ROUNDS = 4
 _REPAIRED = "This was repaired."
@@ -57,7 +58,7 @@ MISTAKES: dict[str, str] = base.TITLES | {
 
 
 @dataclass(frozen=True)
-class Ready:
+class Prepared:
     """A recording without the rows that are no measurement, and the mistakes that were found on the way.
 
     findings: those that were repaired say so, and spoil nothing any more. left_out: of each
@@ -81,10 +82,10 @@ class Ready:
 
 def inspect(recording: Recording) -> list[Finding]:
     """Return what is wrong with a recording's samples, before any fit, and what reading it put right."""
-    return list(make_ready(recording).findings)
+    return list(prepare(recording).findings)
 
 
-def make_ready(recording: Recording, repair: bool = False, magnetometer: bool = False) -> Ready:
+def prepare(recording: Recording, repair: bool = False, magnetometer: bool = False) -> Prepared:
     """Leave out what is no measurement, and with `repair` change what can be put right; look again until nothing comes.
 
     Each kind of mistake of a sensor is handled once, in at most four rounds. `magnetometer`: look at the magnetometer's
@@ -131,18 +132,18 @@ def make_ready(recording: Recording, repair: bool = False, magnetometer: bool = 
             stage += 1
             if stage == len(stages):
                 break
-    return Ready(recording, tuple(_sorted(findings)), left_out)
+    return Prepared(recording, tuple(_sorted(findings)), left_out)
 
 
 @contextmanager
 def prepared(
     recordings: Sequence[Recording], repair: bool = False, gyroscope: bool = True, magnetometer: bool = False
-) -> Iterator[tuple[Ready, ...]]:
+) -> Iterator[tuple[Prepared, ...]]:
     """Make recordings ready; an error on the way begins with the mistake found in them, which is the likelier cause.
 
     Raises InputError where a sensor that is needed holds nothing to calibrate, with the finding's own sentence.
     """
-    ready = tuple(make_ready(recording, repair, magnetometer) for recording in recordings)
+    ready = tuple(prepare(recording, repair, magnetometer) for recording in recordings)
     for each in ready:
         for finding in each.findings:
             if finding.refuses and (gyroscope or finding.refuses != "gyroscope"):
@@ -162,7 +163,7 @@ def prepared(
         raise NotPossibleError(f"{' '.join(list(said.values())[::-1][:3])} Hence: {reason}") from error
 
 
-def _named(ready: Ready, number: int) -> Ready:
+def _named(ready: Prepared, number: int) -> Prepared:
     """Return one of several recordings, its name or number in all that was found in it."""
     files = " and ".join(Path(source.path).name for source in ready.recording.sources) or f"recording {number}"
     return replace(ready, findings=tuple(replace(each, text=f"In {files}: {each.text}") for each in ready.findings))
