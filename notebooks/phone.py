@@ -13,13 +13,13 @@ import jax
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.effects import CATALOGUE
 from jaximu.simulation import consumer_noise, draw_imu, simulate
-from jaximu.simulation.artefacts import Jitter, Quantisation
+from jaximu.simulation.artefacts import Jitter, QuantisedOutput
 from jaximu.simulation.protocols import HandHeld
 
 PATH = Path(__file__).parents[1] / "jaximu" / "simulation" / "phone.zip"
 RATES = {"Accelerometer": 99.6, "Gyroscope": 100.3}  # Hz
 UNITS = {"Accelerometer": "m/s^2", "Gyroscope": "rad/s"}
-STEPS = Quantisation(STANDARD_GRAVITY / 8192, 1000 / 32768 * 3.14159 / 180)
+STEPS = QuantisedOutput(STANDARD_GRAVITY / 8192, 1000 / 32768 * 3.14159 / 180)
 HIDDEN = "accel.asymmetry"
 
 

@@ -25,6 +25,7 @@ ROOT = HERE.parent
 PAGES, SITE = ROOT / "build" / "pages", ROOT / "build" / "site"
 MODULES = (
     "jaximu",
+    "jaximu.model",
     "jaximu.model.sensor",
     "jaximu.recordings.recording",
     "jaximu.calibration",

@@ -8,7 +8,7 @@ from jaximu.mistakes import inspect
 from jaximu.mistakes.clipping import stops
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, draw_imu, simulate
-from jaximu.simulation.artefacts import Clipping, Dropped, Gap, Jitter, Periodic, Quantisation, Repeated, StuckAxis
+from jaximu.simulation.artefacts import Clipping, Dropped, Gap, Jitter, Periodic, QuantisedOutput, Repeated, StuckAxis
 from jaximu.simulation.protocols import HandHeld, RateTable
 
 G = 9.80665
@@ -48,7 +48,7 @@ def still(force, rate):
 )
 def test_clean_recordings_give_no_finding(steps):
     for seed in range(6):
-        found = inspect(recording(seed, [Quantisation(*steps)], poses=12 + 2 * seed, rate=(100.0, 200.0)[seed % 2]))
+        found = inspect(recording(seed, [QuantisedOutput(*steps)], poses=12 + 2 * seed, rate=(100.0, 200.0)[seed % 2]))
         assert not found, (seed, [finding.text for finding in found])
 
 
@@ -146,7 +146,7 @@ def test_an_accelerometer_clipped_at_rest():
 @pytest.mark.parametrize("bits", [10, 12])
 def test_coarse_steps_are_named_and_nothing_else(bits):
     step = 16 * G / 2 ** (bits - 1), np.radians(2000) / 2 ** (bits - 1)
-    found = only(inspect(recording(1, [Quantisation(*step)])), "data.quantisation")
+    found = only(inspect(recording(1, [QuantisedOutput(*step)])), "data.quantisation")
     assert "accelerometer x, y, z" in {finding.text.split(":")[0] for finding in found}
     for finding in found:
         expected = size(step[0], "m/s^2") if finding.text.startswith("accelerometer") else size(step[1], "rad/s")

@@ -32,7 +32,7 @@ from jaximu.simulation.artefacts import (
     Jitter,
     LoggedRows,
     Periodic,
-    Quantisation,
+    QuantisedOutput,
     Repeated,
     StuckAxis,
     SwappedAxes,
@@ -107,7 +107,7 @@ def test_blocks_make_no_difference(block, seed, rate):
         CATALOGUE["setup.clock_scale"].make(1e-3),
     )
     artefacts = [
-        Periodic("accel_x", 0.1, 3.0), Clipping(9.0, 1.0), Quantisation(1e-3, 1e-4, 0.1),
+        Periodic("accel_x", 0.1, 3.0), Clipping(9.0, 1.0), QuantisedOutput(1e-3, 1e-4, 0.1),
         StuckAxis("gyro_y", 2.0, 3.0), Repeated(0.1), Dropped(0.05), Gap(4.0, 5.0),
     ]  # fmt: skip
     case = Case.of(imu, HELD, RICH, rate, seed, 0, WARMING, artefacts)
@@ -203,7 +203,7 @@ def test_clipping_stops_at_the_range_and_says_so():
 
 
 def test_quantisation_rounds_to_steps():
-    after, before, _ = applied(Quantisation(0.25, None, 0.5))
+    after, before, _ = applied(QuantisedOutput(0.25, None, 0.5))
     steps = after.values["accelerometer"] / 0.25
     np.testing.assert_array_equal(steps, np.round(steps))
     assert np.abs(after.values["accelerometer"] - before.values["accelerometer"]).max() <= 0.125
@@ -250,8 +250,8 @@ def test_jittered_stamps_increase(sigma, share):
 
 
 def test_artefacts_are_applied_in_the_order_in_which_they_happen():
-    case = Case.of(draw_imu(0), HELD, artefacts=[Jitter(1e-3), Quantisation(0.1), Clipping(9.03)])
-    assert [type(each) for each in case.artefacts] == [Clipping, Quantisation, Jitter]
+    case = Case.of(draw_imu(0), HELD, artefacts=[Jitter(1e-3), QuantisedOutput(0.1), Clipping(9.03)])
+    assert [type(each) for each in case.artefacts] == [Clipping, QuantisedOutput, Jitter]
     recording, truth = simulate_cases([case])[0]
     assert np.abs(recording.accelerometer.values).max() == pytest.approx(9.0)
     assert "left its range" in truth.notes[0]
@@ -261,7 +261,7 @@ def test_artefacts_are_applied_in_the_order_in_which_they_happen():
     ("make", "words"),
     [
         (lambda: Clipping(-1.0), "clipping: accelerometer must not be negative"),
-        (lambda: Quantisation(gyroscope=float("nan")), "quantisation: gyroscope must not be negative"),
+        (lambda: QuantisedOutput(gyroscope=float("nan")), "quantisation: gyroscope must not be negative"),
         (lambda: StuckAxis("accel_w", 1.0), "axis must be one of accel_x"),
         (lambda: StuckAxis("accel_x", 2.0, 1.0), "start must be before stop"),
         (lambda: Gap(2.0, 2.0), "start must be before stop"),

@@ -43,7 +43,7 @@ from jaximu.model.sensor import Imu
 
 __all__ = [
     "Alarm",
-    "Fleet",
+    "Batch",
     "FollowedQuantity",
     "Line",
     "follow",
@@ -63,7 +63,7 @@ _ROW = ("device", "file", "status", "date", "lot", "accel_gain", "accel_bias", "
 
 
 @dataclass(frozen=True)
-class Fleet:
+class Batch:
     """Calibrated units of a fleet's table: which rows they are, their parameters, and what they are grouped by.
 
     rows: (n,) places in the table; total: of all rows. units: outputs in the table's units. days: since 1970, NaN where
@@ -112,7 +112,7 @@ class FollowedQuantity:
 class Line(Document):
     """A table's verdicts and statistics. verdicts: (rows,) of the table, undecided for what was not calibrated."""
 
-    table: Fleet
+    table: Batch
     limits: Limits | None
     judged: Judged | None
     measured: Measured
@@ -205,7 +205,7 @@ def _entry(each: FollowedQuantity) -> dict[str, Any]:
 # --- the table --------------------------------------------------------------------------------------------------------
 
 
-def read_table(path: str | os.PathLike[str]) -> Fleet:
+def read_table(path: str | os.PathLike[str]) -> Batch:
     """Read the calibrated rows of a fleet's table.
 
     Raises `InputError` where it is no such table, `NotPossibleError` where nothing in it was calibrated.
@@ -259,7 +259,7 @@ def read_table(path: str | os.PathLike[str]) -> Fleet:
     units = Units(like, np.concatenate(parts, axis=1), tuple(PARAMETERS[place] for place in free),
                   covariance + reach[:, :, None] * reach[:, None, :], gravity, conditions)  # fmt: skip
     nominal = {owner: (numbers(f"{short}_nominal")[0, :3], np.zeros(3)) for short, owner in triads.items()}
-    return Fleet(name, len(table), rows, units, words("device"), words("file"), days_of(words("date")), words("lot"),
+    return Batch(name, len(table), rows, units, words("device"), words("file"), days_of(words("date")), words("lot"),
                  words("station"), nominal)  # fmt: skip
 
 
@@ -291,13 +291,13 @@ def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
     return Limits(tuple(limits), rule, nominal, table.file, file_digest(path))
 
 
-def _in_counts(table: Fleet, nominal: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict:
+def _in_counts(table: Batch, nominal: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict:
     """Return the nominal scales of the triads that were logged in counts."""
     triads = table.units.like.triads()
     return {owner: each for owner, each in nominal.items() if triads[owner].output_unit == "count"}
 
 
-def _first_recordings(table: Fleet) -> NDArray[np.int64]:
+def _first_recordings(table: Batch) -> NDArray[np.int64]:
     """Return the place of each device's first recording, by date, in the order of the dates; undated ones come last."""
     order = np.argsort(np.where(np.isnan(table.days), np.inf, table.days), kind="stable")
     first = np.unique(np.array(table.devices)[order], return_index=True)[1]
@@ -307,7 +307,7 @@ def _first_recordings(table: Fleet) -> NDArray[np.int64]:
 # --- the line ---------------------------------------------------------------------------------------------------------
 
 
-def follow(table: Fleet, limits: Limits | None = None, golden: str = "") -> Line:
+def follow(table: Batch, limits: Limits | None = None, golden: str = "") -> Line:
     """Hold a table's units to limits and question their course.
 
     **Arguments:** `golden`: the device that is recorded again and again to watch the line; it is left out of charts and
@@ -368,14 +368,14 @@ def follow(table: Fleet, limits: Limits | None = None, golden: str = "") -> Line
     return Line(table, limits, judged, measured, verdicts, tuple(followed), tuple(alarms), golden, tuple(notes))
 
 
-def _when(table: Fleet, place: int) -> str:
+def _when(table: Batch, place: int) -> str:
     if np.isnan(table.days[place]):
         return table.devices[place]
     return f"{np.datetime64(round(table.days[place] * 86400), 's').astype('datetime64[D]')} ({table.devices[place]})"
 
 
 def _alarms(
-    table: Fleet, name: str, unit: str, charts: dict[str, tuple[Chart, NDArray[np.int64]]], course: Drift | None,
+    table: Batch, name: str, unit: str, charts: dict[str, tuple[Chart, NDArray[np.int64]]], course: Drift | None,
     golden: str, questions: int,
 ) -> list[Alarm]:  # fmt: skip
     found = []

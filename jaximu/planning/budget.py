@@ -81,7 +81,7 @@ from jaximu.planning.setup_errors import (
 )
 from jaximu.recordings.observations import Stations
 
-__all__ = ["SCHEMA", "Budget", "Goal", "MonteCarlo", "Need", "Task", "budget", "read_task", "task"]
+__all__ = ["SCHEMA", "Budget", "Goal", "Need", "Task", "Trials", "budget", "read_task", "task"]
 
 SCHEMA = "jaximu.budget/1"
 _OFF = 0.05  # of a total: a source whose linear share is wrong by more is said to be
@@ -118,7 +118,7 @@ class Goal:
 
 
 @dataclass(frozen=True)
-class MonteCarlo:
+class Trials:
     """Monte Carlo through the whole estimator. rms (p,): root mean square error of each parameter, in its unit."""
 
     draws: int
@@ -149,7 +149,7 @@ class Budget(Document):
     open: tuple[str, ...]
     goals: tuple[Goal, ...]
     notes: tuple[str, ...]
-    check: MonteCarlo | None = None
+    check: Trials | None = None
 
     @property
     def total(self) -> FloatArray:
@@ -360,7 +360,7 @@ def _expected_excess(
 
 def _check(
     task: Task, found: Budget, scheme: ErrorScheme, per: FloatArray, truth: FloatArray, draws: int, seed: int
-) -> MonteCarlo:
+) -> Trials:
     """Put sessions with all errors at once through `fit_turntable`, from the data sheet on."""
     rng = np.random.default_rng([seed, 1])
     errors = np.sum([source.draw(rng, draws) for source in found.sources], axis=0)
@@ -385,9 +385,7 @@ def _check(
     start = Imu(sheet(unit.accelerometer), None if unit.gyroscope is None else sheet(unit.gyroscope), unit.setup)
     *off, good = _chunks(fitted, _recorded(scheme, errors)).T
     fine = good > 0
-    return MonteCarlo(
-        draws, np.sqrt(_mean_square((np.stack(off, axis=1) - errors @ truth.T)[fine])), int(np.sum(~fine))
-    )
+    return Trials(draws, np.sqrt(_mean_square((np.stack(off, axis=1) - errors @ truth.T)[fine])), int(np.sum(~fine)))
 
 
 def _truth(scheme: ErrorScheme, unit: Imu, names: Sequence[Name]) -> FloatArray:

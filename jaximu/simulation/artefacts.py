@@ -118,7 +118,7 @@ class Clipping(Artefact):
 
 
 @dataclass(frozen=True)
-class Quantisation(Artefact):
+class QuantisedOutput(Artefact):
     """Outputs are whole multiples of a step (output unit; °C); None leaves a signal as it is."""
 
     accelerometer: float | None = None
@@ -284,7 +284,7 @@ ARTEFACTS: dict[str, type[Artefact]] = {
     for artefact in (
         Periodic,
         Clipping,
-        Quantisation,
+        QuantisedOutput,
         SwappedAxes,
         StuckAxis,
         Repeated,
