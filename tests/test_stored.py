@@ -177,7 +177,7 @@ PROGRAM = """
 import os, signal, sys
 import numpy as np
 from pathlib import Path
-from jaximu import stored
+from jaximu.ground import stored
 
 stored.prepare_process(Path(sys.argv[1]))
 if sys.argv[2:] == ["killed"]:
