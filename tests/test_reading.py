@@ -494,6 +494,23 @@ def test_columns_rate_scales_and_axes_are_kept(counts, recordings, tmp_path, cap
     assert main(["check", str(path), str(log), "--json", "--fail-on", "invalid"]) == 0
 
 
+def test_the_gyroscopes_file_of_the_next_log_is_asked_for(recordings, tmp_path, capsys):
+    """The fault seen: "--columns names 7 columns, the file has 4", of columns that nobody had typed."""
+    logs = []
+    for name, (each, _) in zip(("one", "two"), recordings, strict=True):
+        for signal in (each.accelerometer, each.gyroscope):
+            rows = np.column_stack([signal.time, signal.values])
+            logs.append(str(tmp_path / f"{name}_{'gyro' if signal is each.gyroscope else 'accel'}.csv"))
+            np.savetxt(logs[-1], rows, fmt="%.9g", delimiter=",")
+    line = ["--columns", "time [s],accel [m/s^2],gyro [rad/s]", "-o", str(tmp_path / "d"), "--quiet"]
+    assert main(["calibrate", logs[0], "--gyro-log", logs[1], *line]) == 0
+    line = ["compensate", str(tmp_path / "d" / "calibration.json"), logs[2], "-o", str(tmp_path / "out.csv")]
+    assert main(line) == 2
+    message = capsys.readouterr().err
+    assert "two_accel.csv" in message and "--gyro-log" in message and "names 7 columns" not in message
+    assert main([*line, "--gyro-log", logs[3]]) == 0
+
+
 def test_an_export_of_counts_turns_the_sense_of_a_logger_of_minus_specific_force(counts, recordings):
     path, log, _ = counts
     written = writer("c-header").write(ExportedUnit.of(load_calibration(path)))

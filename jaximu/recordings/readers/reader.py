@@ -21,7 +21,7 @@ from jaximu.recordings.columns import nominal
 from jaximu.recordings.columns.choose import choose_columns, choose_pair, column_units
 from jaximu.recordings.columns.guess import Advice, advise
 from jaximu.recordings.columns.known import known_names, whole_stamps
-from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns
+from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, parse_columns
 from jaximu.recordings.columns.table import MessageSelection, Table, from_arrow, mapped_axes, named_with_units
 from jaximu.recordings.readers.records import apart
 from jaximu.recordings.recording import (
@@ -64,8 +64,14 @@ def read_recording(
     tables = read_tables(path, selection)
     if tables[0].messages and options.columns is not None:
         raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
+    open_columns = options.columns is None and options.gyro_columns is None
     options = _alike(options, tables[0])
     if gyro_log is None:
+        if open_columns and _of_two_files(options, tables[0]):
+            raise InputError(
+                f"{tables[0].path}: the log of the calibration had its gyroscope in a file of its own: name this "
+                "log's, too (--gyro-log)."
+            )
         parts = _parts(tables, options)
     else:
         table, second = _stamped(tables[0], options.columns), read_tables(gyro_log, selection)[0]
@@ -132,6 +138,12 @@ def _alike(options: ReadOptions, table: Table) -> ReadOptions:
     mapped = Reading(axes=table.axes)
     like.require_alike(mapped if options.axes is None else mapped.mapped(options.axes), table.path, like.units)
     return options
+
+
+def _of_two_files(options: ReadOptions, table: Table) -> bool:
+    """Whether the columns are those of this file and of the gyroscope's."""
+    names = parse_columns(options.columns or ())
+    return options.gyro_columns is not None or len(names) > len(table.columns)
 
 
 def _counts(options: ReadOptions, name: str) -> tuple[Stated | None, Stated | None]:
