@@ -8,7 +8,7 @@ import pytest
 from everyday import Trial, instants, swaying, with_jitter, with_losses
 
 from jaximu import LocalGravity, diagnose, read_recording
-from jaximu.diagnosis.evidence import Evidence, TestedBlock
+from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.selection import select
 from jaximu.mistakes import inspect
 from jaximu.model.effects import CATALOGUE
@@ -98,7 +98,7 @@ def test_two_curves_that_mend_each_other_are_no_pair():
     """Quadratic and asymmetry together fit a quartic to the noise; an odd curve is another matter."""
     rate = np.linspace(-5.0, 5.0, 80)
     curves = {"gyro.quadratic": rate**2, "gyro.asymmetry": np.abs(rate), "gyro.cubic": rate**3}
-    blocks = [TestedBlock(k, each[:, None], np.ones(1), curved=CATALOGUE[k].curved()) for k, each in curves.items()]
+    blocks = [EffectBlock(k, each[:, None], np.ones(1), curved=CATALOGUE[k].curved()) for k, each in curves.items()]
     base = np.stack([np.ones(80), rate], axis=1)
 
     def causes(seed, shape):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jaximu.diagnosis.evidence import LIMIT_LEVEL, Evidence, TestedBlock, detection_limit, limit_noncentrality
+from jaximu.diagnosis.evidence import LIMIT_LEVEL, EffectBlock, Evidence, detection_limit, limit_noncentrality
 from jaximu.diagnosis.improvement import cross_validated
 from jaximu.diagnosis.selection import select
 
@@ -19,7 +19,7 @@ def blocks_of(random, rows, sizes=SIZES, alike=0.4):
     found = []
     for k, size in enumerate(sizes):
         columns = random.standard_normal((rows, size)) + alike * common
-        found.append(TestedBlock(f"effect {k}", columns * 10.0 ** random.uniform(-3, 3), np.ones(size)))
+        found.append(EffectBlock(f"effect {k}", columns * 10.0 ** random.uniform(-3, 3), np.ones(size)))
     return found
 
 
@@ -48,7 +48,7 @@ def planted(evidence, block, times, random):
 @pytest.mark.parametrize("given", [(), (0,), (1, 4), (2, 3, 5)])
 def test_scores_are_differences_of_refits(given):
     random, jacobian, blocks = problem(1)
-    blocks[3] = TestedBlock(blocks[3].name, blocks[3].columns, blocks[3].sizes, position=True)
+    blocks[3] = EffectBlock(blocks[3].name, blocks[3].columns, blocks[3].sizes, position=True)
     residual = 3 * random.standard_normal(60)  # far from the null: the factor on the noise is used, too
     scores = Evidence(residual, jacobian, blocks).scores(given)
     taken = np.concatenate([jacobian, *(blocks[k].columns for k in given)], axis=1)
@@ -125,9 +125,9 @@ def test_false_alarms_over_all_tests_together(rows):
     draws, alarms, p_values = 400, 0, []
     for seed in range(draws):
         random, jacobian, blocks = problem([6, rows, seed], rows=rows, base=6, sizes=(1, 3, 3, 2))
-        blocks.append(TestedBlock("copy", 7 * blocks[1].columns @ random.standard_normal((3, 3)), np.ones(3)))
-        blocks.append(TestedBlock("blind", jacobian @ random.standard_normal((6, 2)), np.ones(2)))
-        blocks.append(TestedBlock("place", random.standard_normal((rows, 3)), np.ones(3), "data", {"pose": 1.0}, True))
+        blocks.append(EffectBlock("copy", 7 * blocks[1].columns @ random.standard_normal((3, 3)), np.ones(3)))
+        blocks.append(EffectBlock("blind", jacobian @ random.standard_normal((6, 2)), np.ones(2)))
+        blocks.append(EffectBlock("place", random.standard_normal((rows, 3)), np.ones(3), "data", {"pose": 1.0}, True))
         evidence = Evidence(random.standard_normal(rows), jacobian, blocks)
         found = select(evidence)
         p_values.append(found.p_value)
@@ -208,8 +208,8 @@ def test_exact_ties_are_returned_whatever_their_order(order):
         jacobian, first = random.standard_normal((60, 6)), random.standard_normal((60, 3))
         mixed = first @ random.standard_normal((3, 3)) + jacobian @ random.standard_normal((6, 3))
         # the third imitates the first only once the base has moved
-        tied = [TestedBlock("first", first, np.ones(3)), TestedBlock("twin", 1e-4 * first[:, ::-1], np.ones(3)),
-                TestedBlock("imitator", 10 * mixed, np.ones(3))]  # fmt: skip
+        tied = [EffectBlock("first", first, np.ones(3)), EffectBlock("twin", 1e-4 * first[:, ::-1], np.ones(3)),
+                EffectBlock("imitator", 10 * mixed, np.ones(3))]  # fmt: skip
         blocks = [tied[k] for k in order] + blocks_of(random, 60)
         noise = random.standard_normal(60)
         residual = noise + planted(Evidence(noise, jacobian, blocks), 0, 3, random)
@@ -230,8 +230,8 @@ def test_near_ties_part_when_the_effect_is_large():
             across -= first * (first * across).sum() / (first**2).sum()
             near = first + np.tan(0.1) * across / np.linalg.norm(across) * np.linalg.norm(first)
             blocks = [
-                TestedBlock("first", first, np.ones(1)),
-                TestedBlock("near", near, np.ones(1)),
+                EffectBlock("first", first, np.ones(1)),
+                EffectBlock("near", near, np.ones(1)),
                 *blocks_of(random, 60),
             ]
             noise = random.standard_normal(60)
@@ -264,7 +264,7 @@ def test_a_tie_inside_a_pair_is_returned():
     for seed in range(10):
         random = np.random.default_rng([11, seed])
         jacobian, blocks = random.standard_normal((90, 6)), blocks_of(random, 90)
-        blocks.append(TestedBlock("twin of 1", blocks[1].columns @ random.standard_normal((3, 3)), np.ones(3)))
+        blocks.append(EffectBlock("twin of 1", blocks[1].columns @ random.standard_normal((3, 3)), np.ones(3)))
         noise = random.standard_normal(90)
         clean = Evidence(noise, jacobian, blocks)
         residual = noise + planted(clean, 1, 5, random) + planted(clean, 5, 5, random)
@@ -343,9 +343,9 @@ def test_blind_blocks_have_no_rank_and_no_name():
     half = random.standard_normal((80, 3))
     half[:, 1] = jacobian @ random.standard_normal(8)
     blocks += [
-        TestedBlock("blind", 1e5 * jacobian @ random.standard_normal((8, 3)), np.ones(3)),
-        TestedBlock("nothing", np.zeros((80, 2)), np.ones(2)),
-        TestedBlock("half", half, np.ones(3)),
+        EffectBlock("blind", 1e5 * jacobian @ random.standard_normal((8, 3)), np.ones(3)),
+        EffectBlock("nothing", np.zeros((80, 2)), np.ones(2)),
+        EffectBlock("half", half, np.ones(3)),
     ]
     evidence = Evidence(random.standard_normal(80) + jacobian @ np.full(8, 1e4), jacobian, blocks)
     scores = evidence.scores()
@@ -366,8 +366,8 @@ def test_the_p_value_of_a_cause_allows_for_its_grid():
     random = np.random.default_rng(16)
     jacobian, blocks = random.standard_normal((80, 6)), []
     for k in range(5):
-        blocks.append(TestedBlock("lag", random.standard_normal((80, 1)), np.ones(1), inner={"tau": float(k)}))
-    blocks.append(TestedBlock("other", random.standard_normal((80, 1)), np.ones(1)))
+        blocks.append(EffectBlock("lag", random.standard_normal((80, 1)), np.ones(1), inner={"tau": float(k)}))
+    blocks.append(EffectBlock("other", random.standard_normal((80, 1)), np.ones(1)))
     noise = random.standard_normal(80)
     residual = noise + planted(Evidence(noise, jacobian, blocks), 2, 1.2, random)
     found = select(Evidence(residual, jacobian, blocks))
@@ -403,11 +403,11 @@ def test_conditions_left_out_by_a_parameter_each_are_not_there():
     covariance, weights = correlated(random, 60)
     raw = 3 * random.standard_normal(60)
     kept = np.arange(60) % 5 != 2
-    whitened = [TestedBlock(each.name, weights @ each.columns, each.sizes) for each in blocks]
+    whitened = [EffectBlock(each.name, weights @ each.columns, each.sizes) for each in blocks]
     whole = Evidence(weights @ raw, weights @ jacobian, whitened)
     own = np.linalg.inv(np.linalg.cholesky(covariance[np.ix_(kept, kept)]))
     part = Evidence(own @ raw[kept], own @ jacobian[kept],
-                    [TestedBlock(each.name, own @ each.columns[kept], each.sizes) for each in blocks])  # fmt: skip
+                    [EffectBlock(each.name, own @ each.columns[kept], each.sizes) for each in blocks])  # fmt: skip
     found, expected = whole.without(weights[:, ~kept]).scores(), part.scores()
     np.testing.assert_allclose(found.statistic, expected.statistic, rtol=1e-6)
     assert found.outside == pytest.approx(expected.outside, rel=1e-6)
@@ -418,7 +418,7 @@ def left_out(seed, times):
     """The gain by cross-validation where the second block is there, `times` its limit: poses are every third row."""
     random, jacobian, blocks = problem(seed, rows=90)
     _, weights = correlated(random, 90)
-    blocks = [TestedBlock(each.name, weights @ each.columns, each.sizes) for each in blocks]
+    blocks = [EffectBlock(each.name, weights @ each.columns, each.sizes) for each in blocks]
     noise = random.standard_normal(90)
     residual = noise + planted(Evidence(noise, weights @ jacobian, blocks), 1, times, random)
     place = np.arange(90) // 3
@@ -474,8 +474,8 @@ def test_power_at_the_limit_of_an_effect_with_a_grid(shape):
     }[shape]  # fmt: skip
     base = np.kron(np.ones((40, 1)), np.eye(3))  # a bias on each of three axes
     columns = [np.kron(curve[:, None], np.diag([1.0, 2.0, 0.5])) for curve in curves]
-    others = [TestedBlock("other", random.standard_normal((120, 3)), np.ones(3)) for _ in range(200)]
-    evidence = Evidence(np.zeros(120), base, [TestedBlock("it", each, np.full(3, 2.0)) for each in columns] + others)
+    others = [EffectBlock("other", random.standard_normal((120, 3)), np.ones(3)) for _ in range(200)]
+    evidence = Evidence(np.zeros(120), base, [EffectBlock("it", each, np.full(3, 2.0)) for each in columns] + others)
     limit = evidence.limit(range(len(columns)))
     off = np.eye(120) - base @ base.T / 40
     whole = [off @ each for each in columns]
@@ -508,7 +508,7 @@ def test_limits_scale_and_end():
 def test_the_limit_of_a_blind_effect_is_infinite():
     """What rounding leaves of columns inside the base's span is no information."""
     random, jacobian, blocks = problem(19)
-    blocks.append(TestedBlock("blind", jacobian @ random.standard_normal((8, 3)), np.ones(3)))
+    blocks.append(EffectBlock("blind", jacobian @ random.standard_normal((8, 3)), np.ones(3)))
     evidence = Evidence(random.standard_normal(60), jacobian, blocks)
     reach = np.linalg.norm(blocks[-1].columns, axis=0)
     assert detection_limit(evidence.information(len(blocks) - 1), reach) == np.inf
@@ -524,7 +524,7 @@ def test_an_axis_that_hardly_anything_reaches_adds_nothing_to_a_limit():
             own = [
                 each * [1.0, 1.0, size if place < rest * len(columns) else 1.0] for place, each in enumerate(columns)
             ]
-            evidence = Evidence(np.zeros(60), np.ones((60, 1)), [TestedBlock("it", each, np.ones(3)) for each in own])
+            evidence = Evidence(np.zeros(60), np.ones((60, 1)), [EffectBlock("it", each, np.ones(3)) for each in own])
             limits.append(evidence.limit(range(len(own))))
         np.testing.assert_allclose(limits, limits[0], rtol=0.05)  # of two thousand draws
         assert limits[0] > 0.1

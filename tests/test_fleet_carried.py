@@ -248,11 +248,11 @@ import sys, jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, sys.argv[1])
 from synthetic import simulated
-from jaximu.fleets import Unit, fit_units
+from jaximu.fleets import FleetUnit, fit_units
 from jaximu.fleets.fit import _devices
 from jaximu.model.sensor import Imu
 nominal = jax.tree.map(np.asarray, Imu.nominal())
-units = [Unit(jax.tree.map(np.asarray, simulated(seed).observations), nominal, False) for seed in range(11)]
+units = [FleetUnit(jax.tree.map(np.asarray, simulated(seed).observations), nominal, False) for seed in range(11)]
 assert jax.local_device_count() == 2
 assert len(_devices()) == int(sys.argv[3])
 np.save(sys.argv[2], [fitted.numbers for fitted in fit_units(units)])

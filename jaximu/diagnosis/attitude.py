@@ -19,7 +19,7 @@ from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
 from jaximu.data.path import Path
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
-from jaximu.diagnosis.evidence import TestedBlock
+from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.estimation.fitting import About, Linear, Prior, effect_numbers
@@ -102,7 +102,7 @@ class MeasuredAttitude(Experiment):
         """Return how the conditions react to effects."""
         return self.measurement.reactions(details)
 
-    def generic(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
+    def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause: slow changes, and what depends on orientation."""
         reactions, path, windows = linear.details.reactions, linear.details.path.gyroscope, self._windows
         time, none = np.asarray(path.time), np.zeros((len(np.asarray(path.time)), 3, 1))
@@ -121,7 +121,7 @@ class MeasuredAttitude(Experiment):
                 both[1 - triad] = np.zeros_like(both[triad])
                 columns.append(np.asarray(reactions.react(*both, windows)))
             columns = np.concatenate(columns, axis=1)
-            found.append(TestedBlock(name, columns * size, np.full(columns.shape[1], size), "generic"))
+            found.append(EffectBlock(name, columns * size, np.full(columns.shape[1], size), "generic"))
 
         add("slow change of the accelerometer", waves, 0, _FORCE)
         add("slow change of the gyroscope", waves, 1, _RATE)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import Evidence, TestedBlock
+from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.estimation.problem import Name
@@ -124,7 +124,7 @@ def _dependences(state: State, experiment: HandHeldExperiment) -> list[Check]:
         basis = np.polynomial.legendre.legvander(2 * (used - used.min()) / np.ptp(used) - 1, degree)[:, 1:]
         columns = np.zeros((len(rows), degree * shapes.shape[1]))
         columns[rows] = (basis[:, :, None] * shapes[rows, None, :]).reshape(len(used), -1)
-        blocks.append(TestedBlock(f"{names[kind]} against {name}", state.weights @ columns, np.ones(columns.shape[1])))
+        blocks.append(EffectBlock(f"{names[kind]} against {name}", state.weights @ columns, np.ones(columns.shape[1])))
 
     axes = np.zeros((len(kinds), 3))
     axes[kinds == 2] = np.tile(np.eye(3), (int(np.sum(kinds == 2)) // 3, 1))

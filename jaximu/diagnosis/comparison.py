@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
-from jaximu.diagnosis.evidence import Evidence, TestedBlock
+from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.estimation.fitting import About, Measurement, Prior, effect_numbers, fit
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
@@ -260,7 +260,7 @@ class Explanation:
     scope: as in `Cause`. places: of the parameters that would have moved.
     """
 
-    block: TestedBlock
+    block: EffectBlock
     scope: str
     places: tuple[int, ...] = ()
 
@@ -312,11 +312,11 @@ class Question:
             blocks = [replace(each.block, columns=weights @ each.block.columns) for each in of]
             return Evidence(weights @ conditions, weights @ bias, blocks)
 
-        found = [Explanation(TestedBlock(name, -columns[:, places] * old.sizes[places], old.sizes[places]), "parameter",
+        found = [Explanation(EffectBlock(name, -columns[:, places] * old.sizes[places], old.sizes[places]), "parameter",
                            tuple(places)) for name, places in _groups(old)]  # fmt: skip
         if old.shared > 0:  # unless the place was another one
             sigma = np.sqrt(2) * old.shared  # between two places
-            gravity = Explanation(TestedBlock("setup.gravity", sigma * reach[:, None], np.full(1, sigma)), "fixture")
+            gravity = Explanation(EffectBlock("setup.gravity", sigma * reach[:, None], np.full(1, sigma)), "fixture")
             if abs(evidence([gravity]).coefficients([0])[0]) < 3:
                 found.append(gravity)
         found += others

@@ -20,7 +20,7 @@ from jaximu.diagnosis.drift import DRAWS
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
 
-__all__ = ["Evidence", "Scores", "TestedBlock", "detection_limit", "limit_noncentrality", "strength"]
+__all__ = ["EffectBlock", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
 
 _BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
@@ -38,7 +38,7 @@ LIMIT_POWER = 0.9
 
 
 @dataclass(frozen=True)
-class TestedBlock:
+class EffectBlock:
     """One question: the whitened derivatives (n, q) by the coefficients of an effect, each in units of `sizes`.
 
     kind: "effect" (a catalogue name), "data" (a defect of the recording) or "generic" (a shape without a cause).
@@ -94,7 +94,7 @@ class Evidence:
     """
 
     def __init__(
-        self, residual: FloatArray, jacobian: FloatArray, blocks: Sequence[TestedBlock], noise: FloatArray | None = None
+        self, residual: FloatArray, jacobian: FloatArray, blocks: Sequence[EffectBlock], noise: FloatArray | None = None
     ):
         self.blocks = tuple(blocks)
         self._noise = noise
@@ -226,7 +226,7 @@ class Evidence:
                 np.minimum(smallest, chi2_sf(best, each), out=smallest)
         return np.sort(smallest)
 
-    def strongest(self, blocks: Sequence[TestedBlock]) -> tuple[float, TestedBlock]:
+    def strongest(self, blocks: Sequence[EffectBlock]) -> tuple[float, EffectBlock]:
         """Return of other blocks the one that stands out most, and the probability that one does so by chance."""
         other = Evidence(self.residual, self.jacobian, blocks, self._noise)
         p_value = other.scores().p_value

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jaximu.data.path import Path, terms
 from jaximu.diagnosis.drift import DriftComponents
-from jaximu.diagnosis.evidence import Evidence, TestedBlock
+from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.handling import Handling
 from jaximu.estimation.fitting import Linear, Measurement, Prior, fit, linearise
 from jaximu.estimation.problem import Name
@@ -111,10 +111,10 @@ class Experiment(Measurement):
         """Return whether a number is free."""
 
     @abstractmethod
-    def generic(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
+    def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause and defects of single observations, not whitened, padding included."""
 
-    def nearly(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
+    def nearly(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes, as `generic` does, that named causes may be taken for: asked of what these leave."""
         return []
 
@@ -346,7 +346,7 @@ class Experiment(Measurement):
 
     def _blocks(
         self, imu: Imu, linear: Linear, weights: FloatArray, fitted: set[str], asking: Container[str] | None
-    ) -> tuple[list[TestedBlock], dict[str, str]]:
+    ) -> tuple[list[EffectBlock], dict[str, str]]:
         asked, refused = self.askable(linear)
         if asking is not None:
             asked = {name: kind for name, kind in asked.items() if kind.plain in asking}
@@ -360,7 +360,7 @@ class Experiment(Measurement):
             for given, columns in zip(grids[kind], found[kind], strict=True):
                 placed = kind.beginning() in given
                 blocks.append(
-                    TestedBlock(name, weights @ (columns * size)[used], size, "effect", given, placed, kind.curved())
+                    EffectBlock(name, weights @ (columns * size)[used], size, "effect", given, placed, kind.curved())
                 )
         generic = [replace(b, columns=weights @ b.columns[used]) for b in self.generic(imu, linear)]
         return blocks + generic, refused

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import Evidence, TestedBlock, strength
+from jaximu.diagnosis.evidence import EffectBlock, Evidence, strength
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import on_held_out
 from jaximu.diagnosis.selection import BESIDE, SelectedCause, Selection, causes_of, one_curve, select
@@ -175,7 +175,7 @@ def _fitted(extension: Extension, state: State, name: str, cause: SelectedCause)
     return extension.experiment.fit([*others, CATALOGUE[block.name].make(coefficients, **block.inner)], state.imu)
 
 
-def _named(blocks: Sequence[TestedBlock], cause: SelectedCause) -> Found:
+def _named(blocks: Sequence[EffectBlock], cause: SelectedCause) -> Found:
     name = blocks[cause.block].name
     rivals = tuple(sorted({blocks[k].name for k in cause.rivals} - {name}))
     return Found(name, rivals, cause.p_value, cause.statistic, cause.freedom)

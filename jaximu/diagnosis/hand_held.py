@@ -16,7 +16,7 @@ from jaximu.data.drift import drift_components, mean_output_reactions
 from jaximu.data.path import Path
 from jaximu.data.poses import RecordedByHand, extent_of
 from jaximu.diagnosis.drift import DriftComponents
-from jaximu.diagnosis.evidence import TestedBlock
+from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
 from jaximu.diagnosis.twin import twin_recordings
@@ -190,7 +190,7 @@ class HandHeldExperiment(RecordedByHand, Experiment):
         poses, turns = np.asarray(self.observations.poses.mask), np.asarray(self.observations.turns.mask)
         return np.concatenate([poses, np.repeat(turns, 2), np.repeat(poses, 3)])
 
-    def generic(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
+    def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause, and poses that were bumped."""
         poses = self.observations.poses
         real = np.flatnonzero(poses.mask)
@@ -214,11 +214,11 @@ class HandHeldExperiment(RecordedByHand, Experiment):
             found.append(rate("the gyroscope's bias swings to and fro", wave, period=period))
         by_force, _ = mean_output_reactions(linear.details.reaction)
         for pose in real:
-            found.append(TestedBlock("data.bumped_pose", by_force[:, pose] * _FORCE, np.full(3, _FORCE), "data",
+            found.append(EffectBlock("data.bumped_pose", by_force[:, pose] * _FORCE, np.full(3, _FORCE), "data",
                                {"pose": int(pose)}, True))  # fmt: skip
         return found
 
-    def nearly(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
+    def nearly(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes that a cause may be taken for: higher harmonics, a heading, curves of an axis's own force."""
         poses = self.observations.poses
         real = np.asarray(poses.mask)
@@ -232,17 +232,17 @@ class HandHeldExperiment(RecordedByHand, Experiment):
             force("the accelerometer's axes are curved (odd powers)", curves[..., 1::2]),
         ]
 
-    def _shaper(self, linear: Linear) -> tuple[Callable[..., TestedBlock], Callable[..., TestedBlock]]:
+    def _shaper(self, linear: Linear) -> tuple[Callable[..., EffectBlock], Callable[..., EffectBlock]]:
         """Return what makes a block of a shape in the poses of accelerometer and gyroscope.
 
         A shape (poses, k) is each axis's, or (poses, 3, k) to each its own.
         """
         real = np.asarray(self.observations.poses.mask)
 
-        def block(reach: FloatArray, size: float, name: str, shape: FloatArray, **inner: float) -> TestedBlock:
+        def block(reach: FloatArray, size: float, name: str, shape: FloatArray, **inner: float) -> EffectBlock:
             columns = np.einsum("npi,pk->nki" if shape.ndim == 2 else "npi,pik->nik", reach[:, real], shape)
             columns = columns.reshape(len(reach), -1)
-            return TestedBlock(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner))
+            return EffectBlock(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner))
 
         by_force, by_rate = mean_output_reactions(linear.details.reaction)
         return partial(block, by_force, _FORCE), partial(block, by_rate, _RATE)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.data.field import FieldWindows, MagneticField
-from jaximu.diagnosis.evidence import Evidence, TestedBlock
+from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.selection import select
 from jaximu.estimation.fitting import linearise
 from jaximu.estimation.leave_out import leave_out
@@ -121,7 +121,7 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
     for kind, slopes in measurement.dormant_columns(bare, linear.details, grids).items():
         size = np.asarray(kind.dormant().typical_sizes(scale).coefficients)
         blocks += [
-            TestedBlock(kind.name, weights @ (each * size)[rows], size, "effect", inner, kind.beginning() in inner)
+            EffectBlock(kind.name, weights @ (each * size)[rows], size, "effect", inner, kind.beginning() in inner)
             for inner, each in zip(grids[kind], slopes, strict=True)
         ]
     if not blocks:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaximu.diagnosis.evidence import FAMILY_LEVEL, Evidence, Scores, TestedBlock
+from jaximu.diagnosis.evidence import FAMILY_LEVEL, EffectBlock, Evidence, Scores
 
 __all__ = ["BESIDE", "LEVEL", "SelectedCause", "Selection", "causes_of", "one_curve", "select", "shape_of"]
 
@@ -103,7 +103,7 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
     return Selection((_cause(evidence, named + rivals, scores),) if named else (), False, p_value, scores)
 
 
-def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[TestedBlock, float] | None:
+def shape_of(evidence: Evidence, level: float = LEVEL) -> tuple[EffectBlock, float] | None:
     """Return the shape without a cause that explains a misfit by itself, and what it gains, nats.
 
     If need be it lies between two places of a grid.

@@ -24,7 +24,7 @@ from jaximu.data.path import Path, terms, with_effect
 from jaximu.data.rest import block_means
 from jaximu.data.rest_blocks import rest_blocks
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
-from jaximu.diagnosis.evidence import TestedBlock
+from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.learned import left_out
 from jaximu.diagnosis.twin import drawn_noise
@@ -132,7 +132,7 @@ class Resting(Experiment):
 
         return f"rest {count}", of, details
 
-    def generic(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
+    def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause, and blocks in which the unit was knocked."""
         count = len(self.blocks)
         share = self.blocks.time - self.blocks.time.min()
@@ -144,10 +144,10 @@ class Resting(Experiment):
             shown += [] if self.smooth else [(f"the {name} depends smoothly on temperature", curves)]
             for words, shape in shown:
                 columns = np.einsum("nk,ca->ncka", shape, axes[:, triad]).reshape(6 * count, -1)
-                found.append(TestedBlock(words, columns * size, np.full(columns.shape[1], size), "generic"))
+                found.append(EffectBlock(words, columns * size, np.full(columns.shape[1], size), "generic"))
         for block, at in enumerate(np.eye(count)):
             columns = np.asarray(_FORCE * np.kron(at[:, None], axes[:, 0]), np.float64)
-            found.append(TestedBlock("data.bumped_pose", columns, np.full(3, _FORCE), "data", {"pose": block}, True))
+            found.append(EffectBlock("data.bumped_pose", columns, np.full(3, _FORCE), "data", {"pose": block}, True))
         return found
 
     def extent(self) -> Extent:

@@ -18,7 +18,7 @@ from jaximu.data.path import Path, padded, padded_places, stimuli, terms, with_e
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.stations import KnownStations, StationConditions, station_covariances
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
-from jaximu.diagnosis.evidence import TestedBlock
+from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.diagnosis.noise import own_noise
@@ -104,7 +104,7 @@ class Turntable(Experiment):
 
         return f"stations {count}", of, [details.path]
 
-    def generic(self, imu: Imu, linear: Linear) -> list[TestedBlock]:
+    def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause, and poses that were bumped."""
         stations = self.stations
         pose, still = np.asarray(stations.accelerometer_used), np.asarray(stations.gyroscope_used)
@@ -123,7 +123,7 @@ class Turntable(Experiment):
             for axis in range(3):
                 columns[rows, 3 * triad + axis, :, axis] = shape[rows]
             columns = columns.reshape(6 * len(turn), -1)
-            found.append(TestedBlock(name, columns * size, np.full(columns.shape[1], size), "generic"))
+            found.append(EffectBlock(name, columns * size, np.full(columns.shape[1], size), "generic"))
 
         add("slow change of the accelerometer", waves, 0, pose, _FORCE)
         add("slow change of the gyroscope", waves, 1, still, _RATE)
@@ -134,7 +134,7 @@ class Turntable(Experiment):
         for station in np.flatnonzero(pose & ~turn):
             columns = np.zeros((len(turn), 6, 3))
             columns[station, :3] = _FORCE * np.eye(3)
-            found.append(TestedBlock("data.bumped_pose", columns.reshape(-1, 3), np.full(3, _FORCE), "data",
+            found.append(EffectBlock("data.bumped_pose", columns.reshape(-1, 3), np.full(3, _FORCE), "data",
                                {"pose": int(station)}, True))  # fmt: skip
         return found
 
