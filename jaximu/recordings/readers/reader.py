@@ -69,8 +69,8 @@ def read_recording(
     if gyro_log is None:
         if open_columns and _of_two_files(options, tables[0]):
             raise InputError(
-                f"{tables[0].path}: the log of the calibration had its gyroscope in a file of its own: name this "
-                "log's, too (--gyro-log)."
+                f"{tables[0].path}: the calibrated log had its gyroscope in a separate file: name this log's, too "
+                "(--gyro-log)."
             )
         parts = _parts(tables, options)
     else:
