@@ -98,7 +98,7 @@ def compare():
                 table.add(words, verb, pair(*first[way, verb]), pair(*least), f"{kept:.2f}")
                 figures[f"{words}: {verb}"] = {"first": first[way, verb], "later": least, "megabytes": kept}
     version = "".join(map(str, sys.version_info[:2]))
-    finish(f"kept_programs_{version}", [table], figures, keep=not options.small)
+    finish(f"kept_programs_{version}", [table], figures, keep=not options.small, script="kept_programs")
 
 
 if __name__ == "__main__":
