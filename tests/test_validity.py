@@ -16,7 +16,8 @@ from jaximu.cli.app import main
 from jaximu.diagnosis import check
 from jaximu.diagnosis.comparison import Fresh, Old, Question
 from jaximu.diagnosis.hand_held import HandHeldExperiment
-from jaximu.estimation.fitting import About, Conditions, effect_numbers
+from jaximu.estimation.data import About, Conditions
+from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Parameters, without_equipment
 from jaximu.estimation.uncertainty import label
 from jaximu.ground.gravity import STANDARD

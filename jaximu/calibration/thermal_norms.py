@@ -14,7 +14,8 @@ from jaximu.calibration.calibration import effect_named
 from jaximu.calibration.refusals import require_solved
 from jaximu.data.gravity_norm import gravity_norm_error
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.fitting import About, Conditions, Fit, Measurement, fit
+from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import NotPossibleError
@@ -44,7 +45,7 @@ class _Norms(Conditions):
         return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
 
 
-class _Windows(Measurement):
+class _Windows(Data):
     effects_inside = True
     excess_names = ("accelerometer",)
     coarse = (1e6,)

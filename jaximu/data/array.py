@@ -19,7 +19,7 @@ from jaxtyping import Float
 from jaximu.data.gravity_direction import across, unit_vectors
 from jaximu.data.poses import EXCESS_NAMES, HandHeldConditions, condense
 from jaximu.estimation.covariance import Covariance, mean_root
-from jaximu.estimation.fitting import About, Conditions, Measurement
+from jaximu.estimation.data import About, Conditions, Data
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix
@@ -75,7 +75,7 @@ def _mountings(board: Board) -> Float[Array, "U-1 3"]:
 
 
 @dataclass
-class UnitsOnOneBody(Measurement):
+class UnitsOnOneBody(Data):
     """Observations of U units along a leading axis, cut at the same rests.
 
     Components of the excess: those of poses and turns, as many times each unit's own noise, alike for all units; and

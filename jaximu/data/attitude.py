@@ -24,7 +24,7 @@ from jaximu.data.path import Path, padded, padded_places, stimuli, with_effect
 from jaximu.data.poses_covariance import integrate_turns
 from jaximu.data.preintegration import swing
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.fitting import About, Conditions, Measurement
+from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import Parameters
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -290,7 +290,7 @@ def shared_ends(back: Float[Array, "T 3 3"]) -> Float[Array, "3*T 3*(T+1)"]:
 
 
 @dataclass(frozen=True)
-class AgainstAttitude(Measurement):
+class AgainstAttitude(Data):
     """One recording of a unit against a measured attitude, whose zero of time is the recording's (`offset`, s, later).
 
     noise: of the unit at rest, where known. left_out: windows of the force that do not count, with their rotations.

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import BlockFactor, Covariance
-from jaximu.estimation.fitting import About, Conditions, Measurement
+from jaximu.estimation.data import About, Conditions, Data
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import exponential, inverse_matrix, rotate, running_rotations
@@ -336,7 +336,7 @@ class _At(eqx.Module):
 
 
 @dataclass(frozen=True)
-class MagneticField(Measurement):
+class MagneticField(Data):
     """A unit's magnetometer in a field of the same strength (µT) and direction at all times.
 
     dip: of the field below the level, and its standard deviation, rad; None where it is not known.

@@ -49,7 +49,7 @@ from jaximu.data.sightings import (
     outside_numbers,
 )
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
-from jaximu.estimation.fitting import About, Conditions, Measurement
+from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
 from jaximu.estimation.problem import flatten
 from jaximu.ground import stored
@@ -735,7 +735,7 @@ class FilterPass:
 
 
 @dataclass
-class IntervalsOfMotion(Measurement):
+class IntervalsOfMotion(Data):
     """One recording of a unit, cut into intervals of rest and of motion; its states are eliminated by a filter.
 
     The path about which it is linearised is kept from one evaluation to the next, and its first attitudes, `anchor`.

@@ -30,7 +30,7 @@ from jaximu.data.poses_covariance import (
     sensitivities,
 )
 from jaximu.estimation.covariance import BlockFactor, Covariance, component_covariance
-from jaximu.estimation.fitting import About, Conditions, Measurement
+from jaximu.estimation.data import About, Conditions, Data
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import (
@@ -181,7 +181,7 @@ def condensed(
     return Condensed(conditions, covariance, force, angle, Sensitivities(*reaction), running)
 
 
-class PosesAndTurns(Measurement):
+class PosesAndTurns(Data):
     """Observations of units, one leading axis on every array; their effects are not looked at.
 
     rows: "all"; "norm", gravity's magnitude alone; or "turning", all but that, neighbouring turns taken as independent
@@ -237,7 +237,7 @@ class Along:
 
 
 @dataclass
-class RecordedByHand(Measurement):
+class RecordedByHand(Data):
     """Poses and turns of one unit, and the recordings that they were cut from, along which effects act."""
 
     segmentations: tuple[Segmentation, ...]

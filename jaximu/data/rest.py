@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.fitting import About, Conditions, Measurement, derivatives_by_numbers
+from jaximu.estimation.data import About, Conditions, Data, derivatives_by_numbers
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import CATALOGUE, Effect
@@ -50,7 +50,7 @@ class _WhiteOutputs(Conditions):
         return self
 
 
-class RestOverTemperature(Measurement):
+class RestOverTemperature(Data):
     """Mean outputs (n, 3) of one triad over blocks at rest, in output units.
 
     **Arguments:** `weights` (3, n, n): by axis, whiten the outputs' noise. `level` (n,): the rest of each block.

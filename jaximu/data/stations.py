@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaximu.data.station_error import turntable_error
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
-from jaximu.estimation.fitting import About, Conditions, Measurement
+from jaximu.estimation.data import About, Conditions, Data
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu
@@ -95,7 +95,7 @@ def station_covariance(stations: Stations) -> Covariance:
     return Covariance(whole, factors, used.T.reshape(-1), group)
 
 
-class KnownStations(Measurement):
+class KnownStations(Data):
     """Stations of units, one leading axis on every array."""
 
     effects_inside = True

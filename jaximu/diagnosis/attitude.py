@@ -22,7 +22,8 @@ from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
-from jaximu.estimation.fitting import About, Linear, Prior, effect_numbers
+from jaximu.estimation.data import About
+from jaximu.estimation.fitting import Linear, Prior, effect_numbers
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray

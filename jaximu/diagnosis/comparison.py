@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.hand_held import HandHeldExperiment
-from jaximu.estimation.fitting import About, Measurement, Prior, effect_numbers, fit
+from jaximu.estimation.data import About, Data
+from jaximu.estimation.fitting import Prior, effect_numbers, fit
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
 from jaximu.estimation.uncertainty import label
 from jaximu.ground.array_types import FloatArray
@@ -146,7 +147,7 @@ class FollowedUnit:
         return self.conditions, self.columns, np.eye(len(self.conditions)), ()
 
 
-class Widened(Measurement):
+class Widened(Data):
     """A recording by hand whose noise is wider by factors `scatter` (kinds,), with causes of unknown size in it.
 
     causes (n, q): what they add to the real conditions at sizes that they may have (one sigma). Their sizes are free

@@ -16,7 +16,8 @@ from jaximu.data.path import Path, terms
 from jaximu.diagnosis.drift import DriftComponents
 from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.handling import Handling
-from jaximu.estimation.fitting import Linear, Measurement, Prior, fit, linearise
+from jaximu.estimation.data import Data
+from jaximu.estimation.fitting import Linear, Prior, fit, linearise
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import FloatArray
@@ -87,7 +88,7 @@ class State:
         return [k for k, each in enumerate(self.names) if (each.owner, each.effect) == key and each.part == part]
 
 
-class Experiment(Measurement):
+class Experiment(Data):
     """A recording of one unit as conditions that its parameters and effects should bring to zero.
 
     A subclass says how conditions and the effects' columns are computed; fitting, asking and predicting are the same

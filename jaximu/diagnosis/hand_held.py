@@ -20,7 +20,8 @@ from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
 from jaximu.diagnosis.twin import twin_recordings
-from jaximu.estimation.fitting import About, Linear
+from jaximu.estimation.data import About
+from jaximu.estimation.fitting import Linear
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects.base import Extent

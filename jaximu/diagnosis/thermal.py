@@ -29,7 +29,8 @@ from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.learned import left_out
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.fitting import About, Conditions, Linear
+from jaximu.estimation.data import About, Conditions
+from jaximu.estimation.fitting import Linear
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError

@@ -23,7 +23,8 @@ from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.twin import drawn_noise
-from jaximu.estimation.fitting import About, Linear
+from jaximu.estimation.data import About
+from jaximu.estimation.fitting import Linear
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray

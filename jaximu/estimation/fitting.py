@@ -1,19 +1,18 @@
 """The one place that iterates to an estimate: `fit` alternates Levenberg–Marquardt with the excess variance.
 
-Data's way: a `Measurement` is evaluated about a unit, samples and effects included (`about`); what comes out is small,
+The way: `Data` are evaluated about a unit, samples and effects included (`about`); what comes out is small,
 conditions as a function of gain and bias, their covariance, and how they react to the effects' numbers. On that the
-compiled pass solves for all free numbers and improves the excess; then the measurement is evaluated anew where the
+compiled pass solves for all free numbers and improves the excess; then the data are evaluated again where the
 estimate went, until nothing moves.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, ClassVar, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,7 +21,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu.estimation.covariance import Covariance, placed, update_excess, whitened
+from jaximu.estimation.covariance import placed, update_excess, whitened
+from jaximu.estimation.data import Conditions, Data
 from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, unflatten
 from jaximu.estimation.solver import MAX_STEPS, Failure, solve
 from jaximu.ground import stored
@@ -33,13 +33,9 @@ from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu
 
 __all__ = [
-    "About",
-    "Conditions",
     "Fit",
     "Linear",
-    "Measurement",
     "Prior",
-    "derivatives_by_numbers",
     "effect_numbers",
     "fit",
     "fitted_effect",
@@ -47,8 +43,6 @@ __all__ = [
     "linearise",
 ]
 
-_GRID = 16
-"""Inner parameters of an effect are asked for in multiples of so many."""
 _CHUNK = 64
 """Units that are in memory together, with the covariances of their conditions."""
 _SPARE = (12, 36, 84)
@@ -75,139 +69,6 @@ _DAMPING = 1.0
 """Of the first step after one that led astray, in typical sizes to a standard deviation."""
 _MILD = 10.0
 """Damping that holds back what data do not determine and nothing else: a step that is still under it is at rest."""
-
-
-class Conditions(eqx.Module):
-    """What a measurement says about a unit once samples are no longer needed.
-
-    `magnitude`: what is known and uncertain, gravity (m/s²) or the strength of the field (µT).
-    """
-
-    @abstractmethod
-    def __call__(self, imu: Imu) -> Float[Array, " n"]:
-        """Return the conditions, which would be zero without noise at the true unit; zero for padding."""
-
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> Self:
-        """Return the same with another magnitude."""
-        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)  # pyright: ignore[reportAttributeAccessIssue]
-
-
-@dataclass(frozen=True)
-class About:
-    """A measurement evaluated about units, the leading axis of every array.
-
-    columns (N, n, q): derivatives of the conditions by the effects' numbers, in their own units. details: what the
-    measurement itself needs again.
-    """
-
-    conditions: Conditions
-    covariance: Covariance
-    columns: FloatArray
-    details: Any = None
-
-
-class Measurement(ABC):
-    """What recordings say about a unit, or about units along a leading axis.
-
-    effects_inside: the conditions evaluate effects themselves; else `about` gives their columns. coarse: the excess to
-    begin with.
-    """
-
-    effects_inside: ClassVar[bool] = False
-    excess_names: ClassVar[tuple[str, ...]] = ()
-    coarse: ClassVar[tuple[float, ...]] = ()
-
-    @abstractmethod
-    def about(self, imu: Imu) -> About:
-        """Return what is measured about units, the leading axis of every array of `imu`."""
-
-    def take(self, lanes: NDArray[np.int64]) -> Measurement:
-        """Return the measurement of some of the units; of a single one, itself."""
-        return self
-
-    def reactions(self, details: Any) -> tuple[str, Callable[..., Float[Array, " n"]], Sequence[Any]]:
-        """Return how the conditions react to effects: a key, a function, and the parts whose reactions add up.
-
-        The function takes an effect, the unit without effects and a part, and is traced; the key tells kinds of
-        measurement apart. The conditions feel an effect with the opposite sign.
-        """
-        raise NotImplementedError
-
-    def own_columns(self, imu: Imu, details: Any, rows: int) -> FloatArray:
-        """Return the derivatives (rows, q) of the conditions by the numbers of the unit's effects, in their own units.
-
-        `details`: of the measurement about the unit.
-        """
-        key, react, parts = self.reactions(details)
-        found = [np.zeros((rows, 0))]
-        for effect in imu.all_effects().values():
-            kind = type(effect)
-
-            def derivatives(imu, part, numbers, kind=kind):
-                return (derivatives_by_numbers(kind, lambda varied: react(varied, imu, part), numbers),)
-
-            inner = [float(getattr(effect, name)) for name in effect.inner]
-            numbers = np.concatenate([np.asarray(effect.coefficients), inner])
-            own = [
-                stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers)[0] for part in parts
-            ]
-            found.append(-np.sum([np.asarray(each) for each in own], axis=0))
-        return np.concatenate(found, axis=1)
-
-    def dormant_columns(
-        self, imu: Imu, details: Any, asked: Mapping[type[Effect], Sequence[Mapping[str, float]]]
-    ) -> dict[type[Effect], FloatArray]:
-        """Return the reactions (G, n, q) by the coefficients of effects at zero, each at G inner parameters.
-
-        One program for all effects: loading one from the cache takes as long as running it ten times. A diagnosis runs
-        it four times and more, which pays for compiling it in full.
-        """
-        if not asked:
-            return {}
-        key, react, parts = self.reactions(details)
-        kinds, inner = list(asked), []
-        for kind, grid in asked.items():
-            given = np.array([[each[name] for name in kind.inner] for each in grid]).reshape(len(grid), len(kind.inner))
-            missing = -len(given) % _GRID if len(given) > _GRID else 0  # few lengths, and so few programs
-            inner.append(np.concatenate([given, np.repeat(given[-1:], missing, axis=0)]))
-
-        def derivatives(imu, part, *inner):
-            def at(kind, values):
-                def of(coefficients):
-                    return react(kind(coefficients, **dict(zip(kind.inner, values, strict=True))), imu, part)
-
-                return _slope(kind, of, jnp.zeros(kind.size))
-
-            return tuple(
-                at(kind, grid[0])[None] if len(grid) == 1 else jax.lax.map(partial(at, kind), grid)
-                for kind, grid in zip(kinds, inner, strict=True)
-            )
-
-        names = ",".join(kind.name for kind in kinds)
-        key = f"{key} dormant {names}"
-        found = [stored.call(derivatives, key, imu, part, *inner, quick=False) for part in parts]
-        sums = [np.sum([np.asarray(each) for each in own], axis=0) for own in zip(*found, strict=True)]
-        return {kind: each[: len(asked[kind])] for kind, each in zip(kinds, sums, strict=True)}
-
-
-def _slope(kind: type[Effect], of: Callable[[Array], Array], numbers: Array) -> Array:
-    """Return the derivatives (n, p) of a reaction by an effect's numbers."""
-    if not kind.probes:
-        return jax.jacfwd(of)(numbers)
-    # the derivative vanishes nearly everywhere: the change over a quarter of what there is, or the least probe
-    reach = jnp.maximum(jnp.abs(numbers) / 4, kind.probes[0])
-    return jax.vmap(lambda e, h: (of(numbers + h * e) - of(numbers - h * e)) / (2 * h), out_axes=1)(
-        jnp.eye(len(numbers)), reach
-    )
-
-
-def derivatives_by_numbers(kind: type[Effect], reaction: Callable[[Effect], Array], numbers: Array) -> Array:
-    """Return the derivatives (n, q + i) of a reaction by an effect's coefficients and inner parameters."""
-
-    def of(numbers):
-        return reaction(kind(numbers[: kind.size], **dict(zip(kind.inner, numbers[kind.size :], strict=True))))
-
-    return _slope(kind, of, numbers)
 
 
 @dataclass(frozen=True)
@@ -381,7 +242,7 @@ class Linear:
     details: Any
 
 
-def linearise(imu: Imu, measurement: Measurement, free: Callable[[Name], bool]) -> Linear:
+def linearise(imu: Imu, measurement: Data, free: Callable[[Name], bool]) -> Linear:
     """Return a measurement about one unit with its effects, as a linear problem in the free numbers."""
     imu = jax.tree.map(lambda leaf: np.asarray(leaf, float), imu)
     about = measurement.about(jax.tree.map(lambda leaf: leaf[None], imu))
@@ -532,7 +393,7 @@ def _run(loss: str, like: Imu, parameters: Parameters, units) -> _Pass:
 
 def fit(
     imu: Imu,
-    measurements: Measurement | Sequence[Measurement],
+    data: Data | Sequence[Data],
     free: Callable[[Name], bool],
     *,
     prior: Prior | None = None,
@@ -549,7 +410,7 @@ def fit(
 
     - `imu`: where the fit starts: gain and bias as the data sheet or an old calibration has them, and the effects to be
       fitted, or to be held, with their numbers.
-    - `measurements`: what was measured; several of one unit are one problem.
+    - `data`: what was measured; several of one unit are one problem.
     - `free`: which numbers are free, by name.
     - `prior`: what is known beforehand. A number of which it says nothing is known to five typical sizes about its
       start, so a problem is never singular; where data speak, that counts for less than a millionth.
@@ -564,7 +425,7 @@ def fit(
     """
     one_of("loss", loss, tuple(LOSSES))
     require_float64()
-    given = (measurements,) if isinstance(measurements, Measurement) else tuple(measurements)
+    given = (data,) if isinstance(data, Data) else tuple(data)
     single = np.ndim(imu.accelerometer.bias) == 1
     imu = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None] if single else np.asarray(leaf, float), imu)
     count = len(imu.accelerometer.bias)
@@ -584,9 +445,9 @@ def fit(
 class _Passes:
     """The passes of up to `_CHUNK` units, and where they are."""
 
-    def __init__(self, imu: Imu, measurements, free, prior, loss: str, estimated: bool, follow: bool):
-        self.measurements, self.loss, self.estimated, self.follow = measurements, loss, estimated, follow
-        self.inside = measurements[0].effects_inside
+    def __init__(self, imu: Imu, data: tuple[Data, ...], free, prior, loss: str, estimated: bool, follow: bool):
+        self.data, self.loss, self.estimated, self.follow = data, loss, estimated, follow
+        self.inside = data[0].effects_inside
         like = jax.tree.map(lambda leaf: leaf[0], imu)
         self.like = like if self.inside else like.with_effects()
         self.full = like
@@ -647,11 +508,11 @@ class _Passes:
         return mean, np.broadcast_to(whole, (len(lanes), *whole.shape)).copy()
 
     def once(self, lanes: NDArray[np.int64], excess: FloatArray, damping: FloatArray, tolerance: float) -> _Pass:
-        """Evaluate the measurements where the passes are, and solve; `lanes` are padded to a shape by repetition."""
+        """Evaluate the data where the passes are, and solve; `lanes` are padded to a shape by repetition."""
         size = 1 if len(lanes) == 1 else 8 if len(lanes) <= 8 else _CHUNK
         padded = np.concatenate([lanes, np.full(size - len(lanes), lanes[-1])])
         imu = self.model(padded)
-        about = [each.take(padded).about(imu) for each in self.measurements]
+        about = [each.take(padded).about(imu) for each in self.data]
         columns = np.concatenate([each.columns for each in about], axis=1)
         columns = columns[..., self.kept] * self.sizes[self.base :]
         columns = np.pad(columns, [(0, 0), (0, 0), (0, self.spare)])
@@ -678,7 +539,7 @@ class _Passes:
         A pass solves a problem that is linear in what the turns rotate by and in what effects add. Where its step made
         the sum of squares larger after all, it is taken back, and the next one is damped.
         """
-        coarse = [size for each in self.measurements for size in each.coarse]
+        coarse = [size for each in self.data for size in each.coarse]
         begin = np.array(coarse if excess is None else excess, float)
         excess = np.tile(begin, (self.count, 1)) if begin.ndim == 1 else begin
         blunted = self.estimated and bool(begin.any())
