@@ -68,7 +68,9 @@ def test_what_is_not_known_of_the_reference_is_part_of_the_noise(calibrated):
     copied = experiment.twin(state, None, 3)
     twin = copied.fit(asking=())
     # how the reference is mounted was found: the twin does not draw it anew, which would be degrees
-    for own, simulated in zip(experiment.errors(state.conditions), copied.errors(twin.conditions), strict=True):
+    for own, simulated in zip(
+        experiment.real.errors(state.conditions), copied.real.errors(twin.conditions), strict=True
+    ):
         assert 0.5 < np.sqrt(np.mean(np.square(simulated)) / np.mean(np.square(own))) < 2.0
     chi = np.sum(twin.evidence.residual**2) / twin.evidence.freedom
     assert chi == pytest.approx(1.0, abs=5 * np.sqrt(2 / twin.evidence.freedom))

@@ -116,7 +116,7 @@ def test_its_twin_has_no_misfit(clean):
     scores = twin.fit().evidence.scores()
     assert scores.outside[2] > 1e-4
     # the errors of the twin are noise: as large as those of the recording
-    ours, theirs = (each.summary(each.fit().conditions) for each in (clean.experiment, twin))
+    ours, theirs = (each.real.rms(each.fit().conditions) for each in (clean.experiment, twin))
     for kind, (value, _) in ours.items():
         assert theirs[kind][0] == pytest.approx(value, rel=0.5)
 

@@ -83,7 +83,7 @@ def print_validity(validity: Validity) -> None:
     screen.print(validity.bias_words())
     if validity.nis is not None:
         screen.print(f"squared innovations of the filter: {validity.nis:.2f} times what their uncertainty expects")
-    words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.residual_kinds}
+    words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.real.kinds}
     for name, (before, after, unit) in validity.errors.items():
         screen.print(
             f"{words[name]}: rms {size(before, unit)} with this calibration, {size(after, unit)} with a fresh one"

@@ -146,7 +146,7 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
              "\n".join(map(effect_title, each.rivals))) for each in diagnosis.effects
         ]  # fmt: skip
         table(screen, ("effect", "coefficients ± 95 %", "evidence", "or"), rows)
-    gain, words = diagnosis.gain, {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
+    gain, words = diagnosis.gain, {kind.name: kind.words for kind in diagnosis.experiment.real.kinds}
     if gain is not None:
         before, after = (part.chi_squared / part.count for part in (gain.before, gain.after))
         screen.print(
