@@ -20,9 +20,9 @@ from jaximu.calibration.thermal_selection import richest
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.calibration.thermal_terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
 from jaximu.calibration.thermal_triad import TriadFit, fit_triad
-from jaximu.data.path import TEMPERATURE_WINDOW
 from jaximu.data.rest import mean_terms
 from jaximu.data.rest_blocks import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
+from jaximu.data.track import TEMPERATURE_WINDOW
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure

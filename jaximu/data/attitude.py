@@ -20,9 +20,9 @@ import scipy
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu.data.path import Path, padded, padded_places, stimuli, with_effect
 from jaximu.data.poses_covariance import integrate_turns
 from jaximu.data.preintegration import swing
+from jaximu.data.track import Path, padded, padded_places, stimuli, with_effect
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import Parameters

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from jaximu.data.gravity_direction import gravity_direction_error, unit_vectors
 from jaximu.data.gravity_norm import gravity_norm_error
-from jaximu.data.path import Path, Terms, paths, react, terms, with_effect
 from jaximu.data.poses_covariance import (
     IntegratedTurns,
     Sensitivities,
@@ -29,6 +28,7 @@ from jaximu.data.poses_covariance import (
     integrate_turns,
     sensitivities,
 )
+from jaximu.data.track import Path, Terms, paths, react, terms, with_effect
 from jaximu.estimation.covariance import BlockFactor, Covariance, component_covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.ground import stored

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.data.path import TEMPERATURE_WINDOW, padded, padded_places
 from jaximu.data.rest import BlockPath
+from jaximu.data.track import TEMPERATURE_WINDOW, padded, padded_places
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.noise_model import AxisNoise, NoiseModel

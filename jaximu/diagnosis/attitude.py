@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
-from jaximu.data.path import Path
+from jaximu.data.track import Path
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State

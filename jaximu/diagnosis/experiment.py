@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu.data.path import Path, terms
+from jaximu.data.track import Path, terms
 from jaximu.diagnosis.drift import DriftComponents
 from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.handling import Handling

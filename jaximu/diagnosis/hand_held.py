@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
 from jaximu.data.drift import drift_components, mean_output_reactions
-from jaximu.data.path import Path
 from jaximu.data.poses import RecordedByHand, extent_of
+from jaximu.data.track import Path
 from jaximu.diagnosis.drift import DriftComponents
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State

@@ -20,9 +20,9 @@ from jaximu.calibration.thermal_selection import folds_of
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.calibration.thermal_terms import HISTORY, RATES
 from jaximu.data import RestBlocks
-from jaximu.data.path import Path, terms, with_effect
 from jaximu.data.rest import block_means
 from jaximu.data.rest_blocks import rest_blocks
+from jaximu.data.track import Path, terms, with_effect
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from jaximu.calibration.turntable import calibrate_turntable, station_rms
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.observe_stations import observe_stations
-from jaximu.data.path import Path, padded, padded_places, stimuli, terms, with_effect
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.stations import KnownStations, StationConditions, station_covariances
+from jaximu.data.track import Path, padded, padded_places, stimuli, terms, with_effect
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
