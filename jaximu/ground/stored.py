@@ -103,8 +103,11 @@ def _options(quick: bool) -> dict[str, bool | int | str]:
     return known
 
 
-def compiled(function: F) -> F:
-    """Decorate a function of arrays in any structure: compiled for their shapes, kept, and inlined under a trace."""
+def compiled(function: F, quick: bool = False) -> F:
+    """Decorate a function of arrays in any structure: compiled for their shapes, kept, and inlined under a trace.
+
+    `quick`: as of `call`.
+    """
     description = f"{function.__module__}.{function.__qualname__}"
 
     @wraps(function)
@@ -114,7 +117,7 @@ def compiled(function: F) -> F:
 
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
             return function(*arguments)
-        return _called(function, description, *arguments, quick=False)
+        return _called(function, description, *arguments, quick=quick)
 
     return cast(F, run)
 
