@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from jaximu.data.track import Track, measured, recovered
@@ -19,6 +20,9 @@ from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation
 
 __all__ = ["tracks_by_hand", "turn_samples"]
+
+_DOWN = -1 + 1e-9
+"""Vertical part of a direction that is straight down: any half turn about a level axis brings it upright."""
 
 
 def turn_samples(segmentations: Sequence[Segmentation], observations: Observations) -> list[NDArray[np.int64]]:
@@ -69,18 +73,16 @@ def _tracks(
     means = np.stack([force[own["accelerometer"] == k].mean(axis=0) for k in range(len(intervals))])
     rate[own["gyroscope"] >= 0] = 0.0
 
-    heading = np.array([1.0, 0.0, 0.0, 0.0])
-    attitude = np.tile(heading, (len(rate), 1))
-    now = _levelled(heading, means[0])
-    for k in range(len(intervals)):
-        attitude[own["gyroscope"] == k] = now
-        if k + 1 == len(intervals):
-            break
-        inside = samples[first + k][samples[first + k] > 0]
+    attitude = np.tile([1.0, 0.0, 0.0, 0.0], (len(rate), 1))
+    rotation = scipy.spatial.transform.Rotation
+    now = rotation.identity()
+    for k, mean in enumerate(means):
+        now = _levelled(now, mean)
+        attitude[own["gyroscope"] == k] = now.as_quat(scalar_first=True)
+        inside = samples[first + k][samples[first + k] > 0] if k + 1 < len(means) else []
         if len(inside):
-            attitude[inside] = _multiply(now, running[first + k, : len(inside)])
-            now = attitude[inside[-1]]
-        now = _levelled(now, means[k + 1])
+            turned = now * rotation.from_quat(running[first + k, : len(inside)], scalar_first=True)
+            attitude[inside], now = turned.as_quat(scalar_first=True), turned[-1]
 
     gyroscope, tracks = recording.signals["gyroscope"], {}
     for name, known in measured(recording, force, rate).items():
@@ -106,23 +108,8 @@ def _pose_of(signal: Signal, intervals: FloatArray) -> NDArray[np.int64]:
     return np.where(inside, pose, -1)
 
 
-def _multiply(p: FloatArray, q: FloatArray) -> FloatArray:
-    (a, b, c, d), (w, x, y, z) = p, q.T
-    return np.stack(
-        [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x,
-         a * z + b * y - c * x + d * w], axis=1)  # fmt: skip
-
-
-def _levelled(attitude: FloatArray, force: FloatArray) -> FloatArray:
+def _levelled(attitude: scipy.spatial.transform.Rotation, force: FloatArray) -> scipy.spatial.transform.Rotation:
     """The attitude turned by the smallest rotation that brings the specific force upright."""
-    w, x, y, z = attitude.tolist()
-    a, b, c = (force / np.linalg.norm(force)).tolist()
-    lab = (  # the force's direction in the level frame
-        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - w * z) * b + 2 * (x * z + w * y) * c,
-        2 * (x * y + w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - w * x) * c,
-        2 * (x * z - w * y) * a + 2 * (y * z + w * x) * b + (1 - 2 * (x * x + y * y)) * c,
-    )
-    half = np.array([1 + lab[2], lab[1], -lab[0], 0.0])  # from `lab` to z: 1 + cosine, and the cross product
-    if np.linalg.norm(half) < 1e-9:
-        half = np.array([0.0, 1.0, 0.0, 0.0])
-    return _multiply(half / np.linalg.norm(half), attitude[None])[0]
+    x, y, z = attitude.apply(force / np.linalg.norm(force))
+    half = [1 + z, y, -x, 0.0] if z > _DOWN else [0.0, 1.0, 0.0, 0.0]
+    return scipy.spatial.transform.Rotation.from_quat(half, scalar_first=True) * attitude

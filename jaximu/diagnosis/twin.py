@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaximu.data.poses import RecordedByHand
 from jaximu.diagnosis.experiment import Experiment, State
@@ -92,21 +93,13 @@ def _correction(attitude: FloatArray, after: FloatArray, duration: float) -> Flo
     `attitude` (n, 4) is the body's after each sample, level at the start; to first order a rotation δ of the last frame
     is the sum of the rates' parts brought there.
     """
-    matrix = _matrices(attitude)  # body to level
+    matrix = Rotation.from_quat(attitude, scalar_first=True).as_matrix()  # body to level
     lab = np.array([0.0, 0.0, 1.0])
     carried = matrix[-1].T @ lab
     delta = np.cross(after, carried)  # turning the frame by δ moves a fixed direction by −δ × u
     # δ in the last frame is R_kᵀ-transported to each sample's own frame
     back = np.einsum("nji,jk,k->ni", matrix, matrix[-1], delta)
     return back / max(duration, 1e-9)
-
-
-def _matrices(quaternion: FloatArray) -> FloatArray:
-    w, x, y, z = quaternion.T
-    return np.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1).reshape(-1, 3, 3)  # fmt: skip
 
 
 def drawn_noise(noise: AxisNoise, signal: Signal, seed: list[int]) -> FloatArray:
