@@ -120,7 +120,7 @@ class FieldSamples(eqx.Module):
     def mean_added(self, imu: Imu) -> Float[Array, "n 3 3 3"]:
         """Return its means over the windows, each sample's brought to its window's frame: by frame and output."""
         brought = self.turned[..., None] * self.added(imu)[..., None, None, :]
-        return self.track.means(brought.reshape(-1, 27), len(self.output)).reshape(-1, 3, 3, 3)
+        return self.track.means(brought.reshape(*self.output.shape[:2], -1), len(self.output)).reshape(-1, 3, 3, 3)
 
     @classmethod
     def joined(cls, parts: Sequence[FieldSamples]) -> FieldSamples:

@@ -21,9 +21,6 @@ from jaximu.recordings.segmentation import Segmentation
 
 __all__ = ["tracks_by_hand", "turn_samples"]
 
-_DOWN = -1 + 1e-9
-"""Vertical part of a direction that is straight down: any half turn about a level axis brings it upright."""
-
 
 def turn_samples(segmentations: Sequence[Segmentation], observations: Observations) -> list[NDArray[np.int64]]:
     """Return, of each recording, where the samples (T, S) of each turn are among its gyroscope's; 0 for none."""
@@ -111,5 +108,5 @@ def _pose_of(signal: Signal, intervals: FloatArray) -> NDArray[np.int64]:
 def _levelled(attitude: scipy.spatial.transform.Rotation, force: FloatArray) -> scipy.spatial.transform.Rotation:
     """The attitude turned by the smallest rotation that brings the specific force upright."""
     x, y, z = attitude.apply(force / np.linalg.norm(force))
-    half = [1 + z, y, -x, 0.0] if z > _DOWN else [0.0, 1.0, 0.0, 0.0]
+    half = [1 + z, y, -x, 0.0] if 1 + z > 1e-9 else [0.0, 1.0, 0.0, 0.0]  # straight down: a half turn
     return scipy.spatial.transform.Rotation.from_quat(half, scalar_first=True) * attitude
