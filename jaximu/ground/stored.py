@@ -63,7 +63,7 @@ def forget() -> None:
 def _code() -> str:
     """A digest of the library's source and of what it is compiled with and for: any change makes a new entry."""
     digest = hashlib.sha256(repr(_machine()).encode())
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
