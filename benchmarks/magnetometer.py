@@ -98,7 +98,7 @@ def disturbed(units: int) -> dict:
         windows = windows_of(log.magnetometer, log.recording, np.zeros(3))
         found, _, _ = calibrate_magnetometer([log], FieldStrength(case.strength), PERFECT)
         left = {round(each[0], 6) for each in found.magnetic["disturbed"]}
-        stop = windows.path.time[np.arange(len(windows)), windows.count.astype(int) - 1]
+        stop = windows.samples.track.stimulus.time[np.arange(len(windows)), windows.count.astype(int) - 1]
         inside = (windows.time[:, 0] >= start) & (stop <= start + 4.0)  # of the samples in its mean
         outside = (stop < start) | (windows.time[:, 0] > start + 4.0)
         out = np.array([round(each, 6) in left for each in windows.time[:, 0]])

@@ -63,6 +63,19 @@ def test_an_edit_elsewhere_compiles_nothing(folder):
     assert times(folder, "program") == written and len(times(folder, "name")) == 1
 
 
+def test_an_edit_in_any_room_makes_other_names(folder, tmp_path, monkeypatch):
+    """What a program is called holds all of the library's source: else an edited effect would run as it was."""
+    effect = tmp_path / "library" / "model" / "effect.py"
+    effect.parent.mkdir(parents=True)
+    monkeypatch.setattr(stored, "__file__", str(effect.parents[1] / "ground" / "stored.py"))
+    for count, text in enumerate(("term = 1", "term = 1", "term = 2")):
+        effect.write_text(text, encoding="utf-8")
+        stored._code.cache_clear()
+        again(MATRIX, np.zeros(3))
+        assert len(times(folder, "name")) == (1 if count < 2 else 2)
+    stored._code.cache_clear()
+
+
 def test_what_is_made_anew_can_be_kept_anew(folder):
     """JAX's own cache has no part in it: a program that comes out of that cannot be written again."""
     for _ in range(3):

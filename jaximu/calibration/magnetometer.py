@@ -685,8 +685,8 @@ def _left_out(
         shape = ellipsoid(np.concatenate([samples[k] for k in np.flatnonzero(rest.used).tolist()]))
         found["before"].append(_strengths(raw, output))
         if extended:  # what they add is known where the windows have their samples
-            seen = windows.path.share[own] > 0
-            output = (windows.path.output - windows.added(own_model))[own][seen]
+            inside = np.asarray(windows.samples.track.observation)[own] < len(windows)
+            output = (windows.samples.output - windows.added(own_model))[own][inside]
         found["after"].append(_strengths(own_model, output))
         if shape is not None:
             found["algebraic"].append(np.linalg.norm((output - shape[1]) @ shape[0], axis=1))

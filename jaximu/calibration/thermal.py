@@ -20,9 +20,9 @@ from jaximu.calibration.thermal_selection import richest
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.calibration.thermal_terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
 from jaximu.calibration.thermal_triad import TriadFit, fit_triad
-from jaximu.data.path import TEMPERATURE_WINDOW
 from jaximu.data.rest import mean_terms
 from jaximu.data.rest_blocks import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
+from jaximu.data.track import TEMPERATURE_WINDOW, Track
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
@@ -398,8 +398,9 @@ def steady(
     celsius = np.atleast_1d(np.asarray(celsius, float))
     ends = np.pad(celsius, (0, -len(celsius) % _BUCKET), "edge")
     time = np.broadcast_to([-_LONG, 0.0], (len(ends), 2))
-    path = Stimulus(specific_force=np.full((len(ends), 2, 3), force), temperature=ends[:, None] + rate * time,
+    stimulus = Stimulus(specific_force=np.full((len(ends), 2, 3), force), temperature=ends[:, None] + rate * time,
                     temperature_rate=np.full((len(ends), 2), rate), time=time,
                     temperature_reference=reference)  # pyright: ignore[reportArgumentType] # fmt: skip
     now = np.minimum(np.arange(len(ends)), len(celsius))
-    return mean_terms(effects, [(path, np.stack([np.full(len(ends), len(celsius)), now], axis=1))], len(celsius))
+    track = Track(stimulus, np.stack([np.full(len(ends), len(celsius)), now], axis=1))
+    return mean_terms(effects, [track], len(celsius))

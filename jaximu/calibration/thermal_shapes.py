@@ -21,8 +21,9 @@ from jaximu.calibration.thermal_terms import (
     ThermalTerm,
     history,
 )
-from jaximu.data.rest import block_means, mean_terms, rows_of
+from jaximu.data.rest import mean_terms, padded_count
 from jaximu.data.rest_blocks import RestBlocks
+from jaximu.data.track import Track
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects import CATALOGUE
@@ -37,19 +38,19 @@ GRID = 12
 _BUCKET = 256
 
 
-def _shapes(names: Sequence[str], path: Stimulus, place, rows, *grids):
-    """Return of each effect the mean shapes over the blocks, (G, n, 3, k), at inner parameters (G, i).
+def _shapes(names: Sequence[str], count: int, track: Track, *grids):
+    """Return of each effect the mean shapes over `count` blocks, (G, n, 3, k), at inner parameters (G, i).
 
     They count from the reference temperature, those of a curve, too.
     """
-    celsius = path.temperature_reference
+    celsius = track.stimulus.temperature_reference
     reference = Stimulus(jnp.zeros(3), temperature=jnp.asarray(celsius), temperature_rate=jnp.zeros(()),
                          time=jnp.zeros(()), temperature_reference=celsius)  # fmt: skip
 
     def at(kind, values):
         def of(share):
             effect = kind(jnp.tile(share, 3), **dict(zip(kind.inner, values, strict=True)))
-            return block_means(effect.term(path) - effect.term(reference), place, rows)
+            return track.means(effect.term(track.stimulus) - effect.term(reference), count)
 
         return jax.vmap(of, out_axes=-1)(jnp.eye(kind.size // 3))
 
@@ -71,7 +72,7 @@ class ThermalShapes:
     def __init__(self, blocks: RestBlocks, reference: float, like: ThermalShapes | None = None):
         self.blocks, self.reference = blocks, reference
         low, high = blocks.range
-        duration = max(float(np.ptp(path[0])) for path in blocks.paths)
+        duration = max(blocks.spans)
         # a lag shorter than the path's own nodes is none; one as long as the recording is drift
         spans = {"s": np.geomspace(max(blocks.duration / 2, 1e-3 * duration), 0.4 * duration, GRID),
                  "K": np.geomspace(0.01, 0.45, GRID) * (high - low)}  # fmt: skip
@@ -80,7 +81,7 @@ class ThermalShapes:
         reach = float(np.max(np.abs(blocks.rate)))
         self.bounds = {"low": low + ZERO_CELSIUS, "high": high + ZERO_CELSIUS, "reach": reach}
         self.force = blocks.by_rest(blocks.means["accelerometer"])
-        self.paths = blocks.stimuli(self.force, reference)
+        self.tracks = blocks.tracks(self.force, reference)
         self._columns: dict[ThermalTerm, FloatArray] = {}
         none, curve = np.zeros((1, 0)), np.array([[self.bounds["low"], self.bounds["high"]]])
         self._add(dict.fromkeys((*POWERS, *RATES, SCALE), none) | {LEARNED: curve})
@@ -99,10 +100,10 @@ class ThermalShapes:
     def _add(self, asked: Mapping[str, FloatArray]) -> None:
         """Take the shapes of effects at inner parameters (G, i)."""
         count, names = len(self.blocks), tuple(asked)
-        of = partial(_shapes, names)
-        found = [stored.call(of, f"thermal {','.join(names)}", *path, rows_of(count), *asked.values())
-                 for path in self.paths]  # fmt: skip
-        for name, grid, *parts in zip(names, asked.values(), *found, strict=True):
+        rows = padded_count(count)
+        of, key = partial(_shapes, names, rows), f"thermal {','.join(names)} {rows}"
+        recordings = [stored.call(of, key, track, *asked.values()) for track in self.tracks]
+        for name, grid, *parts in zip(names, asked.values(), *recordings, strict=True):
             for values, own in zip(grid, np.sum([np.asarray(part)[:, :count] for part in parts], axis=0), strict=True):
                 term = history(name, values[0]) if name in HISTORY else ThermalTerm(name)
                 for shape, column in enumerate(own.T):  # (3, n)
@@ -121,9 +122,10 @@ class ThermalShapes:
         if net not in self._nets:
             blocks, missing = self.blocks, -len(self.blocks) % _BUCKET
             celsius, rate = (np.pad(each, (0, missing), "edge") for each in (blocks.temperature, blocks.rate))
-            path = Stimulus(temperature=celsius, temperature_rate=rate, temperature_reference=self.reference)
+            stimulus = Stimulus(temperature=celsius, temperature_rate=rate, temperature_reference=self.reference)
             effect = CATALOGUE[f"accel.{NETWORK}"](np.array(net.weights), **self.bounds)
-            value, slopes = mean_terms([effect], [(path, np.arange(len(celsius)))], len(blocks))
+            track = Track(stimulus, np.arange(len(celsius)))
+            value, slopes = mean_terms([effect], [track], len(blocks))
             own = [slopes[:, axis, axis * WEIGHTS : (axis + 1) * WEIGHTS] for axis in range(3)]
             self._nets[net] = value.T, np.stack(own)
         return self._nets[net]

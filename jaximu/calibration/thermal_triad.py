@@ -144,7 +144,7 @@ def _concluded(
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(chosen.model)])
     found = _fitted(data, chosen.model, np.maximum(misfit / freedom, 1.0))
     effects = tuple(getattr(found.model, data.name).effects)
-    added = mean_terms(effects, data.shapes.paths, count)[0] / getattr(blocks.recordings[0], data.name).nominal_scale
+    added = mean_terms(effects, data.shapes.tracks, count)[0] / getattr(blocks.recordings[0], data.name).nominal_scale
     rest = data.means - added
     level = np.stack([np.linalg.lstsq(data.levels[axis], data.root[axis] @ rest[:, axis], rcond=None)[0]
                       for axis in range(3)])  # fmt: skip
@@ -188,7 +188,7 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
                for plain, kind in kinds.items()]  # fmt: skip
     outputs = blocks.means[name] * signal.nominal_scale + signal.nominal_offset
     weights = data.root / signal.nominal_scale[:, None, None]
-    measurement = RestOverTemperature(name, outputs, weights, blocks.level, shapes.paths)
+    measurement = RestOverTemperature(name, outputs, weights, blocks.level, shapes.tracks)
     triads = {owner: replace(triad, temperature_reference=shapes.reference)
               for owner, triad in Imu.nominal().triads().items()}  # fmt: skip
     triads[name] = replace(triads[name], gain=np.diag(signal.nominal_scale), bias=outputs.mean(axis=0))

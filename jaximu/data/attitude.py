@@ -20,9 +20,9 @@ import scipy
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu.data.path import Path, padded, padded_places, stimuli, with_effect
 from jaximu.data.poses_covariance import integrate_turns
 from jaximu.data.preintegration import swing
+from jaximu.data.track import Track, added, stimuli
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import Parameters
@@ -55,6 +55,7 @@ RESIDUALS = (
 )
 OF_REFERENCE = (SetupReferenceDelay, SetupClockScale, SetupReferenceRotation, SetupTableTilt)
 """Effects that say how a reference is mounted, late and tilted; the unit's path is the same without them."""
+_TRIADS = ("accelerometer", "gyroscope")
 _KNOWN = 0.03
 """Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
 INTERVALS = 192
@@ -139,11 +140,10 @@ class AttitudeDetails:
     imu: Imu
 
     @cached_property
-    def path(self) -> Path:
-        """What the unit went through at the gyroscope's samples, the accelerometer's included."""
-        whole = padded(self.measurement.around(self.imu))
-        place = padded_places(np.zeros(len(self.measurement.recording.gyroscope or ()), np.int64), 1)
-        return Path(whole, whole, place, place, np.zeros((0, 0), np.int64))
+    def tracks(self) -> dict[str, Track]:
+        """What the unit went through at the gyroscope's samples, the accelerometer's included: one observation."""
+        stimulus = self.measurement.around(self.imu)
+        return dict.fromkeys(_TRIADS, Track.padded(stimulus, np.zeros(len(np.asarray(stimulus.time)), np.int64), 1))
 
 
 class Intervals(eqx.Module):
@@ -209,8 +209,8 @@ def _added(imu: Imu, data: Intervals, around: Stimulus | None) -> tuple[Array, A
             around, specific_force=bare.accelerometer.recover(data.force - force), angular_rate=turning, time=time,
             angular_acceleration=jnp.concatenate([inner[:1], inner, inner[-1:]]),
         )  # fmt: skip
-        whole = unit.respond(stimulus)
-        force, rate = (a - b for a, b in zip(whole, bare.respond(stimulus), strict=True))  # pyright: ignore
+        outputs = added(unit, dict.fromkeys(_TRIADS, Track(stimulus, jnp.zeros(len(time), int))))
+        force, rate = (outputs[name] for name in _TRIADS)
     return force, rate
 
 
@@ -399,7 +399,7 @@ class AgainstAttitude(Data):
 
     def around(self, imu: Imu) -> Stimulus:
         """Return what the unit went through at the gyroscope's samples as it measured it, standing as was measured."""
-        (_, (_, known)) = stimuli(self.recording, imu.with_effects())
+        known = stimuli(self.recording, imu)["gyroscope"]
         delay, scale, turned, _ = (np.array(each) for each in reference_numbers(imu))
         time = self.attitude.time + self.offset
         stamps = np.clip(np.asarray(known.time) / (1 + scale) + delay, *time[[0, -1]])
@@ -479,16 +479,12 @@ class AgainstAttitude(Data):
         windows = len(details.duration) // self.group
 
         def of(effect, imu, part):
-            path, reactions = part
-            outputs = with_effect(imu, effect, path)
-            matrices = (inverse_matrix(triad.gain) for triad in (imu.accelerometer, imu.gyroscope))
-            force, rate = (
-                jnp.zeros((len(path.gyroscope.time), 3, 1)) if each is None else (each @ matrix.T)[..., None]
-                for each, matrix in zip(outputs, matrices, strict=True)
-            )
+            tracks, reactions = part
+            outputs, triads = added(imu.with_effects(effect), tracks), imu.triads()
+            force, rate = ((outputs[name] @ inverse_matrix(triads[name].gain).T)[..., None] for name in _TRIADS)
             return reactions.react(force, rate, windows)[:, 0]
 
-        return f"against attitude {windows}", of, [(details.path, details.reactions)]
+        return f"against attitude {windows}", of, [(details.tracks, details.reactions)]
 
     def _covariance(
         self, conditions, spread: FloatArray, duration: FloatArray, leaning: FloatArray, white: float

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -20,6 +21,7 @@ import scipy
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from jaximu.data.track import Track, added
 from jaximu.estimation.covariance import BlockFactor, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
@@ -31,7 +33,7 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["EXCESS_NAMES", "FieldConditions", "FieldPath", "FieldWindows", "MagneticField", "windows_of"]
+__all__ = ["EXCESS_NAMES", "FieldConditions", "FieldSamples", "FieldWindows", "MagneticField", "windows_of"]
 
 EXCESS_NAMES = ("magnetometer", "carried field", "angle to gravity")
 RESIDUALS = (
@@ -101,49 +103,50 @@ class FieldConditions(Conditions):
         return jnp.concatenate([norm, across.reshape(-1), dip])
 
 
-class FieldPath(eqx.Module):
+class FieldSamples(eqx.Module):
     """The samples of n windows, S of each, along which effects act.
 
-    output (n, S, 3): as measured; share (n, S): of each in its window's mean, zero for padding; turned (n, S, 3, 3):
-    from the frame at a sample to the window's. temperature (°C) and current (A): None where they were not recorded,
-    rate (rad/s): None without a gyroscope.
+    output (n, S, 3): as measured; turned (n, S, 3, 3): from the frame at a sample to the window's. track: what the unit
+    went through but for the field, which its output tells; of no window where a window has fewer samples than others.
     """
 
     output: Float[Array, "n S 3"]
-    share: Float[Array, "n S"]
     turned: Float[Array, "n S 3 3"]
-    time: Float[Array, "n S"]
-    temperature: Float[Array, "n S"] | None = None
-    current: Float[Array, "n S"] | None = None
-    rate: Float[Array, "n S 3"] | None = None
+    track: Track
 
-    def stimulus(self, field: Float[Array, "n S 3"] | None = None) -> Stimulus:
-        """Return what the magnetometer went through in a field (µT, body frame)."""
-        return Stimulus(
-            magnetic_field=field, time=self.time, temperature=self.temperature, current=self.current,
-            angular_rate=self.rate,
-        )  # fmt: skip
-
+    @partial(stored.compiled, quick=True)
     def added(self, imu: Imu) -> Float[Array, "n S 3"]:
         """Return what the effects of a unit's magnetometer add to its output (output units)."""
-        triad = imu.magnetometer
-        assert triad is not None
-        stimulus = self.stimulus(triad.recover(self.output, self.stimulus()))
-        return triad.respond(stimulus) - replace(triad, effects=()).respond(stimulus)
+        assert imu.magnetometer is not None
+        field = imu.magnetometer.recover(self.output, self.track.stimulus)
+        stimulus = replace(self.track.stimulus, magnetic_field=field)
+        return added(imu, {"magnetometer": replace(self.track, stimulus=stimulus)})["magnetometer"]
+
+    @partial(stored.compiled, quick=True)
+    def mean_added(self, imu: Imu) -> Float[Array, "n 3 3 3"]:
+        """Return its means over the windows, each sample's brought to its window's frame: by frame and output."""
+        brought = self.turned[..., None] * self.added(imu)[..., None, None, :]
+        return self.track.means(brought.reshape(*self.output.shape[:2], -1), len(self.output)).reshape(-1, 3, 3, 3)
 
     @classmethod
-    def joined(cls, parts: Sequence[FieldPath]) -> FieldPath:
-        """Return the paths of several recordings as one; what one of them lacks is unknown of all."""
-        size = max(each.share.shape[1] for each in parts)
+    def joined(cls, parts: Sequence[FieldSamples]) -> FieldSamples:
+        """Return the samples of several recordings as one; what one of them lacks is unknown of all."""
+        counts, size = [len(part.output) for part in parts], max(part.output.shape[1] for part in parts)
+        total, first = sum(counts), np.cumsum([0, *counts])
 
-        def together(*leaves):
-            if any(leaf is None for leaf in leaves):
-                return None
+        def together(leaves):
             grown = [np.pad(leaf, [(0, 0), (0, size - leaf.shape[1]), *[(0, 0)] * (leaf.ndim - 2)]) for leaf in leaves]
             return np.concatenate(grown)
 
-        names = cls.__dataclass_fields__
-        return cls(**{name: together(*(getattr(each, name) for each in parts)) for name in names})
+        numbers = [np.append(start + np.arange(count), total) for start, count in zip(first, counts, strict=False)]
+        tracks = [part.track.renumbered(own) for part, own in zip(parts, numbers, strict=True)]
+        observation = together([track.observation - total for track in tracks]) + total  # padding is of none
+        stimuli = [vars(track.stimulus) for track in tracks]
+        known = [name for name in ("time", "temperature", "current", "angular_rate")
+                 if all(stimulus[name] is not None for stimulus in stimuli)]  # fmt: skip
+        inputs: dict[str, Any] = {name: together([stimulus[name] for stimulus in stimuli]) for name in known}
+        output, turned = (together([vars(part)[name] for part in parts]) for name in ("output", "turned"))
+        return cls(output, turned, Track(Stimulus(**inputs), observation))
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,7 @@ class FieldWindows:
     `FieldConditions`;
     off (n,): how far the specific force is from gravity, over gravity; angle (n,): rad turned to the next window;
     time (n, 2): s; count (n,): samples. used, turn, level (n,): which of them tell strength, turn and dip. noise: of a
-    sample, output units. origin (3,): the gyroscope's bias, output units, that was taken off its rates. path: samples.
+    sample, output units. origin (3,): the gyroscope's bias, output units, that was taken off its rates.
     vertical (12, 12): covariance of what is wrong of the specific force f, (B f + b g) with (B row by row | b), which
     bends the measured up of all windows together.
     """
@@ -173,7 +176,7 @@ class FieldWindows:
     level: NDArray[np.bool_]
     noise: float
     origin: FloatArray
-    path: FieldPath
+    samples: FieldSamples
     vertical: FloatArray
 
     def __len__(self) -> int:
@@ -192,16 +195,15 @@ class FieldWindows:
     def added(self, imu: Imu) -> FloatArray:
         """Return what the effects of a unit's magnetometer add to each sample's output (n, S, 3), output units."""
         if imu.magnetometer is None or not imu.magnetometer.effects:
-            return np.zeros_like(self.path.output)
-        names = " ".join(each.name for each in imu.magnetometer.effects)
-        return np.asarray(stored.call(lambda unit, path: path.added(unit), f"added {names}", imu, self.path)[0])
+            return np.zeros_like(self.samples.output)
+        return np.asarray(self.samples.added(imu))
 
     def along(self, imu: Imu) -> FieldWindows:
         """Return the same with what a unit's effects add taken off the samples."""
         if imu.magnetometer is None or not imu.magnetometer.effects:
             return self
         slope = np.array(self.slope)
-        slope[..., :3] -= np.einsum("ns,nsij,nsk->nijk", self.path.share, self.path.turned, self.added(imu))
+        slope[..., :3] -= np.asarray(self.samples.mean_added(imu))
         return replace(self, slope=slope)
 
     def bent(self, field: FloatArray) -> FloatArray:
@@ -223,8 +225,8 @@ class FieldWindows:
         names = ("output", "slope", "carried", "swept", "up", "off", "angle", "time", "count", "used", "turn", "level")
         together = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
         noise = float(np.sqrt(np.mean([each.noise**2 for each in parts])))
-        path = FieldPath.joined([each.path for each in parts])
-        return cls(**together, noise=noise, origin=parts[0].origin, path=path, vertical=parts[0].vertical)
+        samples = FieldSamples.joined([each.samples for each in parts])
+        return cls(**together, noise=noise, origin=parts[0].origin, samples=samples, vertical=parts[0].vertical)
 
 
 def white_noise(signal: Signal) -> float:
@@ -289,17 +291,19 @@ def windows_of(
         return np.stack([np.interp(at, other.time, each) for each in other.values.T], axis=-1)
 
     warm, flow = (None, None) if motion is None else (known(motion.temperature), known(motion.current))
-    path = FieldPath(
-        values[place], weight, np.array(turned), at, None if warm is None else warm[..., 0],
-        None if flow is None else flow[..., 0], known(gyroscope),
+    stimulus = Stimulus(
+        time=at, temperature=None if warm is None else warm[..., 0], current=None if flow is None else flow[..., 0],
+        angular_rate=known(gyroscope),
     )  # pyright: ignore # fmt: skip
+    window = np.where(weight > 0, np.arange(len(count))[:, None], len(count))
+    samples = FieldSamples(values[place], np.array(turned), Track(stimulus, window))
     everywhere = np.ones(len(centre), bool)
     following = np.append(everywhere[1:], False)
     return FieldWindows(
         (weight[:, :, None] * values[place]).sum(axis=1), slope, np.array(carried), swept, up, off, angle,
         np.stack([time[edges[:-1]], time[edges[1:] - 1]], axis=1), count.astype(float), everywhere,
         following if gyroscope is not None else ~everywhere, everywhere if motion is not None else ~everywhere,
-        white_noise(signal), origin, path, np.zeros((12, 12)) if vertical is None else vertical,
+        white_noise(signal), origin, samples, np.zeros((12, 12)) if vertical is None else vertical,
     )  # fmt: skip
 
 
@@ -336,10 +340,10 @@ def _carried(gyroscope: Signal):
 
 
 class _At(eqx.Module):
-    """Where the effects' reactions are taken: the conditions there, and the path."""
+    """Where the effects' reactions are taken: the conditions there, and the samples."""
 
     conditions: FieldConditions
-    path: FieldPath
+    samples: FieldSamples
 
 
 @dataclass(frozen=True)
@@ -396,7 +400,7 @@ class MagneticField(Data):
         conditions = eqx.tree_at(lambda each: each.basis, blank, basis)
         covariance = self._covariance(whole, field, basis)
         lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions)
-        details = _At(conditions, windows.path)
+        details = _At(conditions, windows.samples)
         columns = self.own_columns(single, details, covariance.used.shape[1])
         return About(lifted, covariance, columns[None], details)
 
@@ -404,9 +408,8 @@ class MagneticField(Data):
         """Return how the conditions react to an effect of the magnetometer: its mean over each window, as a field."""
 
         def of(effect, imu, at):
-            unit = imu.with_effects(effect)
-            inverse = inverse_matrix(imu.magnetometer.gain)
-            moved = jnp.einsum("ns,nsij,jk,nsk->ni", at.path.share, at.path.turned, inverse, at.path.added(unit))
+            mean = at.samples.mean_added(imu.with_effects(effect))
+            moved = jnp.einsum("nijk,jk->ni", mean, inverse_matrix(imu.magnetometer.gain))
             field = at.conditions.field(imu)
             return jax.jvp(lambda field: at.conditions.of(imu, field), (field,), (moved,))[1]
 

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from jaximu.data.gravity_direction import gravity_direction_error, unit_vectors
 from jaximu.data.gravity_norm import gravity_norm_error
-from jaximu.data.path import Path, Terms, paths, react, terms, with_effect
 from jaximu.data.poses_covariance import (
     IntegratedTurns,
     Sensitivities,
@@ -29,6 +28,8 @@ from jaximu.data.poses_covariance import (
     integrate_turns,
     sensitivities,
 )
+from jaximu.data.track import Track, added, mean_outputs
+from jaximu.data.tracks_by_hand import tracks_by_hand, turn_samples
 from jaximu.estimation.covariance import BlockFactor, Covariance, component_covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
@@ -258,16 +259,16 @@ def pose_rows(imu: Imu, observations: Observations) -> Rows:
 
 
 class Along:
-    """A hand-held recording about a unit: what was condensed, and the path of each part, made when it is asked for.
+    """A hand-held recording about a unit: what was condensed, and the tracks of each part, made when asked for.
 
     observations: with what the effects add taken off.
     """
 
-    def __init__(self, condensed: Condensed, observations: Observations, made: Callable[[], list[Path]]):
+    def __init__(self, condensed: Condensed, observations: Observations, made: Callable[[], list[dict[str, Track]]]):
         self.condensed, self.observations, self._made = condensed, observations, made
 
     @cached_property
-    def path(self) -> list[Path]:
+    def tracks(self) -> list[dict[str, Track]]:
         """What the unit went through, part by part."""
         return self._made()
 
@@ -297,6 +298,11 @@ class RecordedByHand(Data):
         """Return what each condition is: norms of poses, two components of turns, three of means at rest."""
         return pose_rows(imu, self.observations)
 
+    @cached_property
+    def turn_samples(self) -> list[NDArray[np.int64]]:
+        """Where the samples (T, S) of each turn are among those of each recording's gyroscope; 0 for none."""
+        return turn_samples(self.segmentations, self.observations)
+
     def about(self, imu: Imu) -> About:
         """Return the conditions about one unit, the leading axis of length one, and its effects' columns."""
         unit = jax.tree.map(lambda leaf: leaf[0], imu)
@@ -306,55 +312,60 @@ class RecordedByHand(Data):
         return About(along.condensed.conditions, covariance, columns, along)
 
     def along(self, imu: Imu, effects: tuple[Effect, ...]) -> Along:
-        """Return the recordings about a unit with effects: the path, and the observations without what they add."""
-        lengths = [
-            (len(part.recording.accelerometer), len(part.recording.gyroscope or ())) for part in self.segmentations
-        ]
+        """Return the recordings about a unit with effects: the tracks, and the observations without what they add."""
         bare = jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu.with_effects())
-        offsets: list[Any] = [None] * len(self.segmentations)
-        observations = self.observations
-        change = np.inf
-        for number in range(_ROUNDS):  # the path tells what effects add, and what they add changes the path
+        recorded = [
+            {"accelerometer": signals["accelerometer"].values, "gyroscope": signals["gyroscope"].values - shift}
+            for signals, shift in zip((part.recording.signals for part in self.segmentations), self.shifts, strict=True)
+        ]
+        offsets: list[Any] = [None] * len(recorded)
+        outputs, observations, change = recorded, self.observations, np.inf
+        for number in range(_ROUNDS):  # the tracks tell what effects add, and what they add changes the tracks
             found = condensed(bare, jax.tree.map(lambda leaf: np.asarray(leaf)[None], observations))
             assert found.running is not None
-            made = partial(paths, self.segmentations, observations, imu, offsets, self.shifts, found.running)
+            made = partial(tracks_by_hand, self.segmentations, self.turn_samples, imu, outputs, found.running)
             if not effects or change < _CHANGED or number == _ROUNDS - 1:
                 break
-            before, path = offsets, made()
-            offsets = [terms(imu, each, effects, size) for each, size in zip(path, lengths, strict=True)]
+            before, tracks = offsets, made()
+            offsets = [jax.tree.map(np.asarray, added(imu.with_effects(*effects), each)) for each in tracks]
             change = max(_change(old, new) for old, new in zip(before, offsets, strict=True))
-            observations = self._without(path, offsets)
+            outputs = [
+                {name: values - offset[name][: len(values)] for name, values in whole.items()}
+                for whole, offset in zip(recorded, offsets, strict=True)
+            ]
+            observations = self._without(tracks, offsets)
         return Along(found, observations, made)
 
     def reactions(self, details: Along):
         """Return how norms, directions and means at rest react to effects, recording by recording."""
 
         def of(effect, imu, part):
-            path, reaction = part
-            return react(*with_effect(imu, effect, path), path, reaction)
+            tracks, samples, reaction = part
+            outputs = added(imu.with_effects(effect), tracks)
+            means = mean_outputs(tracks, outputs, reaction.norm.shape[0])
+            force = means[:, :3]
+            norm = jnp.sum(reaction.norm * force, axis=-1)
+            turn = jnp.einsum("tai,ti->ta", reaction.after, force[1:])
+            turn = turn + jnp.einsum("tai,ti->ta", reaction.before, force[:-1])
+            turn = turn + jnp.einsum("tasi,tsi->ta", reaction.turn, outputs["gyroscope"][samples])
+            return jnp.concatenate([norm, turn.reshape(-1), means[:, 3:].reshape(-1)])
 
-        return "by hand", of, [(path, details.reaction) for path in details.path]
+        parts = zip(details.tracks, self.turn_samples, strict=True)
+        return "by hand", of, [(tracks, samples, details.reaction) for tracks, samples in parts]
 
-    def _without(self, path: Sequence[Path], offsets: Sequence[Terms]) -> Observations:
+    def _without(self, tracks: Sequence[dict[str, Track]], offsets: Sequence[dict[str, FloatArray]]) -> Observations:
+        """Return the observations with what is added to the samples of each recording taken off."""
         poses, turns = self.observations.poses, self.observations.turns
-        padded = len(poses.mask)
-        force, rate = np.zeros((padded, 3)), np.zeros((padded, 3))
-        output = np.array(turns.output)
-        for each, offset in zip(path, offsets, strict=True):
-            for total, values, pose in ((force, offset.accelerometer, each.accelerometer_pose),
-                                        (rate, offset.gyroscope, each.gyroscope_pose)):  # fmt: skip
-                pose = np.asarray(pose)[: len(values)]
-                count = np.maximum(np.bincount(pose, minlength=padded + 1)[:padded], 1)
-                for axis in range(3):
-                    total[:, axis] += np.bincount(pose, values[:, axis], minlength=padded + 1)[:padded] / count
-            inside = np.asarray(each.turn_sample) > 0
-            output[inside] -= offset.gyroscope[np.asarray(each.turn_sample)[inside]]
+        means, output = np.zeros((len(poses.mask), 6)), np.array(turns.output)
+        for track, offset, samples in zip(tracks, offsets, self.turn_samples, strict=True):
+            means += np.asarray(mean_outputs(track, offset, len(means)))
+            output[samples > 0] -= offset["gyroscope"][samples[samples > 0]]
         return replace(
             self.observations,
             poses=replace(
                 poses,
-                accelerometer_mean=np.asarray(poses.accelerometer_mean) - force,
-                gyroscope_mean=np.asarray(poses.gyroscope_mean) - rate,
+                accelerometer_mean=np.asarray(poses.accelerometer_mean) - means[:, :3],
+                gyroscope_mean=np.asarray(poses.gyroscope_mean) - means[:, 3:],
             ),
             turns=replace(turns, output=output),
         )
@@ -396,12 +407,11 @@ def missed_by_sampling(turns: Turns, gyroscope: Triad, running: FloatArray) -> F
     return np.sum(turned * (interval * sign)[..., None], axis=1)
 
 
-def _change(before: Terms | None, after: Terms) -> float:
+def _change(before: dict[str, FloatArray] | None, after: dict[str, FloatArray]) -> float:
     """Return the largest change of what effects add, as a share of the most that they add to a triad."""
     shares = [0.0]
-    for name in ("accelerometer", "gyroscope"):
-        old, new = 0.0 if before is None else getattr(before, name), getattr(after, name)
-        most = np.max(np.abs(new), initial=0.0)
+    for name, new in after.items():
+        old, most = 0.0 if before is None else before[name], np.max(np.abs(new), initial=0.0)
         shares.append(float(np.max(np.abs(new - old), initial=0.0) / most) if most > 0 else 0.0)
     return max(shares)
 

@@ -15,18 +15,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from jaximu.data.track import Track
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, Data, derivatives_by_numbers
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.sensor import Imu
-from jaximu.model.stimulus import Stimulus
 
-__all__ = ["BlockPath", "RestOverTemperature", "block_means", "mean_terms", "rows_of"]
+__all__ = ["RestOverTemperature", "mean_terms", "padded_count"]
 
-BlockPath = tuple[Stimulus, NDArray[np.int64]]
-"""What the unit went through in one recording at its nodes, and the block of each; n: none."""
 _ROWS = 256
 """Blocks are padded to a multiple of so many: few shapes to compile."""
 
@@ -54,22 +52,22 @@ class RestOverTemperature(Data):
     """Mean outputs (n, 3) of one triad over blocks at rest, in output units.
 
     **Arguments:** `weights` (3, n, n): by axis, whiten the outputs' noise. `level` (n,): the rest of each block.
-    `paths`: of each recording. Effects are those that temperature and force have on the triad's output.
+    `tracks`: of each recording. Effects are those that temperature and force have on the triad's output.
     """
 
     coarse = (0.0, 0.0, 0.0)
 
     def __init__(
-        self, triad: str, output: FloatArray, weights: FloatArray, level: NDArray[np.int64], paths: Sequence[BlockPath]
+        self, triad: str, output: FloatArray, weights: FloatArray, level: NDArray[np.int64], tracks: Sequence[Track]
     ):
-        self.triad, self.output, self.paths = triad, output, paths
+        self.triad, self.output, self.tracks = triad, output, tracks
         member = np.eye(int(level.max()) + 1)[level]
         apart = member[:, 1:] - member[:, :1]  # levels that add up to nothing: their mean is the bias
         self.weights = weights
         if apart.shape[1]:  # combinations that no level moves
             whole = [np.linalg.qr(own @ apart, mode="complete")[0] for own in weights]
             self.weights = np.stack([q[:, apart.shape[1] :].T @ own for q, own in zip(whole, weights, strict=True)])
-        self._length = _padded(self.weights.shape[1])  # of an axis
+        self._length = padded_count(self.weights.shape[1])  # of an axis
         used = np.zeros((3, self._length))
         used[:, : self.weights.shape[1]] = 1.0
         factors = tuple((used * axis[:, None]).reshape(1, -1) for axis in np.eye(3))
@@ -81,7 +79,7 @@ class RestOverTemperature(Data):
     def about(self, imu: Imu) -> About:
         """Return the outputs without what the effects of one unit, the leading axis, add to them."""
         unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        added, slopes = mean_terms(tuple(unit.all_effects().values()), self.paths, len(self.output))
+        added, slopes = mean_terms(tuple(unit.all_effects().values()), self.tracks, len(self.output))
         conditions = _WhiteOutputs(
             self._white((self.output - added)[:, :, None])[:, :, 0], self.bias, np.zeros(1),
             np.full(1, int(self.triad == "gyroscope")),
@@ -95,41 +93,30 @@ class RestOverTemperature(Data):
         return found.reshape(1, 3 * self._length, -1)
 
 
-def mean_terms(effects: Sequence[Effect], paths: Sequence[BlockPath], count: int) -> tuple[FloatArray, FloatArray]:
+def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -> tuple[FloatArray, FloatArray]:
     """Return what a triad's effects add to means over blocks (n, 3), and its derivatives (n, 3, q) by their numbers.
 
     In output units; numbers are in the order of `effect_numbers`.
     """
-    added, slopes = np.zeros((count, 3)), [np.zeros((count, 3, 0))]
+    added, slopes, rows = np.zeros((count, 3)), [np.zeros((count, 3, 0))], padded_count(count)
     for effect in effects:
         kind = CATALOGUE[f"accel.{effect.plain}"]  # its term is the gyroscope's, too: half as many to compile
         numbers = np.concatenate([effect.coefficients, [float(getattr(effect, name)) for name in effect.inner]])
 
-        def means(path, place, rows, numbers, kind=kind):
-            def of(own):
-                return block_means(own.term(path), place, rows)
+        def means(track, numbers, kind=kind):
+            def of(varied):
+                return track.means(varied.term(track.stimulus), rows)
 
             inner = dict(zip(kind.inner, numbers[kind.size :], strict=True))
             return of(kind(numbers[: kind.size], **inner)), derivatives_by_numbers(kind, of, numbers)
 
-        found = [stored.call(means, f"rest {kind.name}", *path, rows_of(count), numbers) for path in paths]
-        value, slope = (sum(np.asarray(part)[:count] for part in parts) for parts in zip(*found, strict=True))
+        recordings = [stored.call(means, f"rest {kind.name} {rows}", track, numbers) for track in tracks]
+        value, slope = (sum(np.asarray(part)[:count] for part in parts) for parts in zip(*recordings, strict=True))
         added = added + value
         slopes.append(np.asarray(slope))
     return added, np.concatenate(slopes, axis=2)
 
 
-def block_means(values: Float[Array, "... m"], place: Int[Array, " ..."], rows: Float[Array, " n"]) -> Array:
-    """Return the means (n, m) over blocks of values at nodes whose blocks are `place`; zero where a block has none."""
-    place, values = place.reshape(-1), values.reshape(-1, values.shape[-1])
-    number = jax.ops.segment_sum(jnp.ones(len(place)), place, len(rows))
-    return jax.ops.segment_sum(values, place, len(rows)) / jnp.maximum(number, 1.0)[:, None]
-
-
-def rows_of(count: int) -> FloatArray:
-    """Return zeros, at least one more than there are blocks: where nodes of no block go. Few lengths, few programs."""
-    return np.zeros(_padded(count) + 1)
-
-
-def _padded(count: int) -> int:
+def padded_count(count: int) -> int:
+    """Return a number of blocks, and a few more that are none: few numbers, few programs."""
     return -(-count // _ROWS) * _ROWS

@@ -9,8 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.data.path import TEMPERATURE_WINDOW, padded, padded_places
-from jaximu.data.rest import BlockPath
+from jaximu.data.track import TEMPERATURE_WINDOW, Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -79,9 +78,8 @@ class RestBlocks:
 
     start, stop (n,): s, on the clock of the block's recording. log (n,): which recording. level (n,): which rest, from
     0 on over all recordings; in each the unit lay still. temperature (n,) °C and rate (n,) K/s: means over the blocks.
-    means: by triad (n, 3), SI. paths: of each recording, times (s), temperature (°C) and its rate (K/s) at nodes, and
-    the block that each node lies in (n: none). ambient (n,): °C, where every recording has it. dropped: blocks in which
-    the unit moved.
+    means: by triad (n, 3), SI. nodes: of each recording, where time, temperature and its rate are known, and the blocks
+    that they lie in. ambient (n,): °C, where every recording has it. dropped: blocks in which the unit moved.
     """
 
     recordings: tuple[Recording, ...]
@@ -92,7 +90,7 @@ class RestBlocks:
     temperature: FloatArray
     rate: FloatArray
     means: dict[str, FloatArray]
-    paths: tuple[tuple[FloatArray, FloatArray, FloatArray, NDArray[np.int64]], ...]
+    nodes: tuple[Track, ...]
     ambient: FloatArray | None
     duration: float
     dropped: int
@@ -140,20 +138,31 @@ class RestBlocks:
         member = np.eye(self.levels)[self.level]
         return member @ (member.T @ values / member.sum(axis=0)[:, None])
 
-    def stimuli(self, force: FloatArray, reference: float) -> list[BlockPath]:
+    @property
+    def spans(self) -> list[float]:
+        """How long each recording is, s."""
+        return [float(np.ptp(np.asarray(track.stimulus.time))) for track in self.nodes]
+
+    def tracks(self, force: FloatArray, reference: float) -> list[Track]:
         """Return what the unit went through, recording by recording, at the force (n, 3) of each block's rest.
 
         Effects count from `reference`, °C. Nodes of no block are at the force of the block before.
         """
-        found, count = [], len(self)
-        for time, celsius, rate, place in self.paths:
-            inside = place < count
-            nearest = np.maximum.accumulate(np.where(inside, np.arange(len(place)), np.argmax(inside)))
-            still = np.zeros((len(time), 3))
-            stimulus = Stimulus(force[np.minimum(place[nearest], count - 1)], still, still, celsius, rate, time,
-                                temperature_reference=reference)  # pyright: ignore[reportArgumentType] # fmt: skip
-            found.append((padded(stimulus), padded_places(place, count)))
-        return found
+        tracks, count = [], len(self)
+        for track in self.nodes:
+            block = np.asarray(track.observation)
+            inside = block < count
+            nearest = np.maximum.accumulate(np.where(inside, np.arange(len(block)), np.argmax(inside)))
+            here, still = force[np.minimum(block[nearest], count - 1)], np.zeros((len(block), 3))
+            stimulus = replace(
+                track.stimulus,
+                specific_force=here,
+                angular_rate=still,
+                angular_acceleration=still,
+                temperature_reference=reference,
+            )
+            tracks.append(Track.padded(stimulus, block, count))
+        return tracks
 
     def legs(self) -> list[Leg]:
         """Return the stretches in which the temperature goes one way; half of a soak belongs to each side."""
@@ -176,14 +185,14 @@ class RestBlocks:
 
     def only(self, keep: NDArray[np.bool_]) -> RestBlocks:
         """Return the blocks that are kept (n,), with the whole path of temperature."""
-        place = np.full(len(self) + 1, int(keep.sum()))
-        place[:-1][keep] = np.arange(keep.sum())
+        numbers = np.full(len(self) + 1, int(keep.sum()))
+        numbers[:-1][keep] = np.arange(keep.sum())
         levels = np.unique(self.level[keep], return_inverse=True)[1]
         return replace(
             self, start=self.start[keep], stop=self.stop[keep], log=self.log[keep], level=levels,
             temperature=self.temperature[keep], rate=self.rate[keep],
             means={name: values[keep] for name, values in self.means.items()},
-            paths=tuple((*path[:3], place[path[3]]) for path in self.paths),
+            nodes=tuple(track.renumbered(numbers) for track in self.nodes),
             ambient=None if self.ambient is None else self.ambient[keep],
         )  # fmt: skip
 
@@ -273,12 +282,13 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
 def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
     """Return the blocks of several recordings as those of one unit; every recording has rests of its own."""
     total, first, log, level = sum(map(len, parts)), 0, 0, 0
-    logs, levels, paths = [], [], []
+    logs, levels, nodes = [], [], []
     for part in parts:
         logs.append(part.log + log)
         levels.append(part.level + level)
-        paths += [(*path[:3], np.where(path[3] < len(part), path[3] + first, total)) for path in part.paths]
-        first, log, level = first + len(part), log + len(part.paths), level + part.levels
+        numbers = np.append(first + np.arange(len(part)), total)
+        nodes += [track.renumbered(numbers) for track in part.nodes]
+        first, log, level = first + len(part), log + len(part.nodes), level + part.levels
 
     def whole(name: str) -> FloatArray:
         return np.concatenate([getattr(part, name) for part in parts])
@@ -286,7 +296,7 @@ def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
     return RestBlocks(
         tuple(recording for part in parts for recording in part.recordings), whole("start"), whole("stop"),
         np.concatenate(logs), np.concatenate(levels), whole("temperature"), whole("rate"),
-        {name: np.concatenate([part.means[name] for part in parts]) for name in parts[0].means}, tuple(paths),
+        {name: np.concatenate([part.means[name] for part in parts]) for name in parts[0].means}, tuple(nodes),
         None if any(part.ambient is None for part in parts) else whole("ambient"), parts[0].duration,
         sum(part.dropped for part in parts), (),
     )  # fmt: skip
@@ -333,7 +343,8 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
     return RestBlocks(
         (recording,), start, np.asarray(start + block, np.float64), np.zeros(len(keep), np.int64),
         np.cumsum(np.concatenate([[0], jumps]), dtype=np.int64)[: len(keep)], by_block(celsius), by_block(slope), means,
-        ((time, celsius, slope, place[np.minimum(np.arange(nodes) // _NODES, count)]),),
+        (Track(Stimulus(temperature=celsius, temperature_rate=slope, time=time),
+               place[np.minimum(np.arange(nodes) // _NODES, count)]),),
         None if ambient is None else by_block(_cells(ambient, edges)), float(block), int(np.sum(good & moved)), (),
     )  # fmt: skip
 
@@ -431,7 +442,7 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     that slow noise is told by what no temperature explains. Some flicker is always taken to be there.
     """
     shortest = blocks.duration
-    longest = 4 * max(float(np.ptp(path[0])) for path in blocks.paths)
+    longest = 4 * max(blocks.spans)
     members = 1 + int(np.ceil(np.log(longest / shortest) / np.log(4.0)))
     times = np.asarray(shortest * 4.0 ** np.arange(members), np.float64)
     indicator = np.eye(blocks.levels)[blocks.level]

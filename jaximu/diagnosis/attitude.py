@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
-from jaximu.data.path import Path
+from jaximu.data.track import Track
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, State
@@ -106,7 +106,7 @@ class MeasuredAttitude(Experiment):
 
     def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause: slow changes, and what depends on orientation."""
-        reactions, path, windows = linear.details.reactions, linear.details.path.gyroscope, self._windows
+        reactions, path, windows = linear.details.reactions, linear.details.tracks["gyroscope"].stimulus, self._windows
         time, none = np.asarray(path.time), np.zeros((len(np.asarray(path.time)), 3, 1))
         middle = np.asarray(self.measurement.intervals.stamp)
         waves = np.cos(np.pi * ((time - middle[0]) / np.ptp(middle))[:, None] * np.arange(1, 6))
@@ -139,9 +139,9 @@ class MeasuredAttitude(Experiment):
         return Extent(float(np.ptp(stamps)), tuple(stamps[1:-1].tolist()),
                       0.0 if warm is None else float(np.ptp(warm.values)))  # fmt: skip
 
-    def paths(self, linear: Linear) -> list[Path]:
+    def tracks(self, linear: Linear) -> list[dict[str, Track]]:
         """Return what the unit went through, part by part."""
-        return [linear.details.path]
+        return [linear.details.tracks]
 
     def without(self, place: int) -> MeasuredAttitude:
         """Return the recording with a window of the force left out, and the rotations in it."""

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu.data.path import Path, terms
+from jaximu.data.track import Track, added
 from jaximu.diagnosis.drift import DriftComponents
 from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.handling import Handling
@@ -120,16 +120,16 @@ class Experiment(Data):
     def extent(self) -> Extent:
         """Return what the recordings span."""
 
-    def paths(self, linear: Linear) -> list[Path]:
-        """Return what the unit went through, part by part."""
-        return linear.details.path
+    def tracks(self, linear: Linear) -> list[dict[str, Track]]:
+        """Return what the unit went through, part by part, at the samples of each triad."""
+        return linear.details.tracks
 
     def lacks(self, linear: Linear) -> Mapping[str, str]:
         """Return fields of the stimulus that are not known along the path, and why."""
         found = {}
         for field in ("temperature", "temperature_rate", "vibration_power"):
-            if any(getattr(getattr(path, triad), field) is None for path in self.paths(linear)
-                   for triad in ("accelerometer", "gyroscope")):  # fmt: skip
+            stimuli = (track.stimulus for tracks in self.tracks(linear) for track in tracks.values())
+            if any(getattr(stimulus, field) is None for stimulus in stimuli):
                 said = "vibration that stands out" if field == "vibration_power" else field.replace("_", " ")
                 found[field] = f"the recording has no {said}"
         return found
@@ -138,10 +138,9 @@ class Experiment(Data):
         """Return the most (SI) that an effect adds to each triad's output in these recordings."""
         triads = state.imu.triads()
         most = dict.fromkeys(triads, 0.0)
-        for recording, path in zip(self.recordings, self.paths(state.linear), strict=True):
-            size = len(recording.accelerometer), len(recording.gyroscope or ())
-            added = terms(state.imu, path, [effect], size)
-            for name, values in (("accelerometer", added.accelerometer), ("gyroscope", added.gyroscope)):
+        for recording, tracks in zip(self.recordings, self.tracks(state.linear), strict=True):
+            for name, outputs in added(state.imu.with_effects(effect), tracks).items():
+                values = np.asarray(outputs)[: len(recording.signals[name])]
                 scale = np.linalg.norm(np.asarray(triads[name].gain), axis=1)
                 most[name] = max(most[name], float(np.max(np.abs(values / scale))))
         return most

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
 from jaximu.data.drift import drift_components, mean_output_reactions
-from jaximu.data.path import Path
 from jaximu.data.poses import RecordedByHand, extent_of
+from jaximu.data.track import Track
 from jaximu.diagnosis.drift import DriftComponents
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, State
@@ -107,7 +107,7 @@ class HandHeldExperiment(RecordedByHand, Experiment):
 
     def twin(self, state: State, noise: NoiseModel, seed: int) -> HandHeldExperiment:
         """Return the recording as a fit without effects would have it, along the same motion, noise included."""
-        made = twin_recordings(self.segmentations, self.observations, self.shifts, state, noise, seed)
+        made = twin_recordings(self, state, noise, seed)
         parts = tuple(replace(part, recording=each) for part, each in zip(self.segmentations, made, strict=True))
         return HandHeldExperiment(parts, observe(parts, float(self.observations.gravity), noise=noise), state.imu)
 
@@ -162,7 +162,7 @@ class HandHeldExperiment(RecordedByHand, Experiment):
         force, rate = self._shaper(linear)
         curves = np.polynomial.legendre.legvander(up, 7)[..., 4:]
         return [
-            rate("the gyroscope at rest depends on its heading", _attitudes(self.paths(linear), len(real))[real]),
+            rate("the gyroscope at rest depends on its heading", _attitudes(self.tracks(linear), len(real))[real]),
             rate("the gyroscope at rest depends on orientation (third harmonics)", harmonics(up)[1]),
             force("the accelerometer's axes are curved (even powers)", curves[..., ::2]),
             force("the accelerometer's axes are curved (odd powers)", curves[..., 1::2]),
@@ -194,13 +194,13 @@ def _directions(imu: Imu, output) -> FloatArray:
     return force / np.linalg.norm(force, axis=1, keepdims=True)
 
 
-def _attitudes(paths: Sequence[Path], poses: int) -> FloatArray:
-    """Return the level frame's axes in the body's (poses, 9) in each pose, padding included, as the paths have them."""
+def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
+    """Return the level frame's axes in the body's (poses, 9) in each pose, padding included, as tracks have them."""
     found = np.zeros((poses, 9))
-    for path in paths:
-        pose, first = np.unique(np.asarray(path.gyroscope_pose), return_index=True)
+    for track in (each["gyroscope"] for each in tracks):
+        pose, first = np.unique(np.asarray(track.observation), return_index=True)
         inside = pose < poses
-        attitude = np.asarray(path.gyroscope.attitude)[first[inside]]
+        attitude = np.asarray(track.stimulus.attitude)[first[inside]]
         found[pose[inside]] = Rotation.from_quat(attitude, scalar_first=True).as_matrix().reshape(-1, 9)
     return found
 

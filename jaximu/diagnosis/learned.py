@@ -168,15 +168,14 @@ def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatA
 def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve | None:
     """Return the dormant curve over what its covariate was in what is compared; None where it stood still."""
     name = kind.owner
-    paths = experiment.paths(state.linear)
     typical = {name: each.typical for name, each in kind.inner.items()}
     values = []
-    for path in paths:
-        place = np.asarray(getattr(path, f"{name}_pose"))
-        still = place < place.max()
+    for track in (tracks[name] for tracks in experiment.tracks(state.linear)):
+        observation = np.asarray(track.observation)
+        still = observation < observation.max()
         if name == "gyroscope":  # its turns count, too, but not the padding at the end
             still[: np.flatnonzero(still)[-1]] = True
-        true = jax.tree.map(lambda leaf, rows=still: np.asarray(leaf)[rows], getattr(path, name))
+        true = jax.tree.map(lambda leaf, rows=still: np.asarray(leaf)[rows], track.stimulus)
         true = replace(true, time_reference=state.imu.triads()[name].time_reference)
         values.append(np.asarray(kind(np.zeros(kind.size), **typical).covariate(true)))
     low, high = min(float(each.min()) for each in values), max(float(each.max()) for each in values)

@@ -247,9 +247,9 @@ def _heading_off(triads, magnetic: dict[str, Any]) -> float | None:
 
 def _askable(windows: FieldWindows, triad) -> tuple[list[type[Effect]], dict[str, str]]:
     """Return the effects of a magnetometer that can be asked, and why others cannot."""
-    path, fitted = windows.path, {effect.name for effect in triad.effects}
-    inputs = {"temperature": (path.temperature, _LEAST_WARMING), "current": (path.current, _LEAST_CURRENT),
-              "angular_rate": (path.rate, 0.0)}  # fmt: skip
+    stimulus, fitted = windows.samples.track.stimulus, {effect.name for effect in triad.effects}
+    inputs = {"temperature": (stimulus.temperature, _LEAST_WARMING), "current": (stimulus.current, _LEAST_CURRENT),
+              "angular_rate": (stimulus.angular_rate, 0.0)}  # fmt: skip
     asked, refused = [], {}
     for kind in CATALOGUE.values():
         if kind.owner != "magnetometer" or kind.name in fitted:
@@ -271,7 +271,7 @@ def _askable(windows: FieldWindows, triad) -> tuple[list[type[Effect]], dict[str
 
 def _extent(windows: FieldWindows) -> Extent:
     edges = windows.time[1:, 0]
-    warm = windows.path.temperature
+    warm = windows.samples.track.stimulus.temperature
     span = 0.0 if warm is None else float(np.ptp(np.asarray(warm)))
     return Extent(float(np.ptp(windows.time)), tuple(edges[:: -(-len(edges) // _PLACES)].tolist()), span)
 

@@ -20,9 +20,8 @@ from jaximu.calibration.thermal_selection import folds_of
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.calibration.thermal_terms import HISTORY, RATES
 from jaximu.data import RestBlocks
-from jaximu.data.path import Path, terms, with_effect
-from jaximu.data.rest import block_means
 from jaximu.data.rest_blocks import rest_blocks
+from jaximu.data.track import Track, added, mean_outputs
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, State
@@ -138,21 +137,17 @@ class Resting(Experiment):
     def about(self, imu: Imu) -> About:
         """Return the mean outputs less those of one unit, the leading axis, and its effects' columns."""
         unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        bare, effects = unit.with_effects(), tuple(unit.all_effects().values())
-        paths = self._paths(bare)
-        output = self._outputs - (self._added(bare, paths, effects) if effects else 0.0)
-        conditions = RestingConditions(output[None], self._force(bare)[None], np.zeros(1))  # pyright: ignore[reportArgumentType]
-        return About(conditions, self._covariance, self.own_columns(unit, paths, output.size)[None], paths)
+        tracks = self._tracks(unit)
+        output = self._outputs - (self._added(unit, tracks) if unit.all_effects() else 0.0)
+        conditions = RestingConditions(output[None], self._force(unit)[None], np.zeros(1))  # pyright: ignore[reportArgumentType]
+        return About(conditions, self._covariance, self.own_columns(unit, tracks, output.size)[None], tracks)
 
-    def reactions(self, details: list[Path]):
+    def reactions(self, details: list[dict[str, Track]]):
         """Return how the mean outputs react to effects, recording by recording."""
         count = len(self.blocks)
 
-        def of(effect, imu, path):
-            both = [jnp.zeros((count, 3)) if each is None else
-                    block_means(each, path.accelerometer_pose, np.zeros(count + 1))[:count]
-                    for each in with_effect(imu, effect, path)]  # fmt: skip
-            return jnp.concatenate(both, axis=-1).reshape(-1)
+        def of(effect, imu, tracks):
+            return mean_outputs(tracks, added(imu.with_effects(effect), tracks), count).reshape(-1)
 
         return f"rest {count}", of, details
 
@@ -179,12 +174,12 @@ class Resting(Experiment):
         edges = np.sort(np.unique(self.blocks.start))[1:]
         every = -(-len(edges) // _PLACES)
         return Extent(
-            max(float(np.ptp(path[0])) for path in self.blocks.paths),
+            max(self.blocks.spans),
             tuple(float(edge) for edge in edges[::every]),
             float(np.ptp(self.blocks.range)),
         )
 
-    def paths(self, linear: Linear) -> list[Path]:
+    def tracks(self, linear: Linear) -> list[dict[str, Track]]:
         """Return what the unit went through, part by part."""
         return linear.details
 
@@ -197,7 +192,7 @@ class Resting(Experiment):
 
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's mean output."""
-        most = np.abs(self._added(state.imu, state.linear.details, (effect,))) / self._scale
+        most = np.abs(self._added(state.imu.with_effects(effect), state.linear.details)) / self._scale
         return {"accelerometer": float(most[:, :3].max()), "gyroscope": float(most[:, 3:].max())}
 
     def without(self, place: int) -> Resting:
@@ -289,19 +284,14 @@ class Resting(Experiment):
         group = np.tile(np.repeat([0, 1], 3), count)[None]
         return Covariance(whole.reshape(size, size)[None], factors, np.ones((1, size)), group)  # pyright: ignore[reportArgumentType]
 
-    def _paths(self, imu: Imu) -> list[Path]:
-        made = self.blocks.stimuli(self._force(imu), imu.accelerometer.temperature_reference)
-        return [Path(each, each, place, place, np.zeros((0, 0), np.int64)) for each, place in made]
+    def _tracks(self, imu: Imu) -> list[dict[str, Track]]:
+        made = self.blocks.tracks(self._force(imu), imu.accelerometer.temperature_reference)
+        return [dict.fromkeys(_TRIADS, track) for track in made]
 
-    def _added(self, imu: Imu, paths: Sequence[Path], effects: tuple[Effect, ...]) -> FloatArray:
-        """What the effects add to the mean outputs (n, 6)."""
-        count, total = len(self.blocks), np.zeros((len(self.blocks), 6))
-        for path in paths:
-            place = path.accelerometer_pose
-            added = terms(imu, path, effects, (len(place), len(place)))
-            both = np.concatenate([added.accelerometer, added.gyroscope], axis=1)
-            total += np.asarray(block_means(both, place, np.zeros(count + 1)))[:count]
-        return total
+    def _added(self, imu: Imu, tracks: Sequence[dict[str, Track]]) -> FloatArray:
+        """What the unit's effects add to the mean outputs (n, 6)."""
+        count = len(self.blocks)
+        return np.sum([np.asarray(mean_outputs(each, added(imu, each), count)) for each in tracks], axis=0)
 
 
 def diagnose_thermal(

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.turntable import calibrate_turntable, station_rms
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.observe_stations import observe_stations
-from jaximu.data.path import Path, padded, padded_places, stimuli, terms, with_effect
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.stations import KnownStations, StationConditions, station_covariances, station_rows
+from jaximu.data.track import Track, added, mean_outputs, stimuli
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, State
@@ -28,7 +27,7 @@ from jaximu.estimation.fitting import Linear
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.uncertainty import station_advice
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.mistakes import inspect
@@ -49,9 +48,9 @@ _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 
 @dataclass(frozen=True)
 class AtStations:
-    """Stations with what the effects add taken off their means, and the path that the unit went, sample by sample."""
+    """Stations with what the effects add taken off their means, and what the unit went through, sample by sample."""
 
-    path: Path
+    tracks: dict[str, Track]
     stations: Stations
 
 
@@ -78,12 +77,10 @@ class Turntable(Experiment):
     def about(self, imu: Imu) -> About:
         """Return the errors of the mean outputs of one unit, the leading axis, and its effects' columns."""
         unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        path, stations = station_path(self.recording, self.stations, unit.with_effects()), self.stations
-        effects = tuple(unit.all_effects().values())
-        if effects:
-            added = terms(unit.with_effects(), path, effects, self._lengths)
-            stations = self._without(self._means(added.accelerometer, added.gyroscope))
-        details = AtStations(path, stations)
+        tracks, stations = station_tracks(self.recording, self.stations, unit), self.stations
+        if unit.all_effects():
+            stations = self._without(self._means(tracks, added(unit, tracks)))
+        details = AtStations(tracks, stations)
         lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], stations)
         columns = self.own_columns(unit, details, 6 * len(stations.turn))
         return About(StationConditions(lifted), station_covariances(lifted), columns[None], details)
@@ -92,18 +89,10 @@ class Turntable(Experiment):
         """Return how the mean outputs react to effects."""
         count = len(self.stations.turn)
 
-        def means(values, station):
-            if values is None:
-                return jnp.zeros((count, 3))
-            number = jax.ops.segment_sum(jnp.ones_like(values[:, 0]), station, count + 1)[:count]
-            return jax.ops.segment_sum(values, station, count + 1)[:count] / jnp.maximum(number, 1.0)[:, None]
+        def of(effect, imu, tracks):
+            return mean_outputs(tracks, added(imu.with_effects(effect), tracks), count).reshape(-1)
 
-        def of(effect, imu, path):
-            force, rate = with_effect(imu, effect, path)
-            parts = [means(force, path.accelerometer_pose), means(rate, path.gyroscope_pose)]
-            return jnp.concatenate(parts, axis=-1).reshape(-1)
-
-        return f"stations {count}", of, [details.path]
+        return f"stations {count}", of, [details.tracks]
 
     def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause, and poses that were bumped."""
@@ -150,9 +139,9 @@ class Turntable(Experiment):
             0.0 if kelvin is None else float(np.ptp(kelvin.values)),
         )
 
-    def paths(self, linear: Linear) -> list[Path]:
+    def tracks(self, linear: Linear) -> list[dict[str, Track]]:
         """Return what the unit went through, part by part."""
-        return [linear.details.path]
+        return [linear.details.tracks]
 
     def lacks(self, linear: Linear) -> dict[str, str]:
         """Return fields of the stimulus that are not known along the path, and why."""
@@ -162,12 +151,14 @@ class Turntable(Experiment):
             "vibration_power": "the recording has no vibration that stands out",
             "attitude": "the reference does not state the attitude of every station",
         }
-        return {field: text for field, text in why.items() if getattr(linear.details.path.gyroscope, field) is None}
+        stimulus = linear.details.tracks["gyroscope"].stimulus
+        return {field: text for field, text in why.items() if getattr(stimulus, field) is None}
 
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's mean output."""
-        added = terms(state.imu, state.linear.details.path, [effect], self._lengths)
-        means = np.abs(self._means(added.accelerometer, added.gyroscope)[self.used] * self.real.to_si)
+        tracks = state.linear.details.tracks
+        means = self._means(tracks, added(state.imu.with_effects(effect), tracks))
+        means = np.abs(means[self.used] * self.real.to_si)
         force = self.real.kind == 0
         return {
             "accelerometer": float(np.max(means[force], initial=0.0)),
@@ -192,14 +183,14 @@ class Turntable(Experiment):
 
     def twin(self, state: State, noise: NoiseModel, seed: int) -> Turntable:
         """Return the recording as a fit without effects would have it, along the set-up's motion, noise included."""
-        changed, drawn = {}, []
+        changed, drawn, tracks = {}, {}, state.linear.details.tracks
         for number, (name, triad) in enumerate(state.imu.triads().items()):
             signal = getattr(self.recording, name)
-            true = np.asarray(getattr(getattr(state.linear.details.path, name), triad.quantity))[: len(signal)]
-            drawn.append(drawn_noise(getattr(noise, name), signal, [seed, number]) * signal.nominal_scale)
-            outputs = true @ np.asarray(triad.gain).T + np.asarray(triad.bias) + drawn[-1]
+            true = np.asarray(getattr(tracks[name].stimulus, triad.quantity))[: len(signal)]
+            drawn[name] = drawn_noise(getattr(noise, name), signal, [seed, number]) * signal.nominal_scale
+            outputs = true @ np.asarray(triad.gain).T + np.asarray(triad.bias) + drawn[name]
             changed[name] = replace(signal, values=outputs)
-        stations = self._without(state.linear.conditions - self._means(*drawn, *[None] * (2 - len(drawn))))
+        stations = self._without(state.linear.conditions - self._means(tracks, drawn))
         return Turntable(replace(self.recording, **changed, notes=()), stations, state.imu)
 
     def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
@@ -219,10 +210,6 @@ class Turntable(Experiment):
     def _real(self) -> NDArray[np.bool_]:
         return np.asarray(self.stations.accelerometer_used) | np.asarray(self.stations.gyroscope_used)
 
-    @property
-    def _lengths(self) -> tuple[int, int]:
-        return len(self.recording.accelerometer), len(self.recording.gyroscope or ())
-
     def _without(self, outputs: FloatArray) -> Stations:
         """Return the stations with mean outputs (6 S,) taken off."""
         force, rate = np.split(outputs.reshape(-1, 6), 2, axis=1)
@@ -232,22 +219,9 @@ class Turntable(Experiment):
             gyroscope_mean=np.asarray(self.stations.gyroscope_mean) - rate,
         )
 
-    def _means(self, force: FloatArray, rate: FloatArray | None) -> FloatArray:
+    def _means(self, tracks: dict[str, Track], outputs: Mapping[str, Array | FloatArray]) -> FloatArray:
         """Return the mean outputs (6 S,) over the stations, accelerometer and gyroscope of one after another."""
-        count = len(self.stations.turn)
-        means = np.zeros((count, 6))
-        for place, (values, signal) in enumerate(
-            ((force, self.recording.accelerometer), (rate, self.recording.gyroscope))
-        ):
-            if values is None or signal is None:
-                continue
-            station = station_of(signal.time, self.stations)
-            inside = station < count
-            number = np.maximum(np.bincount(station[inside], minlength=count), 1)
-            for axis in range(3):
-                sums = np.bincount(station[inside], values[inside, axis], minlength=count)
-                means[:, 3 * place + axis] = sums / number
-        return means.ravel()
+        return np.asarray(mean_outputs(tracks, outputs, len(self.stations.turn)), np.float64).ravel()
 
 
 def diagnose_turntable(
@@ -308,15 +282,15 @@ def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:
     return np.where(inside, order[place], len(stations.turn))
 
 
-def station_path(recording: Recording, stations: Stations, imu: Imu) -> Path:
+def station_tracks(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track]:
     """Return the stimulus at every sample: in a station as the set-up says, in between as `imu` measured it."""
-    parts = stimuli(recording, imu)
     count = len(stations.turn)
     real = np.flatnonzero(np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used))
     order = real[np.argsort(np.asarray(stations.start)[real])]
     nodes = jax.tree.map(lambda leaf: np.asarray(leaf)[order].reshape(-1, *np.shape(leaf)[2:]), stations.stimulus)
-    changed, station = [], []
-    for signal, known in parts:
+    tracks = {}
+    for name, known in stimuli(recording, imu).items():
+        signal = recording.signals[name]
         own = station_of(signal.time, stations)
         inside = own < count
         nearest = np.clip(np.searchsorted((nodes.time[1:] + nodes.time[:-1]) / 2, signal.time), 0, len(nodes.time) - 1)
@@ -332,6 +306,6 @@ def station_path(recording: Recording, stations: Stations, imu: Imu) -> Path:
         acceleration = np.gradient(said["angular_rate"], signal.time, axis=0)
         acceleration[pose] = 0.0
         attitude = None if nodes.attitude is None else nodes.attitude[nearest]
-        changed.append(padded(replace(known, **said, angular_acceleration=acceleration, attitude=attitude)))
-        station.append(padded_places(own, count))
-    return Path(changed[0], changed[1], station[0], station[1], np.zeros((0, 0), np.int64))
+        stimulus = replace(known, **said, angular_acceleration=acceleration, attitude=attitude)
+        tracks[name] = Track.padded(stimulus, own, count)
+    return tracks

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from jaximu.data.poses import RecordedByHand
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise import Noise
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import FirstOrderGaussMarkov, White
-from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import Segmentation
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.diagnosis import Diagnosis
@@ -28,49 +27,36 @@ def twin_of(diagnosis: Diagnosis, seed: int = 0) -> Experiment:
     return diagnosis.experiment.twin(diagnosis.base, diagnosis.noise, seed)
 
 
-def twin_recordings(
-    segmentations: Sequence[Segmentation],
-    observations: Observations,
-    shifts: FloatArray,
-    state: State,
-    noise: NoiseModel,
-    seed: int,
-) -> list[Recording]:
+def twin_recordings(recorded: RecordedByHand, state: State, noise: NoiseModel, seed: int) -> list[Recording]:
     """Return hand-held recordings as a fit would have them.
 
     At rest the unit lies in the estimated orientation, under exactly local gravity; in a turn it rotates as measured,
     corrected by what carries gravity from the one orientation exactly to the other. What it puts out is the base model
     without effects and noise drawn from the noise model, on the recording's own stamps. What noise the measured rates
-    of a turn held is motion to the twin. `shifts` (k, 3): what the observations took off each gyroscope's output.
+    of a turn held is motion to the twin.
     """
-    first = np.cumsum([0, *(len(part.intervals) for part in segmentations)])
+    first = np.cumsum([0, *(len(part.intervals) for part in recorded.segmentations)])
     return [
-        _simulated(part, place, int(first[place]), observations, shift, state, noise, seed)
-        for place, (part, shift) in enumerate(zip(segmentations, shifts, strict=True))
+        _simulated(recorded, place, int(first[place]), state, noise, seed)
+        for place in range(len(recorded.segmentations))
     ]
 
 
 def _simulated(
-    part: Segmentation,
-    place: int,
-    first: int,
-    observations: Observations,
-    shift: FloatArray,
-    state: State,
-    noise: NoiseModel,
-    seed: int,
+    recorded: RecordedByHand, place: int, first: int, state: State, noise: NoiseModel, seed: int
 ) -> Recording:
-    recording, path = part.recording, state.linear.details.path[place]
+    part, observations = recorded.segmentations[place], recorded.observations
+    recording, tracks = part.recording, state.linear.details.tracks[place]
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
     assert gyroscope is not None and noise.gyroscope is not None and state.imu.gyroscope is not None
     gravity = float(observations.gravity)
-    force = np.array(path.accelerometer.specific_force)[: len(accelerometer)]
-    pose = np.asarray(path.accelerometer_pose)[: len(accelerometer)]
+    force = np.array(tracks["accelerometer"].stimulus.specific_force)[: len(accelerometer)]
+    pose = np.asarray(tracks["accelerometer"].observation)[: len(accelerometer)]
     padded = len(observations.poses.mask)
     at_rest = pose < padded
     force[at_rest] *= gravity / np.linalg.norm(force[at_rest], axis=1, keepdims=True)
-    rate = np.array(path.gyroscope.angular_rate)[: len(gyroscope)]
-    attitude = np.asarray(path.gyroscope.attitude)[: len(gyroscope)]
+    rate = np.array(tracks["gyroscope"].stimulus.angular_rate)[: len(gyroscope)]
+    attitude = np.asarray(tracks["gyroscope"].stimulus.attitude)[: len(gyroscope)]
     up = np.zeros((padded, 3))
     for k in range(padded):
         if (pose == k).any():
@@ -78,7 +64,7 @@ def _simulated(
     turns = observations.turns
     for k in range(first, first + len(part.intervals) - 1):
         if np.asarray(turns.mask)[k]:
-            inside = np.asarray(path.turn_sample)[k][np.asarray(turns.interval)[k] > 0]
+            inside = recorded.turn_samples[place][k][np.asarray(turns.interval)[k] > 0]
             rate[inside] += _correction(attitude[inside], up[k + 1], float(np.sum(turns.interval[k])))
     drawn = [
         drawn_noise(axis_noise, signal, [seed, place, number])
@@ -96,7 +82,7 @@ def _simulated(
     return replace(
         recording,
         accelerometer=replace(accelerometer, values=outputs[0]),
-        gyroscope=replace(gyroscope, values=outputs[1] + shift),
+        gyroscope=replace(gyroscope, values=outputs[1] + recorded.shifts[place]),
         notes=(),
     )
 
@@ -107,21 +93,13 @@ def _correction(attitude: FloatArray, after: FloatArray, duration: float) -> Flo
     `attitude` (n, 4) is the body's after each sample, level at the start; to first order a rotation δ of the last frame
     is the sum of the rates' parts brought there.
     """
-    matrix = _matrices(attitude)  # body to level
+    matrix = Rotation.from_quat(attitude, scalar_first=True).as_matrix()  # body to level
     lab = np.array([0.0, 0.0, 1.0])
     carried = matrix[-1].T @ lab
     delta = np.cross(after, carried)  # turning the frame by δ moves a fixed direction by −δ × u
     # δ in the last frame is R_kᵀ-transported to each sample's own frame
     back = np.einsum("nji,jk,k->ni", matrix, matrix[-1], delta)
     return back / max(duration, 1e-9)
-
-
-def _matrices(quaternion: FloatArray) -> FloatArray:
-    w, x, y, z = quaternion.T
-    return np.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1).reshape(-1, 3, 3)  # fmt: skip
 
 
 def drawn_noise(noise: AxisNoise, signal: Signal, seed: list[int]) -> FloatArray:

@@ -63,7 +63,7 @@ def forget() -> None:
 def _code() -> str:
     """A digest of the library's source and of what it is compiled with and for: any change makes a new entry."""
     digest = hashlib.sha256(repr(_machine()).encode())
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -103,8 +103,11 @@ def _options(quick: bool) -> dict[str, bool | int | str]:
     return known
 
 
-def compiled(function: F) -> F:
-    """Decorate a function of arrays in any structure: compiled for their shapes, kept, and inlined under a trace."""
+def compiled(function: F, quick: bool = False) -> F:
+    """Decorate a function of arrays in any structure: compiled for their shapes, kept, and inlined under a trace.
+
+    `quick`: as of `call`.
+    """
     description = f"{function.__module__}.{function.__qualname__}"
 
     @wraps(function)
@@ -114,7 +117,7 @@ def compiled(function: F) -> F:
 
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
             return function(*arguments)
-        return _called(function, description, *arguments, quick=False)
+        return _called(function, description, *arguments, quick=quick)
 
     return cast(F, run)
 

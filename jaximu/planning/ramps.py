@@ -16,6 +16,8 @@ import numpy as np
 from jaximu.calibration.identifiability import ENOUGH, Separation, separated
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.data.rest_blocks import RestBlocks, joined
+from jaximu.data.track import Track
+from jaximu.model.stimulus import Stimulus
 
 __all__ = ["Ramp", "next_ramps"]
 
@@ -46,7 +48,7 @@ def next_ramps(blocks: RestBlocks) -> tuple[dict[str, Separation], tuple[Ramp, .
     low, high = blocks.range
     legs = blocks.legs()
     rate = float(np.median([abs(leg.rate) for leg in legs]))
-    length = sum(float(np.ptp(path[0])) for path in blocks.paths)
+    length = sum(blocks.spans)
     shapes = ThermalShapes(blocks, float(np.mean(blocks.range)))
     now = separated(shapes)
     weak = [name for name, each in now.items() if each.apart < ENOUGH] or list(now)
@@ -77,6 +79,7 @@ def _with(blocks: RestBlocks, ends: Sequence[float], rate: float) -> tuple[RestB
     celsius, rates = (values.reshape(count, 8).mean(axis=1) for values in (path, slope))
     means = {name: np.tile(values[-1], (count, 1)) for name, values in blocks.means.items()}
     none = np.zeros(count, np.int64)
+    track = Track(Stimulus(temperature=path, temperature_rate=slope, time=time), np.arange(8 * count) // 8)
     more = RestBlocks((), edges[:-1:8], edges[8::8], none, none, celsius, rates, means,
-                      ((time, path, slope, np.arange(8 * count) // 8),), None, blocks.duration, 0, ())  # fmt: skip
+                      (track,), None, blocks.duration, 0, ())  # fmt: skip
     return joined([blocks, more]), float(knots[-1])
