@@ -392,7 +392,7 @@ class AgainstAttitude(Data):
         time = self.attitude.time + self.offset
         stamps = np.clip(mounting.on_reference(np.asarray(known.time)), *time[[0, -1]])
         stood = scipy.spatial.transform.Slerp(time, self.attitude.rotation())(stamps)
-        stood = stood * scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation)
+        stood = stood * scipy.spatial.transform.Rotation.from_rotvec(np.array(mounting.rotation))
         return replace(known, attitude=stood.as_quat(scalar_first=True))
 
     def about(self, imu: Imu) -> About:

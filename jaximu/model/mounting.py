@@ -11,6 +11,7 @@ from jaxtyping import ArrayLike, Float
 
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, multiply
+from jaximu.ground.stored import compiled
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.clock_scale import SetupClockScale
 from jaximu.model.effects.lever_arm import AccelLeverArm
@@ -90,10 +91,12 @@ class Mounting(NamedTuple):
         """Return the rotations by which a unit stands behind what a smoothed reference says."""
         return exponential(behind(self.filter_variance, acceleration, jerk))
 
+    @compiled
     def unit_attitude(self, reported: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
         """Return the unit's attitude, to the level frame, from the one that the reference reports."""
         return multiply(self.tilted, multiply(reported, self.turned))
 
+    @compiled
     def reported(self, attitude: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
         """Return what a reference reports of a unit that stands so."""
         return multiply(conjugate(self.tilted), multiply(attitude, conjugate(self.turned)))
