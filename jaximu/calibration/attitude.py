@@ -208,8 +208,9 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     rate, slope = np.asarray(data.rate) @ matrix[:, :3].T + matrix[:, 3], np.asarray(data.slope) @ matrix[:, :3].T
     spread = abs(float(Mounting.of(imu).filter_variance))
     late = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
-    place = [kind.name for kind in imu.setup].index(SetupReferenceDelay.name)
-    return np.diag([late**2 if (name.owner, name.effect) == ("setup", place) else 0.0 for name in calibration.names])
+    effects = imu.all_effects()
+    delayed = [isinstance(effects.get((name.owner, name.effect)), SetupReferenceDelay) for name in calibration.names]
+    return late**2 * np.diag(delayed)
 
 
 def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect], unit: Imu | None = None) -> Imu:
