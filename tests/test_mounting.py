@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaximu.model.effects.reference_filter import SetupReferenceFilter
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
@@ -65,19 +64,3 @@ def test_attitudes_turn_as_scipy_and_the_effects_turn_them(unit):
     path = Stimulus(still, still, attitude=reported, time=np.arange(5.0))
     askew = Imu.nominal().with_effects(*Mounting.effects(rotation=START["rotation"], tilt=START["tilt"]))
     np.testing.assert_allclose(askew.acted(path, "specific_force").attitude, turned, atol=1e-12)
-
-
-def test_a_smoothed_reference_is_sharpened_as_the_effect_does(unit):
-    """The rate grows evenly about one axis, so that all that is left of the filter is its variance."""
-    times = np.linspace(0.0, 1.0, 11)
-    acceleration = np.tile([0.0, 0.0, 0.8], (11, 1))
-    attitudes = Rotation.from_rotvec(acceleration * times[:, None] ** 2 / 2)
-    path = Stimulus(
-        None, acceleration * times[:, None], acceleration, time=times, attitude=attitudes.as_quat(scalar_first=True)
-    )
-    smoothed = Imu.nominal().with_effects(SetupReferenceFilter.make(4e-4))
-    behind = Rotation.from_quat(Mounting.of(unit).sharpened(acceleration, 0 * acceleration), scalar_first=True)
-    true = Rotation.from_quat(smoothed.acted(path, "angular_rate").attitude, scalar_first=True)
-    expected = attitudes * behind
-    np.testing.assert_allclose(true.as_quat(), expected.as_quat(), atol=1e-12)
-    np.testing.assert_allclose(behind.as_rotvec(), -2e-4 * acceleration, atol=1e-12)

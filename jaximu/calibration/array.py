@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
-from jaximu.calibration.attitude import delay_of_speeds, mounting_covariance
+from jaximu.calibration.attitude import delay_of_speeds, fitted_mounting
 from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import calibrate
@@ -263,8 +263,7 @@ def _unit(
     name: str, calibration: Calibration, found: Fit, delay: float, motion: Stations
 ) -> tuple[ArrayUnit, FloatArray]:
     """Return what the fit says of a unit, and its errors in motion."""
-    mounting = Mounting.of(found.model)
-    covariance = mounting_covariance(found.model, found.names, found.covariance)
+    mounting, covariance = fitted_mounting(found.model, found.names, found.covariance)
     turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation)
     own, back = np.asarray(right_jacobian(mounting.rotation)), turned.as_matrix()
     errors = {each.name: each.error for each in station_errors(found.model, motion, np.zeros(3))}

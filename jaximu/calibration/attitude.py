@@ -37,8 +37,14 @@ from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral
 
-__all__ = ["Mounted", "calibrate_against_attitude", "delay_of_speeds", "mounted_on",
-           "mounting_covariance", "reference_summary"]  # fmt: skip
+__all__ = [
+    "Mounted",
+    "calibrate_against_attitude",
+    "delay_of_speeds",
+    "fitted_mounting",
+    "mounted_on",
+    "reference_summary",
+]
 
 _NEAR = 10.0
 """Seconds within which the reference's clock is believed, unless another offset explains far more."""
@@ -232,21 +238,20 @@ def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]
             for name, (_, error, unit) in measurement.errors(imu).items()}  # fmt: skip
 
 
-def mounting_covariance(imu: Imu, names: Sequence[Name], covariance: FloatArray) -> Mounting:
-    """Return the covariance (q, q) of each field of a unit's mounting; zero where it was not fitted."""
+def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: FloatArray) -> tuple[Mounting, Mounting]:
+    """Return a unit's mounting, and the covariance (q, q) of each of its fields; zero where it was not fitted."""
     effects = imu.all_effects()
 
     def of(kind):
         rows = [row for row, name in enumerate(names) if isinstance(effects.get((name.owner, name.effect)), kind)]
         return covariance[np.ix_(rows, rows)] if rows else np.zeros((kind.size, kind.size))
 
-    return Mounting(*map(of, MOUNTING_EFFECTS))
+    return Mounting.of(imu), Mounting(*map(of, MOUNTING_EFFECTS))
 
 
 def reference_summary(calibration: Calibration) -> dict[str, Any]:
     """Return what `calibration.json` says of the reference; the lever arm is from it to the unit, in its axes."""
-    mounting = Mounting.of(calibration.imu)
-    covariance = mounting_covariance(calibration.imu, calibration.names, calibration.covariance)
+    mounting, covariance = fitted_mounting(calibration.imu, calibration.names, calibration.covariance)
     turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation)
     matrix = turned.as_matrix()
     arm = {

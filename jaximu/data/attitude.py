@@ -30,6 +30,7 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotate, rotation_matrix
 from jaximu.model.effects import Effect
+from jaximu.model.effects.reference_filter import behind
 from jaximu.model.mounting import Mounting
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
@@ -173,7 +174,7 @@ def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Ar
         jnp.stack([jnp.interp(stamps, time, axis) for axis in slope.T], axis=-1) @ matrix.T
         for slope in (data.slope, data.curve)
     )
-    return Mounting.of(imu).sharpened(acceleration, jerk)
+    return exponential(behind(Mounting.of(imu).filter_variance, acceleration, jerk))
 
 
 def reference_sigmas(excess: Mapping[str, float]) -> tuple[float, float]:

@@ -91,8 +91,8 @@ class AttitudeSeen(Sighting):
 
     def off(self, standing: Standing, mounting: Mounting) -> Float[Array, 3]:
         """Return the rotation vector, in the reference's body, from what was measured to what it should be (rad)."""
-        unit = standing.after(self._ahead(mounting)).attitude
-        return logarithm(multiply(conjugate(self.value), mounting.reported(unit)))
+        expected = mounting.reported(standing.after(self._ahead(mounting)).attitude)
+        return logarithm(multiply(conjugate(self.value), expected))
 
     def placed(self, attitude: Float[Array, 4], mounting: Mounting) -> Float[Array, 4]:
         """Return the unit's attitude, to the level frame, as the reference has it."""

@@ -17,7 +17,7 @@ from jaximu.model.effects.clock_scale import SetupClockScale
 from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.model.effects.reference_delay import SetupReferenceDelay
-from jaximu.model.effects.reference_filter import SetupReferenceFilter, behind
+from jaximu.model.effects.reference_filter import SetupReferenceFilter
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.sensor import Imu
@@ -53,8 +53,8 @@ class Mounting(NamedTuple):
     @classmethod
     def of(cls, imu: Imu) -> Mounting:
         """Return what the effects of a unit say."""
-        numbers = (imu.coefficients(kind) for kind in MOUNTING_EFFECTS)
-        return cls(*(each[0] if len(each) == 1 else each for each in numbers))
+        coefficients = map(imu.coefficients, MOUNTING_EFFECTS)
+        return cls(*(numbers[0] if len(numbers) == 1 else numbers for numbers in coefficients))
 
     @classmethod
     def from_numbers(cls, numbers: Float[Array, " q"]) -> Mounting:
@@ -64,8 +64,7 @@ class Mounting(NamedTuple):
     @staticmethod
     def effects(duration: float = 0.0, **start: ArrayLike) -> tuple[Effect, ...]:
         """Return the effects of these fields, from start values; over a long `duration` (s) the clocks' too."""
-        if duration > _LONG:
-            start["clock_scale"] = 0.0
+        start |= {"clock_scale": 0.0} if duration > _LONG else {}
         kinds = zip(Mounting._fields, MOUNTING_EFFECTS, strict=True)
         return tuple(kind.make(start[name]) for name, kind in kinds if name in start)
 
@@ -86,10 +85,6 @@ class Mounting(NamedTuple):
     def tilted(self) -> Float[Array, 4]:
         """The rotation from the reference's level frame to the one that is level."""
         return exponential(jnp.append(self.tilt, 0.0))
-
-    def sharpened(self, acceleration: Float[Array, "... 3"], jerk: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
-        """Return the rotations by which a unit stands behind what a smoothed reference says."""
-        return exponential(behind(self.filter_variance, acceleration, jerk))
 
     @compiled
     def unit_attitude(self, reported: Float[Array, "... 4"]) -> Float[Array, "... 4"]:

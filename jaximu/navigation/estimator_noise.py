@@ -193,9 +193,8 @@ class MeasuredErrors:
             measurement.around(found.imu), specific_force=None, angular_rate=None, angular_acceleration=None
         )
         force, rate = compiled(Imu.recover)(replace(found.imu, setup=()), data.force, data.rate, beside)
-        rotations = scipy.spatial.transform.Rotation
-        tilt = rotations.from_rotvec(np.append(mounting.tilt, 0.0))
-        whole = rotations.from_quat(np.asarray(mounting.unit_attitude(known.quaternion)), scalar_first=True)
+        tilt = scipy.spatial.transform.Rotation.from_rotvec(np.append(mounting.tilt, 0.0))
+        whole = replace(known, quaternion=np.asarray(mounting.unit_attitude(known.quaternion))).rotation()
         velocity = known.velocities()
         stamp = np.asarray(mounting.on_log(known.time))
         felt = np.stack([np.interp(stamp, middle, each) for each in np.asarray(force).T], axis=1)
