@@ -28,6 +28,7 @@ from jaximu.ground.rotation import exponential, multiply
 from jaximu.model import Noise, White
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.earth_rotation import EARTH_RATE
+from jaximu.model.mounting import Mounting
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings import write_recording
@@ -144,7 +145,7 @@ def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(protoco
     recording, truth = simulate(imu, PROTOCOLS[protocol], white, rate=50.0, seed=5)
     seen, first = (tracked(recording, truth, 5, moving=True), 0.5) if protocol == "tracked" else (None, 1e-3)
     field = field_of(*magnetic(recording, truth)[::-1]) if protocol == "magnetic" else None
-    intervals, _ = cut(recording, truth.intervals, attitude=seen, clock=(LATE, 0.0), field=field)
+    intervals, _ = cut(recording, truth.intervals, attitude=seen, mounting=Mounting(delay=LATE), field=field)
     errors = replace(
         disturbed(drifts, grade), reference=np.float64(NOISE_OF_TRACKER), velocity=np.float64(SPEED_NOISE),
         field=np.float64(FIELD_NOISE),
@@ -355,7 +356,7 @@ def test_what_is_measured_from_outside_has_the_derivatives_of_what_it_means(reco
              "setup.reference_rotation": TURNED, "setup.table_tilt": TILT}  # fmt: skip
     imu = imu.with_effects(*(CATALOGUE[name].make(each) for name, each in setup.items()))
     moving = replace(tracker, velocity=np.sin(tracker.time[:, None] + [0.0, 1.0, 2.0]))
-    intervals, _ = cut(recording, rests, attitude=moving, clock=(LATE, 0.0))
+    intervals, _ = cut(recording, rests, attitude=moving, mounting=Mounting(delay=LATE))
     chosen = np.asarray(intervals.sightings[0].measured) > np.asarray(intervals.rest)
     part = jax.tree.map(lambda leaf: np.asarray(leaf)[int(np.flatnonzero(chosen)[3])], intervals)
     numbers, (seen, speed) = np.asarray(ravel_pytree(imu)[0]), part.sightings
@@ -448,7 +449,7 @@ def test_a_measured_velocity_tightens_the_accelerometer_where_rests_are_few(reco
     unit = imu.with_effects(*(CATALOGUE[name].make(each) for name, each in setup.items()))
     fits = []
     for attitude in (said, replace(said, velocity=None)):
-        intervals, notes = cut(recording, rests[[0, -1]], attitude=attitude, clock=(LATE, 0.0))
+        intervals, notes = cut(recording, rests[[0, -1]], attitude=attitude, mounting=Mounting(delay=LATE))
         assert notes == [] and not np.any(intervals.restart)
         measurement = IntervalsOfMotion(intervals, errors, GRAVITY.value)
         fits.append(fit(unit, measurement, without_equipment, follow=True, estimate_excess=False, excess=(0.0,)))
@@ -539,10 +540,10 @@ def test_a_measured_attitude_carries_through_long_motion(recorded):
     assert apart[2, 0] - apart[1, 1] > 30.0
     alone, left_out = cut(recording, apart)
     assert any("left out" in note for note in left_out) and np.sum(alone.restart) == 1
-    seen, notes = cut(recording, apart, attitude=tracker, clock=(LATE, 0.0))
+    seen, notes = cut(recording, apart, attitude=tracker, mounting=Mounting(delay=LATE))
     assert notes == [] and np.sum(seen.restart) == 0
     lost = replace(tracker, time=tracker.time[:100], quaternion=tracker.quaternion[:100])
-    assert np.sum(cut(recording, apart, attitude=lost, clock=(LATE, 0.0))[0].restart) == 1
+    assert np.sum(cut(recording, apart, attitude=lost, mounting=Mounting(delay=LATE))[0].restart) == 1
 
 
 def test_the_attitude_of_another_body_is_refused(recorded):

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
-from jaximu.calibration.attitude import delay_of_speeds
+from jaximu.calibration.attitude import delay_of_speeds, fitted_mounting
 from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import calibrate
@@ -23,7 +23,7 @@ from jaximu.calibration.refusals import require_solved
 from jaximu.calibration.turntable import station_errors
 from jaximu.data.shared_motion import shared_stations
 from jaximu.data.stations import KnownStations
-from jaximu.estimation.fitting import Fit, Prior, fit, fitted_effect
+from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.problem import Loss, flatten, names_of, typical_sizes
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -31,10 +31,7 @@ from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import right_jacobian
 from jaximu.mistakes import prepare
-from jaximu.model.effects.clock_scale import SetupClockScale
-from jaximu.model.effects.lever_arm import AccelLeverArm
-from jaximu.model.effects.reference_delay import SetupReferenceDelay
-from jaximu.model.effects.reference_rotation import SetupReferenceRotation
+from jaximu.model.mounting import Mounting
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.alignment import turning_best
@@ -49,8 +46,6 @@ _WINDOWS = 128
 """Intervals of motion in which two units are compared."""
 _LENGTH = 8
 """Samples of the slower unit in such an interval: short beside a quick turn, long beside a sample's noise."""
-_LONG = 300.0
-"""Seconds from which on clocks may drift apart by what can be told."""
 _NEAR = 3
 """Samples from a window within which all units must have measured: what is interpolated there reaches into it."""
 _SLOW = np.radians(3.0)
@@ -195,9 +190,7 @@ def _pair(
     """Return a unit of the array, and its errors (S, 6), m/s² and rad/s, less the first's, in the first's axes."""
     back = _rotation(shared, corrected, delay)
     turned = scipy.spatial.transform.Rotation.from_matrix(back)
-    setup = [SetupReferenceRotation.make(turned.as_rotvec()), SetupReferenceDelay.dormant(), AccelLeverArm.dormant()]
-    if float(np.ptp(shared.moving)) > _LONG:
-        setup.append(SetupClockScale.dormant())
+    setup = Mounting.effects(np.ptp(shared.moving), rotation=turned.as_rotvec(), delay=0.0, lever_arm=0.0)
     start = jax.tree.map(np.asarray, calibration.imu.with_effects(*setup))
     noise = _noise(recording, shared, start, back, delay)
     stations = [
@@ -270,21 +263,18 @@ def _unit(
     name: str, calibration: Calibration, found: Fit, delay: float, motion: Stations
 ) -> tuple[ArrayUnit, FloatArray]:
     """Return what the fit says of a unit, and its errors in motion."""
-    (vector, spread), (arm, arm_spread), ((late,), late_spread), ((fast,), _) = (
-        fitted_effect(kind, found.model, found.names, found.covariance)
-        for kind in (SetupReferenceRotation, AccelLeverArm, SetupReferenceDelay, SetupClockScale)
-    )
-    turned = scipy.spatial.transform.Rotation.from_rotvec(vector)
-    own, back = np.asarray(right_jacobian(vector)), turned.as_matrix()
+    mounting, covariance = fitted_mounting(found.model, found.names, found.covariance)
+    turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation)
+    own, back = np.asarray(right_jacobian(mounting.rotation)), turned.as_matrix()
     errors = {each.name: each.error for each in station_errors(found.model, motion, np.zeros(3))}
     length = np.asarray(motion.stop - motion.start)[np.asarray(motion.gyroscope_used)]
     both = np.concatenate([back @ errors["specific_force"], back @ (np.radians(errors["turn_angle"]) / length)]).T
     rms = [float(np.sqrt(np.mean(both[:, columns] ** 2))) for columns in (slice(3, 6), slice(3))]
     unit = ArrayUnit(
         name, calibration, turned.inv().as_quat(canonical=True, scalar_first=True),
-        np.sqrt(np.diagonal(own @ spread @ own.T)), back @ arm, np.sqrt(np.diagonal(back @ arm_spread @ back.T)),
-        -(delay + float(late)), float(np.sqrt(late_spread[0, 0])),
-        float(fast), (rms[0], rms[1]),
+        np.sqrt(np.diagonal(own @ covariance.rotation @ own.T)), back @ mounting.lever_arm,
+        np.sqrt(np.diagonal(back @ covariance.lever_arm @ back.T)), -(delay + float(mounting.delay)),
+        float(np.sqrt(covariance.delay[0, 0])), float(mounting.clock_scale), (rms[0], rms[1]),
     )  # fmt: skip
     return unit, both
 

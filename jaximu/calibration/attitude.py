@@ -17,8 +17,7 @@ from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
 from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, reference_sigmas
 from jaximu.data.field import white_noise
-from jaximu.data.sightings import FROM_OUTSIDE
-from jaximu.estimation.fitting import Prior, fit, fitted_effect
+from jaximu.estimation.fitting import Prior, fit
 from jaximu.estimation.problem import Loss, Name
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray
@@ -27,12 +26,9 @@ from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.mistakes import prepared
 from jaximu.model.effects import Effect
-from jaximu.model.effects.clock_scale import SetupClockScale
-from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.reference_delay import SetupReferenceDelay
 from jaximu.model.effects.reference_filter import SetupReferenceFilter
-from jaximu.model.effects.reference_rotation import SetupReferenceRotation
-from jaximu.model.effects.table_tilt import SetupTableTilt
+from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
@@ -41,7 +37,14 @@ from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral
 
-__all__ = ["Mounted", "calibrate_against_attitude", "delay_of_speeds", "mounted_on", "reference_summary"]
+__all__ = [
+    "Mounted",
+    "calibrate_against_attitude",
+    "delay_of_speeds",
+    "fitted_mounting",
+    "mounted_on",
+    "reference_summary",
+]
 
 _NEAR = 10.0
 """Seconds within which the reference's clock is believed, unless another offset explains far more."""
@@ -56,10 +59,6 @@ _CLEAR = 0.9
 _BACK, _LAST = np.array([1.0, -1.0, -1.0, -1.0]), [3, 0, 1, 2]
 _LEAST = np.radians(3.0)
 """rad/s, rms: a reference that turns less stands still."""
-_LONG = 300.0
-"""Seconds from which on clocks may drift apart by what can be told."""
-
-
 _AGAINST, _CHANCE = 0.5, 4.0
 """Correlation beyond which velocities that run against the felt force are taken to be turned round, and how many of its
 standard deviations by chance that must be."""
@@ -164,13 +163,13 @@ def calibrate_against_attitude(
 class Mounted:
     """A reference as it stands to a unit.
 
-    attitude: as it is to be read, without its own smoothing, on the recording's zero of time; late by `clock`: s, and
-    the scale of the clocks. effects: of the set-up, as they were found. sigmas: of its attitude (rad) and velocity
-    (m/s), each axis. summary: what `calibration.json` says of it.
+    attitude: as it is to be read, without its own smoothing, on the recording's zero of time. mounting: of it, and
+    effects: that say so to a unit. sigmas: of its attitude (rad) and velocity (m/s), each axis. summary: what
+    `calibration.json` says of it.
     """
 
     attitude: Attitude
-    clock: tuple[float, float]
+    mounting: Mounting
     effects: tuple[Effect, ...]
     sigmas: tuple[float, float]
     summary: Mapping[str, Any]
@@ -184,14 +183,14 @@ def mounted_on(
     Raises as that does.
     """
     found, how = calibrate_against_attitude(recording, attitude, gravity, static=noise, unit=unit)
-    effects = tuple(each for each in found.imu.all_effects().values() if isinstance(each, FROM_OUTSIDE))
-    late, scale = (float(found.imu.coefficients(kind)[0]) for kind in (SetupReferenceDelay, SetupClockScale))
+    sharp_unit = found.imu.without(SetupReferenceFilter)
+    effects = tuple(effect for effect in sharp_unit.all_effects().values() if isinstance(effect, MOUNTING_EFFECTS))
     assert found.reference is not None
     still, fast = reference_sigmas(found.excess)
     sharp = how.unsmoothed(found.imu)
     if (velocity := sharp.velocities()) is not None:  # few windows of force show it, its samples more
         fast = max(fast, white_noise(Signal(sharp.time, velocity, "m/s")))
-    return Mounted(sharp, (late, scale), effects, (still, fast), found.reference)
+    return Mounted(sharp, Mounting.of(sharp_unit), effects, (still, fast), found.reference)
 
 
 _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis up and down for a while."
@@ -213,21 +212,20 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     assert imu.gyroscope is not None
     matrix = np.asarray(imu.gyroscope.inverse())
     rate, slope = np.asarray(data.rate) @ matrix[:, :3].T + matrix[:, 3], np.asarray(data.slope) @ matrix[:, :3].T
-    spread = abs(float(imu.coefficients(SetupReferenceFilter)[0]))
+    spread = abs(float(Mounting.of(imu).filter_variance))
     late = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
-    place = [kind.name for kind in imu.setup].index(SetupReferenceDelay.name)
-    return np.diag([late**2 if (name.owner, name.effect) == ("setup", place) else 0.0 for name in calibration.names])
+    effects = imu.all_effects()
+    delayed = [isinstance(effects.get((name.owner, name.effect)), SetupReferenceDelay) for name in calibration.names]
+    return late**2 * np.diag(delayed)
 
 
 def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect], unit: Imu | None = None) -> Imu:
     """Return the unit, the data sheet's if None, under the reference as it was coarsely aligned."""
     turned = scipy.spatial.transform.Rotation.from_matrix(begun.matrix.T).as_rotvec()
-    setup = [SetupReferenceRotation.make(turned), SetupReferenceDelay.make(begun.delay), SetupTableTilt.dormant(),
-             SetupReferenceFilter.dormant()]  # fmt: skip
-    if begun.attitude.velocities() is not None:
-        setup.append(AccelLeverArm.dormant())
-    if float(np.ptp(recording.accelerometer.time)) > _LONG:
-        setup.append(SetupClockScale.dormant())
+    arm = {} if begun.attitude.velocities() is None else {"lever_arm": 0.0}
+    setup = Mounting.effects(
+        np.ptp(recording.accelerometer.time), rotation=turned, delay=begun.delay, tilt=0.0, filter_variance=0.0, **arm
+    )
     imu = as_stated(recording) if unit is None else unit.transferable()
     if unit is None and imu.gyroscope is not None:
         imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ begun.arranged))
@@ -240,24 +238,37 @@ def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]
             for name, (_, error, unit) in measurement.errors(imu).items()}  # fmt: skip
 
 
+def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: FloatArray) -> tuple[Mounting, Mounting]:
+    """Return a unit's mounting, and the covariance (q, q) of each of its fields; zero where it was not fitted."""
+    effects = imu.all_effects()
+
+    def of(kind):
+        rows = [row for row, name in enumerate(names) if isinstance(effects.get((name.owner, name.effect)), kind)]
+        return covariance[np.ix_(rows, rows)] if rows else np.zeros((kind.size, kind.size))
+
+    return Mounting.of(imu), Mounting(*map(of, MOUNTING_EFFECTS))
+
+
 def reference_summary(calibration: Calibration) -> dict[str, Any]:
     """Return what `calibration.json` says of the reference; the lever arm is from it to the unit, in its axes."""
-    (turned, _), (late, spread), (fast, _), (wide, unsure), (arm, beside) = (
-        fitted_effect(kind, calibration.imu, calibration.names, calibration.covariance)
-        for kind in (
-            SetupReferenceRotation, SetupReferenceDelay, SetupClockScale, SetupReferenceFilter, AccelLeverArm
-        )
-    )  # fmt: skip
-    mounted = scipy.spatial.transform.Rotation.from_rotvec(turned)
-    matrix = mounted.as_matrix()
-    placed = {"value": (matrix @ arm).tolist(), "sigma": np.sqrt(np.diag(matrix @ beside @ matrix.T)).tolist(),
-              "unit": "m"}  # fmt: skip
+    mounting, covariance = fitted_mounting(calibration.imu, calibration.names, calibration.covariance)
+    turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation)
+    matrix = turned.as_matrix()
+    arm = {
+        "value": (matrix @ mounting.lever_arm).tolist(),
+        "sigma": np.sqrt(np.diag(matrix @ covariance.lever_arm @ matrix.T)).tolist(),
+        "unit": "m",
+    }
     return {
-        "rotation": mounted.inv().as_quat(canonical=True, scalar_first=True).tolist(),
-        "time_offset": {"value": float(late[0]), "sigma": float(np.sqrt(spread[0, 0])), "unit": "s"},
-        "clock_scale": 1.0 + float(fast[0]),
-        "filter": {"variance": float(wide[0]), "sigma": float(np.sqrt(unsure[0, 0])), "unit": "s^2"},
-        "lever_arm": placed if beside.any() else None,
+        "rotation": turned.inv().as_quat(canonical=True, scalar_first=True).tolist(),
+        "time_offset": {"value": float(mounting.delay), "sigma": float(np.sqrt(covariance.delay[0, 0])), "unit": "s"},
+        "clock_scale": 1.0 + float(mounting.clock_scale),
+        "filter": {
+            "variance": float(mounting.filter_variance),
+            "sigma": float(np.sqrt(covariance.filter_variance[0, 0])),
+            "unit": "s^2",
+        },
+        "lever_arm": arm if covariance.lever_arm.any() else None,
         "residual_rms": {name: {"value": after, "unit": unit} for name, (_, after, unit) in calibration.rms.items()},
         "open": [weak.text for weak in calibration.weak],
     }
@@ -379,9 +390,9 @@ def _same_unit(recording: Recording, begun: _Start, imu: Imu) -> list[str]:
     """
     gyroscope = recording.gyroscope
     assert gyroscope is not None
-    delay, turned = (np.array(imu.coefficients(kind)) for kind in (SetupReferenceDelay, SetupReferenceRotation))
-    mounting = scipy.spatial.transform.Rotation.from_rotvec(turned).as_matrix()
-    unit, said, time = _rates(recording, begun.attitude, float(delay[0]))
+    mounting = Mounting.of(imu)
+    turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation).as_matrix()
+    unit, said, time = _rates(recording, begun.attitude, float(mounting.delay))
     unit = unit @ np.linalg.inv(begun.arranged).T
     count = (len(unit) - 2) // _BLOCK
     samples = np.diff(gyroscope.si(), 3, axis=0)
@@ -390,7 +401,7 @@ def _same_unit(recording: Recording, begun: _Start, imu: Imu) -> list[str]:
         return []
     moved, apart = (
         np.mean(np.diff(values, 2, axis=0)[: count * _BLOCK].reshape(count, -1) ** 2, axis=1)
-        for values in (unit, unit - said @ mounting)
+        for values in (unit, unit - said @ turned)
     )
     still = np.argsort(moved)[: max(_FEWEST // 2, count // 10)]
     powers = np.mean(samples[: quiet * _LONGER].reshape(quiet, -1) ** 2, axis=1)

@@ -34,15 +34,7 @@ from jaximu.data.motion import (
     level,
     turned,
 )
-from jaximu.data.sightings import (
-    FROM_OUTSIDE,
-    AttitudeSeen,
-    FieldSeen,
-    Outside,
-    Sighting,
-    VelocitySeen,
-    outside_numbers,
-)
+from jaximu.data.sightings import AttitudeSeen, FieldSeen, Sighting, VelocitySeen
 from jaximu.estimation.information_filter import Knowledge, Rows, advance, estimate
 from jaximu.estimation.problem import Parameters, flatten, unflatten
 from jaximu.estimation.uncertainty import describe
@@ -55,8 +47,8 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
-from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.magnetic_field import SetupMagneticField
+from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.attitude import Attitude
@@ -112,8 +104,8 @@ class FilterInUse:
     """A calibrated unit followed in use.
 
     **Arguments:** `calibration`: of both triads; `noise`: of the unit; `rate`: Hz; `gravity`: where it is used, if it
-    is known better than where it was calibrated; `mounted`: a reference that measures attitude, and velocity where
-    its effects have a lever arm, as it roughly stands to the unit: how exactly is among the numbers that are followed;
+    is known better than where it was calibrated; `mounted`: a reference that measures attitude, and velocity where it
+    has one, as it roughly stands to the unit: how exactly is among the numbers that are followed;
     `magnetic`: whether a calibrated magnetometer is read, too: the Earth's field is then followed, and holds the
     heading of every rest; `changing`: by triad, how far (one sigma, rad/s or m/s²) its bias may be from the
     calibration's.
@@ -151,7 +143,7 @@ class FilterInUse:
         known = {name: place for place, name in enumerate(calibration.names) if name.effect is None}
         beside = {at: EARTH_RATE if isinstance(each, GyroEarthRotation) else each.known
                   for at, each in self.imu.all_effects().items()
-                  if isinstance(each, (GyroEarthRotation, *FROM_OUTSIDE))}  # fmt: skip
+                  if isinstance(each, (GyroEarthRotation, *MOUNTING_EFFECTS))}  # fmt: skip
         free = Parameters.select(self.imu, lambda name: name in known or (name.owner, name.effect) in beside)
         self.names, self._index = free.names, np.asarray(free.index, int)
         rows = [known[name] for name in free.names if name in known]
@@ -167,7 +159,7 @@ class FilterInUse:
         self.prior = np.linalg.inv(np.linalg.cholesky(covariance))
         self.errors: Disturbances = seen_from_outside(disturbances(noise, known_scale(calibration)), mounted)
         self._mounted, self._magnetic = mounted, magnetic
-        self._moves = any(isinstance(each, AccelLeverArm) for each in outside)
+        self._moves = mounted is not None and mounted.attitude.velocities() is not None
         self._pending: deque[tuple[float, float, FloatArray, FloatArray | None]] = deque()
         self._floor = np.asarray(disturbances(noise).white) * rate
         self._count, self._padded = round(INTERVAL * rate), int(np.ceil(_SPAN * INTERVAL * rate))
@@ -230,10 +222,9 @@ class FilterInUse:
         """Keep what a reference said until the samples come that it belongs to."""
         if self._mounted is None:
             raise InputError("a reference was handed over, and nothing is known of how it is mounted: see `mounted`.")
-        late, scale = self._mounted.clock
-        for place, (stamp, quaternion) in enumerate(zip(attitude.time.tolist(), attitude.quaternion, strict=True)):
-            velocity = None if attitude.velocity is None else attitude.velocity[place]
-            self._pending.append(((stamp - late) * (1 + scale), stamp, quaternion, velocity))
+        marks = np.asarray(self._mounted.mounting.on_log(attitude.time)).tolist()
+        velocities = [None] * len(marks) if attitude.velocity is None else attitude.velocity
+        self._pending.extend(zip(marks, attitude.time.tolist(), attitude.quaternion, velocities, strict=True))
 
     def _due(self, now: float) -> bool:
         """Return whether an interval is complete: half a second, or a little more for it to end where something was
@@ -288,7 +279,7 @@ class FilterInUse:
         unit = unflatten(self.imu, self._numbers)
         attitude = level(self._path.attitude, unit.with_effects().accelerometer.recover(force.mean(axis=0)))
         for each in sightings:
-            attitude = each.placed(attitude, Outside.of(outside_numbers(unit)))
+            attitude = each.placed(attitude, Mounting.of(unit))
         return MotionPath(attitude, np.zeros(3))  # pyright: ignore[reportArgumentType]
 
     def _interval(self) -> list[FilterState]:

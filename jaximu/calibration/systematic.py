@@ -212,7 +212,7 @@ def calibrate_by_filter(
         still, beyond = longest_rest(errors), NEIGHBOURS if chosen else 0
         mounted = None if attitude is None else mounted_on(rests.recording, attitude, gravity, noise, start.imu)
         errors = seen_from_outside(errors, mounted)
-        seen: dict[str, Any] = {} if mounted is None else {"attitude": mounted.attitude, "clock": mounted.clock}
+        seen: dict[str, Any] = {} if mounted is None else {"attitude": mounted.attitude, "mounting": mounted.mounting}
         outside = () if mounted is None else mounted.effects
         seen["field"] = None if magnetometer is None else field_of(magnetometer, rests.recording)
         intervals, notes = cut(rests.recording, rests.intervals, still, beyond, **seen)

@@ -29,13 +29,10 @@ from jaximu.estimation.problem import Parameters
 from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotation_matrix
+from jaximu.ground.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotate, rotation_matrix
 from jaximu.model.effects import Effect
-from jaximu.model.effects.clock_scale import SetupClockScale
-from jaximu.model.effects.reference_delay import SetupReferenceDelay
-from jaximu.model.effects.reference_filter import SetupReferenceFilter, behind
-from jaximu.model.effects.reference_rotation import SetupReferenceRotation
-from jaximu.model.effects.table_tilt import SetupTableTilt
+from jaximu.model.effects.reference_filter import behind
+from jaximu.model.mounting import Mounting
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
@@ -43,8 +40,17 @@ from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.observations import Turns
 from jaximu.recordings.recording import Recording, Signal, smoothed_slope
 
-__all__ = ["EXCESS_NAMES", "INTERVALS", "OF_REFERENCE", "WINDOW", "AgainstAttitude", "AttitudeConditions", "Intervals",
-           "evaluated", "reference_numbers", "reference_sigmas", "shared_ends"]  # fmt: skip
+__all__ = [
+    "EXCESS_NAMES",
+    "INTERVALS",
+    "WINDOW",
+    "AgainstAttitude",
+    "AttitudeConditions",
+    "Intervals",
+    "evaluated",
+    "reference_sigmas",
+    "shared_ends",
+]
 
 EXCESS_NAMES = ("gyroscope", "reference attitude", "gyroscope bias walk", "accelerometer", "reference velocity")
 _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
@@ -53,8 +59,6 @@ RESIDUALS = (
     ResidualKind("specific_force", "specific force against gravity", "m/s^2", 3),
     ResidualKind("rotation", "rate against the reference", "rad/s", 3),
 )
-OF_REFERENCE = (SetupReferenceDelay, SetupClockScale, SetupReferenceRotation, SetupTableTilt)
-"""Effects that say how a reference is mounted, late and tilted; the unit's path is the same without them."""
 _TRIADS = ("accelerometer", "gyroscope")
 _KNOWN = 0.03
 """Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
@@ -175,7 +179,7 @@ def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Ar
         jnp.stack([jnp.interp(stamps, time, axis) for axis in slope.T], axis=-1) @ matrix.T
         for slope in (data.slope, data.curve)
     )
-    return exponential(behind(imu.coefficients(SetupReferenceFilter)[0], acceleration, jerk))
+    return exponential(behind(Mounting.of(imu).filter_variance, acceleration, jerk))
 
 
 def reference_sigmas(excess: Mapping[str, float]) -> tuple[float, float]:
@@ -184,12 +188,6 @@ def reference_sigmas(excess: Mapping[str, float]) -> tuple[float, float]:
         _UNITS[place] * float(np.sqrt(excess[EXCESS_NAMES[place]])) for place in (1, 4)
     )  # fmt: skip
     return attitude, velocity
-
-
-def reference_numbers(imu: Imu) -> tuple[Array, Array, Array, Array]:
-    """Delay (s) and clock scale of the reference, its rotation to the unit and the tilt of its vertical (rad)."""
-    delay, scale = imu.coefficients(SetupReferenceDelay)[0], imu.coefficients(SetupClockScale)[0]
-    return delay, scale, imu.coefficients(SetupReferenceRotation), jnp.append(imu.coefficients(SetupTableTilt), 0.0)
 
 
 def _added(imu: Imu, data: Intervals, around: Stimulus | None) -> tuple[Array, Array]:
@@ -233,15 +231,14 @@ def evaluated(
     """
     bare = imu.with_effects()
     assert bare.gyroscope is not None
-    delay, scale, turned, tilt = reference_numbers(imu)
+    mounting = Mounting.of(imu)
     force, rate = _added(imu, data, around)
-    stamps = (data.stamp - delay) * (1 + scale)
+    stamps = mounting.on_log(data.stamp)
     held = jnp.minimum(data.late[place], stamps[1:, None]) - jnp.maximum(data.early[place], stamps[:-1, None])
-    held = jnp.maximum(held, 0.0) / (1 + scale)  # of the reference's time, in which rates are meant
+    held = jnp.maximum(held, 0.0) / (1 + mounting.clock_scale)  # of the reference's time, in which rates are meant
     turns = Turns((data.rate - rate)[place], held, noise, jnp.zeros((len(place), 2, 3)), data.used)
     whole = integrate_turns(bare, turns)
-    mounting = jnp.broadcast_to(exponential(turned), data.attitude.shape)
-    true = multiply(multiply(data.attitude, mounting), _smoothed(imu, data, stamps))
+    true = multiply(multiply(data.attitude, mounting.turned), _smoothed(imu, data, stamps))
     before, after = true[:-1], true[1:]
     target = multiply(conjugate(before), after)
     with_one = jnp.concatenate([turns.output, jnp.ones_like(held)[..., None]], axis=-1)
@@ -251,7 +248,7 @@ def evaluated(
     start = jnp.zeros_like(whole.running[:, :1]).at[..., 0].set(1.0)
     middle = jnp.concatenate([start, whole.running[:, :-1]], axis=1) + whole.running
     middle = middle / jnp.linalg.norm(middle, axis=-1, keepdims=True)
-    upright = rotation_matrix(exponential(tilt)) @ rotation_matrix(before)
+    upright = rotation_matrix(multiply(mounting.tilted, before))
     sensed = jnp.concatenate([(data.force - force)[place], jnp.ones_like(held)[..., None]], axis=-1)
     summed = jnp.einsum("ts,tsij,tsk->tijk", held, rotation_matrix(middle), sensed)
     local = jnp.einsum("tsij,tsj->tsi", rotation_matrix(middle), sensed @ bare.accelerometer.inverse().T)
@@ -269,7 +266,7 @@ def evaluated(
         return jnp.sum(there.reshape(windows, group, 3, 3, 4), axis=1) / safe[:, None, None, None]
 
     lever = jnp.einsum("tijk,jk->ti", summed, bare.accelerometer.inverse())
-    gained = jnp.sum(data.velocity.reshape(windows, group, 3), axis=1) @ rotation_matrix(exponential(tilt)).T
+    gained = rotate(mounting.tilted, jnp.sum(data.velocity.reshape(windows, group, 3), axis=1))
     conditions = AttitudeConditions(
         whole.rotation, target, slope, bare.gyroscope.inverse(), by_window(summed), by_window(swung),
         gained / safe[:, None], data.used, complete, data.gravity, jnp.zeros(3 * (len(place) + windows)),
@@ -361,8 +358,7 @@ class AgainstAttitude(Data):
     def _places(self, imu: Imu) -> NDArray[np.int64]:
         """Samples (T, S) of each interval, with some more on either side for the delay to move."""
         data = self.intervals
-        delay, scale, *_ = (np.asarray(each) for each in reference_numbers(imu))
-        stamps = (np.asarray(data.stamp) - delay) * (1 + scale)
+        stamps = Mounting.of(imu).on_log(np.asarray(data.stamp))
         first = np.searchsorted(data.late, stamps[:-1]) - _MARGIN
         longest = np.searchsorted(data.late, stamps[1:]) - first + _MARGIN
         size = -(-longest[np.asarray(data.used)].max() // _SAMPLES) * _SAMPLES
@@ -370,11 +366,9 @@ class AgainstAttitude(Data):
 
     def unsmoothed(self, imu: Imu) -> Attitude:
         """Return the reference as it would be without the filter that a fitted unit's set-up says it has."""
-        delay, scale, turned, _ = reference_numbers(imu)
-        stamps = (jnp.asarray(self.attitude.time + self.offset) - delay) * (1 + scale)
-        mounting, said = exponential(turned), jnp.asarray(self.attitude.quaternion)
-        true = multiply(multiply(said, jnp.broadcast_to(mounting, said.shape)), _smoothed(imu, self.intervals, stamps))
-        sharp = multiply(true, jnp.broadcast_to(conjugate(mounting), said.shape))
+        mounting = Mounting.of(imu)
+        smoothed = _smoothed(imu, self.intervals, mounting.on_log(self.attitude.time + self.offset))
+        sharp = mounting.reported(multiply(mounting.unit_attitude(self.attitude.quaternion), smoothed))
         return replace(self.attitude, quaternion=np.asarray(sharp))
 
     def densities(self) -> tuple[FloatArray, float]:
@@ -400,11 +394,11 @@ class AgainstAttitude(Data):
     def around(self, imu: Imu) -> Stimulus:
         """Return what the unit went through at the gyroscope's samples as it measured it, standing as was measured."""
         known = stimuli(self.recording, imu)["gyroscope"]
-        delay, scale, turned, _ = (np.array(each) for each in reference_numbers(imu))
+        mounting = Mounting.of(imu)
         time = self.attitude.time + self.offset
-        stamps = np.clip(np.asarray(known.time) / (1 + scale) + delay, *time[[0, -1]])
+        stamps = np.clip(mounting.on_reference(np.asarray(known.time)), *time[[0, -1]])
         stood = scipy.spatial.transform.Slerp(time, self.attitude.rotation())(stamps)
-        stood = stood * scipy.spatial.transform.Rotation.from_rotvec(turned)
+        stood = stood * scipy.spatial.transform.Rotation.from_rotvec(np.array(mounting.rotation))
         return replace(known, attitude=stood.as_quat(scalar_first=True))
 
     def rows(self, imu: Imu) -> Rows:

@@ -37,17 +37,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from jaximu.data.preintegration import preintegrate_samples
-from jaximu.data.sightings import (
-    FROM_OUTSIDE,
-    SIZE,
-    AttitudeSeen,
-    FieldSeen,
-    Outside,
-    Sighting,
-    Standing,
-    VelocitySeen,
-    outside_numbers,
-)
+from jaximu.data.sightings import SIZE, AttitudeSeen, FieldSeen, Sighting, Standing, VelocitySeen
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
@@ -57,6 +47,7 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
+from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
@@ -219,12 +210,12 @@ def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
 
 
 def _seen(like: Imu, numbers: Array, part: MotionIntervals):
-    """Return rates and forces (S, 6) of an interval's samples, the Earth's rotation (3,) and the numbers of `Outside`.
+    """Return rates and forces (S, 6) of an interval's samples, the Earth's rotation (3,) and the mounting's numbers.
 
     Errors of the set-up are undone by iteration: what they would make of the rates is taken off the rates.
     """
     imu = ravel_pytree(like)[1](numbers)
-    bare = imu.without(GyroEarthRotation, *FROM_OUTSIDE)
+    bare = imu.without(GyroEarthRotation, *MOUNTING_EFFECTS)
     force, rate = bare.recover(part.accelerometer, part.gyroscope, Stimulus(time=part.time))
     seen = jnp.concatenate([rate, force], axis=-1)
     found = seen
@@ -233,7 +224,7 @@ def _seen(like: Imu, numbers: Array, part: MotionIntervals):
         made = [getattr(bare.acted(path, name), name) for name in ("angular_rate", "specific_force")]
         found = seen - jnp.concatenate(made, axis=-1) + found
     inside = found[part.time.shape[-1] - part.length.shape[-1] :]
-    return inside, imu.coefficients(GyroEarthRotation), outside_numbers(imu)
+    return inside, imu.coefficients(GyroEarthRotation), jnp.hstack(Mounting.of(imu))
 
 
 class _Means(eqx.Module):
@@ -254,8 +245,8 @@ class _Means(eqx.Module):
     ending: Array  # (9,) rate and force in the last sample, angular acceleration
     by_ending: Array  # (9, M)
     half: Array  # of the last sample
-    outside: Array  # (q,) numbers of `Outside`
-    by_outside: Array  # (q, M)
+    mounting: Array  # (q,) numbers of a `Mounting`
+    by_mounting: Array  # (q, M)
     duration: Array
 
 
@@ -265,7 +256,7 @@ def _condensed(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -
 
 
 def _of_motion(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> _Means:
-    samples, earth, outside = _seen(like, numbers, part)
+    samples, earth, mounting = _seen(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     reaction = whole.reaction[:, :6]
     length = jnp.asarray(part.length)
@@ -277,17 +268,17 @@ def _of_motion(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -
         return jnp.concatenate([samples[last], (samples[last] - samples[before])[:3] / jnp.maximum(apart, 1e-9)])
 
     def moved(numbers):  # exactly: a change of rates and forces also changes coning and sculling
-        samples, earth, outside = _seen(like, numbers, part)
+        samples, earth, mounting = _seen(like, numbers, part)
         varied = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
         turned = logarithm(multiply(conjugate(whole.rotation), varied.rotation))
-        return jnp.concatenate([turned, varied.velocity]), earth, ended(samples), outside
+        return jnp.concatenate([turned, varied.velocity]), earth, ended(samples), mounting
 
-    increments, by_earth, by_ending, by_outside = jax.jacfwd(moved)(numbers)
+    increments, by_earth, by_ending, by_mounting = jax.jacfwd(moved)(numbers)
     per_sample = reaction / jnp.sqrt(jnp.where(part.length > 0, part.length, 1.0))[:, None, None]
     return _Means(
         whole.rotation, whole.velocity, jnp.einsum("sij,j,slj->il", per_sample, white, per_sample),
         reaction.sum(axis=0), increments, jnp.zeros(6), jnp.zeros_like(increments), earth, by_earth,
-        ended(samples), by_ending, length[last] / 2, outside, by_outside, _duration(part),
+        ended(samples), by_ending, length[last] / 2, mounting, by_mounting, _duration(part),
     )  # fmt: skip
 
 
@@ -303,12 +294,12 @@ def _of_rest(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> 
         samples, *apart = _seen(like, numbers, still)
         return (samples[0], *apart), (samples[0], *apart)
 
-    (means, by_earth, by_outside), (found, earth, outside) = jax.jacfwd(mean, has_aux=True)(numbers)
+    (means, by_earth, by_mounting), (found, earth, mounting) = jax.jacfwd(mean, has_aux=True)(numbers)
     alike, none = jnp.zeros(4).at[0].set(1.0), jnp.zeros((6, 6))
     return _Means(
         alike, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth,
         jnp.concatenate([found, jnp.zeros(3)]), jnp.concatenate([means, jnp.zeros_like(means[:3])]),
-        jnp.asarray(part.length)[0] / 2, outside, by_outside, _duration(part),
+        jnp.asarray(part.length)[0] / 2, mounting, by_mounting, _duration(part),
     )  # fmt: skip
 
 
@@ -442,21 +433,21 @@ def _sighted(
 ) -> Rows:
     """Return the rows of what was measured from outside at the end, or nothing."""
 
-    def off(change):  # attitude and velocity, the end, gravity, what is outside
-        moved, ended, gravitated, placed = jnp.split(change, (6, 6 + SIZE, 7 + SIZE))
+    def off(change):  # attitude and velocity, the end, gravity, the mounting
+        moved, ended, gravitated, remounted = jnp.split(change, (6, 6 + SIZE, 7 + SIZE))
         rate, force, acceleration = jnp.split(means.ending + ended, 3)
         standing = Standing(
             multiply(after.attitude, exponential(moved[:3])), after.velocity + moved[3:], rate, force, acceleration,
             means.half, gravity + gravitated[0],
         )  # fmt: skip
-        found = sighting.off(standing, Outside.of(means.outside + placed))
+        found = sighting.off(standing, Mounting.from_numbers(means.mounting + remounted))
         return found, found
 
-    slopes, value = jax.jacfwd(off, has_aux=True)(jnp.zeros(7 + SIZE + len(means.outside)))
+    slopes, value = jax.jacfwd(off, has_aux=True)(jnp.zeros(7 + SIZE + len(means.mounting)))
     weight = sighting.measured * part.real / getattr(errors, sighting.noise)
-    by_path, by_ending, by_gravity, by_outside = jnp.split(slopes, (6, 6 + SIZE, 7 + SIZE), axis=1)
+    by_path, by_ending, by_gravity, by_mounting = jnp.split(slopes, (6, 6 + SIZE, 7 + SIZE), axis=1)
     by_state = jnp.concatenate([by_path, jnp.zeros((len(value), size - 6))], axis=1)
-    by_number = jnp.concatenate([by_ending @ means.by_ending + by_outside @ means.by_outside, by_gravity], axis=1)
+    by_number = jnp.concatenate([by_ending @ means.by_ending + by_mounting @ means.by_mounting, by_gravity], axis=1)
     return Rows(jnp.zeros_like(by_state), weight * by_state, weight * by_number, -weight * value)
 
 
@@ -497,7 +488,7 @@ def first_field(intervals: MotionIntervals, imu: Imu) -> FloatArray:
     attitude = level(jnp.array([1.0, 0.0, 0.0, 0.0]), imu.with_effects().accelerometer.recover(mean))
     for each in part.sightings:
         if each.absolute and each.measured > 0:
-            attitude = each.placed(attitude, Outside.of(outside_numbers(imu)))
+            attitude = each.placed(attitude, Mounting.of(imu))
     return np.asarray(rotate(attitude, np.asarray(sighting.value)[at]))
 
 
@@ -541,13 +532,13 @@ def longest_rest(errors: Disturbances) -> float:
 
 def cut(
     recording: Recording, rests: FloatArray, still: float = _LONGEST, beyond: int = 0,
-    attitude: Attitude | None = None, clock: tuple[float, float] = (0.0, 0.0), field: Signal | None = None,
+    attitude: Attitude | None = None, mounting: Mounting | None = None, field: Signal | None = None,
 ) -> tuple[MotionIntervals, list[str]]:  # fmt: skip
     """Cut a recording into intervals, from its first rest to its last, padded in number and length; and notes.
 
     **Arguments:** `rests` (P, 2): start and stop, s; `still`: s, the longest interval of a rest, of which each has
     eight or more (`longest_rest`); `beyond`: samples before and after each interval that are kept, for effects that
-    look at neighbours; `attitude`: measured, late by `clock` (s, and the scale of the clocks), at whose stamps
+    look at neighbours; `attitude`: measured, with its `mounting`, at whose stamps
     intervals of motion then end; `field`: magnetic, in the body frame (µT), by a calibrated magnetometer on the
     recording's clock, whose mean over each rest is used. Where the triads have stamps of their own
     the accelerometer is interpolated to the gyroscope's.
@@ -565,7 +556,7 @@ def cut(
     missing = np.where(step > 2.5 * period, step - period, 0.0)
     lost = (missing[1:] + missing[:-1]) / 2
     first, last = np.searchsorted(time, rests[:, 0] + _SETTLING), np.searchsorted(time, rests[:, 1] - _SETTLING)
-    marks = np.zeros(0) if attitude is None else (attitude.time - clock[0]) * (1 + clock[1])
+    marks = np.zeros(0) if attitude is None else np.asarray((mounting or Mounting()).on_log(attitude.time))
     unseen = lost * np.linalg.norm(gyroscope.si(), axis=1)
     pieces, skipped, jumped, bridged = [], 0.0, 0, lost[first[0] : last[-1]].sum()
     for place, (start, stop) in enumerate(zip(first, last, strict=True)):
@@ -876,7 +867,7 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
         moved = _carried(attitude, jnp.zeros(3), means.rotation, means.gained, means.duration, means.earth, gravity)[0]
         moved = jnp.where(resting, attitude, moved)
         for each in interval.sightings if sighted else ():
-            placed = each.placed(moved, Outside.of(means.outside))
+            placed = each.placed(moved, Mounting.from_numbers(means.mounting))
             moved = jnp.where(each.measured > 0, placed, moved)
         levelled = jnp.where(resting, level(moved, means.mean[3:]), moved)
         attitude = jnp.where(resting, levelled, moved)
@@ -888,9 +879,10 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
     start = level(jnp.array([1.0, 0.0, 0.0, 0.0]), means.mean[0, 3:])
     for each in intervals.sightings:  # the heading at the first sighting is the heading of all
         first = jnp.argmax(each.measured > 0)
-        sighting, outside = jax.tree.map(lambda leaf, first=first: leaf[first], (each, means.outside))
+        sighting, numbers = jax.tree.map(lambda leaf, first=first: leaf[first], (each, means.mounting))
         now = reckoned(start, False)[first]
-        heading = multiply(sighting.placed(now, Outside.of(outside)), conjugate(now)) * jnp.array([1.0, 0.0, 0.0, 1.0])
+        placed = sighting.placed(now, Mounting.from_numbers(numbers))
+        heading = multiply(placed, conjugate(now)) * jnp.array([1.0, 0.0, 0.0, 1.0])
         start = multiply(heading / jnp.linalg.norm(heading), start)
     attitudes = jnp.concatenate([start[None], reckoned(start, True)])
     return MotionPath(attitudes, jnp.zeros((len(attitudes), 3)))

@@ -24,47 +24,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu.data.attitude import OF_REFERENCE, reference_numbers
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
-from jaximu.model.effects.lever_arm import AccelLeverArm
-from jaximu.model.effects.magnetic_field import SetupMagneticField
-from jaximu.model.sensor import Imu
+from jaximu.model.mounting import Mounting
 
-__all__ = ["FROM_OUTSIDE", "SIZE", "AttitudeSeen", "FieldSeen", "Outside", "Sighting", "Standing", "VelocitySeen",
-           "outside_numbers"]  # fmt: skip
+__all__ = ["SIZE", "AttitudeSeen", "FieldSeen", "Sighting", "Standing", "VelocitySeen"]
 
-FROM_OUTSIDE = (*OF_REFERENCE, AccelLeverArm, SetupMagneticField)
-"""Effects that say how what measures from outside is placed; the unit's path is the same without them."""
 SIZE = 9
 """Numbers of a `Standing` that follow from a unit's outputs: rate, specific force, angular acceleration."""
-
-
-class Outside(NamedTuple):
-    """How what measures from outside is placed.
-
-    delay: s; scale: of the clocks; mounting, tilt (3,): rotation vectors, rad; arm (3,): m; field (3,): µT.
-    """
-
-    delay: Float[Array, ""]
-    scale: Float[Array, ""]
-    mounting: Float[Array, 3]
-    tilt: Float[Array, 3]
-    arm: Float[Array, 3]
-    field: Float[Array, 3]
-
-    @classmethod
-    def of(cls, numbers: Float[Array, " q"]) -> Outside:
-        """Return it from the numbers that `outside_numbers` returned."""
-        delay, scale, *vectors = jnp.split(numbers, (1, 2, 5, 8, 11))
-        return cls(delay[0], scale[0], *vectors)
-
-
-def outside_numbers(imu: Imu) -> Float[Array, " q"]:
-    """Return the numbers of a unit's set-up that `Outside` is made of."""
-    return jnp.hstack(
-        [*reference_numbers(imu), imu.coefficients(AccelLeverArm), imu.coefficients(SetupMagneticField)]
-    )  # fmt: skip
 
 
 class Standing(NamedTuple):
@@ -105,16 +72,16 @@ class Sighting(eqx.Module):
     noise: ClassVar[str]
     absolute: ClassVar[bool] = True
 
-    def off(self, standing: Standing, outside: Outside) -> Float[Array, 3]:
+    def off(self, standing: Standing, mounting: Mounting) -> Float[Array, 3]:
         """Return by how much a unit that stands so differs from what was measured."""
         raise NotImplementedError
 
-    def placed(self, attitude: Float[Array, 4], outside: Outside) -> Float[Array, 4]:
+    def placed(self, attitude: Float[Array, 4], mounting: Mounting) -> Float[Array, 4]:
         """Return the attitude that was measured, as far as it was, else the one given."""
         return attitude
 
-    def _ahead(self, outside: Outside) -> Float[Array, ""]:
-        return (self.stamp - outside.delay) * (1 + outside.scale) - self.end
+    def _ahead(self, mounting: Mounting) -> Float[Array, ""]:
+        return mounting.on_log(self.stamp) - self.end
 
 
 class AttitudeSeen(Sighting):
@@ -122,15 +89,14 @@ class AttitudeSeen(Sighting):
 
     noise = "reference"
 
-    def off(self, standing: Standing, outside: Outside) -> Float[Array, 3]:
+    def off(self, standing: Standing, mounting: Mounting) -> Float[Array, 3]:
         """Return the rotation vector, in the reference's body, from what was measured to what it should be (rad)."""
-        unit = standing.after(self._ahead(outside)).attitude
-        said = multiply(conjugate(exponential(outside.tilt)), multiply(unit, conjugate(exponential(outside.mounting))))
-        return logarithm(multiply(conjugate(self.value), said))
+        expected = mounting.reported(standing.after(self._ahead(mounting)).attitude)
+        return logarithm(multiply(conjugate(self.value), expected))
 
-    def placed(self, attitude: Float[Array, 4], outside: Outside) -> Float[Array, 4]:
+    def placed(self, attitude: Float[Array, 4], mounting: Mounting) -> Float[Array, 4]:
         """Return the unit's attitude, to the level frame, as the reference has it."""
-        return multiply(multiply(exponential(outside.tilt), self.value), exponential(outside.mounting))
+        return mounting.unit_attitude(self.value)
 
 
 class VelocitySeen(Sighting):
@@ -138,13 +104,13 @@ class VelocitySeen(Sighting):
 
     noise = "velocity"
 
-    def off(self, standing: Standing, outside: Outside) -> Float[Array, 3]:
+    def off(self, standing: Standing, mounting: Mounting) -> Float[Array, 3]:
         """Return the velocity less what was measured (m/s), in the reference's level frame."""
-        ahead = self._ahead(outside)
+        ahead = self._ahead(mounting)
         there = standing.after(ahead)
         rate = standing.rate + standing.acceleration * (standing.half + ahead)
-        swung = rotate(there.attitude, jnp.cross(rate, outside.arm))
-        return rotate(conjugate(exponential(outside.tilt)), there.velocity - swung) - self.value
+        swung = rotate(there.attitude, jnp.cross(rate, mounting.lever_arm))
+        return rotate(conjugate(mounting.tilted), there.velocity - swung) - self.value
 
 
 class FieldSeen(Sighting):
@@ -153,16 +119,15 @@ class FieldSeen(Sighting):
     noise = "field"
     absolute = False
 
-    def off(self, standing: Standing, outside: Outside) -> Float[Array, 3]:
+    def off(self, standing: Standing, mounting: Mounting) -> Float[Array, 3]:
         """Return the field less what was measured (µT), body frame."""
-        return rotate(conjugate(standing.attitude), outside.field) - self.value
+        return rotate(conjugate(standing.attitude), mounting.field) - self.value
 
-    def placed(self, attitude: Float[Array, 4], outside: Outside) -> Float[Array, 4]:
+    def placed(self, attitude: Float[Array, 4], mounting: Mounting) -> Float[Array, 4]:
         """Return the attitude turned about the vertical to where the level parts of both fields point alike."""
         east, north, _ = rotate(attitude, self.value)
-        along, across = (
-            outside.field[0] * east + outside.field[1] * north, outside.field[1] * east - outside.field[0] * north
-        )  # fmt: skip
+        eastward, northward, _ = mounting.field
+        along, across = eastward * east + northward * north, northward * east - eastward * north
         known = jnp.hypot(along, across) > 0
         angle = jnp.where(known, jnp.arctan2(across, jnp.where(known, along, 1.0)), 0.0)
         return multiply(exponential(jnp.array([0.0, 0.0, 1.0]) * angle), attitude)

@@ -29,7 +29,6 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
-from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu
 
 __all__ = [
@@ -38,7 +37,6 @@ __all__ = [
     "Prior",
     "effect_numbers",
     "fit",
-    "fitted_effect",
     "informed",
     "linearise",
 ]
@@ -193,21 +191,6 @@ def effect_numbers(imu: Imu) -> tuple[tuple[Name, ...], FloatArray, FloatArray]:
             values.append(value)
             sizes.append(max(abs(value), 1e-9))
     return tuple(names), np.array(values), np.array(sizes)
-
-
-def fitted_effect(
-    kind: type[Effect], imu: Imu, names: Sequence[Name], covariance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return a fitted effect's coefficients (q,) and their covariance (q, q); zero where the unit has no such effect.
-
-    `covariance` is of `names`.
-    """
-    for (owner, place), effect in imu.all_effects().items():
-        if isinstance(effect, kind):
-            own = [Name(owner, "coefficients", (k,), place) for k in range(kind.size)]
-            rows = [names.index(name) for name in own]
-            return np.asarray(effect.coefficients), np.asarray(covariance)[np.ix_(rows, rows)]
-    return np.zeros(kind.size), np.zeros((kind.size, kind.size))
 
 
 def _with_numbers(imu: Imu, values: FloatArray) -> Imu:

@@ -177,7 +177,7 @@ class Imu(eqx.Module):
     def coefficients(self, kind: type[Effect]) -> Array:
         """Return the coefficients (q,) of the unit's effect of a kind; zeros where it has none."""
         found = (each.coefficients for each in self.all_effects().values() if isinstance(each, kind))
-        return next(found, jnp.zeros(kind.size))
+        return next(found, np.zeros(kind.size))
 
     def without(self, *kinds: type[Effect]) -> Imu:
         """Return the unit without its effects of some kinds."""

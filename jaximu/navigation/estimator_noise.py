@@ -44,10 +44,7 @@ from jaximu.ground.quantities import number
 from jaximu.ground.stored import compiled
 from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model import BiasInstability
-from jaximu.model.effects.clock_scale import SetupClockScale
-from jaximu.model.effects.reference_delay import SetupReferenceDelay
-from jaximu.model.effects.reference_rotation import SetupReferenceRotation
-from jaximu.model.effects.table_tilt import SetupTableTilt
+from jaximu.model.mounting import Mounting
 from jaximu.model.sensor import Imu
 from jaximu.navigation import noise_covariance
 from jaximu.navigation.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
@@ -190,17 +187,16 @@ class MeasuredErrors:
         require_float64()
         found, measurement = calibrate_against_attitude(recording, attitude, gravity, unit=unit)
         data, known = measurement.intervals, measurement.attitude
-        delay, scale = (float(found.imu.coefficients(kind)[0]) for kind in (SetupReferenceDelay, SetupClockScale))
+        mounting = Mounting.of(found.imu)
         middle = (np.asarray(data.early) + np.asarray(data.late)) / 2
         beside = replace(
             measurement.around(found.imu), specific_force=None, angular_rate=None, angular_acceleration=None
         )
         force, rate = compiled(Imu.recover)(replace(found.imu, setup=()), data.force, data.rate, beside)
-        rotations = scipy.spatial.transform.Rotation.from_rotvec
-        tilt = rotations(np.append(found.imu.coefficients(SetupTableTilt), 0.0))
-        whole = tilt * known.rotation() * rotations(np.asarray(found.imu.coefficients(SetupReferenceRotation)))
+        tilt = scipy.spatial.transform.Rotation.from_rotvec(np.append(mounting.tilt, 0.0))
+        whole = replace(known, quaternion=np.asarray(mounting.unit_attitude(known.quaternion))).rotation()
         velocity = known.velocities()
-        stamp = (known.time - delay) * (1 + scale)
+        stamp = np.asarray(mounting.on_log(known.time))
         felt = np.stack([np.interp(stamp, middle, each) for each in np.asarray(force).T], axis=1)
         steady = np.ones(len(stamp), bool)
         notes: list[str] = []

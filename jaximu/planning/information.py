@@ -13,6 +13,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
@@ -23,10 +24,7 @@ from jaximu.estimation.problem import Parameters
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.ground.stored import compiled
-from jaximu.model.effects.reference_delay import SetupReferenceDelay
-from jaximu.model.effects.reference_filter import SetupReferenceFilter
-from jaximu.model.effects.reference_rotation import SetupReferenceRotation
-from jaximu.model.effects.table_tilt import SetupTableTilt
+from jaximu.model.mounting import Mounting
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Poses, Turns
@@ -45,11 +43,8 @@ COARSE = 32
 """Intervals that a robot's motion is cut into while a design is sought."""
 _SPLIT, _BESIDE = 2, 1
 """Samples to an interval of a robot's motion, and samples on either side of it that its conditions look at."""
-_OF_ROBOT = ((SetupReferenceRotation, 1e-3), (SetupTableTilt, 1e-3), (SetupReferenceDelay, 1e-3),
-             (SetupReferenceFilter, 1e-4))  # fmt: skip
-"""What is unknown of a robot's report, and its unit (SI) here."""
 _FREE = 1e3
-"""Units within which it is known beforehand: as good as not at all."""
+"""Typical sizes within which the mounting on a robot is known beforehand: as good as not at all."""
 
 
 class Accuracy(eqx.Module):
@@ -266,20 +261,18 @@ def robot_information(
     count = _grouped(count, group)
     place = jnp.clip(_SPLIT * jnp.arange(count)[:, None] + jnp.arange(-_BESIDE, _SPLIT + 1 + _BESIDE), 0,
                      _SPLIT * count)  # fmt: skip
+    mounting = Mounting.effects(rotation=0.0, delay=0.0, tilt=0.0, filter_variance=0.0)
+    sizes, effects_of = ravel_pytree([effect.typical_sizes(1.0) for effect in mounting])
     known = len(parameters.names)
 
     def found(z):
-        setup, start = [], known
-        for kind, size in _OF_ROBOT:
-            setup.append(kind(size * z[start : start + kind.size]))
-            start += kind.size
         reported = _reported(parameters.model(imu, z[:known]), design, accuracy, gravity, count)
         conditions, spread, length, leaning, _ = evaluated(
-            unit.with_effects(*setup), reported, None, place, accuracy.density, group
+            unit.with_effects(*effects_of(sizes * z[known:])), reported, None, place, accuracy.density, group
         )
         return conditions(unit), (spread, length, leaning, conditions.target)
 
-    size = known + sum(kind.size for kind, _ in _OF_ROBOT)
+    size = known + len(sizes)
     jacobian, (spread, length, leaning, target) = jax.jacfwd(found, has_aux=True)(jnp.zeros(size))
     interval, window = jnp.arange(count), jnp.arange(count // group)
     rotation, force = 3 * interval[:, None] + jnp.arange(3), 3 * count + 3 * window[:, None] + jnp.arange(3)

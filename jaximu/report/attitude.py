@@ -12,7 +12,7 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.ground.quantities import number, unit_text
 from jaximu.ground.summary import sentence
-from jaximu.model.effects.table_tilt import SetupTableTilt
+from jaximu.model.mounting import Mounting
 from jaximu.report.figures import AFTER, BEFORE, dressed, new_figure
 from jaximu.report.html import write_calibration
 from jaximu.report.words import Lead, Statement, gravity_statement, how_much_smaller, weak_statements
@@ -66,7 +66,7 @@ def mounting_words(calibration: Calibration) -> list[str]:
         places = ", ".join(f"{1e3 * value:.3g} ± {1.96e3 * sigma:.2g}"
                            for value, sigma in zip(arm["value"], arm["sigma"], strict=True))  # fmt: skip
         said.append(f"The unit lies {places} mm (95 %) from the point that is tracked, along the reference's x, y, z.")
-    tilt = np.linalg.norm(calibration.imu.coefficients(SetupTableTilt))
+    tilt = np.linalg.norm(Mounting.of(calibration.imu).tilt)
     said.append(f"The reference's vertical is off by {np.degrees(tilt):.2g}°.")
     return said
 
