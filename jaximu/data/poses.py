@@ -69,7 +69,7 @@ COARSE_EXCESS = (1e2, 1e4, 1e2)
 """The first pass starts at the data sheet's values, percents away: weights as sharp as the noise would make it chase
 wrong minima, so they are blunted by this excess. The next pass finds the right ones."""
 _ROUNDS, _CHANGED = 6, 1e-3
-"""Times that the path is taken anew with what effects add taken off, and the relative change of it that ends them."""
+"""Times that tracks are taken anew with what effects add taken off, and the relative change of it that ends them."""
 
 
 class HandHeldConditions(Conditions):
