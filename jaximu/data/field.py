@@ -138,8 +138,8 @@ class FieldSamples(eqx.Module):
             grown = [np.pad(leaf, [(0, 0), (0, size - leaf.shape[1]), *[(0, 0)] * (leaf.ndim - 2)]) for leaf in leaves]
             return np.concatenate(grown)
 
-        numbers = [np.append(start + np.arange(count), total) for start, count in zip(first, counts, strict=False)]
-        tracks = [part.track.renumbered(own) for part, own in zip(parts, numbers, strict=True)]
+        renumberings = [np.append(start + np.arange(count), total) for start, count in zip(first, counts, strict=False)]
+        tracks = [part.track.renumbered(numbers) for part, numbers in zip(parts, renumberings, strict=True)]
         observation = together([track.observation - total for track in tracks]) + total  # padding is of none
         stimuli = [vars(track.stimulus) for track in tracks]
         known = [name for name in ("time", "temperature", "current", "angular_rate")
@@ -157,7 +157,8 @@ class FieldWindows:
     `FieldConditions`;
     off (n,): how far the specific force is from gravity, over gravity; angle (n,): rad turned to the next window;
     time (n, 2): s; count (n,): samples. used, turn, level (n,): which of them tell strength, turn and dip. noise: of a
-    sample, output units. origin (3,): the gyroscope's bias, output units, that was taken off its rates.
+    sample, output units. origin (3,): the gyroscope's bias, output units, that was taken off its rates. samples: of all
+    windows, along which effects act.
     vertical (12, 12): covariance of what is wrong of the specific force f, (B f + b g) with (B row by row | b), which
     bends the measured up of all windows together.
     """

@@ -77,7 +77,7 @@ RESIDUALS = (
     ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
 )
 _ROUNDS, _CHANGED = 6, 1e-3
-"""Times that the path is taken anew with what effects add taken off, and the relative change of it that ends them."""
+"""Times that tracks are taken anew with what effects add taken off, and the relative change of it that ends them."""
 
 
 class HandHeldConditions(Conditions):

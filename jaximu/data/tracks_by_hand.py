@@ -24,16 +24,16 @@ __all__ = ["tracks_by_hand", "turn_samples"]
 
 def turn_samples(segmentations: Sequence[Segmentation], observations: Observations) -> list[NDArray[np.int64]]:
     """Return, of each recording, where the samples (T, S) of each turn are among its gyroscope's; 0 for none."""
-    interval, first, places = np.asarray(observations.turns.interval), 0, []
+    interval, first, recordings = np.asarray(observations.turns.interval), 0, []
     for part in segmentations:
         time, samples = part.recording.signals["gyroscope"].time, np.zeros(interval.shape, np.int64)
         for turn, (start, stop) in enumerate(zip(part.intervals[:-1, 1], part.intervals[1:, 0], strict=True), first):
             if (interval[turn] > 0).any():
                 inside = np.flatnonzero((time >= start) & (time < stop))
                 samples[turn, : len(inside)] = inside
-        places.append(samples)
+        recordings.append(samples)
         first += len(part.intervals)
-    return places
+    return recordings
 
 
 def tracks_by_hand(
@@ -49,8 +49,8 @@ def tracks_by_hand(
     and triad, at its samples, without what effects add; `running` (T, S, 4): the turns' rotations, sample by sample.
     """
     tracks, first = [], 0
-    for part, places, values in zip(segmentations, samples, outputs, strict=True):
-        tracks.append(_tracks(part, places, imu, values, first, running))
+    for part, turns, values in zip(segmentations, samples, outputs, strict=True):
+        tracks.append(_tracks(part, turns, imu, values, first, running))
         first += len(part.intervals)
     return tracks
 
@@ -66,16 +66,16 @@ def _tracks(
     recording, intervals, poses = part.recording, part.intervals, len(samples) + 1
     triads = imu.triads()
     force, rate = (triads[name].recover_on_host(outputs[name]) for name in ("accelerometer", "gyroscope"))
-    own = {name: _pose_of(recording.signals[name], intervals) for name in outputs}
-    means = np.stack([force[own["accelerometer"] == k].mean(axis=0) for k in range(len(intervals))])
-    rate[own["gyroscope"] >= 0] = 0.0
+    poses_of = {name: _pose_of(recording.signals[name], intervals) for name in outputs}
+    means = np.stack([force[poses_of["accelerometer"] == k].mean(axis=0) for k in range(len(intervals))])
+    rate[poses_of["gyroscope"] >= 0] = 0.0
 
     attitude = np.tile([1.0, 0.0, 0.0, 0.0], (len(rate), 1))
     rotation = scipy.spatial.transform.Rotation
     now = rotation.identity()
     for k, mean in enumerate(means):
         now = _levelled(now, mean)
-        attitude[own["gyroscope"] == k] = now.as_quat(scalar_first=True)
+        attitude[poses_of["gyroscope"] == k] = now.as_quat(scalar_first=True)
         inside = samples[first + k][samples[first + k] > 0] if k + 1 < len(means) else []
         if len(inside):
             turned = now * rotation.from_quat(running[first + k, : len(inside)], scalar_first=True)
@@ -84,7 +84,7 @@ def _tracks(
     gyroscope, tracks = recording.signals["gyroscope"], {}
     for name, known in measured(recording, force, rate).items():
         assert known.specific_force is not None
-        time, pose = recording.signals[name].time, own[name]
+        time, pose = recording.signals[name].time, poses_of[name]
         acceleration = np.array(known.angular_acceleration)
         acceleration[pose >= 0] = 0.0
         nearest = np.clip(np.searchsorted(gyroscope.time, time - 0.5 / gyroscope.rate), 0, len(gyroscope) - 1)
