@@ -64,7 +64,7 @@ def test_statistic_is_the_difference_of_two_fits(problem):
     poses = experiment.observations.poses
     real = np.asarray(poses.mask)
     time = (np.asarray(poses.start) + np.asarray(poses.stop))[real] / 2
-    rows = experiment.kinds == 0
+    rows = experiment.real.kind == 0
     extra = np.zeros((len(rows), 3))
     x = 2 * (time - time.min()) / np.ptp(time) - 1
     extra[rows] = np.stack([x, 3 * x**2 - 1, 5 * x**3 - 3 * x], axis=1)
@@ -118,12 +118,12 @@ def test_odd_poses_are_predicted_from_even_ones(problem):
     _, _, state, experiment = problem
     root = np.linalg.inv(state.weights)
     covariance, jacobian = root @ root.T, root @ state.evidence.jacobian
-    touched, kinds = experiment.touched, experiment.kinds
-    alone = touched[:, 0] == touched[:, 1]
+    first, kinds = experiment.real.first, experiment.real.kind
+    alone = first == experiment.real.last
     parity = np.zeros(len(kinds), int)
     for kind in np.unique(kinds[alone]):
         rows = alone & (kinds == kind)
-        parity[rows] = np.unique(touched[rows, 0], return_inverse=True)[1] % 2
+        parity[rows] = np.unique(first[rows], return_inverse=True)[1] % 2
     even, odd = alone & (parity == 0), alone & (parity == 1)
     apart = np.where(np.equal.outer(parity, parity), covariance, 0.0)
     made = replace(state, weights=np.linalg.inv(np.linalg.cholesky(apart)))

@@ -14,7 +14,7 @@ import synthetic
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording, calibrate
 from jaximu.cli.app import main
 from jaximu.diagnosis import check
-from jaximu.diagnosis.comparison import Fresh, Old, Question
+from jaximu.diagnosis.comparison import Fresh, Old, Question, Widened
 from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.estimation.data import About, Conditions
 from jaximu.estimation.fitting import effect_numbers
@@ -137,7 +137,7 @@ def test_laws_where_nothing_moved(calibration, unmoved, common):
         drawn = drawn + columns[:, old.allowed] @ (0.02 * random.standard_normal(3))  # another power-on
         linear.drawn = drawn
         scatter = np.ones(3)
-        question = Question.ask(old, linear, scatter)
+        question = Question.ask(old, Widened(linear, scatter).predict(old.imu))
         square = question.evidence.residual @ question.evidence.residual
         told.append(scipy.stats.chi2.sf(square, question.evidence.freedom))
         fresh = Fresh.fit(old, linear, scatter)

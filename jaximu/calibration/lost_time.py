@@ -260,7 +260,7 @@ class _Recorded:
         """Return a recording's rates (n, 3), rad/s."""
         signal, triad = self.found.segmentations[part].recording.gyroscope, self.found.imu.gyroscope
         assert signal is not None and triad is not None
-        return (signal.values - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
+        return triad.recover_on_host(signal.values)
 
     def jumps(self) -> list[FloatArray]:
         """Return for each turn (S − 1,) by how many times its usual step the course of the rate jumps in an interval.

@@ -26,6 +26,7 @@ from jaximu.data.preintegration import swing
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import Parameters
+from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotate, rotation_matrix
@@ -37,7 +38,7 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.observations import Turns
-from jaximu.recordings.recording import Recording, smoothed_slope
+from jaximu.recordings.recording import Recording, Signal, smoothed_slope
 
 __all__ = [
     "EXCESS_NAMES",
@@ -54,6 +55,10 @@ __all__ = [
 EXCESS_NAMES = ("gyroscope", "reference attitude", "gyroscope bias walk", "accelerometer", "reference velocity")
 _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
 """Standard deviation of each component at an excess of one: rad/√s, rad, rad/s/√s, m/s²·√s, m/s."""
+RESIDUALS = (
+    ResidualKind("specific_force", "specific force against gravity", "m/s^2", 3),
+    ResidualKind("rotation", "rate against the reference", "rad/s", 3),
+)
 _KNOWN = 0.03
 """Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
 INTERVALS = 192
@@ -395,6 +400,40 @@ class AgainstAttitude(Data):
         stood = scipy.spatial.transform.Slerp(time, self.attitude.rotation())(stamps)
         stood = stood * scipy.spatial.transform.Rotation.from_rotvec(np.array(mounting.rotation))
         return replace(known, attitude=stood.as_quat(scalar_first=True))
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition is: three of each rotation, then three of each window's mean force."""
+        data, group = self.intervals, self.group
+        stamps, used = np.asarray(data.stamp), np.asarray(data.used)
+        ends = stamps[::group]
+        window = np.arange(len(ends) - 1)
+        observation = np.repeat(np.concatenate([np.repeat(window, group), window]), 3)
+        middle = np.concatenate([(stamps[1:] + stamps[:-1]) / 2, (ends[1:] + ends[:-1]) / 2])
+        rotations = (np.arange(len(middle)) < len(used))[:, None]
+
+        def known(signal: Signal, values: FloatArray) -> FloatArray:
+            return np.stack([np.interp(middle, signal.time, column) for column in values.T], axis=1)
+
+        gyroscope, accelerometer = self.recording.gyroscope, self.recording.accelerometer
+        warmth = self.recording.temperature
+        assert gyroscope is not None
+        rate, force = known(gyroscope, np.degrees(gyroscope.si())), known(accelerometer, accelerometer.si())
+        covariates = {TIME: middle} | by_axis("rate", "°/s", np.where(rotations, rate, np.nan))
+        covariates |= by_axis("specific force", "m/s²", np.where(rotations, np.nan, force))
+        if warmth is not None:
+            covariates["temperature [°C]"] = known(warmth, warmth.values)[:, 0]
+        length = np.concatenate([np.where(used, np.diff(stamps), 1.0), np.ones(len(window))])
+        return Rows(
+            kinds=RESIDUALS,
+            kind=np.repeat([1, 0], [3 * len(used), 3 * len(window)]),
+            first=observation,
+            last=observation,
+            to_si=np.repeat(1 / length, 3),
+            used=np.repeat(np.concatenate([used, used.reshape(-1, group).all(axis=1)]), 3),
+            covariates={name: np.repeat(values, 3) for name, values in covariates.items()},
+            spans=np.stack([ends[:-1], ends[1:]], axis=1),
+            observation="motion",
+        )
 
     def about(self, imu: Imu) -> About:
         """Return the conditions about the unit, their covariance, and columns of effects, of the set-up's included."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import BlockFactor, Covariance
 from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import exponential, inverse_matrix, rotate, running_rotations
@@ -32,6 +34,11 @@ from jaximu.recordings.recording import Recording, Signal
 __all__ = ["EXCESS_NAMES", "FieldConditions", "FieldPath", "FieldWindows", "MagneticField", "windows_of"]
 
 EXCESS_NAMES = ("magnetometer", "carried field", "angle to gravity")
+RESIDUALS = (
+    ResidualKind("field_strength", "strength of the field", "uT", 1),
+    ResidualKind("carried_field", "field carried over a turn", "uT", 2),
+    ResidualKind("dip", "sine of the field's dip", "1", 1),
+)
 _UNITS = (0.1, 1e-3, 1e-2)
 """Standard deviation of each component at an excess of one: µT, rad (and a hundredth of the angle turned), rad."""
 _TURN_SHARE = 0.01
@@ -348,6 +355,31 @@ class MagneticField(Data):
 
     excess_names = EXCESS_NAMES
     coarse = (1.0, 1.0, 1.0)
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition is: strengths, two components of turns, dips; a turn leads to the next window."""
+        windows, count = self.windows, len(self.windows)
+        window = np.arange(count)
+        middle = windows.time.mean(axis=1)
+
+        def placed(of_windows: NDArray[Any], of_turns: NDArray[Any]) -> NDArray[Any]:
+            parts = [of_windows, np.repeat(of_turns, 2), of_windows]
+            return parts[0] if windows.alone else np.concatenate(parts)
+
+        used = [windows.used, np.repeat(windows.turn, 2), windows.level]
+        kind = placed(np.zeros(count, np.int64), np.ones(count, np.int64))
+        kind[3 * count :] = 2
+        return Rows(
+            kinds=RESIDUALS,
+            kind=kind,
+            first=placed(window, window),
+            last=placed(window, (window + 1) % count),
+            to_si=np.ones(len(kind)),
+            used=np.concatenate(used)[: len(kind)],
+            covariates={TIME: placed(middle, middle)},
+            spans=windows.time,
+            observation="window",
+        )
 
     def about(self, imu: Imu) -> About:
         """Return the conditions about the unit and their covariance."""

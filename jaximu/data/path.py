@@ -21,7 +21,7 @@ from jaximu.data.poses_covariance import Sensitivities
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import Effect
-from jaximu.model.sensor import Imu, Triad
+from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, Signal, smoothed_slope
@@ -97,8 +97,8 @@ def _path(
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
     assert gyroscope is not None and imu.gyroscope is not None
     count = len(observations.poses.mask)
-    force = _recover(imu.accelerometer, accelerometer.values - (0.0 if offset is None else offset.accelerometer))
-    rate = _recover(imu.gyroscope, gyroscope.values - shift - (0.0 if offset is None else offset.gyroscope))
+    force = imu.accelerometer.recover_on_host(accelerometer.values - (0.0 if offset is None else offset.accelerometer))
+    rate = imu.gyroscope.recover_on_host(gyroscope.values - shift - (0.0 if offset is None else offset.gyroscope))
     pose_a, pose_g = (_pose_of(signal, intervals) for signal in (accelerometer, gyroscope))
     means = np.stack([force[pose_a == k].mean(axis=0) for k in range(len(intervals))])
     rate[pose_g >= 0] = 0.0
@@ -142,7 +142,8 @@ def stimuli(recording: Recording, imu: Imu) -> list[tuple[Signal, Stimulus]]:
     """
     accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
     assert gyroscope is not None and imu.gyroscope is not None
-    force, rate = _recover(imu.accelerometer, accelerometer.values), _recover(imu.gyroscope, gyroscope.values)
+    force = imu.accelerometer.recover_on_host(accelerometer.values)
+    rate = imu.gyroscope.recover_on_host(gyroscope.values)
     return _measured(recording, force, rate)
 
 
@@ -172,10 +173,6 @@ def _pose_of(signal: Signal, intervals: FloatArray) -> NDArray[np.int64]:
     place = np.searchsorted(intervals[:, 0], signal.time, side="right") - 1
     inside = (place >= 0) & (signal.time < intervals[np.maximum(place, 0), 1])
     return np.where(inside, place, -1)
-
-
-def _recover(triad: Triad, values: FloatArray) -> FloatArray:
-    return (values - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
 
 
 def _at(time: FloatArray, values: FloatArray, wanted: FloatArray) -> FloatArray:

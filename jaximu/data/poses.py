@@ -31,6 +31,7 @@ from jaximu.data.poses_covariance import (
 )
 from jaximu.estimation.covariance import BlockFactor, Covariance, component_covariance
 from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import (
@@ -50,6 +51,7 @@ from jaximu.recordings.segmentation import Segmentation
 __all__ = [
     "COARSE_EXCESS",
     "EXCESS_NAMES",
+    "RESIDUALS",
     "Along",
     "Condensed",
     "HandHeldConditions",
@@ -60,6 +62,7 @@ __all__ = [
     "extent_of",
     "missed_by_sampling",
     "only",
+    "pose_rows",
     "rest_shifts",
 ]
 
@@ -67,6 +70,11 @@ EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
 COARSE_EXCESS = (1e2, 1e4, 1e2)
 """The first pass starts at the data sheet's values, percents away: weights as sharp as the noise would make it chase
 wrong minima, so they are blunted by this excess. The next pass finds the right ones."""
+RESIDUALS = (
+    ResidualKind("gravity_norm", "gravity norm at rest", "m/s^2", 1),
+    ResidualKind("gravity_direction", "gravity carried over a turn", "deg", 2, float(np.degrees(1.0))),
+    ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
+)
 _ROUNDS, _CHANGED = 6, 1e-3
 """Times that the path is taken anew with what effects add taken off, and the relative change of it that ends them."""
 
@@ -184,9 +192,9 @@ def condensed(
 class PosesAndTurns(Data):
     """Observations of units, one leading axis on every array; their effects are not looked at.
 
-    rows: "all"; "norm", gravity's magnitude alone; or "turning", all but that, neighbouring turns taken as independent
-    and the accelerometer as known. accelerometer_excess (N,): of its poses, with "turning". method: how rates are
-    integrated.
+    conditions: "all"; "norm", gravity's magnitude alone; or "turning", all but that, neighbouring turns taken as
+    independent and the accelerometer as known. accelerometer_excess (N,): of its poses, with "turning". method: how
+    rates are integrated.
     """
 
     excess_names = EXCESS_NAMES
@@ -195,24 +203,58 @@ class PosesAndTurns(Data):
     def __init__(
         self,
         observations: Observations,
-        rows: str = "all",
+        conditions: str = "all",
         accelerometer_excess: FloatArray | None = None,
         method: str = "exponential",
     ):
-        self.observations, self.rows, self.method = observations, rows, method
+        self.observations, self.conditions, self.method = observations, conditions, method
         self.accelerometer_excess = accelerometer_excess
 
     def take(self, lanes: NDArray[np.int64]) -> PosesAndTurns:
         """Return the measurement of some of the units."""
         observations = jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self.observations)
         excess = None if self.accelerometer_excess is None else self.accelerometer_excess[lanes]
-        return PosesAndTurns(observations, self.rows, excess, self.method)
+        return PosesAndTurns(observations, self.conditions, excess, self.method)
 
     def about(self, imu: Imu) -> About:
         """Return the conditions about units without effects."""
-        found = condensed(imu, self.observations, self.rows, self.method, self.accelerometer_excess)
+        found = condensed(imu, self.observations, self.conditions, self.method, self.accelerometer_excess)
         none = np.zeros((*found.covariance.used.shape, 0))
         return About(found.conditions, found.covariance, none, found)
+
+
+def pose_rows(imu: Imu, observations: Observations) -> Rows:
+    """Return what each of the conditions of poses and turns is, by a unit close to this one."""
+    poses, turns = jax.tree.map(np.asarray, (observations.poses, observations.turns))
+    gyroscope = imu.gyroscope
+    assert gyroscope is not None
+    pose, turn = np.arange(len(poses.mask)), np.arange(len(turns.mask))
+
+    def placed(of_poses, of_turns):
+        return np.concatenate([of_poses, np.repeat(of_turns, 2, axis=0), np.repeat(of_poses, 3, axis=0)])
+
+    unknown = np.full(len(pose), np.nan), np.full(len(turn), np.nan)
+    speed = np.degrees(np.linalg.norm(gyroscope.recover_on_host(turns.output), axis=2)) * (turns.interval > 0)
+    middle = (poses.start + poses.stop) / 2, (poses.stop[:-1] + poses.start[1:]) / 2
+    covariates = {TIME: placed(*middle), "temperature [°C]": placed(poses.temperature, unknown[1])}
+    forces = imu.accelerometer.recover_on_host(poses.accelerometer_mean)
+    covariates |= by_axis("specific force", "m/s²", placed(forces, np.full((len(turn), 3), np.nan)))
+    covariates |= {
+        "angle [°]": placed(unknown[0], np.sum(speed * turns.interval, axis=1)),
+        "rate [°/s]": placed(unknown[0], speed.max(axis=1)),
+        "duration [s]": placed(unknown[0], turns.interval.sum(axis=1)),
+    }
+    scale = np.linalg.norm(gyroscope.gain, axis=1)
+    return Rows(
+        kinds=RESIDUALS,
+        kind=np.repeat([0, 1, 2], [len(pose), 2 * len(turn), 3 * len(pose)]),
+        first=placed(pose, turn),
+        last=placed(pose, turn + 1),
+        to_si=np.concatenate([np.ones(len(pose) + 2 * len(turn)), np.tile(1 / scale, len(pose))]),
+        used=placed(poses.mask, turns.mask).astype(bool),
+        covariates=covariates,
+        spans=np.stack([poses.start, poses.stop], axis=1),
+    )
 
 
 class Along:
@@ -250,6 +292,10 @@ class RecordedByHand(Data):
     def shifts(self) -> FloatArray:
         """What the observations took off each recording's gyroscope output (k, 3): its bias against the first's."""
         return rest_shifts(self.segmentations)
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition is: norms of poses, two components of turns, three of means at rest."""
+        return pose_rows(imu, self.observations)
 
     def about(self, imu: Imu) -> About:
         """Return the conditions about one unit, the leading axis of length one, and its effects' columns."""
@@ -341,7 +387,7 @@ def missed_by_sampling(turns: Turns, gyroscope: Triad, running: FloatArray) -> F
 
     Where sampling is dense enough it is noise. running: the turns' rotations (T, S, 4) after each sample.
     """
-    rates = (np.asarray(turns.output) - np.asarray(gyroscope.bias)) @ np.linalg.inv(np.asarray(gyroscope.gain)).T
+    rates = gyroscope.recover_on_host(turns.output)
     interval = np.asarray(turns.interval)
     sign = np.where(np.arange(interval.shape[1]) % 2 == 0, 1.0, -1.0)
     axis = running[..., 1:]

@@ -69,12 +69,12 @@ class RestOverTemperature(Data):
         if apart.shape[1]:  # combinations that no level moves
             whole = [np.linalg.qr(own @ apart, mode="complete")[0] for own in weights]
             self.weights = np.stack([q[:, apart.shape[1] :].T @ own for q, own in zip(whole, weights, strict=True)])
-        self.rows = _padded(self.weights.shape[1])  # of an axis
-        used = np.zeros((3, self.rows))
+        self._length = _padded(self.weights.shape[1])  # of an axis
+        used = np.zeros((3, self._length))
         used[:, : self.weights.shape[1]] = 1.0
         factors = tuple((used * axis[:, None]).reshape(1, -1) for axis in np.eye(3))
-        group = np.repeat(np.arange(3), self.rows)[None]
-        one = np.ones((1, 3 * self.rows))
+        group = np.repeat(np.arange(3), self._length)[None]
+        one = np.ones((1, 3 * self._length))
         self.covariance = Covariance(one, factors, used.reshape(1, -1), group)  # pyright: ignore[reportArgumentType]
         self.bias = self._white(np.tile(np.eye(3), (len(output), 1, 1)))
 
@@ -90,9 +90,9 @@ class RestOverTemperature(Data):
 
     def _white(self, values: FloatArray) -> FloatArray:
         """Return (1, 3 rows, q) of values (n, 3, q) by block and axis."""
-        found = np.zeros((3, self.rows, values.shape[2]))
+        found = np.zeros((3, self._length, values.shape[2]))
         found[:, : self.weights.shape[1]] = self.weights @ values.transpose(1, 0, 2)
-        return found.reshape(1, 3 * self.rows, -1)
+        return found.reshape(1, 3 * self._length, -1)
 
 
 def mean_terms(effects: Sequence[Effect], paths: Sequence[BlockPath], count: int) -> tuple[FloatArray, FloatArray]:

@@ -12,20 +12,30 @@ from numpy.typing import NDArray
 from jaximu.data.station_error import turntable_error
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 
 __all__ = [
+    "RESIDUALS",
     "KnownStations",
     "StationConditions",
     "station_covariance",
     "station_covariances",
     "station_excess",
+    "station_rows",
     "station_weights",
     "turntable",
 ]
+
+
+RESIDUALS = (
+    ResidualKind("accelerometer", "specific force in the poses", "m/s^2", 3),
+    ResidualKind("turns", "rate over the turns", "rad/s", 3),
+    ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
+)
 
 
 class StationConditions(Conditions):
@@ -47,6 +57,36 @@ class StationConditions(Conditions):
         stations = self.stations
         force = stations.stimulus.specific_force * (magnitude / stations.gravity)
         return StationConditions(eqx.tree_at(lambda s: s.stimulus.specific_force, stations, force))
+
+
+def station_rows(imu: Imu, stations: Stations) -> Rows:
+    """Return what each error of a mean output is, by a unit close to this one."""
+    count, turn = len(stations.turn), np.asarray(stations.turn)
+    start, stop = np.asarray(stations.start), np.asarray(stations.stop)
+    station, stimulus = np.repeat(np.arange(count), 6), stations.stimulus
+    kind = np.repeat(np.stack([np.zeros(count, np.int64), np.where(turn, 1, 2)], axis=1), 3, axis=1).ravel()
+    covariates = {TIME: np.repeat((start + stop) / 2, 6)}
+    if stimulus.temperature is not None:
+        covariates["temperature [°C]"] = np.repeat(np.asarray(stimulus.temperature).mean(axis=1), 6)
+    force, rate = (
+        np.repeat(np.asarray(vectors).mean(axis=1), 6, axis=0)
+        for vectors in (stimulus.specific_force, stimulus.angular_rate)
+    )
+    turning = (kind == 1)[:, None]
+    covariates |= by_axis("specific force", "m/s²", np.where(turning, np.nan, force))
+    covariates |= by_axis("rate", "°/s", np.where(turning, np.degrees(rate), np.nan))
+    scale = [np.linalg.norm(np.asarray(triad.gain), axis=1) for triad in imu.triads().values()]
+    used = np.stack([np.asarray(stations.accelerometer_used), np.asarray(stations.gyroscope_used)], axis=1)
+    return Rows(
+        kinds=RESIDUALS,
+        kind=kind,
+        first=station,
+        last=station,
+        to_si=1 / np.tile(np.concatenate([*scale, np.ones(3)])[:6], count),
+        used=np.repeat(used, 3, axis=1).ravel(),
+        covariates=covariates,
+        spans=np.stack([start, stop], axis=1),
+    )
 
 
 def station_excess(stations: Stations) -> Float[Array, "3 6 S"]:

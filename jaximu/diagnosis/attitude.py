@@ -20,11 +20,12 @@ from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditio
 from jaximu.data.path import Path
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import EffectBlock
-from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
+from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.estimation.data import About
 from jaximu.estimation.fitting import Linear, Prior, effect_numbers
 from jaximu.estimation.problem import Name
+from jaximu.estimation.rows import Rows
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
@@ -61,15 +62,15 @@ class MeasuredAttitude(Experiment):
     excess_names = EXCESS_NAMES
     coarse = AgainstAttitude.coarse
     advice = staticmethod(station_advice)
-    residual_kinds = (
-        ResidualKind("specific_force", "specific force against gravity", "m/s^2", 3),
-        ResidualKind("rotation", "rate against the reference", "rad/s", 3),
-    )
     no_fixture = "how the reference is mounted, late and smoothed is estimated in any case"
 
     def free(self, name: Name) -> bool:
         """Return whether a number is free: the accelerometer's gain is lower triangular, which fixes the frame."""
         return without_equipment_or_effects(name)
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition is."""
+        return self.measurement.rows(imu)
 
     def about(self, imu: Imu) -> About:
         """Return the conditions about one unit, the leading axis, its effects' columns, and all that is not known."""
@@ -146,14 +147,9 @@ class MeasuredAttitude(Experiment):
         """Return the recording with a window of the force left out, and the rotations in it."""
         return replace(self, measurement=replace(self.measurement, left_out=(*self.measurement.left_out, place)))
 
-    def describe(self, place: int) -> str:
-        """Name a window by its time."""
-        start, stop = np.asarray(self.measurement.intervals.stamp)[self._edges[place : place + 2]]
-        return f"the motion from {start:.1f} to {stop:.1f} s"
-
     def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
-        found = self.summary(linear.conditions[self.used])
+        found = self.real.rms(linear.conditions[self.used])
         return found | {"rotation": (float(np.degrees(found["rotation"][0])), "deg/s")}
 
     def twin(self, state: State, noise: NoiseModel, seed: int) -> MeasuredAttitude:
@@ -163,26 +159,6 @@ class MeasuredAttitude(Experiment):
         drawn = np.linalg.cholesky(covariance) @ np.random.default_rng(seed).normal(size=len(self.used))
         return replace(self, start=state.imu, shift=self.shift + drawn * self.used - state.linear.conditions)
 
-    def covariates(self, kind: int) -> dict[str, FloatArray]:
-        """Return what errors of a kind may depend on: for each of its vectors (v,), by name with unit, time first."""
-        stamps, used = np.asarray(self.measurement.intervals.stamp), self.measurement.intervals.used
-        recording = self.measurement.recording
-        first, last = (stamps[:-1], stamps[1:]) if kind else (stamps[self._edges[:-1]], stamps[self._edges[1:]])
-        real = np.asarray(used if kind else self._complete)
-        middle = ((first + last) / 2)[real]
-        signal, name, unit = (
-            (recording.gyroscope, "rate", "°/s") if kind else (recording.accelerometer, "specific force", "m/s²")
-        )
-        assert signal is not None
-        values = np.degrees(signal.si()) if kind else signal.si()
-        found = {"time [s]": middle}
-        found |= {f"{name}, {axis} [{unit}]": np.interp(middle, signal.time, values[:, k])
-                  for k, axis in enumerate("xyz")}  # fmt: skip
-        if recording.temperature is not None:
-            warm = recording.temperature
-            found["temperature [°C]"] = np.interp(middle, warm.time, warm.values[:, 0])
-        return {label: each for label, each in found.items() if np.ptp(each) > 0.1}
-
     def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
         """Return no parts: the unit is in motion, and its noise the calibration's."""
         return [], getattr(self.measurement.recording, triad).rate
@@ -191,29 +167,6 @@ class MeasuredAttitude(Experiment):
     def recordings(self) -> tuple[Recording, ...]:
         """What is diagnosed, as it was recorded."""
         return (self.measurement.recording,)
-
-    @property
-    def used(self) -> NDArray[np.bool_]:
-        """Which of the conditions are real: three of each rotation, then three of each mean force."""
-        return np.repeat(np.concatenate([np.asarray(self.measurement.intervals.used), self._complete]), 3)
-
-    @property
-    def kinds(self) -> NDArray[np.int64]:
-        """What each real condition is: 0 of a mean force, 1 of a rotation."""
-        return np.repeat([1, 0], [3 * len(self.measurement.intervals.used), 3 * self._windows])[self.used]
-
-    @property
-    def touched(self) -> NDArray[np.int64]:
-        """The window, twice (n, 2), of each real condition."""
-        window = np.arange(self._windows)
-        place = np.repeat(np.concatenate([np.repeat(window, self.measurement.group), window]), 3)[self.used]
-        return np.stack([place, place], axis=1)
-
-    def in_si(self, conditions: FloatArray) -> FloatArray:
-        """Return real conditions (n,), rotations as mean rates, rad/s."""
-        length = np.diff(np.asarray(self.measurement.intervals.stamp))
-        whole = np.repeat(np.concatenate([length, np.ones(self._windows)]), 3)
-        return np.asarray(np.divide(conditions, whole[self.used]), np.float64)
 
     @property
     def _windows(self) -> int:

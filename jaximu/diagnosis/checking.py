@@ -13,7 +13,7 @@ from jaximu.calibration.calibration import provenance, require_calibration
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.systematic import History, noise_at_rest
 from jaximu.data.drift import with_usual_drift
-from jaximu.diagnosis.comparison import FollowedUnit, Fresh, Old, Question, candidates, scatter_about_a_fit
+from jaximu.diagnosis.comparison import FollowedUnit, Fresh, Old, Question, Widened, candidates, scatter_about_a_fit
 from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
@@ -131,16 +131,16 @@ def _checked(
     conditions = experiment.predict(old.imu)[0]
     _same_unit(experiment, conditions, recordings[0].name)
 
-    scatter = np.ones(len(experiment.residual_kinds))
+    scatter = np.ones(len(experiment.real.kinds))
     fresh = Fresh.fit(old, experiment, scatter)
     _same_gains(old, fresh, recordings[0].name)
     enough = len(conditions) - len(old.names) >= _FEWEST and bool(fresh.known(old).all())
     others = candidates(old, experiment) if enough else []
-    question = Question.ask(old, experiment, scatter, others)
+    question = Question.ask(old, Widened(experiment, scatter).predict(old.imu), others)
     selection = select(question.evidence, level)
     if not selection.complete:
         scatter = scatter_about_a_fit(old, experiment, fresh)
-        question = Question.ask(old, experiment, scatter, others)
+        question = Question.ask(old, Widened(experiment, scatter).predict(old.imu), others)
         selection = select(question.evidence, level)
     known = fresh.known(old)
     causes = tuple(
@@ -171,7 +171,7 @@ def _checked(
             "them from "
             "parameters that moved."
         )
-    kinds = [kind.name for kind in experiment.residual_kinds]
+    kinds = [kind.name for kind in experiment.real.kinds]
     wide = {name: float(value) for name, value in zip(kinds, scatter, strict=True)}
     if scatter.max() > 1:
         said = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in wide.items() if value > 1)
@@ -179,7 +179,7 @@ def _checked(
             f"the recording scatters more than its noise about any calibration ({said} times): the noise was widened "
             "by it. `jaximu diagnose` seeks the reason."
         )
-    before, after = (experiment.summary(each) for each in (conditions, fresh.conditions))
+    before, after = (experiment.real.rms(each) for each in (conditions, fresh.conditions))
     observed = experiment.observations
     return Validity(
         verdict, selection.p_value, float(question.evidence.residual @ question.evidence.residual),
@@ -227,7 +227,7 @@ def _followed(
     free = int(history.freedom.sum()) - len(followed.conditions)
     left = max(float(history.innovations.sum()) - explained, 0.0) / max(free, 1)
     scatter = np.full(1, max(1.0, np.sqrt(left)))
-    question = Question.ask(old, followed, scatter)
+    question = Question.ask(old, followed.predict(float(scatter[0])))
     selection = select(question.evidence, level)
     fresh = Fresh.of_linear(old, followed, float(scatter[0]))
     strange = left > _LARGE and chi2_sf(left * free, free) < _IMPLAUSIBLE
@@ -348,10 +348,10 @@ def _same_sensors(calibration: Calibration, recordings: Sequence[Recording]) -> 
 
 
 def _same_unit(experiment: HandHeldExperiment, conditions: FloatArray, name: str) -> None:
-    values, kinds = experiment.in_si(conditions), experiment.kinds
-    for place, (kind, limit) in enumerate(zip(experiment.residual_kinds, _FAR_OFF, strict=False)):
-        own = values[kinds == place].reshape(-1, kind.components)
-        if len(own) and (median := float(np.median(np.linalg.norm(own, axis=1)))) > limit:
+    real = experiment.real
+    for index, (kind, limit) in enumerate(zip(real.kinds, _FAR_OFF, strict=False)):
+        vectors = (conditions * real.to_si)[real.kind == index].reshape(-1, kind.components)
+        if len(vectors) and (median := float(np.median(np.linalg.norm(vectors, axis=1)))) > limit:
             raise InputError(
                 f"{name}: with this calibration the {kind.name.replace('_', ' ')} is off by "
                 f"{size(kind.factor * median, kind.unit)} in the median: is it the same unit, in the same units and "

@@ -84,10 +84,10 @@ def _by_kind(state: State, experiment: Experiment) -> list[Check]:
     basis = np.linalg.svd(evidence.jacobian, full_matrices=False)[0]
     left = root @ (np.eye(len(residual)) - basis @ basis.T) @ root.T
     found = []
-    for place, kind in enumerate(experiment.residual_kinds):
+    for place, kind in enumerate(experiment.real.kinds):
         plain = kind.name.replace("_", " ")
         name, words = _KINDS.get(kind.name, (plain, plain))
-        rows = experiment.kinds == place
+        rows = experiment.real.kind == place
         if not rows.any():
             continue
         values, vectors = np.linalg.eigh(left[np.ix_(rows, rows)])
@@ -109,31 +109,36 @@ def _dependences(state: State, experiment: HandHeldExperiment) -> list[Check]:
     """
     root = np.linalg.inv(state.weights)
     jacobian = root @ state.evidence.jacobian
-    at_pose, at_turn = _covariates(state, experiment)
-    kinds, first = experiment.kinds, experiment.touched[:, 0]
+    real = experiment.rows(state.imu).real()
+    kinds, steady = real.kind, experiment.extent().temperature_range <= _LEAST_WARMING
     names = ("gravity norm at rest", "gravity direction over turns", "rate at rest")
     scales = [state.names.index(Name("gyroscope", "gain", (axis, axis))) for axis in range(3)]
     blocks = []
 
-    def add(kind: int, name: str, values: FloatArray, degree: int, shapes: FloatArray) -> None:
-        """`values` by observation; `shapes` (n, k) of all conditions, taken where they are of this kind."""
+    def add(kind: int, name: str, degree: int, shapes: FloatArray) -> None:
+        """`shapes` (n, k) of all conditions, taken where they are of this kind."""
         rows = kinds == kind
-        used = values[first[rows]]
-        if not rows.any() or np.ptp(used) <= _STILL * np.max(np.abs(used)):
+        used = real.covariates[name][rows]
+        if not rows.any() or not np.ptp(used) > _STILL * np.max(np.abs(used)):  # nor where a kind has no such covariate
             return
         basis = np.polynomial.legendre.legvander(2 * (used - used.min()) / np.ptp(used) - 1, degree)[:, 1:]
         columns = np.zeros((len(rows), degree * shapes.shape[1]))
         columns[rows] = (basis[:, :, None] * shapes[rows, None, :]).reshape(len(used), -1)
-        blocks.append(EffectBlock(f"{names[kind]} against {name}", state.weights @ columns, np.ones(columns.shape[1])))
+        blocks.append(
+            EffectBlock(
+                f"{names[kind]} against {name.partition(' [')[0]}", state.weights @ columns, np.ones(columns.shape[1])
+            )
+        )
 
     axes = np.zeros((len(kinds), 3))
     axes[kinds == 2] = np.tile(np.eye(3), (int(np.sum(kinds == 2)) // 3, 1))
-    for name, values in at_pose.items():
+    asked = [name for name in real.covariates if not (steady and name.startswith("temperature"))]
+    for name in asked:
         degree = 4 if name.startswith("specific force") else 3  # bias and scale take the first two degrees of force
-        add(0, name, values, degree, np.ones((len(kinds), 1)))
-        add(2, name, values, degree, axes)
-    for name, values in at_turn.items():
-        add(1, name, values, 2, jacobian[:, scales])
+        add(0, name, degree, np.ones((len(kinds), 1)))
+        add(2, name, degree, axes)
+    for name in asked:
+        add(1, name, 2, jacobian[:, scales])
     evidence = Evidence(state.evidence.residual, state.evidence.jacobian, blocks)
     scores = evidence.scores()
     found = []
@@ -144,26 +149,6 @@ def _dependences(state: State, experiment: HandHeldExperiment) -> list[Check]:
             p_value = float(chi2_sf(statistic, freedom))
             found.append(Check(block.name, statistic / int(freedom), p_value, text))
     return found
-
-
-def _covariates(state: State, experiment: HandHeldExperiment) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-    """What errors of poses (P,) and of turns (T,) may depend on, by name, padding included."""
-    poses, turns = experiment.observations.poses, experiment.observations.turns
-    accelerometer, gyroscope = state.imu.accelerometer, state.imu.gyroscope
-    assert gyroscope is not None
-    start, stop = np.asarray(poses.start), np.asarray(poses.stop)
-    force = (np.asarray(poses.accelerometer_mean) - np.asarray(accelerometer.bias)) @ np.linalg.inv(
-        np.asarray(accelerometer.gain)
-    ).T
-    at_pose = {"time": (start + stop) / 2}
-    if experiment.extent().temperature_range > _LEAST_WARMING:
-        at_pose["temperature"] = np.asarray(poses.temperature)
-    at_pose |= {f"specific force {axis}": force[:, k] for k, axis in enumerate("xyz")}
-    interval = np.asarray(turns.interval)
-    rate = (np.asarray(turns.output) - np.asarray(gyroscope.bias)) @ np.linalg.inv(np.asarray(gyroscope.gain)).T
-    speed = np.linalg.norm(rate, axis=2) * (interval > 0)
-    at_turn = {"time": (stop[:-1] + start[1:]) / 2, "angle": np.sum(speed * interval, axis=1)}
-    return at_pose, at_turn | {"rate": speed.max(axis=1), "duration": interval.sum(axis=1)}
 
 
 def _distribution(state: State) -> Check:
@@ -183,12 +168,12 @@ def _odd_even(state: State, experiment: Experiment) -> Check:
     """
     root = np.linalg.inv(state.weights)
     covariance, jacobian = root @ root.T, root @ state.evidence.jacobian
-    touched, kinds = experiment.touched, experiment.kinds
-    alone = touched[:, 0] == touched[:, 1]  # a turn may join an odd and an even pose
+    first, kinds = experiment.real.first, experiment.real.kind
+    alone = first == experiment.real.last  # a turn may join an odd and an even pose
     parity = np.zeros(len(kinds), np.int64)
     for kind in np.unique(kinds[alone]):
         own = alone & (kinds == kind)
-        parity[own] = np.unique(touched[own, 0], return_inverse=True)[1] % 2
+        parity[own] = np.unique(first[own], return_inverse=True)[1] % 2
     even = alone & (parity == 0)
 
     def misfit(rows) -> tuple[float, int]:

@@ -132,19 +132,9 @@ class FollowedUnit:
     conditions: FloatArray
     columns: FloatArray
 
-    @property
-    def kinds(self) -> NDArray[np.int64]:
-        """One kind of condition."""
-        return np.zeros(len(self.conditions), np.int64)
-
-    @property
-    def used(self) -> NDArray[np.int64]:
-        """All of them."""
-        return np.arange(len(self.conditions))
-
-    def predict(self, imu: Imu) -> tuple[FloatArray, FloatArray, FloatArray, tuple[Name, ...]]:
-        """Return the conditions of the old calibration, their columns and covariance."""
-        return self.conditions, self.columns, np.eye(len(self.conditions)), ()
+    def predict(self, scatter: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the conditions, their columns and covariance, as wide as they scatter."""
+        return self.conditions, self.columns, scatter**2 * np.eye(len(self.conditions))
 
 
 class Widened(Data):
@@ -157,11 +147,9 @@ class Widened(Data):
     excess_names = HandHeldExperiment.excess_names
     coarse = HandHeldExperiment.coarse
 
-    def __init__(
-        self, experiment: HandHeldExperiment | FollowedUnit, scatter: FloatArray, causes: Sequence[FloatArray] = ()
-    ):
+    def __init__(self, experiment: HandHeldExperiment, scatter: FloatArray, causes: Sequence[FloatArray] = ()):
         self.experiment, self.used = experiment, experiment.used
-        self.wide = scatter[experiment.kinds]
+        self.wide = scatter[experiment.real.kind]
         self.causes = np.concatenate([np.zeros((len(self.wide), 0)), *causes], axis=1)
 
     def widen(self, covariance: FloatArray) -> FloatArray:
@@ -170,7 +158,6 @@ class Widened(Data):
 
     def about(self, imu: Imu) -> About:
         """Return the recording about the unit."""
-        assert isinstance(self.experiment, HandHeldExperiment)
         found, real = self.experiment.about(imu), np.ix_(self.used, self.used)
         measured = np.array(found.covariance.measured)
         measured[0][real] = self.widen(measured[0][real])
@@ -242,11 +229,11 @@ def scatter_about_a_fit(old: Old, experiment: HandHeldExperiment, fresh: Fresh) 
 
     `fresh`: the calibration with factors of one.
     """
-    scatter = np.ones(len(experiment.residual_kinds))
+    scatter = np.ones(len(experiment.real.kinds))
     for number in range(4):
         fresh = fresh if number == 0 else Fresh.fit(old, experiment, scatter, begin=fresh.imu)
-        for place in np.unique(experiment.kinds):
-            rows = experiment.kinds == place
+        for place in np.unique(experiment.real.kind):
+            rows = experiment.real.kind == place
             values, vectors = np.linalg.eigh(fresh.left[np.ix_(rows, rows)])
             keep = values > 1e-6 * values[-1]
             along = vectors[:, keep].T @ fresh.conditions[rows] / np.sqrt(values[keep])
@@ -296,12 +283,15 @@ class Question:
     def ask(
         cls,
         old: Old,
-        experiment: HandHeldExperiment | FollowedUnit,
-        scatter: FloatArray,
+        predicted: tuple[FloatArray, FloatArray, FloatArray],
         others: Sequence[Explanation] = (),
     ) -> Question:
-        """Predict the recording, and gather what may explain it: parameters, another gravity, and `others`."""
-        conditions, columns, whole = Widened(experiment, scatter).predict(old.imu)
+        """Gather what may explain a prediction's error: parameters, another gravity, and `others`.
+
+        **Arguments:** `predicted`: conditions (n,), columns (n, p) and covariance (n, n), as `Widened.predict` returns
+        them.
+        """
+        conditions, columns, whole = predicted
         tested = old.tested
         whole = whole + columns[:, tested] @ old.covariance[np.ix_(tested, tested)] @ columns[:, tested].T
         reach = columns @ old.gravity

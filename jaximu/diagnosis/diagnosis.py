@@ -687,7 +687,7 @@ def _saturated(experiment: Experiment, state: State) -> list[str]:
     """Return the kinds of conditions, in words, of which the parameters leave none over."""
     jacobian = np.linalg.solve(state.weights, state.evidence.jacobian)
     jacobian /= np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    parts = [(kind.words, jacobian[experiment.kinds == k]) for k, kind in enumerate(experiment.residual_kinds)]
+    parts = [(kind.words, jacobian[experiment.real.kind == k]) for k, kind in enumerate(experiment.real.kinds)]
     return [words for words, part in parts if len(part) and np.linalg.matrix_rank(part, 1e-6) == len(part)]
 
 

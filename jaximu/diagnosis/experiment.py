@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Self
+from functools import cached_property
+from typing import Any, ClassVar, Self
 
 import jax
 import numpy as np
@@ -19,6 +20,7 @@ from jaximu.diagnosis.handling import Handling
 from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import Linear, Prior, fit, linearise
 from jaximu.estimation.problem import Name
+from jaximu.estimation.rows import Rows
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects import CATALOGUE, Effect
@@ -28,27 +30,13 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
-__all__ = ["Experiment", "ResidualKind", "State"]
+__all__ = ["Experiment", "State"]
 
 _PLAUSIBLE = 20.0
 """Typical sizes beyond which a detection limit means that a recording does not show the effect."""
 _LEAST_WARMING = 0.2  # K
 _SEED = 20260101
 _PARTS = 8  # left out in turn
-
-
-class ResidualKind(NamedTuple):
-    """A kind of condition: its name, in words, the unit its rms is told in, how many components make one vector.
-
-    `factor` turns the condition's SI into that unit; `centred`: a common offset is taken off before the rms.
-    """
-
-    name: str
-    words: str
-    unit: str
-    components: int
-    factor: float = 1.0
-    centred: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,7 +86,6 @@ class Experiment(Data):
     start: Imu
     drift: DriftComponents | None = None  # that was estimated from this very recording
     reference: dict[str, Any] | None = None  # what is known of a measured attitude, as `calibration.json` has it
-    residual_kinds: ClassVar[tuple[ResidualKind, ...]]
     advice: ClassVar[Callable[..., str]] = staticmethod(pose_advice)
     owners: ClassVar[tuple[str, ...]] = ("accelerometer", "gyroscope", "setup")  # whose effects are asked
     by_hand: ClassVar[bool] = False  # hands moved the unit
@@ -106,6 +93,16 @@ class Experiment(Data):
     no_session: str = ""  # why effects of a single recording cannot be asked; empty where they can
 
     # --- what a kind of recording says of itself ------------------------------------------------------------------
+
+    @cached_property
+    def used(self) -> NDArray[np.bool_]:
+        """Which of the conditions are real."""
+        return self.rows(self.start).used
+
+    @cached_property
+    def real(self) -> Rows:
+        """What each real condition is."""
+        return self.rows(self.start).real()
 
     @abstractmethod
     def free(self, name: Name) -> bool:
@@ -154,20 +151,12 @@ class Experiment(Data):
         """Return the recording with an observation, and what touches it, left out."""
 
     @abstractmethod
-    def describe(self, place: int) -> str:
-        """Name an observation by its time."""
-
-    @abstractmethod
     def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
 
     @abstractmethod
     def twin(self, state: State, noise: NoiseModel, seed: int) -> Self:
         """Return the recording as a fit without effects would have it, along the same motion, noise included."""
-
-    @abstractmethod
-    def covariates(self, kind: int) -> dict[str, FloatArray]:
-        """Return what errors of a kind may depend on: for each of its vectors (v,), by name with unit, time first."""
 
     @abstractmethod
     def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
@@ -178,25 +167,6 @@ class Experiment(Data):
     def recordings(self) -> tuple[Recording, ...]:
         """What is diagnosed, as it was recorded."""
 
-    @property
-    @abstractmethod
-    def used(self) -> NDArray[np.bool_]:
-        """Which of the conditions are real."""
-
-    @property
-    @abstractmethod
-    def kinds(self) -> NDArray[np.int64]:
-        """What each real condition is: a place in `residual_kinds`."""
-
-    @property
-    @abstractmethod
-    def touched(self) -> NDArray[np.int64]:
-        """The first and last observation (n, 2) that each real condition involves."""
-
-    @abstractmethod
-    def in_si(self, conditions: FloatArray) -> FloatArray:
-        """Return real conditions (n,) with those that are in output units in SI."""
-
     def shortest(self) -> float:
         """Return the usual length (s) of a still part: noise that is slower shows between them."""
         parts, rate = self.still_parts("accelerometer")
@@ -204,7 +174,7 @@ class Experiment(Data):
 
     def parts(self) -> list[NDArray[np.int64]]:
         """Return the observations that are left out in turn, in the order of time."""
-        return np.array_split(np.arange(int(self.touched.max()) + 1), _PARTS)
+        return self.real.parts(_PARTS)
 
     def drifts(self, noise: NoiseModel, linear: Linear, within: bool) -> tuple[dict[str, AxisNoise], FloatArray]:
         """Return drifts of the biases by name, at a size of one, and the covariance (k, n, n) that each adds.
@@ -327,23 +297,6 @@ class Experiment(Data):
         linear, used = self.linearise(imu), self.used
         columns = np.concatenate([linear.slope / linear.sizes[: linear.slope.shape[1]], linear.columns], axis=1)
         return linear.conditions[used], columns[used], linear.covariance[np.ix_(used, used)], linear.names
-
-    def summary(self, conditions: FloatArray) -> dict[str, tuple[float, str]]:
-        """Return the rms of each kind of real conditions (n,), as vectors, with its unit."""
-        return {
-            kind.name: (float(np.sqrt(np.mean(errors**2))), kind.unit)
-            for kind, errors in zip(self.residual_kinds, self.errors(conditions), strict=True)
-            if len(errors)
-        }
-
-    def errors(self, conditions: FloatArray) -> list[FloatArray]:
-        """Return the errors (v,) of each kind of real conditions (n,), in its unit: lengths, or scalars with a sign."""
-        kinds, values, found = self.kinds, self.in_si(conditions), []
-        for place, kind in enumerate(self.residual_kinds):
-            own = values[kinds == place].reshape(-1, kind.components)
-            own = own - own.mean(axis=0) if kind.centred and len(own) else own
-            found.append(kind.factor * (own[:, 0] if kind.components == 1 else np.linalg.norm(own, axis=1)))
-        return found
 
     def _blocks(
         self, imu: Imu, linear: Linear, weights: FloatArray, fitted: set[str], asking: Container[str] | None

@@ -182,5 +182,5 @@ def _named(blocks: Sequence[EffectBlock], cause: SelectedCause) -> Found:
 
 
 def _bumped(experiment: Experiment, place: int) -> Finding:
-    text = f"{experiment.describe(place)} does not fit the others: bumped, or not still. It was left out."
+    text = f"{experiment.real.describe(place)} does not fit the others: bumped, or not still. It was left out."
     return Finding("data.bumped_pose", (), text)

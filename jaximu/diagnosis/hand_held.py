@@ -8,7 +8,6 @@ from functools import partial
 
 import equinox as eqx
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
@@ -17,7 +16,7 @@ from jaximu.data.path import Path
 from jaximu.data.poses import RecordedByHand, extent_of
 from jaximu.diagnosis.drift import DriftComponents
 from jaximu.diagnosis.evidence import EffectBlock
-from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
+from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.estimation.data import About
@@ -42,11 +41,6 @@ class HandHeldExperiment(RecordedByHand, Experiment):
     drift: DriftComponents | None = None
 
     by_hand = True
-    residual_kinds = (
-        ResidualKind("gravity_norm", "gravity norm at rest", "m/s^2", 1),
-        ResidualKind("gravity_direction", "gravity carried over a turn", "deg", 2, float(np.degrees(1.0))),
-        ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
-    )
     no_fixture = "a hand-held recording has no set-up to compare with"
 
     @property
@@ -91,30 +85,6 @@ class HandHeldExperiment(RecordedByHand, Experiment):
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
         return residual_rms(imu, linear.details.observations)
 
-    @property
-    def kinds(self) -> NDArray[np.int64]:
-        """What each real condition is: 0 the norm of a pose, 1 a component of a turn, 2 of a mean at rest."""
-        poses, turns = len(self.observations.poses.mask), len(self.observations.turns.mask)
-        return np.repeat([0, 1, 2], [poses, 2 * turns, 3 * poses])[self.used]
-
-    def in_si(self, conditions: FloatArray) -> FloatArray:
-        """Return real conditions (n,) with those of the means at rest, which are in output units, in rad/s."""
-        gyroscope = self.start.gyroscope
-        assert gyroscope is not None
-        scale = np.linalg.norm(np.asarray(gyroscope.gain), axis=1)
-        rest = self.kinds == 2
-        changed = np.array(conditions)
-        changed[rest] = (changed[rest].reshape(-1, 3) / scale).ravel()
-        return changed
-
-    @property
-    def touched(self) -> NDArray[np.int64]:
-        """The first and last pose (n, 2) that each real condition involves."""
-        poses, turns = (np.arange(len(mask)) for mask in (self.observations.poses.mask, self.observations.turns.mask))
-        first = np.concatenate([poses, np.repeat(turns, 2), np.repeat(poses, 3)])
-        last = np.concatenate([poses, np.repeat(turns + 1, 2), np.repeat(poses, 3)])
-        return np.stack([first, last], axis=1)[self.used]
-
     def without(self, pose: int) -> HandHeldExperiment:
         """Return the recording with a pose, and the turns to and from it, left out."""
         poses, turns = np.array(self.observations.poses.mask), np.array(self.observations.turns.mask)
@@ -135,40 +105,11 @@ class HandHeldExperiment(RecordedByHand, Experiment):
         """Return the recording with the gyroscope's samples of instants turned into means."""
         return averaged(self)
 
-    def describe(self, pose: int) -> str:
-        """Name a pose by its time."""
-        poses = self.observations.poses
-        start, stop = float(np.asarray(poses.start)[pose]), float(np.asarray(poses.stop)[pose])
-        return f"the pose from {start:.1f} to {stop:.1f} s"
-
     def twin(self, state: State, noise: NoiseModel, seed: int) -> HandHeldExperiment:
         """Return the recording as a fit without effects would have it, along the same motion, noise included."""
         made = twin_recordings(self.segmentations, self.observations, self.shifts, state, noise, seed)
         parts = tuple(replace(part, recording=each) for part, each in zip(self.segmentations, made, strict=True))
         return HandHeldExperiment(parts, observe(parts, float(self.observations.gravity), noise=noise), state.imu)
-
-    def covariates(self, kind: int) -> dict[str, FloatArray]:
-        """Return what errors of a kind may depend on: for each of its vectors (v,), by name with unit, time first."""
-        poses, turns = self.observations.poses, self.observations.turns
-        start, stop, kelvin = (np.asarray(each) for each in (poses.start, poses.stop, poses.temperature))
-        if kind == 1:
-            real = np.asarray(turns.mask)
-            assert self.start.gyroscope is not None
-            interval = np.asarray(turns.interval)
-            duration = np.sum(interval, axis=1)
-            rate = (np.asarray(turns.output) - np.asarray(self.start.gyroscope.bias)) @ np.linalg.inv(
-                np.asarray(self.start.gyroscope.gain)
-            ).T
-            turned = np.degrees(np.sum(np.linalg.norm(rate, axis=-1) * interval, axis=1))
-            found = {"time [s]": (stop[:-1] + start[1:]) / 2, "angle [°]": turned,
-                     "rate [°/s]": turned / np.maximum(duration, 1e-9), "duration [s]": duration}  # fmt: skip
-            return {name: values[real] for name, values in found.items()}
-        real = np.asarray(poses.mask)
-        force = 9.80665 * _directions(self.start, poses.accelerometer_mean)
-        found = {"time [s]": (start + stop) / 2, "temperature [°C]": kelvin}
-        found |= {f"specific force, {axis} [m/s²]": force[:, k] for k, axis in enumerate("xyz")}
-        found = {name: values[real] for name, values in found.items()}
-        return {name: values for name, values in found.items() if np.ptp(values) > 0.1}
 
     def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
         """Return what a triad put out (k, 3) in each still part, in SI, and its rate, Hz."""
@@ -184,12 +125,6 @@ class HandHeldExperiment(RecordedByHand, Experiment):
     def recordings(self) -> tuple[Recording, ...]:
         """What is diagnosed, as it was recorded."""
         return tuple(part.recording for part in self.segmentations)
-
-    @property
-    def used(self) -> NDArray[np.bool_]:
-        """Which of the conditions are real: norms of poses, two components of turns, three of means at rest."""
-        poses, turns = np.asarray(self.observations.poses.mask), np.asarray(self.observations.turns.mask)
-        return np.concatenate([poses, np.repeat(turns, 2), np.repeat(poses, 3)])
 
     def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause, and poses that were bumped."""
@@ -255,8 +190,7 @@ _FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 
 
 def _directions(imu: Imu, output) -> FloatArray:
-    triad = imu.accelerometer
-    force = (np.asarray(output) - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
+    force = imu.accelerometer.recover_on_host(output)
     return force / np.linalg.norm(force, axis=1, keepdims=True)
 
 

@@ -89,7 +89,7 @@ def sway(experiment: HandHeldExperiment, noise: NoiseModel) -> list[Finding]:
         tilts, sigma = _tilts(part.recording.accelerometer, part.intervals, imu, noise.accelerometer)
         gyroscope = part.recording.gyroscope
         assert gyroscope is not None
-        rate = (gyroscope.values - np.asarray(imu.gyroscope.bias)) @ np.linalg.inv(np.asarray(imu.gyroscope.gain)).T
+        rate = imu.gyroscope.recover_on_host(gyroscope.values)
         for start, stop in part.intervals:
             inside = (gyroscope.time >= start) & (gyroscope.time < stop)
             weight = 1 - np.abs(2 * (gyroscope.time[inside] - start) / (stop - start) - 1)
@@ -204,7 +204,7 @@ _MANY = 0.2
 def _tilts(signal, intervals: FloatArray, imu: Imu, noise: AxisNoise) -> tuple[FloatArray, FloatArray]:
     """Return the rate (P, 3), rad/s, at which each pose tilts, and its standard deviation (P,) for each component."""
     triad = imu.accelerometer
-    force = (signal.values - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
+    force = triad.recover_on_host(signal.values)
     rates, spreads = [], []
     for start, stop in intervals:
         middle = (start + stop) / 2

@@ -88,7 +88,7 @@ def _predict(held: Experiment, state: State) -> Prediction:
             spread[bias, bias] += (size * np.linalg.norm(np.asarray(imu.triads()[name].gain), axis=1)) ** 2
     whole = covariance + columns @ spread @ columns.T
     chi_squared, likelihood = _likelihood(conditions, whole)
-    return Prediction(held.summary(conditions), chi_squared, len(conditions), likelihood)
+    return Prediction(held.real.rms(conditions), chi_squared, len(conditions), likelihood)
 
 
 def _biases(names: Sequence[Name], triad: str) -> list[int]:
@@ -99,8 +99,8 @@ def _biases(names: Sequence[Name], triad: str) -> list[int]:
 def _rested(held: Experiment, imu: Imu) -> Imu:
     """Return the unit with the gyroscope bias that the recording has at rest; turns are not linear in one far off."""
     conditions, columns, _, names = held.predict(imu)
-    rest = held.kinds == [kind.name for kind in held.residual_kinds].index("static_gyroscope")
-    slope = columns[np.ix_(rest, _biases(names, "gyroscope"))]
+    rest = held.real.of_kind("static_gyroscope")
+    slope = columns[rest][:, _biases(names, "gyroscope")]
     gyroscope = imu.gyroscope
     assert gyroscope is not None
     bias = np.asarray(gyroscope.bias) - np.linalg.lstsq(slope, conditions[rest], rcond=None)[0]
@@ -127,13 +127,12 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
     """
     evidence = base.evidence
     root = np.linalg.inv(base.weights)
-    touched = experiment.touched  # (n, 2): the observations that a condition involves
+    real = experiment.real
     count_out = 0
-    count = int(touched.max()) + 1
-    errors = {key: np.zeros(len(touched)) for key in ("before", "after")}
+    errors = {key: np.zeros(len(real)) for key in ("before", "after")}
     squared, likelihood = {"before": 0.0, "after": 0.0}, {"before": 0.0, "after": 0.0}
-    for fold in np.array_split(np.arange(count), _FOLDS):
-        rows = np.asarray(np.isin(touched, fold).any(axis=1))
+    for fold in real.parts(_FOLDS):
+        rows = real.touching(fold)
         if not rows.any() or np.sum(~rows) <= evidence.jacobian.shape[1]:
             continue
         models = {"before": [(1.0, ())], "after": _models(evidence.without(base.weights[:, rows]))}
@@ -154,9 +153,7 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
             errors[key][rows] = rest - (estimate - told @ (told.T @ estimate))
             squared[key] += part_squared
             likelihood[key] += part_likelihood
-    found = {
-        key: Prediction(experiment.summary(errors[key]), squared[key], count_out, likelihood[key]) for key in errors
-    }
+    found = {key: Prediction(real.rms(errors[key]), squared[key], count_out, likelihood[key]) for key in errors}
     return Gain(found["before"], found["after"], f"{_FOLDS} parts left out in turn")
 
 

@@ -189,9 +189,8 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
 
 def _folds(experiment: Experiment) -> list[NDArray[np.bool_]]:
     """Conditions (n,) that touch each of the parts, in the order of time, which are left out in turn."""
-    touched = experiment.touched
-    found = [np.any(np.isin(touched, part), axis=1) for part in experiment.parts()]
-    return [np.asarray(each, np.bool_) for each in found if each.any()]
+    parts = [experiment.real.touching(part) for part in experiment.parts()]
+    return [rows for rows in parts if rows.any()]
 
 
 def _left_out(state: State, columns: FloatArray, strength: float, folds) -> tuple[float, float, int, FloatArray]:
@@ -215,7 +214,7 @@ def _left_out(state: State, columns: FloatArray, strength: float, folds) -> tupl
 
 def _prediction(experiment: Experiment, found: tuple[float, float, int, FloatArray]) -> Prediction:
     likelihood, squared, count, errors = found
-    return Prediction(experiment.summary(errors), squared, count, likelihood)
+    return Prediction(experiment.real.rms(errors), squared, count, likelihood)
 
 
 def _fitted(experiment: Experiment, state: State, effect: Curve, spread: FloatArray) -> State:

@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.data.field import FieldWindows, MagneticField
@@ -19,6 +18,7 @@ from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.selection import select
 from jaximu.estimation.fitting import linearise
 from jaximu.estimation.leave_out import leave_out
+from jaximu.estimation.rows import Rows
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.errors import InputError
@@ -128,14 +128,13 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
         return MagneticDiagnosis((), 1.0, refused)
     evidence = Evidence(residual, jacobian, blocks)
     selection = select(evidence)
-    touched = _touched(windows)[rows]
-    strength = np.flatnonzero(np.flatnonzero(rows) < len(windows))
+    real = measurement.rows(model).real()
     causes = []
     for cause in selection.causes:
         block = evidence.blocks[cause.block]
         effect = CATALOGUE[block.name].make(evidence.coefficients([cause.block]) * block.sizes, **block.inner)
         pair = [np.asarray(jacobian), np.concatenate([jacobian, block.columns], axis=1)]
-        (first, before), (second, after) = (_left_out(weights, each, residual, touched, strength) for each in pair)
+        (first, before), (second, after) = (_left_out(weights, each, residual, real) for each in pair)
         if second - first < _PAYS:
             refused[effect.name] = "it stands out, but parts left out are predicted no better with it"
             continue
@@ -277,26 +276,12 @@ def _extent(windows: FieldWindows) -> Extent:
     return Extent(float(np.ptp(windows.time)), tuple(edges[:: -(-len(edges) // _PLACES)].tolist()), span)
 
 
-def _touched(windows: FieldWindows) -> NDArray[np.int64]:
-    """The first and last window (rows, 2) that each condition involves, padding included."""
-    each = np.arange(len(windows))
-    single = np.stack([each, each], axis=1)
-    if windows.alone:
-        return single
-    pairs = np.repeat(np.stack([each, (each + 1) % len(windows)], axis=1), 2, axis=0)
-    return np.concatenate([single, pairs, single])
-
-
-def _left_out(
-    weights: FloatArray, columns: FloatArray, residual: FloatArray, touched: NDArray[np.int64],
-    strength: NDArray[np.int64],
-) -> tuple[float, float]:  # fmt: skip
+def _left_out(weights: FloatArray, columns: FloatArray, residual: FloatArray, real: Rows) -> tuple[float, float]:
     """Return log-likelihood and rms error of the strength (µT) of fifths, each predicted from all the rest."""
-    folds = np.array_split(np.arange(int(touched.max()) + 1), _FOLDS)
-    parts = [np.asarray(np.isin(touched, fold).any(axis=1)) for fold in folds]
+    parts = [real.touching(part) for part in real.parts(_FOLDS)]
     likelihood, errors = 0.0, np.zeros(len(residual))
     size = 1 / np.linalg.norm(weights, axis=0)  # rows are in µT and sines: what is blind is told in units of their own
     for part in leave_out(weights * size, columns, residual, parts):
         likelihood += 0.5 * float(np.sum(np.log(part.precisions)) - part.chi_squared)
         errors[part.rows] = size[part.rows] * part.errors
-    return likelihood, float(np.sqrt(np.mean(errors[strength] ** 2)))
+    return likelihood, float(np.sqrt(np.mean(errors[real.of_kind("field_strength")] ** 2)))

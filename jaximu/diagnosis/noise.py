@@ -263,8 +263,7 @@ def _otherwise(experiment: Experiment, state: State) -> Iterator[FloatArray]:
     for block in blocks:
         if block.kind == "generic" and "orientation" in block.name:
             yield block.columns
-    kinds = [kind.name for kind in experiment.residual_kinds]
-    yield state.weights[:, experiment.kinds == kinds.index("static_gyroscope")]
+    yield state.weights[:, experiment.real.of_kind("static_gyroscope")]
     for _, columns, _ in curves(experiment, state):
         yield columns
 

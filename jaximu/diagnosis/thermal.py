@@ -25,13 +25,14 @@ from jaximu.data.rest import block_means
 from jaximu.data.rest_blocks import rest_blocks
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import EffectBlock
-from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
+from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import left_out
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions
 from jaximu.estimation.fitting import Linear
 from jaximu.estimation.problem import Name
+from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.rotation import apply_matrix
@@ -57,6 +58,12 @@ _NAMED = 3  # effects that can be named one by one
 _CYCLE = (
     "Record a cycle: the same temperatures up and down, then again at another rate; what depends on time or on "
     "power-on does not come back with the temperature, and what depends on its rate changes sign."
+)
+
+
+_RESIDUALS = (
+    ResidualKind("accelerometer", "specific force at rest", "m/s^2", 3, centred=True),
+    ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
 )
 
 
@@ -91,10 +98,6 @@ class Resting(Experiment):
     start: Imu
     smooth: bool = False
 
-    residual_kinds = (
-        ResidualKind("accelerometer", "specific force at rest", "m/s^2", 3, centred=True),
-        ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
-    )
     excess_names = _TRIADS
     coarse = (0.0, 0.0)
     no_fixture = "a recording at rest has no set-up to compare with"
@@ -107,6 +110,26 @@ class Resting(Experiment):
                 if asked.pop(name, None) is not None:
                     refused[name] = "in one pose it is a bias over temperature: poses tell them apart"
         return asked, refused
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition is: three of the accelerometer, then three of the gyroscope, of each block."""
+        count, blocks = len(self.blocks), self.blocks
+        block = np.repeat(np.arange(count), 6)
+        return Rows(
+            kinds=_RESIDUALS,
+            kind=np.tile(np.repeat([0, 1], 3), count),
+            first=block,
+            last=block,
+            to_si=np.tile(1 / self._scale, count),
+            used=np.ones(6 * count, bool),
+            covariates={
+                TIME: np.repeat(blocks.time, 6),
+                "temperature [°C]": np.repeat(blocks.temperature, 6),
+                "rate of temperature [K/min]": np.repeat(60 * blocks.rate, 6),
+            },
+            spans=np.stack([blocks.start, blocks.stop], axis=1),
+            observation="block",
+        )
 
     def free(self, name: Name) -> bool:
         """Return whether a number is free: gain does not show at rest."""
@@ -186,13 +209,9 @@ class Resting(Experiment):
         legs = self.blocks.legs()
         return folds_of(self.blocks, legs) if len(legs) >= _WAYS else super().parts()
 
-    def describe(self, place: int) -> str:
-        """Name a block by its time."""
-        return f"the block from {self.blocks.start[place]:.1f} to {self.blocks.stop[place]:.1f} s"
-
     def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit."""
-        return self.summary(linear.conditions)
+        return self.real.rms(linear.conditions)
 
     def twin(self, state: State, noise: NoiseModel, seed: int) -> Resting:
         """Return the recordings as a fit without effects would have them, noise included."""
@@ -216,12 +235,6 @@ class Resting(Experiment):
         }
         return replace(twin, blocks=replace(twin.blocks, means=means))
 
-    def covariates(self, kind: int) -> dict[str, FloatArray]:
-        """Return what errors may depend on (n,), by name with unit, time first."""
-        found = {"time [s]": self.blocks.time, "temperature [°C]": self.blocks.temperature,
-                 "rate of temperature [K/min]": 60 * self.blocks.rate}  # fmt: skip
-        return {name: values for name, values in found.items() if np.ptp(values) > 0.1}
-
     def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
         """Return what a triad put out (k, 3) in each block, in SI, and its rate, Hz."""
         parts: list[FloatArray] = []
@@ -240,26 +253,6 @@ class Resting(Experiment):
         return self.blocks.recordings
 
     @property
-    def used(self) -> NDArray[np.bool_]:
-        """Which of the conditions are real: all."""
-        return np.ones(6 * len(self.blocks), bool)
-
-    @property
-    def kinds(self) -> NDArray[np.int64]:
-        """What each condition is: 0 of the accelerometer, 1 of the gyroscope."""
-        return np.tile(np.repeat([0, 1], 3), len(self.blocks))
-
-    @property
-    def touched(self) -> NDArray[np.int64]:
-        """The block, twice (n, 2), of each condition."""
-        block = np.repeat(np.arange(len(self.blocks)), 6)
-        return np.stack([block, block], axis=1)
-
-    def in_si(self, conditions: FloatArray) -> FloatArray:
-        """Return conditions (n,) in SI."""
-        return (conditions.reshape(-1, 6) / self._scale).ravel()
-
-    @property
     def _scale(self) -> FloatArray:
         signals = [getattr(self.blocks.recordings[0], name) for name in _TRIADS]
         return np.concatenate([signal.nominal_scale for signal in signals])
@@ -272,9 +265,7 @@ class Resting(Experiment):
 
     def _force(self, imu: Imu) -> FloatArray:
         """The specific force (n, 3) of each block's rest, by the mean over it."""
-        triad = imu.accelerometer
-        means = self.blocks.by_rest(self._outputs[:, :3])
-        return (means - np.asarray(triad.bias)) @ np.linalg.inv(np.asarray(triad.gain)).T
+        return imu.accelerometer.recover_on_host(self.blocks.by_rest(self._outputs[:, :3]))
 
     @property
     def _covariance(self) -> Covariance:

@@ -16,16 +16,17 @@ from jaximu.data.drift import with_usual_drift
 from jaximu.data.observe_stations import observe_stations
 from jaximu.data.path import Path, padded, padded_places, stimuli, terms, with_effect
 from jaximu.data.poses import EXCESS_NAMES
-from jaximu.data.stations import KnownStations, StationConditions, station_covariances
+from jaximu.data.stations import KnownStations, StationConditions, station_covariances, station_rows
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
 from jaximu.diagnosis.evidence import EffectBlock
-from jaximu.diagnosis.experiment import Experiment, ResidualKind, State
+from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.hand_held import harmonics
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.estimation.data import About
 from jaximu.estimation.fitting import Linear
 from jaximu.estimation.problem import Name
+from jaximu.estimation.rows import Rows
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
@@ -65,15 +66,14 @@ class Turntable(Experiment):
     excess_names = EXCESS_NAMES
     coarse = KnownStations.coarse
     advice = staticmethod(station_advice)
-    residual_kinds = (
-        ResidualKind("accelerometer", "specific force in the poses", "m/s^2", 3),
-        ResidualKind("turns", "rate over the turns", "rad/s", 3),
-        ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
-    )
 
     def free(self, name: Name) -> bool:
         """Return whether a number is free: all are, for the body frame is the fixture's."""
         return True
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition is."""
+        return station_rows(imu, self.stations)
 
     def about(self, imu: Imu) -> About:
         """Return the errors of the mean outputs of one unit, the leading axis, and its effects' columns."""
@@ -167,8 +167,8 @@ class Turntable(Experiment):
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's mean output."""
         added = terms(state.imu, state.linear.details.path, [effect], self._lengths)
-        means = np.abs(self.in_si(self._means(added.accelerometer, added.gyroscope)[self.used]))
-        force = self.kinds == 0
+        means = np.abs(self._means(added.accelerometer, added.gyroscope)[self.used] * self.real.to_si)
+        force = self.real.kind == 0
         return {
             "accelerometer": float(np.max(means[force], initial=0.0)),
             "gyroscope": float(np.max(means[~force], initial=0.0)),
@@ -186,11 +186,6 @@ class Turntable(Experiment):
             ),
         )
 
-    def describe(self, place: int) -> str:
-        """Name a station by its time."""
-        start, stop = float(np.asarray(self.stations.start)[place]), float(np.asarray(self.stations.stop)[place])
-        return f"the pose from {start:.1f} to {stop:.1f} s"
-
     def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
         return station_rms(imu, linear.details.stations)
@@ -207,24 +202,6 @@ class Turntable(Experiment):
         stations = self._without(state.linear.conditions - self._means(*drawn, *[None] * (2 - len(drawn))))
         return Turntable(replace(self.recording, **changed, notes=()), stations, state.imu)
 
-    def covariates(self, kind: int) -> dict[str, FloatArray]:
-        """Return what errors of a kind may depend on: for each of its vectors (v,), by name with unit, time first."""
-        stations = self.stations
-        still = np.asarray(stations.gyroscope_used)
-        turn = np.asarray(stations.turn)
-        rows = (np.asarray(stations.accelerometer_used), still & turn, still & ~turn)[kind]
-        start, stop, stimulus = np.asarray(stations.start), np.asarray(stations.stop), stations.stimulus
-        found = {"time [s]": (start + stop) / 2}
-        if stimulus.temperature is not None:
-            found["temperature [°C]"] = np.asarray(stimulus.temperature).mean(axis=1)
-        if kind == 1:
-            vector, name, unit = np.degrees(np.asarray(stimulus.angular_rate)).mean(axis=1), "rate", "°/s"
-        else:
-            vector, name, unit = np.asarray(stimulus.specific_force).mean(axis=1), "specific force", "m/s²"
-        found |= {f"{name}, {axis} [{unit}]": vector[:, k] for k, axis in enumerate("xyz")}
-        found = {label: values[rows] for label, values in found.items()}
-        return {label: values for label, values in found.items() if np.ptp(values) > 0.1}
-
     def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
         """Return what a triad put out (k, 3) in each pose, in SI, and its rate, Hz."""
         signal = getattr(self.recording, triad)
@@ -237,31 +214,6 @@ class Turntable(Experiment):
     def recordings(self) -> tuple[Recording, ...]:
         """What is diagnosed, as it was recorded."""
         return (self.recording,)
-
-    @property
-    def used(self) -> NDArray[np.bool_]:
-        """Which of the conditions are real."""
-        masks = [np.asarray(self.stations.accelerometer_used), np.asarray(self.stations.gyroscope_used)]
-        return np.repeat(np.stack(masks, axis=1), 3, axis=1).ravel()
-
-    @property
-    def kinds(self) -> NDArray[np.int64]:
-        """What each real condition is: 0 of a pose's specific force, 1 of a turn's rate, 2 of the rate at rest."""
-        gyroscope = np.where(np.asarray(self.stations.turn), 1, 2)
-        kinds = np.stack([np.zeros_like(gyroscope), gyroscope], axis=1)
-        return np.repeat(kinds, 3, axis=1).ravel()[self.used]
-
-    @property
-    def touched(self) -> NDArray[np.int64]:
-        """The station, twice (n, 2), of each real condition."""
-        station = np.repeat(np.arange(len(self.stations.turn)), 6)[self.used]
-        return np.stack([station, station], axis=1)
-
-    def in_si(self, conditions: FloatArray) -> FloatArray:
-        """Return real conditions (n,) in SI."""
-        scale = [np.linalg.norm(np.asarray(triad.gain), axis=1) for triad in self.start.triads().values()]
-        whole = np.tile(np.concatenate([*scale, np.ones(3)])[:6], len(self.stations.turn))
-        return conditions / whole[self.used]
 
     @property
     def _real(self) -> NDArray[np.bool_]:

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import Covariance
+from jaximu.estimation.rows import Rows
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects.base import Effect
@@ -70,6 +71,10 @@ class Data(ABC):
     @abstractmethod
     def about(self, imu: Imu) -> About:
         """Return what is measured about units, the leading axis of every array of `imu`."""
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition is; factors to SI and covariates are by a unit close to this one."""
+        raise NotImplementedError
 
     def take(self, lanes: NDArray[np.int64]) -> Data:
         """Return the measurement of some of the units; of a single one, itself."""

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu.ground.array_types import Array
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import apply_matrix, inverse_matrix
 from jaximu.model.effects.base import Effect, SetupEffect
@@ -102,6 +102,10 @@ class Triad(eqx.Module):
                 # a loop, not its unrolled rounds: many effects compile ten times quicker
                 value, _ = jax.lax.fori_loop(0, self.iterations, round_, (value, jnp.zeros_like(value)))
         return value
+
+    def recover_on_host(self, output: FloatArray) -> FloatArray:
+        """Return K⁻¹(y − b) (..., 3), effects left out, of outputs in NumPy, where nothing is to be traced."""
+        return (np.asarray(output) - np.asarray(self.bias)) @ np.linalg.inv(np.asarray(self.gain)).T
 
     def inverse(self) -> Float[Array, "3 4"]:
         """Return (A | c) of u = A y + c, the inverse without effects: A = K⁻¹ and c = −K⁻¹ b."""

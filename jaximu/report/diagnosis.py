@@ -14,6 +14,7 @@ from jaximu.diagnosis import Diagnosis, twin_of
 from jaximu.diagnosis.experiment import State
 from jaximu.diagnosis.hand_held import Experiment
 from jaximu.diagnosis.learned import LearnedTerm
+from jaximu.estimation.rows import TIME
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import probability, readable, size
 from jaximu.ground.summary import sentence
@@ -50,12 +51,12 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     gain, learned = diagnosis.gain, diagnosis.learned
     if learned is not None:
         drawn["learned"], gain = partial(_learned, learned), learned.gain
-    words = {kind.name: kind.words for kind in diagnosis.experiment.residual_kinds}
+    words = {kind.name: kind.words for kind in diagnosis.experiment.real.kinds}
     place = _shown_kind(diagnosis)
-    shown = diagnosis.experiment.residual_kinds[place]
+    shown = diagnosis.experiment.real.kinds[place]
     measured, simulated = (
         size(float(np.sqrt(np.mean(np.square(errors[place])))), shown.unit, 2)
-        for errors in (diagnosis.experiment.errors(diagnosis.base.conditions), twin.errors(copied.conditions))
+        for errors in (diagnosis.experiment.real.errors(diagnosis.base.conditions), twin.real.errors(copied.conditions))
     )
     number, meaning = measured, f"rms of {shown.words}: no more than noise, drift and handling leave"
     if diagnosis.verdict != "adequate":
@@ -105,12 +106,12 @@ def _option_rows(diagnosis: Diagnosis) -> list[list[str]]:
 
 def _shown_kind(diagnosis: Diagnosis) -> int:
     """The kind of error that the lead is about, as a place among the experiment's."""
-    kinds = [kind.name for kind in diagnosis.experiment.residual_kinds]
+    kinds = [kind.name for kind in diagnosis.experiment.real.kinds]
     if diagnosis.learned is not None:
         return kinds.index(diagnosis.learned.gain.best_kind(diagnosis.learned.effect))
     if diagnosis.named and diagnosis.gain is not None:
         return kinds.index(diagnosis.gain.best_kind(diagnosis.named[0].effect))
-    present = np.unique(diagnosis.experiment.kinds)
+    present = np.unique(diagnosis.experiment.real.kind)
     first = diagnosis.checks[: len(present)]
     return int(present[first.index(min(first, key=lambda check: check.p_value))])
 
@@ -120,15 +121,17 @@ def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=[1.35, 1])
     kind = _shown_kind(diagnosis)
     experiment = diagnosis.experiment
-    factor, unit = readable(experiment.residual_kinds[kind].unit, _AN_ERROR)
+    shown = experiment.real.kinds[kind]
+    factor, unit = readable(shown.unit, _AN_ERROR)
     series = [("twin", _TWIN, twin, copied), ("measured, base model", _MEASURED, experiment, diagnosis.base)]
     if diagnosis.extended.effects:
         series.append(("measured, extended model", _EXTENDED, experiment, diagnosis.extended))
     for label, colour, source, state in series:
-        time = next(iter(source.covariates(kind).values()))  # a twin need not have as many poses and turns
-        left.plot(time, factor * source.errors(state.conditions)[kind], "o", color=colour, markersize=4, label=label)
+        real = source.real  # a twin need not have as many poses and turns
+        time = real.dependences(kind)[TIME]
+        left.plot(time, factor * real.errors(state.conditions)[kind], "o", color=colour, markersize=4, label=label)
     left.axhline(0.0, color="0.7", linewidth=0.8)
-    dressed(left, experiment.residual_kinds[kind].words, xlabel="time [s]", ylabel=f"error [{unit}]")
+    dressed(left, shown.words, xlabel="time [s]", ylabel=f"error [{unit}]")
     left.legend(fontsize=8)
     _ranking(right, diagnosis)
     return figure
@@ -154,14 +157,14 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
 
 
 def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
-    experiment = diagnosis.experiment
-    rows = [int(kind) for kind in np.unique(experiment.kinds)]
-    covariates, shadow = ({row: each.covariates(row) for row in rows} for each in (experiment, twin))
+    real = diagnosis.experiment.real
+    rows = [int(kind) for kind in np.unique(real.kind)]
+    covariates, shadow = ({row: source.dependences(row) for row in rows} for source in (real, twin.real))
     figure = figures.new_figure(2.1 * len(rows) + 0.4)
     panels = figure.subplots(len(rows), max(len(each) for each in covariates.values()), squeeze=False, sharey="row")
-    measured, simulated = experiment.errors(diagnosis.base.conditions), twin.errors(copied.conditions)
+    measured, simulated = real.errors(diagnosis.base.conditions), twin.real.errors(copied.conditions)
     for line, row in zip(panels, rows, strict=True):
-        kind = experiment.residual_kinds[row]
+        kind = real.kinds[row]
         factor, unit = readable(kind.unit, _AN_ERROR)
         line[0].set_ylabel(f"{kind.words}\n[{unit}]", fontsize=8)
         for panel in line[len(covariates[row]) :]:

@@ -39,8 +39,8 @@ def headline(found: HandHeldThermal) -> list[str]:
            "nothing of temperature pays on parts left out; what may still hide is below.")
     ]  # fmt: skip
     if names:
-        before, after = (found.experiment.summary(each.conditions) for each in (found.base, found.state))
-        for kind in found.experiment.residual_kinds:
+        before, after = (found.experiment.real.rms(each.conditions) for each in (found.base, found.state))
+        for kind in found.experiment.real.kinds:
             said.append(
                 f"{sentence(kind.words)}: {size(before[kind.name][0], kind.unit)} rms with one bias and scale for all "
                 f"temperatures, {size(after[kind.name][0], kind.unit)} with these effects."
@@ -107,18 +107,19 @@ def _change_figure(found: HandHeldThermal) -> Figure:
 
 def _error_figure(found: HandHeldThermal) -> Figure:
     """Draw the errors of poses and turns over temperature, without and with the effects."""
-    experiment = found.experiment
-    kelvin = np.asarray(experiment.observations.poses.temperature)[experiment.touched].mean(axis=1)
+    real = found.experiment.real
+    temperature = np.asarray(found.experiment.observations.poses.temperature)
+    temperature = (temperature[real.first] + temperature[real.last]) / 2
     series = [("one bias and scale for all temperatures", BEFORE, found.base)]
     series += [("with the effects", AFTER, found.state)] if found.steps else []
     figure = new_figure(3.6)
-    panels = figure.subplots(1, len(experiment.residual_kinds))
-    for place, (panel, kind) in enumerate(zip(panels, experiment.residual_kinds, strict=True)):
-        errors = [np.abs(experiment.errors(state.conditions)[place]).max() for _, _, state in series]
+    panels = figure.subplots(1, len(real.kinds))
+    for place, (panel, kind) in enumerate(zip(panels, real.kinds, strict=True)):
+        errors = [np.abs(real.errors(state.conditions)[place]).max() for _, _, state in series]
         factor, unit = readable(kind.unit, float(max(errors)))
-        own = kelvin[experiment.kinds == place][:: kind.components]
+        warmth = temperature[real.kind == place][:: kind.components]
         for label, colour, state in series:
-            panel.plot(own, factor * experiment.errors(state.conditions)[place], ".", ms=5, color=colour, label=label)
+            panel.plot(warmth, factor * real.errors(state.conditions)[place], ".", ms=5, color=colour, label=label)
         panel.axhline(0.0, color="0.6", lw=0.8)
         dressed(panel, xlabel="temperature [°C]")
         panel.set_title(f"{sentence(kind.words)} [{unit}]", loc="left", fontsize=9, fontweight="bold")

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaximu.diagnosis import Validity
 from jaximu.diagnosis.validity import Shift
+from jaximu.estimation.rows import TIME
 from jaximu.ground.quantities import change, number, probability, with_interval
 from jaximu.report import figures
 from jaximu.report.html import write_page
@@ -36,7 +37,7 @@ def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
     if value is not None:
         shown = with_interval(value.value, value.sigma, value.unit)
         meaning = f"largest error of the {triad} in this recording under the old calibration, 95 % interval"
-    words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.residual_kinds}
+    words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.real.kinds}
     pictures = {"errors": partial(_errors, validity)}
     if any(_drawn(each) for each in validity.shifts):
         pictures = {"check": partial(_shifts, validity), **pictures}
@@ -97,16 +98,16 @@ def _errors(validity: Validity) -> Figure:
     experiment = validity.experiment
     if experiment is None:
         return _innovations(validity)
-    poses, turns = experiment.observations.poses, experiment.observations.turns
-    start, stop = np.asarray(poses.start), np.asarray(poses.stop)
-    places = ((start + stop)[np.asarray(poses.mask)] / 2, ((stop[:-1] + start[1:]) / 2)[np.asarray(turns.mask)])
+    real = experiment.real
+    norms, turns = real.of_kind("gravity_norm"), real.of_kind("gravity_direction")
+    times = real.covariates[TIME][norms], real.covariates[TIME][turns][::2]
     extended = [each.title for each in validity.causes if each.scope != "parameter"]
     fresh = " with ".join(["fresh calibration", *([", ".join(extended)] if extended else [])])
     labels = (("old calibration", figures.FLAGGED), (fresh, figures.AFTER))
     for (label, colour), conditions in zip(labels, validity.conditions, strict=True):
-        norm = 1e3 * conditions[experiment.kinds == 0]
-        angle = np.degrees(np.linalg.norm(conditions[experiment.kinds == 1].reshape(-1, 2), axis=1))
-        for panel, time, values in zip(panels, places, (norm, angle), strict=True):
+        norm = 1e3 * conditions[norms]
+        angle = np.degrees(np.linalg.norm(conditions[turns].reshape(-1, 2), axis=1))
+        for panel, time, values in zip(panels, times, (norm, angle), strict=True):
             panel.plot(time, values, "o", color=colour, markersize=4, label=label)
     for panel, title, unit in zip(panels, ("gravity norm at rest", "gravity carried over a turn"), ("mm/s²", "°"),
                                   strict=True):  # fmt: skip
