@@ -1362,7 +1362,10 @@ def recipe_of(seed: int) -> Recipe:
 
 
 def run_draw(seed: int, folder: Path, recipe: Recipe | None = None, short: bool = False) -> Draw:
-    """Run the draw of a seed, or of a recipe with a seed, in a folder, which is emptied first, on `short` logs or not."""
+    """Run the draw of a seed, or of a recipe with a seed, in a folder, which is emptied first.
+
+    short: on logs as short as the suite takes them.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     chosen, random = _first(seed)
