@@ -42,7 +42,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import numpy as np
-from agreement_cases import Case, cases, make_inputs
+from agreement_cases import Case, cases, make_inputs, with_needed
 from common import RESULTS, Table, finish, machine
 
 TOLERANCE = 1e-3
@@ -273,7 +273,7 @@ class Worker:
         self.process = None
 
 
-def recorded(chosen: list[Case], folder: Path, jobs: int, save: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+def recorded(chosen: list[Case], folder: Path, jobs: int, save: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
     """Run cases, groups side by side in `jobs` processes, and return their records; `save` gets those there are."""
     make_inputs(folders_of(folder)["MADE"])
     records: dict[str, Any] = {}
@@ -534,6 +534,8 @@ def write_committed(records: dict[str, Any], sizes: list[bool]) -> None:
         path = committed(quick)
         old = read(path) if path.exists() else {}
         names = [case.name for case in cases() if case.quick == quick]
+        if records.keys().isdisjoint(names):
+            continue
         write(path, {name: records.get(name, old.get(name)) for name in names if name in records or name in old})
 
 
@@ -581,7 +583,9 @@ def options_given() -> argparse.Namespace:
     """The options of this script."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="only the cases that every change of code runs")
-    parser.add_argument("--only", default="", help="only cases or groups whose name contains this, and their inputs")
+    parser.add_argument(
+        "--only", nargs="+", default=[""], help="only cases or groups whose name contains one of these words"
+    )
     parser.add_argument("--write", type=Path, nargs="?", const=Path(), help="record again; into FILE if there is one")
     parser.add_argument("--against", type=Path, nargs="+", help="compare with these records, not the committed ones")
     parser.add_argument("--recorded", type=Path, nargs="+", help="compare these records and run nothing")
@@ -594,14 +598,21 @@ def options_given() -> argparse.Namespace:
 
 
 def results(chosen: list[Case], options: argparse.Namespace) -> dict[str, Any]:
-    """Run the cases in a folder of their own."""
+    """Run the cases, and those that make their files, in a separate folder; return the records of the cases alone."""
+    names = [case.name for case in chosen]
+
+    def saved(records: dict[str, Any]) -> dict[str, Any]:
+        kept = {name: records[name] for name in names if name in records}
+        save(kept, options)
+        return kept
+
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.keep or Path(temporary)
         for part in ("made", "out", "cache"):
             (folder / part).mkdir(parents=True, exist_ok=True, mode=0o700)
         if options.cold:
             os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
-        return recorded(chosen, folder, options.jobs, lambda records: save(records, options))
+        return saved(recorded(with_needed(chosen), folder, options.jobs, saved))
 
 
 def save(records: dict[str, Any], options: argparse.Namespace) -> None:
@@ -619,8 +630,7 @@ def main() -> int:
         work(options.worker)
         return 0
     chosen = [case for case in cases() if case.quick or not options.quick]
-    if options.only:
-        chosen = [case for case in chosen if options.only in f"{case.name} {case.group}" or case.simulates]
+    chosen = [case for case in chosen if any(text in f"{case.name} {case.group}" for text in options.only)]
     start = time.perf_counter()
     ours = read(*options.recorded) if options.recorded else results(chosen, options)
     seconds = time.perf_counter() - start
@@ -633,7 +643,7 @@ def main() -> int:
     theirs = read(*(options.against or map(committed, [True] if options.quick else [True, False])))
     names = {case.name for case in chosen}
     table, failed = table_of(ours, {name: record for name, record in theirs.items() if name in names}, options.note)
-    whole = not (options.only or options.quick or options.recorded)
+    whole = not (any(options.only) or options.quick or options.recorded)
     finish("agreement", [table], {"seconds": round(seconds), "differ": failed}, keep=whole)
     for name in failed:
         print(f"differs: {name}", file=sys.stderr)

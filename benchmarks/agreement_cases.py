@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import struct
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,6 +30,11 @@ class Case:
         """Whether it makes an input of other cases."""
         return self.line.startswith("simulate")
 
+    @property
+    def files(self) -> str:
+        """How the line of another case that reads this one's files names them."""
+        return f"MADE/{self.group}" if self.simulates else f"OUT/{self.name}/"
+
     def arguments(self, folders: dict[str, Path]) -> list[str]:
         """The line's words, with `DATA/`, `MADE/`, `OUT/` and `HERE/` as paths."""
         folders = folders | {"HERE": folders["OUT"] / self.name}
@@ -51,6 +57,16 @@ def cases() -> Iterator[Case]:
                 yield Case(name, filled(line, DOCUMENT["texts"]), f"{size} {group}", size == "quick")
 
 
+def with_needed(chosen: list[Case]) -> list[Case]:
+    """The chosen cases and all whose files they read, in order."""
+    listed = list(cases())
+    names = {case.name for case in chosen}
+    for case in reversed(listed):  # a case reads the files of earlier ones only
+        if case.name in names:
+            names |= {other.name for other in listed if other.files in case.line}
+    return [case for case in listed if case.name in names]
+
+
 def filled(text: str, texts: dict[str, str]) -> str:
     """A text with those that it names put in, and those that they name."""
     return Template(Template(text).substitute(texts)).substitute(texts)
@@ -64,6 +80,7 @@ def make_inputs(folder: Path) -> None:
         (folder / name).write_text(filled(text, inputs["texts"]), encoding="utf-8")
     _write_means(folder / "means.csv")
     _write_tracked(folder)
+    _write_ulog(folder / "held.ulg")
 
 
 def _write_means(path: Path) -> None:
@@ -89,3 +106,23 @@ def _write_tracked(folder: Path) -> None:
     names += [f"velocity_{axis} [m/s]" for axis in "xyz"]
     tracked = np.column_stack([tracked, moved.velocity])
     np.savetxt(folder / "tracked with velocity.csv", tracked, "%.9g", ",", header=",".join(names), comments="")
+
+
+def _write_ulog(path: Path) -> None:
+    """PX4's log of a unit that is held in sixteen poses by hand, by the published file format; its axes are FRD."""
+    import array_motion
+
+    (unit,) = array_motion.array(29, units=1)
+    layout = np.dtype([("id", "<u2"), ("stamps", "<u8", 2), ("values", "<f4", 3), ("temperature", "<f4")])
+    fields = "uint64_t timestamp;uint64_t timestamp_sample;float x;float y;float z;float temperature;"
+    names = {"sensor_accel": unit.force, "sensor_gyro": unit.rate}
+    messages = [(b"B", bytes(40)), *((b"F", f"{name}:{fields}".encode()) for name in names)]
+    messages += [(b"A", struct.pack("<BH", 0, number) + name.encode()) for number, name in enumerate(names)]
+    rows = np.zeros((len(unit.time), len(names)), layout)
+    rows["id"] = np.arange(len(names))
+    rows["stamps"] = np.round(1e6 * unit.time)[:, None, None]
+    rows["values"] = np.stack(list(names.values()), axis=1) * [1.0, -1.0, -1.0]
+    rows["temperature"] = 25.0
+    messages += [(b"D", row.tobytes()) for row in rows.ravel()]
+    head = b"ULog\x01\x12\x35\x01" + bytes(8)
+    path.write_bytes(head + b"".join(struct.pack("<Hc", len(body), kind) + body for kind, body in messages))

@@ -13,6 +13,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -21,7 +22,7 @@ from environment import environment
 
 os.environ.update(environment())
 
-from common import Table, finish, share
+from common import Table, finish, machine, share
 
 
 def options() -> argparse.Namespace:
@@ -35,11 +36,20 @@ def options() -> argparse.Namespace:
     return parser.parse_args()
 
 
+@cache
+def code() -> str:
+    """Return the commit whose code this process runs, else the version; asked once, when the process starts."""
+    from jaximu import __version__
+
+    return machine().get("commit", __version__)
+
+
 def prepare() -> None:
     """Get a process ready."""
     from random_units import prepare_process
 
     prepare_process()
+    code()
 
 
 def result_of(seed: int) -> dict:
@@ -58,6 +68,7 @@ def result_of(seed: int) -> dict:
         "seconds": draw.seconds,
         "failures": [[failure.kind, failure.run, failure.text] for failure in draw.failures],
         "command": "jaximu " + " ".join(draw.last),
+        "code": code(),
     }
 
 
@@ -86,12 +97,14 @@ def results(seeds: list[int], processes: int) -> Iterator[dict]:
 
 def tables(draws: list[dict]) -> list[Table]:
     """Return draws by verb or chain, and failures by kind."""
+    codes = Counter(draw.get("code", "not stated") for draw in draws)
     by_recipe = Table(
         "Random units: draws by verb or chain",
         ["verb or chain", "draws", "runs", "exit 0", "1", "2", "3, 4", "refused", "if plain", "failed", "s a draw"],
         "A draw is one unit with one verb or chain, each verb run plain, with --json and with -o. Refused: the last "
         "verb ended with 1 or 2; if plain: of settings without a hidden effect, poor poses or missing sensors. "
-        "Processor seconds, all runs of a draw together, of a process that keeps what it compiled.",
+        "Processor seconds, all runs of a draw together, of a process that keeps what it compiled. "
+        f"Draws by commit: {', '.join(f'{name} {count}' for name, count in codes.most_common())}.",
     )
     names = sorted({draw["recipe"] for draw in draws})
     for name in [*names, "all"]:

@@ -1,7 +1,7 @@
 """A random unit with one verb or one chain of verbs, all of it from one integer: what is run, and what must hold.
 
-`python tests/random_units.py SEED …` runs draws again, prints them in a line each with what went wrong, and keeps the
-files of the last in a folder that it names.
+`python tests/random_units.py [--short] SEED …` runs draws again, prints them in a line each with what went wrong, and
+keeps the files of the last in a folder that it names. `--short`: with logs as short as the tests take them.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ from jaximu.simulation import Specification, Truth, simulate_cases
 GRAVITY = 9.80665
 FIVE_SIGMA = 5.0
 FEWEST = 9  # orientations of a plain setting
+SHORT = 1 / 3  # of the length of a log that is heated, in the tests
 HIDDEN = (
     "accel.quadratic",
     "accel.cubic",
@@ -261,8 +262,13 @@ class Draw:
     truths: dict[str, np.ndarray] = field(default_factory=dict)
     truths_of: str = "calibration.json"
     last: list[str] = field(default_factory=list)
+    short: bool = False
 
     # --- choices
+
+    def length(self, drawn: float) -> float:
+        """The length of a log that is heated: what was drawn, or less where logs are to be short."""
+        return drawn * SHORT if self.short else drawn
 
     def pick(self, name: str, options: Sequence[Any], weights: Sequence[float] | None = None) -> Any:
         """Choose one, and note it."""
@@ -698,6 +704,7 @@ class Heated:
                     sizes = 2 * kind.typical * draw.random.uniform(-1, 1, kind.size)
                     document["effects"][kind.name] = {"coefficients": sizes.tolist(), **inner}
         low, high = draw.size("low", -10, 20), draw.size("high", 35, 60)
+        minutes = draw.length(minutes)
         knots = zip(np.linspace(0, 60 * minutes, 5).tolist(), (low, high, low, high, low), strict=True)
         document["environment"] = {"temperature": [list(knot) for knot in knots]}
         return cls(draw, document, minutes, draw.draw_rate((12.5, 25), None))
@@ -1000,9 +1007,14 @@ ROTATIONS = {
 }
 
 
-def systematic(draw: Draw) -> tuple[Path, list[str]]:
-    """Record a good unit through positions and rotations; return the log and how gravity is stated."""
-    draw.draw_reading(True)
+def systematic(draw: Draw, attitude: bool = False) -> tuple[Path, list[str]]:
+    """Record a good unit through positions and rotations; return the log and how gravity is stated.
+
+    attitude: it stands in the log, too.
+    """
+    draw.draw_reading(not attitude)
+    if attitude and draw.reading.suffix == ".ulg":
+        draw.reading = Reading()
     document = draw.draw_unit(hidden=0.2)
     for name in ("accelerometer", "gyroscope"):
         document[name]["noise"]["white"] *= 0.1
@@ -1025,18 +1037,13 @@ def filtered(draw: Draw) -> None:
 
 def filter_reference(draw: Draw) -> None:
     draw.plain = False
-    log, tracker = tracked(draw)
-    draw.tried(
-        [
-            "filter",
-            str(log),
-            "--reference",
-            str(tracker),
-            "--gravity",
-            f"{attitude_motion.GRAVITY}+-0.001",
-            *draw.reading.options,
-        ]
-    )
+    if draw.chance("table", 0.6):
+        log, local = systematic(draw, attitude=True)
+        reference = log
+    else:  # a unit that never rests: refused
+        log, reference = tracked(draw)
+        local = ["--gravity", f"{attitude_motion.GRAVITY}+-0.001"]
+    draw.tried(["filter", str(log), "--reference", str(reference), *local, *draw.reading.options])
 
 
 def filter_online(draw: Draw) -> None:
@@ -1354,12 +1361,15 @@ def recipe_of(seed: int) -> Recipe:
     return _first(seed)[0]
 
 
-def run_draw(seed: int, folder: Path, recipe: Recipe | None = None) -> Draw:
-    """Run the draw of a seed, or of a recipe with a seed, in a folder, which is emptied first."""
+def run_draw(seed: int, folder: Path, recipe: Recipe | None = None, short: bool = False) -> Draw:
+    """Run the draw of a seed, or of a recipe with a seed, in a folder, which is emptied first.
+
+    short: on logs as short as the suite takes them.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     chosen, random = _first(seed)
-    draw, recipe = Draw(seed, folder, random), recipe or chosen
+    draw, recipe = Draw(seed, folder, random, short=short), recipe or chosen
     draw.settings["recipe"] = recipe.__name__
     began = time.perf_counter(), time.process_time()
     try:
@@ -1387,9 +1397,9 @@ def main() -> None:
     kept = Path(tempfile.mkdtemp(prefix="random-unit-"))
     failed = False
     for text in sys.argv[1:]:
-        if text in recipes:
+        if text in recipes or text == "--short":
             continue
-        draw = run_draw(int(text), kept / "draw", named[0] if named else None)
+        draw = run_draw(int(text), kept / "draw", named[0] if named else None, "--short" in sys.argv)
         print(draw.line, f"[{draw.seconds['processor']:.1f} s]", [status for _, status in draw.statuses])
         for failure in draw.failures:
             failed = True

@@ -168,3 +168,28 @@ def test_the_cases_name_every_verb_and_only_earlier_cases(agreement):
         verbs.add(words[0])
         assert all(Path(word).parts[1] in known for word in words if word.startswith("out/"))
     assert verbs >= set(VERBS)
+
+
+def test_a_case_runs_those_whose_files_it_reads_and_records_itself_alone(agreement, monkeypatch, tmp_path):
+    run = []
+
+    def recorded(chosen, folder, jobs, save):
+        run.extend(case.name for case in chosen)
+        save({case.name: {"status": 0} for case in chosen})
+        return {case.name: {"status": 0} for case in chosen}
+
+    monkeypatch.setattr(agreement, "recorded", recorded)
+    monkeypatch.setattr(agreement, "committed", lambda quick: tmp_path / f"{quick}.json")
+    monkeypatch.setattr("sys.argv", ["agreement.py", "--only", "plan thermal", "--write"])
+    agreement.write(tmp_path / "False.json", {"plan thermal": {"status": 1}, "plan log": {"status": 2}})
+    assert agreement.main() == 0
+    assert {"simulate plain", "simulate chamber", "calibrate for thermal"} <= set(run) and "plan log" not in run
+    assert run[-2:] == ["thermal with a calibration", "plan thermal"]
+    assert agreement.read(tmp_path / "False.json") == {"plan log": {"status": 2}, "plan thermal": {"status": 0}}
+    assert not (tmp_path / "True.json").exists()
+
+
+def test_only_cases_that_are_named_so_are_refused(agreement):
+    for quick in (True, False):
+        for name, record in agreement.read(agreement.committed(quick)).items():
+            assert (record["status"] in (1, 2)) == name.endswith("refused"), name

@@ -1,7 +1,7 @@
 """Forty random units, every verb and chain among them: what a user gets is sound, whatever is asked of whichever unit.
 
 Two thousand of them: benchmarks/results/random_units.md. A draw that fails is run again by
-`python tests/random_units.py SEED`.
+`python tests/random_units.py --short SEED`.
 """
 
 import pytest
@@ -9,48 +9,49 @@ import random_units
 import written_files
 
 SEEDS = (
-    0,
-    1,
-    2,
-    4,
     5,
-    6,
     7,
     8,
-    10,
-    12,
-    13,
     15,
+    17,
     19,
     20,
-    21,
-    22,
-    23,
-    24,
     29,
     33,
-    34,
-    39,
-    41,
+    36,
     44,
     46,
+    47,
+    48,
     49,
+    50,
     51,
+    52,
+    53,
     55,
-    58,
-    61,
     64,
-    67,
+    69,
+    70,
     83,
-    85,
-    95,
-    99,
-    117,
+    93,
+    98,
+    106,
+    130,
+    148,
     150,
-    154,
+    158,
+    160,
+    164,
+    167,
+    178,
+    179,
     335,
+    472,
+    493,
+    594,
 )
-"""Chosen so that every verb and chain is among them once; `jaximu demo` has tests of its own."""
+"""Every verb and chain once, by the draws that cost least among those that differ: all formats, counts and units,
+gyroscope or none, several recordings, hidden effects, artefacts; `jaximu demo` has separate tests."""
 
 
 def test_every_verb_and_chain_is_drawn():
@@ -60,7 +61,7 @@ def test_every_verb_and_chain_is_drawn():
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_random_unit(seed, tmp_path):
-    draw = random_units.run_draw(seed, tmp_path / "draw")
+    draw = random_units.run_draw(seed, tmp_path / "draw", short=True)
     failures = [f"{failure.kind}: {failure.run}: {failure.text}" for failure in draw.failures]
     assert not failures, "\n".join([draw.line, "jaximu " + " ".join(draw.last), *failures])
 
