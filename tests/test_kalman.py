@@ -20,7 +20,7 @@ from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
 from jaximu.data.motion import Disturbances, IntervalsOfMotion, MotionPath, carried, cut, first_field, interval_rows
 from jaximu.estimation.fitting import fit
-from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
+from jaximu.estimation.information_filter import Knowledge, WhiteRows, estimate, run, smooth, smoothed_variances
 from jaximu.estimation.problem import unflatten, without_equipment
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
@@ -75,7 +75,9 @@ def disturbed(drifts: int, grade: float = 1.0) -> Disturbances:
 def test_filter_and_smoother_solve_the_least_squares_problem_of_all_rows():
     random = np.random.default_rng(0)
     n, m, r, steps = 3, 2, 7, 6
-    rows = Rows(*(random.standard_normal(size) for size in ((steps, r, n), (steps, r, n), (steps, r, m), (steps, r))))
+    rows = WhiteRows(
+        *(random.standard_normal(size) for size in ((steps, r, n), (steps, r, n), (steps, r, m), (steps, r)))
+    )
     start = Knowledge(np.diag([1.0, 2.0, 3.0, 0.1, 0.1]), np.ones(n + m))
     last, eliminated, innovations, _ = run(start, rows)
     final, covariance = estimate(last)
@@ -94,7 +96,7 @@ def test_filter_and_smoother_solve_the_least_squares_problem_of_all_rows():
     assert np.sum(innovations) == pytest.approx(float(squares[0]), rel=1e-10)
     parted = run(start, rows, (4, 6))[2]
     np.testing.assert_allclose(parted.sum(axis=1), innovations[:, 0], rtol=1e-10)
-    first = Rows(*(np.asarray(each)[:, :4] for each in rows))
+    first = WhiteRows(*(np.asarray(each)[:, :4] for each in rows))
     assert parted.shape == (steps, 3) and parted[0, 0] == pytest.approx(run(start, first)[2][0, 0], rel=1e-10)
 
 
@@ -347,7 +349,7 @@ def test_a_recording_without_gyroscope_is_refused(recorded):
 
 
 def test_what_is_measured_from_outside_has_the_derivatives_of_what_it_means(recorded):
-    """Rows against differences of the conditions as scipy has them, by every number of the unit and of the path.
+    """WhiteRows against differences of the conditions as scipy has them, by every number of the unit and of the path.
 
     Exp(τ)ᵀ C Exp(ω δ) Exp(α)ᵀ = Q, and Exp(τ)ᵀ (v + (C f − g ẑ) δ − C Exp(ω δ) (ω′ × r)) = V.
     """

@@ -35,7 +35,7 @@ from jaximu.data.motion import (
     turned,
 )
 from jaximu.data.sightings import AttitudeSeen, FieldSeen, Sighting, VelocitySeen
-from jaximu.estimation.information_filter import Knowledge, Rows, advance, estimate
+from jaximu.estimation.information_filter import Knowledge, WhiteRows, advance, estimate
 from jaximu.estimation.problem import Parameters, flatten, unflatten
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground import stored
@@ -345,7 +345,7 @@ class FilterInUse:
         )
         attitude, velocity, before, after, shared, right = (np.asarray(each) for each in leaves)
         columns, states = np.append(self._index, len(self._numbers)), self.errors.states
-        known, _, innovation = advance(self._known, Rows(before, after, shared[:, columns], right))
+        known, _, innovation = advance(self._known, WhiteRows(before, after, shared[:, columns], right))
         found, covariance = estimate(known)
         if not np.isfinite(found).all():
             raise NotPossibleError(
@@ -384,7 +384,7 @@ class FilterInUse:
         return unflatten(self.imu, self._numbers).without(GyroEarthRotation, SetupMagneticField)
 
 
-def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[MotionPath, Rows]:
+def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[MotionPath, WhiteRows]:
     """Return the path's end after an interval, and its white rows about it."""
     after = carried(imu, numbers, gravity, part, path)
     return after, interval_rows(imu, numbers, gravity, part, errors, path, after)

@@ -40,7 +40,7 @@ from jaximu.data.preintegration import preintegrate_samples
 from jaximu.data.sightings import SIZE, AttitudeSeen, FieldSeen, Sighting, Standing, VelocitySeen
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.data import About, Conditions, Data
-from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run, smooth, smoothed_variances
+from jaximu.estimation.information_filter import Knowledge, WhiteRows, estimate, run, smooth, smoothed_variances
 from jaximu.estimation.problem import flatten
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -315,7 +315,7 @@ def _rows(
     before: MotionPath,
     after: MotionPath,
     anchor: Array,
-) -> Rows:
+) -> WhiteRows:
     """Return the white rows of an interval about a path: 6 of attitude and velocity, the drift's, what is measured.
 
     anchor (4,): the attitude at the end as first reckoned, about which one that begins anew is known.
@@ -368,12 +368,12 @@ def _rows(
         return known * found, known * found
 
     by_begun, off = jax.jacfwd(begun, has_aux=True)(jnp.zeros(6))
-    process = Rows(
+    process = WhiteRows(
         weights @ jnp.concatenate([slopes[:, :6], jnp.tile(by_drift, (1, copies))], axis=1),
         weights @ jnp.concatenate([slopes[:, 6:12], jnp.zeros((6, drifts))], axis=1),
         weights @ shared, -weights @ value,
     )  # fmt: skip
-    process = Rows(
+    process = WhiteRows(
         jnp.where(anew, 0.0, process.before),
         jnp.where(anew, jnp.concatenate([by_begun, jnp.zeros((6, drifts))], axis=1), process.after),
         jnp.where(anew, 0.0, process.shared),
@@ -383,7 +383,7 @@ def _rows(
     kept = jnp.exp(-duration / errors.correlation_time)
     variance = errors.variance * -jnp.expm1(-2 * duration / errors.correlation_time)[:, None]
     white = 1 / jnp.sqrt(variance).reshape(-1)
-    wander = Rows(
+    wander = WhiteRows(
         jnp.concatenate([jnp.zeros((drifts, 6)), jnp.diag(-white * jnp.repeat(kept, 6))], axis=1),
         jnp.concatenate([jnp.zeros((drifts, 6)), jnp.diag(white)], axis=1),
         jnp.zeros((drifts, shared.shape[1])), jnp.zeros(drifts),
@@ -395,7 +395,7 @@ def _rows(
 
 def _measured(
     means: _Means, part: MotionIntervals, errors: Disturbances, gravity: Array, after: MotionPath, size: int
-) -> Rows:
+) -> WhiteRows:
     """Return 6 rows measured at the end: rate and force of a rest, the velocity where motion ends, or nothing."""
 
     def still(change):  # attitude, earth, gravity
@@ -415,7 +415,7 @@ def _measured(
     stop = jnp.zeros((6, size)).at[:3, 3:6].set(jnp.eye(3)) / errors.arrival
     arrived = jnp.concatenate([after.velocity, jnp.zeros(3)]) / errors.arrival
     resting, stopping = part.rest * part.real, part.arrival * part.real
-    return Rows(
+    return WhiteRows(
         jnp.zeros((6, size)), resting * weight[:, None] * by_state + stopping * stop,
         resting * weight[:, None] * by_number + jnp.zeros((6, count + 1)),
         -resting * weight * value - stopping * arrived,
@@ -430,7 +430,7 @@ def _sighted(
     gravity: Array,
     after: MotionPath,
     size: int,
-) -> Rows:
+) -> WhiteRows:
     """Return the rows of what was measured from outside at the end, or nothing."""
 
     def off(change):  # attitude and velocity, the end, gravity, the mounting
@@ -448,13 +448,13 @@ def _sighted(
     by_path, by_ending, by_gravity, by_mounting = jnp.split(slopes, (6, 6 + SIZE, 7 + SIZE), axis=1)
     by_state = jnp.concatenate([by_path, jnp.zeros((len(value), size - 6))], axis=1)
     by_number = jnp.concatenate([by_ending @ means.by_ending + by_mounting @ means.by_mounting, by_gravity], axis=1)
-    return Rows(jnp.zeros_like(by_state), weight * by_state, weight * by_number, -weight * value)
+    return WhiteRows(jnp.zeros_like(by_state), weight * by_state, weight * by_number, -weight * value)
 
 
 def interval_rows(
     like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: MotionIntervals, errors: Disturbances,
     before: MotionPath, after: MotionPath,
-) -> Rows:  # fmt: skip
+) -> WhiteRows:  # fmt: skip
     """Return the white rows of one interval, linearised about a unit and the path's two ends.
 
     The state is the rotation vector in the body frame that turns the path's attitude into the true one (rad), the
@@ -705,7 +705,7 @@ class Filtered:
     last: Knowledge
     path: MotionPath
     misfit: float
-    rows: Rows = field(repr=False)
+    rows: WhiteRows = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -811,12 +811,12 @@ class IntervalsOfMotion(Data):
             **{name: getattr(part, name)[:, : before + inside] for name in ("accelerometer", "gyroscope", "time")},
         )  # fmt: skip
 
-    def _rows(self, means: _Means) -> Rows:
+    def _rows(self, means: _Means) -> WhiteRows:
         """Return the white rows (N, r, …) of all intervals about the path."""
         leaves = stored.call(
             _along, "intervals about a path", means, self.intervals, self.errors, self.gravity, self.path, self.anchor
         )
-        return Rows(*(np.asarray(leaf) for leaf in leaves))
+        return WhiteRows(*(np.asarray(leaf) for leaf in leaves))
 
     def followed(self, imu: Imu, index: Sequence[int], prior: Knowledge) -> FilterPass:
         """Return how a filter would have come to know free numbers, linearised about a unit and its path.
@@ -890,7 +890,7 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
 
 def _along(
     means: _Means, intervals: MotionIntervals, errors: Disturbances, gravity: Array, path: MotionPath, anchor: Array
-) -> Rows:  # fmt: skip
+) -> WhiteRows:  # fmt: skip
     before, after = (jax.tree.map(lambda leaf, part=part: leaf[part], path) for part in (slice(-1), slice(1, None)))
 
     def rows(part):

@@ -22,10 +22,10 @@ from scipy.linalg import solve_triangular
 
 from jaximu.ground.array_types import Array
 
-__all__ = ["Eliminated", "Knowledge", "Rows", "advance", "estimate", "run", "smooth", "smoothed_variances"]
+__all__ = ["Eliminated", "Knowledge", "WhiteRows", "advance", "estimate", "run", "smooth", "smoothed_variances"]
 
 
-class Rows(NamedTuple):
+class WhiteRows(NamedTuple):
     """White conditions of a step: before · x + after · x_next + shared · p − right has variance one; leading axes."""
 
     before: Float[Array, "... r n"]
@@ -49,7 +49,7 @@ class Eliminated(NamedTuple):
     right: Float[Array, "... n"]
 
 
-def advance(known: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, float]:
+def advance(known: Knowledge, rows: WhiteRows) -> tuple[Knowledge, Eliminated, float]:
     """Return what is known after a step, what it said of the state before, and its normalised innovation squared.
 
     The last has a χ² distribution with as many degrees of freedom as the step's rows exceed the state's n, once the
@@ -66,7 +66,7 @@ def advance(known: Knowledge, rows: Rows) -> tuple[Knowledge, Eliminated, float]
 
 
 def run(
-    start: Knowledge, rows: Rows, ends: Sequence[int] = ()
+    start: Knowledge, rows: WhiteRows, ends: Sequence[int] = ()
 ) -> tuple[Knowledge, Eliminated, Float[Array, "N k"], Knowledge]:  # fmt: skip
     """Run N steps; return the final knowledge, what each step eliminated, its innovations, and each step's knowledge.
 
@@ -76,8 +76,8 @@ def run(
     """
     n, known, steps = rows.before.shape[-1], start, []
     for part in zip(*rows, strict=True):
-        sums = [advance(known, Rows(*(each[:end] for each in part)))[-1] for end in ends]
-        known, eliminated, innovation = advance(known, Rows(*part))
+        sums = [advance(known, WhiteRows(*(each[:end] for each in part)))[-1] for end in ends]
+        known, eliminated, innovation = advance(known, WhiteRows(*part))
         innovations = np.diff([0.0, *sums, innovation])
         steps.append((eliminated, innovations, Knowledge(known.root[n:, n:], known.right[n:])))
     eliminated, innovations, numbers = zip(*steps, strict=True)
@@ -109,7 +109,7 @@ def smooth(
 def smoothed_variances(eliminated: Eliminated, covariance: Float[Array, "n+m n+m"]) -> Float[Array, "N n"]:
     """Return the variances of smoothed states from the covariance of the last state and the shared numbers.
 
-    Rows and columns of numbers that are held are zero.
+    WhiteRows and columns of numbers that are held are zero.
     """
     n, variances = eliminated.root.shape[-1], []
     m = len(covariance) - n
