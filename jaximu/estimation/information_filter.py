@@ -109,7 +109,7 @@ def smooth(
 def smoothed_variances(eliminated: Eliminated, covariance: Float[Array, "n+m n+m"]) -> Float[Array, "N n"]:
     """Return the variances of smoothed states from the covariance of the last state and the shared numbers.
 
-    WhiteRows and columns of numbers that are held are zero.
+    Rows and columns of numbers that are held are zero.
     """
     n, variances = eliminated.root.shape[-1], []
     m = len(covariance) - n

@@ -30,7 +30,7 @@ from jaximu.calibration.systematic import (
 )
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.motion import Disturbances, IntervalsOfMotion, cut, first_knowledge, longest_rest
-from jaximu.estimation.information_filter import Knowledge, Rows, estimate, run
+from jaximu.estimation.information_filter import Knowledge, WhiteRows, estimate, run
 from jaximu.estimation.problem import Name, Parameters, flatten
 from jaximu.estimation.uncertainty import spoken_amount, weak_directions
 from jaximu.ground import stored
@@ -99,7 +99,7 @@ class Filter:
     index: NDArray[np.int64]
     prior: Knowledge
     beyond: int = 0
-    _legs: dict[tuple, tuple[Rows, Rotation]] = field(default_factory=dict, repr=False)
+    _legs: dict[tuple, tuple[WhiteRows, Rotation]] = field(default_factory=dict, repr=False)
 
     def measured(
         self, words: Sequence[str], first: float | None = None, up: Sequence[float] = (0.0, 0.0, 1.0)
@@ -166,22 +166,22 @@ class Filter:
         spread = (self.numbers(known) / self.size[:, None] / self.size)[np.ix_(kept, kept)]
         return float(stored.call(CRITERIA[criterion], f"sequence's {criterion}", spread, weights[kept])[0])
 
-    def _rows(self, measurement: IntervalsOfMotion, part: slice) -> tuple[Rows, Rotation]:
+    def _rows(self, measurement: IntervalsOfMotion, part: slice) -> tuple[WhiteRows, Rotation]:
         """Return rows of some intervals about the free numbers and gravity, and the attitude where they begin."""
         found = measurement.filtered(self.imu)
         shared = np.append(self.index, len(flatten(self.imu)))
-        rows = Rows(*(np.asarray(each)[part] for each in found.rows))
+        rows = WhiteRows(*(np.asarray(each)[part] for each in found.rows))
         start = Rotation.from_quat(np.asarray(found.path.attitude)[part.start], scalar_first=True)
         return rows._replace(shared=rows.shared[..., shared]), start
 
-    def _headed(self, rows: Rows, ahead: Rotation) -> Rows:
+    def _headed(self, rows: WhiteRows, ahead: Rotation) -> WhiteRows:
         """Return rows of a path turned about the vertical: its heading is by chance, the Earth's rotation is not."""
         shared, earth = np.array(rows.shared), list(self.earth)
         shared[..., earth] = shared[..., earth] @ ahead.as_matrix().T
         return rows._replace(shared=shared)
 
 
-def _merged(rows: Rows) -> Rows:
+def _merged(rows: WhiteRows) -> WhiteRows:
     """Return N steps as one: the states in between are eliminated; leading axis of length one."""
     n = rows.before.shape[-1]
     whole = np.concatenate([rows.before[0], rows.after[0], rows.shared[0], rows.right[0][:, None]], axis=1)
@@ -191,7 +191,7 @@ def _merged(rows: Rows) -> Rows:
         new = np.concatenate([before, np.zeros_like(before), after, shared, right[:, None]], axis=1)
         whole = np.asarray(qr(np.concatenate([old, new]), mode="r")[0])[n:, n:]
         whole = whole[: whole.shape[1]]
-    return Rows(whole[None, :, :n], whole[None, :, n : 2 * n], whole[None, :, 2 * n : -1], whole[None, :, -1])
+    return WhiteRows(whole[None, :, :n], whole[None, :, n : 2 * n], whole[None, :, 2 * n : -1], whole[None, :, -1])
 
 
 def filter_of(
