@@ -21,7 +21,7 @@ from jaximu.data.track import Track
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.hand_held import harmonics
+from jaximu.diagnosis.shapes import Shapes
 from jaximu.estimation.data import About
 from jaximu.estimation.fitting import Linear, Prior, effect_numbers
 from jaximu.estimation.problem import Name
@@ -40,8 +40,6 @@ from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording
 
 __all__ = ["MeasuredAttitude", "diagnose_against_attitude"]
-
-_FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 
 
 @dataclass
@@ -106,31 +104,21 @@ class MeasuredAttitude(Experiment):
 
     def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause: slow changes, and what depends on orientation."""
-        reactions, path, windows = linear.details.reactions, linear.details.tracks["gyroscope"].stimulus, self._windows
-        time, none = np.asarray(path.time), np.zeros((len(np.asarray(path.time)), 3, 1))
-        middle = np.asarray(self.measurement.intervals.stamp)
-        waves = np.cos(np.pi * ((time - middle[0]) / np.ptp(middle))[:, None] * np.arange(1, 6))
-        force = np.asarray(path.specific_force)
-        second, third = harmonics(force / np.linalg.norm(force, axis=1, keepdims=True))
-        found = []
+        reactions, stimulus = linear.details.reactions, linear.details.tracks["gyroscope"].stimulus
+        time, stamps = np.asarray(stimulus.time), np.asarray(self.measurement.intervals.stamp)
+        force = np.asarray(stimulus.specific_force)
 
-        def add(name: str, shape: FloatArray, triad: int, size: float) -> None:
-            """`shape` (m, k), for each axis of a triad."""
+        def react(triad: str, shape: FloatArray) -> FloatArray:
             columns = []
             for axis in np.eye(3):
-                both = [none, none]
-                both[triad] = axis[:, None] * shape[:, None, :]
-                both[1 - triad] = np.zeros_like(both[triad])
-                columns.append(np.asarray(reactions.react(*both, windows)))
-            columns = np.concatenate(columns, axis=1)
-            found.append(EffectBlock(name, columns * size, np.full(columns.shape[1], size), "generic"))
+                along = axis[:, None] * shape[:, None, :]
+                both = (along, np.zeros_like(along)) if triad == "accelerometer" else (np.zeros_like(along), along)
+                columns.append(np.asarray(reactions.react(*both, self._windows)))
+            return np.concatenate(columns, axis=1)
 
-        add("slow change of the accelerometer", waves, 0, _FORCE)
-        add("slow change of the gyroscope", waves, 1, _RATE)
-        add("the accelerometer depends on orientation (second harmonics)", second, 0, _FORCE)
-        add("the accelerometer depends on orientation (third harmonics)", third, 0, _FORCE)
-        add("the gyroscope depends on orientation", second, 1, _RATE)
-        return found
+        shapes = Shapes(react)
+        up = force / np.linalg.norm(force, axis=1, keepdims=True)
+        return shapes.slow_changes((time - stamps[0]) / np.ptp(stamps)) + shapes.orientations(up)
 
     def extent(self) -> Extent:
         """Return what the recording spans."""

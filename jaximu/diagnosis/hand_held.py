@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import equinox as eqx
 import numpy as np
@@ -18,6 +17,7 @@ from jaximu.diagnosis.drift import DriftComponents
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.handling import Handling, averaged, findings, handling, instants, sway
+from jaximu.diagnosis.shapes import SIZES, Shapes, harmonics
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.estimation.data import About
 from jaximu.estimation.fitting import Linear
@@ -30,7 +30,7 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observe
 
-__all__ = ["HandHeldExperiment", "harmonics"]
+__all__ = ["HandHeldExperiment"]
 
 
 @dataclass
@@ -128,65 +128,50 @@ class HandHeldExperiment(RecordedByHand, Experiment):
 
     def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause, and poses that were bumped."""
-        poses = self.observations.poses
+        poses, shapes = self.observations.poses, self._shapes(linear)
         real = np.flatnonzero(poses.mask)
         time = (np.asarray(poses.start)[real] + np.asarray(poses.stop)[real]) / 2
         share = (time - time.min()) / max(np.ptp(time), 1e-9)
         up = _directions(imu, poses.accelerometer_mean)[real]
-        force, rate = self._shaper(linear)
-        waves = np.cos(np.pi * share[:, None] * np.arange(1, 6))
-        second, third = harmonics(up)
-        found = [
-            force("slow change of the accelerometer", waves),
-            rate("slow change of the gyroscope", waves),
-            force("the accelerometer depends on orientation (second harmonics)", second),
-            force("the accelerometer depends on orientation (third harmonics)", third),
-            rate("the gyroscope at rest depends on orientation", np.concatenate([up, second], axis=1)),
-        ]
+        blocks = [*shapes.slow_changes(share), *shapes.orientations(up, np.ones(len(real), bool))]
         for cycles in np.arange(_CYCLES[0], min(_CYCLES[1], len(real) / 2), 0.5):
             phase, period = 2 * np.pi * cycles * share, np.ptp(time) / cycles
             wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
-            found.append(force("the accelerometer's bias swings to and fro", wave, period=period))
-            found.append(rate("the gyroscope's bias swings to and fro", wave, period=period))
-        by_force, _ = mean_output_reactions(linear.details.reaction)
-        for pose in real:
-            found.append(EffectBlock("data.bumped_pose", by_force[:, pose] * _FORCE, np.full(3, _FORCE), "data",
-                               {"pose": int(pose)}, True))  # fmt: skip
-        return found
+            for triad in SIZES:
+                blocks.append(shapes.block(triad, f"the {triad}'s bias swings to and fro", wave, period=period))
+        return blocks + shapes.bumped(real, real)
 
     def nearly(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes that a cause may be taken for: higher harmonics, a heading, curves of an axis's own force."""
-        poses = self.observations.poses
+        poses, shapes = self.observations.poses, self._shapes(linear)
         real = np.asarray(poses.mask)
         up = _directions(imu, poses.accelerometer_mean)[real]
-        force, rate = self._shaper(linear)
-        curves = np.polynomial.legendre.legvander(up, 7)[..., 4:]
+        attitudes = _attitudes(self.tracks(linear), len(real))[real]
+        curves = np.asarray(np.polynomial.legendre.legvander(up, 7)[..., 4:], np.float64)
         return [
-            rate("the gyroscope at rest depends on its heading", _attitudes(self.tracks(linear), len(real))[real]),
-            rate("the gyroscope at rest depends on orientation (third harmonics)", harmonics(up)[1]),
-            force("the accelerometer's axes are curved (even powers)", curves[..., ::2]),
-            force("the accelerometer's axes are curved (odd powers)", curves[..., 1::2]),
+            shapes.block("gyroscope", "the gyroscope at rest depends on its heading", attitudes),
+            shapes.block(
+                "gyroscope", "the gyroscope at rest depends on orientation (third harmonics)", harmonics(up)[1]
+            ),
+            shapes.block("accelerometer", "the accelerometer's axes are curved (even powers)", curves[..., ::2]),
+            shapes.block("accelerometer", "the accelerometer's axes are curved (odd powers)", curves[..., 1::2]),
         ]
 
-    def _shaper(self, linear: Linear) -> tuple[Callable[..., EffectBlock], Callable[..., EffectBlock]]:
-        """Return what makes a block of a shape in the poses of accelerometer and gyroscope.
-
-        A shape (poses, k) is each axis's, or (poses, 3, k) to each its own.
-        """
+    def _shapes(self, linear: Linear) -> Shapes:
+        """Return what makes blocks of shapes over the real poses; (poses, 3, k) are of each axis by itself."""
         real = np.asarray(self.observations.poses.mask)
+        reactions = dict(zip(SIZES, mean_output_reactions(linear.details.reaction), strict=True))
 
-        def block(reach: FloatArray, size: float, name: str, shape: FloatArray, **inner: float) -> EffectBlock:
-            columns = np.einsum("npi,pk->nki" if shape.ndim == 2 else "npi,pik->nik", reach[:, real], shape)
-            columns = columns.reshape(len(reach), -1)
-            return EffectBlock(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner))
+        def react(triad: str, shape: FloatArray) -> FloatArray:
+            equation = "npi,pk->nki" if shape.ndim == 2 else "npi,pik->nik"
+            columns = np.einsum(equation, reactions[triad][:, real], shape)
+            return columns.reshape(len(columns), -1)
 
-        by_force, by_rate = mean_output_reactions(linear.details.reaction)
-        return partial(block, by_force, _FORCE), partial(block, by_rate, _RATE)
+        return Shapes(react)
 
 
 _CYCLES = 2.0, 20.0
 """Periods in a recording, between which a swing of the bias is asked for; half a period apart, none is missed."""
-_FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 
 
 def _directions(imu: Imu, output) -> FloatArray:
@@ -203,12 +188,3 @@ def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
         attitude = np.asarray(track.stimulus.attitude)[first[inside]]
         found[pose[inside]] = Rotation.from_quat(attitude, scalar_first=True).as_matrix().reshape(-1, 9)
     return found
-
-
-def harmonics(up: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Real spherical harmonics (n, 5) of degree two and (n, 7) of degree three, up to factors."""
-    x, y, z = up.T
-    second = [x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1]
-    third = [y * (3 * x * x - y * y), x * y * z, y * (5 * z * z - 1), z * (5 * z * z - 3), x * (5 * z * z - 1),
-             z * (x * x - y * y), x * (x * x - 3 * y * y)]  # fmt: skip
-    return np.stack(second, axis=1), np.stack(third, axis=1)

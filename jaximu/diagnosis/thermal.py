@@ -26,6 +26,7 @@ from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import left_out
+from jaximu.diagnosis.shapes import Shapes, placed
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions
@@ -46,7 +47,6 @@ from jaximu.recordings.recording import Recording, recordings_of
 __all__ = ["Resting", "RestingConditions", "diagnose_thermal"]
 
 _TRIADS = ("accelerometer", "gyroscope")
-_FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 _LEVEL = (1.0, 0.1)  # m/s² and rad/s: how far a rest may lie from another, as good as free
 _SMOOTH = (1.0, 0.1)  # m/s² and rad/s: the same of a smooth function of temperature
 _BLOCKS = 120
@@ -153,21 +153,16 @@ class Resting(Experiment):
 
     def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause, and blocks in which the unit was knocked."""
-        count = len(self.blocks)
-        share = self.blocks.time - self.blocks.time.min()
-        waves = np.cos(np.pi * (share / share.max())[:, None] * np.arange(1, 6))
-        curves = ThermalShapes(self.blocks, imu.accelerometer.temperature_reference).smooth()
-        found, axes = [], np.eye(6).reshape(6, 2, 3)
-        for triad, (name, size) in enumerate(zip(_TRIADS, (_FORCE, _RATE), strict=True)):
-            shown = [(f"slow change of the {name}", waves)]
-            shown += [] if self.smooth else [(f"the {name} depends smoothly on temperature", curves)]
-            for words, shape in shown:
-                columns = np.einsum("nk,ca->ncka", shape, axes[:, triad]).reshape(6 * count, -1)
-                found.append(EffectBlock(words, columns * size, np.full(columns.shape[1], size), "generic"))
-        for block, at in enumerate(np.eye(count)):
-            columns = np.asarray(_FORCE * np.kron(at[:, None], axes[:, 0]), np.float64)
-            found.append(EffectBlock("data.bumped_pose", columns, np.full(3, _FORCE), "data", {"pose": block}, True))
-        return found
+        blocks, count = self.blocks, len(self.blocks)
+        shapes = Shapes(lambda triad, shape: placed(triad, shape, np.ones(count, bool)))
+        share = blocks.time - blocks.time.min()
+        questions = shapes.slow_changes(share / share.max())
+        if not self.smooth:
+            curves = ThermalShapes(blocks, imu.accelerometer.temperature_reference).smooth()
+            questions += [
+                shapes.block(triad, f"the {triad} depends smoothly on temperature", curves) for triad in _TRIADS
+            ]
+        return questions + shapes.bumped(np.arange(count), np.arange(count))
 
     def extent(self) -> Extent:
         """Return what the recordings span."""

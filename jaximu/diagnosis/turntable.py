@@ -19,8 +19,8 @@ from jaximu.data.track import Track, added, mean_outputs, stimuli
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.hand_held import harmonics
 from jaximu.diagnosis.noise import own_noise
+from jaximu.diagnosis.shapes import Shapes, placed
 from jaximu.diagnosis.twin import drawn_noise
 from jaximu.estimation.data import About
 from jaximu.estimation.fitting import Linear
@@ -42,8 +42,6 @@ from jaximu.recordings.reference import Entry, entries_of_columns
 from jaximu.recordings.segmentation import Segmentation
 
 __all__ = ["AtStations", "Turntable", "diagnose_turntable"]
-
-_FORCE, _RATE = 0.01, 1e-3  # m/s² and rad/s: sizes of generic shapes
 
 
 @dataclass(frozen=True)
@@ -96,37 +94,19 @@ class Turntable(Experiment):
 
     def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause, and poses that were bumped."""
-        stations = self.stations
-        pose, still = np.asarray(stations.accelerometer_used), np.asarray(stations.gyroscope_used)
-        turn = np.asarray(stations.turn)
+        stations, turn = self.stations, np.asarray(self.stations.turn)
+        used = {"accelerometer": np.asarray(stations.accelerometer_used),
+                "gyroscope": np.asarray(stations.gyroscope_used)}  # fmt: skip
         middle = (np.asarray(stations.start) + np.asarray(stations.stop)) / 2
-        share = (middle - middle[pose | still].min()) / max(np.ptp(middle[pose | still]), 1e-9)
-        waves = np.cos(np.pi * share[:, None] * np.arange(1, 6))
+        share = (middle - middle[self._real].min()) / max(np.ptp(middle[self._real]), 1e-9)
         force = np.asarray(stations.stimulus.specific_force).mean(axis=1)
         up = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-9)
-        second, third = harmonics(up)
-        found = []
-
-        def add(name: str, shape: FloatArray, triad: int, rows: NDArray[np.bool_], size: float) -> None:
-            """`shape` (S, k), for each axis of a triad."""
-            columns = np.zeros((len(turn), 6, shape.shape[1], 3))
-            for axis in range(3):
-                columns[rows, 3 * triad + axis, :, axis] = shape[rows]
-            columns = columns.reshape(6 * len(turn), -1)
-            found.append(EffectBlock(name, columns * size, np.full(columns.shape[1], size), "generic"))
-
-        add("slow change of the accelerometer", waves, 0, pose, _FORCE)
-        add("slow change of the gyroscope", waves, 1, still, _RATE)
-        add("the accelerometer depends on orientation (second harmonics)", second, 0, pose, _FORCE)
-        add("the accelerometer depends on orientation (third harmonics)", third, 0, pose, _FORCE)
-        at_rest = still & ~turn
-        add("the gyroscope at rest depends on orientation", np.concatenate([up, second], 1), 1, at_rest, _RATE)
-        for station in np.flatnonzero(pose & ~turn):
-            columns = np.zeros((len(turn), 6, 3))
-            columns[station, :3] = _FORCE * np.eye(3)
-            found.append(EffectBlock("data.bumped_pose", columns.reshape(-1, 3), np.full(3, _FORCE), "data",
-                               {"pose": int(station)}, True))  # fmt: skip
-        return found
+        shapes = Shapes(lambda triad, shape: placed(triad, shape, used[triad]))
+        return (
+            shapes.slow_changes(share)
+            + shapes.orientations(up, ~turn)
+            + shapes.bumped(np.flatnonzero(used["accelerometer"] & ~turn), np.arange(len(turn)))
+        )
 
     def extent(self) -> Extent:
         """Return what the recording spans."""
