@@ -102,6 +102,14 @@ class MeasuredAttitude(Experiment):
         """Return how the conditions react to effects."""
         return self.measurement.reactions(details)
 
+    def by_setup(self, state: State) -> FloatArray:
+        """Return what the fixture most likely adds to the real conditions: its numbers' mean, given the conditions.
+
+        Near the level a tilted reference looks like a bias of the accelerometer; which of both it is, nothing tells.
+        """
+        unknown = self._evaluated(state.model)[2][self.used]
+        return unknown @ ((state.weights @ unknown).T @ (state.weights @ state.conditions))
+
     def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause: slow changes, and what depends on orientation."""
         reactions, stimulus = linear.details.reactions, linear.details.tracks["gyroscope"].stimulus

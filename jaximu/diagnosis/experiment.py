@@ -275,6 +275,14 @@ class Experiment(Data):
             model, linear.names, covariance, evidence, linear.conditions[used], weights, limits, blind, linear, prior
         )
 
+    def by_setup(self, state: State) -> FloatArray:
+        """Return what the set-up most likely adds to the real conditions (m,), where their covariance allows for it."""
+        return np.zeros(len(state.conditions))
+
+    def errors(self, state: State) -> list[FloatArray]:
+        """Return the errors (v,) of each kind of condition that a fit leaves, in its unit."""
+        return self.real.errors(state.conditions - self.by_setup(state))
+
     def beside(self, state: State) -> tuple[float, str]:
         """Return which shape, that a fit's effects may be taken for, stands out beside them, and its p-value."""
         blocks = self.nearly(state.imu, state.linear)

@@ -56,7 +56,7 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     shown = diagnosis.experiment.real.kinds[place]
     measured, simulated = (
         size(float(np.sqrt(np.mean(np.square(errors[place])))), shown.unit, 2)
-        for errors in (diagnosis.experiment.real.errors(diagnosis.base.conditions), twin.real.errors(copied.conditions))
+        for errors in (diagnosis.experiment.errors(diagnosis.base), twin.errors(copied))
     )
     number, meaning = measured, f"rms of {shown.words}: no more than noise, drift and handling leave"
     if diagnosis.verdict != "adequate":
@@ -127,9 +127,8 @@ def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
     if diagnosis.extended.effects:
         series.append(("measured, extended model", _EXTENDED, experiment, diagnosis.extended))
     for label, colour, source, state in series:
-        real = source.real  # a twin need not have as many poses and turns
-        time = real.dependences(kind)[TIME]
-        left.plot(time, factor * real.errors(state.conditions)[kind], "o", color=colour, markersize=4, label=label)
+        time = source.real.dependences(kind)[TIME]  # a twin need not have as many poses and turns
+        left.plot(time, factor * source.errors(state)[kind], "o", color=colour, markersize=4, label=label)
     left.axhline(0.0, color="0.7", linewidth=0.8)
     dressed(left, shown.words, xlabel="time [s]", ylabel=f"error [{unit}]")
     left.legend(fontsize=8)
@@ -162,7 +161,7 @@ def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure
     covariates, shadow = ({row: source.dependences(row) for row in rows} for source in (real, twin.real))
     figure = figures.new_figure(2.1 * len(rows) + 0.4)
     panels = figure.subplots(len(rows), max(len(each) for each in covariates.values()), squeeze=False, sharey="row")
-    measured, simulated = real.errors(diagnosis.base.conditions), twin.real.errors(copied.conditions)
+    measured, simulated = diagnosis.experiment.errors(diagnosis.base), twin.errors(copied)
     for line, row in zip(panels, rows, strict=True):
         kind = real.kinds[row]
         factor, unit = readable(kind.unit, _AN_ERROR)

@@ -115,11 +115,11 @@ def _error_figure(found: HandHeldThermal) -> Figure:
     figure = new_figure(3.6)
     panels = figure.subplots(1, len(real.kinds))
     for place, (panel, kind) in enumerate(zip(panels, real.kinds, strict=True)):
-        errors = [np.abs(real.errors(state.conditions)[place]).max() for _, _, state in series]
+        errors = [np.abs(found.experiment.errors(state)[place]).max() for _, _, state in series]
         factor, unit = readable(kind.unit, float(max(errors)))
         warmth = temperature[real.kind == place][:: kind.components]
         for label, colour, state in series:
-            panel.plot(warmth, factor * real.errors(state.conditions)[place], ".", ms=5, color=colour, label=label)
+            panel.plot(warmth, factor * found.experiment.errors(state)[place], ".", ms=5, color=colour, label=label)
         panel.axhline(0.0, color="0.6", lw=0.8)
         dressed(panel, xlabel="temperature [°C]")
         panel.set_title(f"{sentence(kind.words)} [{unit}]", loc="left", fontsize=9, fontweight="bold")
