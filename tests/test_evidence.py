@@ -9,6 +9,7 @@ import scipy.stats
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, EffectBlock, Evidence, detection_limit, limit_noncentrality
 from jaximu.diagnosis.improvement import cross_validated
 from jaximu.diagnosis.selection import select
+from jaximu.estimation.rows import TIME, ResidualKind, Rows
 
 SIZES = (1, 3, 3, 2, 1, 3)
 
@@ -421,8 +422,10 @@ def left_out(seed, times):
     blocks = [EffectBlock(each.name, weights @ each.columns, each.sizes) for each in blocks]
     noise = random.standard_normal(90)
     residual = noise + planted(Evidence(noise, weights @ jacobian, blocks), 1, times, random)
-    place = np.arange(90) // 3
-    experiment = SimpleNamespace(touched=np.stack([place, place], axis=1), summary=lambda errors: {})
+    pose, ones = np.arange(90) // 3, np.ones(90)
+    kinds = (ResidualKind("of a pose", "of a pose", "m/s^2", 3),)
+    rows = Rows(kinds, np.zeros(90, int), pose, pose, ones, ones > 0, {TIME: pose.astype(float)}, np.zeros((30, 2)))
+    experiment = SimpleNamespace(real=rows)
     base = SimpleNamespace(weights=weights, evidence=Evidence(residual, weights @ jacobian, blocks))
     return cross_validated(experiment, base)  # pyright: ignore[reportArgumentType]
 
