@@ -115,13 +115,14 @@ class MeasuredAttitude(Experiment):
         reactions, stimulus = linear.details.reactions, linear.details.tracks["gyroscope"].stimulus
         time, stamps = np.asarray(stimulus.time), np.asarray(self.measurement.intervals.stamp)
         force = np.asarray(stimulus.specific_force)
+        windows = len(self.measurement.intervals.used) // self.measurement.group
 
         def react(triad: str, shape: FloatArray) -> FloatArray:
             columns = []
             for axis in np.eye(3):
                 along = axis[:, None] * shape[:, None, :]
                 both = (along, np.zeros_like(along)) if triad == "accelerometer" else (np.zeros_like(along), along)
-                columns.append(np.asarray(reactions.react(*both, self._windows)))
+                columns.append(np.asarray(reactions.react(*both, windows)))
             return np.concatenate(columns, axis=1)
 
         shapes = Shapes(react)
@@ -130,7 +131,7 @@ class MeasuredAttitude(Experiment):
 
     def extent(self) -> Extent:
         """Return what the recording spans."""
-        stamps = np.asarray(self.measurement.intervals.stamp)[self._edges]
+        stamps = np.asarray(self.measurement.intervals.stamp)[:: self.measurement.group]
         warm = self.measurement.recording.temperature
         return Extent(float(np.ptp(stamps)), tuple(stamps[1:-1].tolist()),
                       0.0 if warm is None else float(np.ptp(warm.values)))  # fmt: skip
@@ -163,20 +164,6 @@ class MeasuredAttitude(Experiment):
     def recordings(self) -> tuple[Recording, ...]:
         """What is diagnosed, as it was recorded."""
         return (self.measurement.recording,)
-
-    @property
-    def _windows(self) -> int:
-        return len(self.measurement.intervals.used) // self.measurement.group
-
-    @property
-    def _edges(self) -> NDArray[np.int64]:
-        """Places of the windows' ends among the stamps, padding included."""
-        return self.measurement.group * np.arange(self._windows + 1)
-
-    @property
-    def _complete(self) -> NDArray[np.bool_]:
-        """Which windows hold no gap."""
-        return np.asarray(np.all(np.asarray(self.measurement.intervals.used).reshape(self._windows, -1), axis=1))
 
 
 def diagnose_against_attitude(
