@@ -371,7 +371,6 @@ class MagneticField(Data):
             parts = [of_windows, np.repeat(of_turns, 2), of_windows]
             return parts[0] if windows.alone else np.concatenate(parts)
 
-        used = [windows.used, np.repeat(windows.turn, 2), windows.level]
         kind = placed(np.zeros(count, np.int64), np.ones(count, np.int64))
         kind[3 * count :] = 2
         return Rows(
@@ -380,7 +379,7 @@ class MagneticField(Data):
             first=placed(window, window),
             last=placed(window, (window + 1) % count),
             to_si=np.ones(len(kind)),
-            used=np.concatenate(used)[: len(kind)],
+            used=np.concatenate([windows.used, np.repeat(windows.turn, 2), windows.level])[: len(kind)],
             covariates={TIME: placed(middle, middle)},
             spans=windows.time,
             observation="window",

@@ -245,13 +245,14 @@ def pose_rows(imu: Imu, observations: Observations) -> Rows:
         "rate [°/s]": placed(unknown[0], speed.max(axis=1)),
         "duration [s]": placed(unknown[0], turns.interval.sum(axis=1)),
     }
-    scale = np.linalg.norm(gyroscope.gain, axis=1)
     return Rows(
         kinds=RESIDUALS,
         kind=np.repeat([0, 1, 2], [len(pose), 2 * len(turn), 3 * len(pose)]),
         first=placed(pose, turn),
         last=placed(pose, turn + 1),
-        to_si=np.concatenate([np.ones(len(pose) + 2 * len(turn)), np.tile(1 / scale, len(pose))]),
+        to_si=np.concatenate(
+            [np.ones(len(pose) + 2 * len(turn)), np.tile(1 / np.linalg.norm(gyroscope.gain, axis=1), len(pose))]
+        ),
         used=placed(poses.mask, turns.mask).astype(bool),
         covariates=covariates,
         spans=np.stack([poses.start, poses.stop], axis=1),

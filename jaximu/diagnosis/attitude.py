@@ -121,7 +121,8 @@ class MeasuredAttitude(Experiment):
             columns = []
             for axis in np.eye(3):
                 along = axis[:, None] * shape[:, None, :]
-                both = (along, np.zeros_like(along)) if triad == "accelerometer" else (np.zeros_like(along), along)
+                none = np.zeros_like(along)
+                both = (along, none) if triad == "accelerometer" else (none, along)
                 columns.append(np.asarray(reactions.react(*both, windows)))
             return np.concatenate(columns, axis=1)
 

@@ -146,10 +146,13 @@ class HandHeldExperiment(RecordedByHand, Experiment):
         poses, shapes = self.observations.poses, self._shapes(linear)
         real = np.asarray(poses.mask)
         up = _directions(imu, poses.accelerometer_mean)[real]
-        attitudes = _attitudes(self.tracks(linear), len(real))[real]
         curves = np.asarray(np.polynomial.legendre.legvander(up, 7)[..., 4:], np.float64)
         return [
-            shapes.block("gyroscope", "the gyroscope at rest depends on its heading", attitudes),
+            shapes.block(
+                "gyroscope",
+                "the gyroscope at rest depends on its heading",
+                _attitudes(self.tracks(linear), len(real))[real],
+            ),
             shapes.block(
                 "gyroscope", "the gyroscope at rest depends on orientation (third harmonics)", harmonics(up)[1]
             ),
