@@ -93,6 +93,20 @@ def test_times_lie_in_the_observations_or_between_them(kind):
     assert following.all() and (time < real.spans[real.last, 1]).all()
 
 
+def test_what_is_used_is_what_the_covariance_uses():
+    """Both are made of the masks, each by itself: rows and weights must leave out the same."""
+    case = simulated(40, poses=10)
+    lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case.imu, case.observations))
+    by_covariance = np.asarray(condensed(*lifted).covariance.used)[0] > 0
+    np.testing.assert_array_equal(pose_rows(case.imu, case.observations).used, by_covariance)
+    assert not by_covariance.all()  # there is padding
+    made = turned(3, duration=20.0)
+    data = MagneticField(windows_of(made.magnetometer, made.recording, np.zeros(3)), made.strength)
+    imu = replace(Imu.nominal(), magnetometer=replace(Imu.nominal().accelerometer, quantity="magnetic_field"))
+    about = data.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu))
+    np.testing.assert_array_equal(data.rows(imu).used, np.asarray(about.covariance.used)[0] > 0)
+
+
 def test_errors_are_the_same_in_counts():
     """A gyroscope that puts out counts, 1000 to a rad/s: the rms in SI stays."""
     case = simulated(41, poses=10)
