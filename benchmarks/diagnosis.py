@@ -40,7 +40,7 @@ from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE
 from jaximu.noise.at_rest import fit_noise
-from jaximu.recordings.segmentation import observe
+from jaximu.recordings.segmentation import observed_poses
 
 jax.config.update("jax_enable_x64", True)
 
@@ -59,13 +59,13 @@ def sized(case, folder, noise, multiples):
     plain = read_recording(bare.write(folder / "bare", ("fit",))["fit"])
     calibration = calibrate(plain, GRAVITY)
     (part,) = calibration.segmentations
-    experiment = HandHeldExperiment((part,), observe(part, GRAVITY.value, noise=noise), calibration.imu)
+    experiment = HandHeldExperiment((part,), observed_poses(part, GRAVITY.value, noise=noise), calibration.imu)
     state = experiment.fit()
     scales = {}
     for effect, multiple in zip(case.hidden, multiples, strict=True):
         loud = {each.name: 5.0 if each.name == effect.name else 0.0 for each in case.hidden}
         other = read_recording(case.with_size(loud).write(folder / "loud", ("fit",))["fit"])
-        observations = observe(replace(part, recording=other), GRAVITY.value, noise=noise)
+        observations = observed_poses(replace(part, recording=other), GRAVITY.value, noise=noise)
         conditions = replace(experiment, observations=observations).predict(state.imu)[0]
         change = state.weights @ (conditions - state.conditions) / 5.0
         basis = np.linalg.svd(state.evidence.jacobian, full_matrices=False)[0]

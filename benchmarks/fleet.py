@@ -37,7 +37,7 @@ from jaximu.estimation.problem import flatten, names_of, without_equipment
 from jaximu.fleets import FleetUnit, Settings, find_jobs, fit_units, run_fleet
 from jaximu.ground import stored
 from jaximu.recordings import write_recording
-from jaximu.recordings.segmentation import observe, segment
+from jaximu.recordings.segmentation import observed_poses, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
 
@@ -53,7 +53,7 @@ def units(count: int) -> list[FleetUnit]:
             values = recording.accelerometer.values.copy()
             values[len(values) // 2 : len(values) // 2 + 150] += 0.05
             recording = replace(recording, accelerometer=replace(recording.accelerometer, values=values))
-        found.append(FleetUnit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True))
+        found.append(FleetUnit(observed_poses(segment(recording), 9.80665), nominal_imu(recording)[0], True))
     return found
 
 
@@ -103,7 +103,7 @@ def agreement(made: list[FleetUnit]) -> float:
     """Largest step, in standard deviations, of the exact path from the fleet's answers."""
     worst = 0.0
     for unit, fitted in zip(made, fit_units(made), strict=True):
-        seen = PosesAndTurns(jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.observations))
+        seen = PosesAndTurns.of(jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.observations))
         exact = fit(fitted.imu, seen, without_equipment, excess=fitted.excess, estimate_excess=False, max_passes=1)
         step = exact.values - flatten(fitted.imu)[[names_of(fitted.imu).index(name) for name in exact.names]]
         worst = max(worst, float(np.abs(step / np.sqrt(np.diagonal(fitted.covariance))).max()))

@@ -28,7 +28,7 @@ from jaximu.model import Noise, White
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.readers import ReadOptions, read_magnetometer, read_recording
 from jaximu.recordings.recording import Signal
-from jaximu.recordings.segmentation import observe, segment
+from jaximu.recordings.segmentation import observed_poses, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import Environment, HandHeld
 
@@ -299,7 +299,7 @@ def fleet(small: bool) -> None:
         alone = replace(found, recording=replace(recording, gyroscope=None, magnetometer=None))
         ways = {
             "accelerometers": lambda part=alone: FleetUnit(
-                observe(part, 9.80665), nominal_imu(part.recording)[0], False
+                observed_poses(part, 9.80665), nominal_imu(part.recording)[0], False
             ),
             "magnetometers": lambda one=recording.magnetometer, part=found: field_unit(one, part, None, "").unit,
         }

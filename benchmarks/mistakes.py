@@ -37,7 +37,7 @@ from jaximu.ground.errors import JaximuError
 from jaximu.mistakes import inspect, prepare
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import observe, segment
+from jaximu.recordings.segmentation import observed_poses, segment
 
 jax.config.update("jax_enable_x64", True)
 
@@ -93,7 +93,7 @@ def of_the_fit(recording: Recording) -> list[Finding]:
 def plain_fit(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | None:
     """Return gains and biases, their standard deviations, and the turns' rms, °, of poses and turns as they are."""
     try:
-        observations = observe(segment(recording), GRAVITY.value)
+        observations = observed_poses(segment(recording), GRAVITY.value)
         found = fit_hand_held(nominal_imu(recording)[0], observations)
         turns = residual_rms(found.model, observations)["gravity_direction"][0]
     except (JaximuError, KeyError, ValueError, ArithmeticError):

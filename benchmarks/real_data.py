@@ -18,7 +18,7 @@ from jaximu.data import turn_angle_errors  # noqa: E402
 from jaximu.data.gravity_norm import recover_specific_force  # noqa: E402
 from jaximu.estimation.problem import names_of  # noqa: E402
 from jaximu.model.conventions import ImuTk, lower_triangular_frame  # noqa: E402
-from jaximu.recordings.segmentation import observe, segment  # noqa: E402
+from jaximu.recordings.segmentation import observed_poses, segment  # noqa: E402
 
 XSENS_GRAVITY = LocalGravity(9.81744, 0.0)
 XSENS = ReadOptions(
@@ -69,7 +69,7 @@ def held_out_angles(nominal, observations, method: str) -> float:
 
 def xsens(folder):
     recording = read_recording(folder / "imu_tk_xsens/xsens_acc.mat", folder / "imu_tk_xsens/xsens_gyro.mat", XSENS)
-    observations = observe(segment(recording), XSENS_GRAVITY.value)
+    observations = observed_poses(segment(recording), XSENS_GRAVITY.value)
     nominal, _ = nominal_imu(recording)
     figures, rows, models = {}, [], {}
     for method in ("two-step", "two-step-rk4", "joint"):
@@ -125,7 +125,7 @@ def practice(folder):
         truth = np.concatenate([np.ravel(part) for part in truth])
         z = (fit.values - truth[[names_of(fit.model).index(name) for name in fit.names]]) / fit.sigmas()
         held = read_recording(folder / f"../practice/{unit}.heldout.parquet")
-        seen = observe(segment(held), gravity.value)
+        seen = observed_poses(segment(held), gravity.value)
         held_norm, held_angle = rms(norms(fit.model, seen)), rms(angles(fit.model, seen, seen.turns.mask))
         figures[unit] = {"z": z.tolist(), "largest_z": float(np.abs(z).max()), "excess": calibration.excess,
                          "heldout_norm_rms": held_norm, "heldout_angle_rms": held_angle,

@@ -25,7 +25,7 @@ from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.problem import names_of
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
-from jaximu.recordings.segmentation import Segmentation, observe, segment
+from jaximu.recordings.segmentation import Segmentation, observed_poses, segment
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
 
@@ -38,11 +38,11 @@ def stack(trees):
 
 def observe_alike(segmentations):
     """Observations of all units, padded to the shapes of the largest."""
-    one_by_one = [observe(found, STANDARD_GRAVITY) for found in segmentations]
+    one_by_one = [observed_poses(found, STANDARD_GRAVITY) for found in segmentations]
     shapes = [(len(o.poses.mask), o.turns.interval.shape[1]) for o in one_by_one]
     bucket = tuple(np.max(shapes, axis=0).tolist())
     alike = (
-        o if shape == bucket else observe(found, STANDARD_GRAVITY, bucket=bucket)
+        o if shape == bucket else observed_poses(found, STANDARD_GRAVITY, bucket=bucket)
         for o, shape, found in zip(one_by_one, shapes, segmentations, strict=True)
     )
     return stack(alike)

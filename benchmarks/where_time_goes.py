@@ -32,7 +32,7 @@ from jaximu.fleets.fit import parameter_set
 from jaximu.model.sensor import Imu
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
-from jaximu.recordings.segmentation import observe, segment
+from jaximu.recordings.segmentation import observed_poses, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
 
@@ -84,10 +84,10 @@ def main() -> None:
             found[f"parse {'Parquet' if name == 'parquet' else 'CSV'}"] = seconds, 0.0, path.stat().st_size + arrays
     poses = segment(long_log)
     found["segment"] = least(lambda: segment(long_log), repetitions), rows * SEGMENT_OPERATIONS, arrays
-    found["observe"] = least(lambda: observe(poses, 9.80665), repetitions), rows * OBSERVE_OPERATIONS, arrays
+    found["observe"] = least(lambda: observed_poses(poses, 9.80665), repetitions), rows * OBSERVE_OPERATIONS, arrays
 
     recording, _ = simulate(draw_imu(1), HandHeld(40, 1.5), consumer_noise(), seed=1)
-    seen = observe(segment(recording), 9.80665)
+    seen = observed_poses(segment(recording), 9.80665)
     _, parameters = parameter_set(True)
     batch = jax.tree.map(lambda leaf: np.stack([leaf] * LANES), seen)
     z = np.zeros((len(parameters.index), LANES))

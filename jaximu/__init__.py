@@ -20,7 +20,11 @@ from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
+    from jaximu.data.poses import observe, stack
     from jaximu.diagnosis import check, diagnose
+    from jaximu.estimation.fitting import Fit, Prior, fit
+    from jaximu.estimation.problem import Parameters, Problem
+    from jaximu.estimation.solver import solve
     from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
     from jaximu.ground.gravity import LocalGravity, parse_gravity, wgs84_gravity
     from jaximu.model.effects import CATALOGUE, Effect
@@ -36,11 +40,15 @@ __all__ = [
     "CATALOGUE",
     "Calibration",
     "Effect",
+    "Fit",
     "Imu",
     "InputError",
     "JaximuError",
     "LocalGravity",
     "NotPossibleError",
+    "Parameters",
+    "Prior",
+    "Problem",
     "ReadOptions",
     "Recording",
     "Segmentation",
@@ -53,11 +61,15 @@ __all__ = [
     "check",
     "compensate",
     "diagnose",
+    "fit",
     "load_calibration",
+    "observe",
     "parse_gravity",
     "read_recording",
     "segment",
     "simulate",
+    "solve",
+    "stack",
     "wgs84_gravity",
     "write_recording",
 ]

@@ -219,7 +219,8 @@ def _mat(path: Path, parts: Parts, named: bool) -> None:
 
 
 def _ulog(path: Path, parts: Parts, named: bool) -> None:
-    time_us = np.round(parts["time"][1][:, 0] * 1e6).astype(np.int64)  # a schedule is on this clock
+    # a schedule is on this clock, which has no stamps before zero
+    time_us = np.maximum(np.round(parts["time"][1][:, 0] * 1e6), 0).astype(np.int64)
     warmth = parts.get("temperature", ("degC", np.full((len(time_us), 1), 25.0)))[1][:, 0]
     rows = []
     for at, force, rate, degrees in zip(time_us.tolist(), parts["accel"][1], parts["gyro"][1], warmth, strict=True):

@@ -13,7 +13,7 @@ from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.recordings.recording import Recording
-from jaximu.recordings.segmentation import observe
+from jaximu.recordings.segmentation import observed_poses
 
 NOISE = NoiseModel(AxisNoise.of_white(np.full(3, 2e-6)), AxisNoise.of_white(np.full(3, 1e-8)))
 GRAVITY = LocalGravity(synthetic.GRAVITY, 0.0)
@@ -21,7 +21,7 @@ GRAVITY = LocalGravity(synthetic.GRAVITY, 0.0)
 
 def fitted(recording: Recording):
     calibration = calibrate(recording, GRAVITY, static=NOISE)
-    observations = observe(calibration.segmentations, GRAVITY.value, noise=NOISE)
+    observations = observed_poses(calibration.segmentations, GRAVITY.value, noise=NOISE)
     experiment = HandHeldExperiment(calibration.segmentations, observations, calibration.imu)
     return experiment.fit(), experiment
 

@@ -18,7 +18,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import observe, segment
+from jaximu.recordings.segmentation import observed_poses, segment
 
 NOMINAL = Imu.nominal()
 
@@ -244,7 +244,7 @@ def test_gyroscope_scale_is_checked_by_gravity_before_the_fit(factor):
     np.testing.assert_allclose(np.diagonal(nominal.gyroscope.gain), factor, rtol=0.1)
     if factor == 1.0:
         np.testing.assert_array_equal(nominal.gyroscope.gain, np.eye(3))
-    fit = fit_hand_held(nominal, observe(segment(log), GRAVITY, bucket=(POSES, 48)))
+    fit = fit_hand_held(nominal, observed_poses(segment(log), GRAVITY, bucket=(POSES, 48)))
     assert fit.converged
     np.testing.assert_allclose(fit.model.gyroscope.gain, imu.gyroscope.gain, atol=5e-3)
     np.testing.assert_allclose(fit.model.accelerometer.gain, imu.accelerometer.gain, atol=2e-3)

@@ -29,7 +29,7 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.recording import Signal
-from jaximu.recordings.segmentation import observe, segment
+from jaximu.recordings.segmentation import observed_poses, segment
 from jaximu.simulation import draw_imu
 
 UNITS, POSES = 30, 12
@@ -133,9 +133,9 @@ def test_preintegrated_answer_is_the_exact_one(folder):
     It integrates every sample with its derivatives; the fleet's derivatives are of blocks of four samples.
     """
     recording = read_recording(folder / "unit005.parquet")
-    unit = FleetUnit(observe(segment(recording), 9.80665), nominal_imu(recording)[0], True)
+    unit = FleetUnit(observed_poses(segment(recording), 9.80665), nominal_imu(recording)[0], True)
     (fitted,) = fit_units([unit])
-    observations = PosesAndTurns(jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.observations))
+    observations = PosesAndTurns.of(jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.observations))
     exact = fit(fitted.imu, observations, without_equipment, excess=fitted.excess, estimate_excess=False, max_passes=1)
     sigma = np.sqrt(np.diagonal(fitted.covariance))
     step = exact.values - flatten(fitted.imu)[[names_of(fitted.imu).index(name) for name in exact.names]]

@@ -78,7 +78,7 @@ def test_is_the_core_s_fit_of_the_same_means(cases, rows):
     own = field_unit(cases[4][0].magnetometer, found, FieldStrength(STRENGTH), "unit")
     (fitted,) = fit_units([own.unit])
     np.testing.assert_allclose(field_row(own, fitted)["mag_bias"], rows[4]["mag_bias"], rtol=0, atol=1e-12)
-    seen = PosesAndTurns(jax.tree.map(lambda leaf: np.asarray(leaf)[None], own.unit.observations), "norm")
+    seen = PosesAndTurns.of(jax.tree.map(lambda leaf: np.asarray(leaf)[None], own.unit.observations), "norm")
     like = jax.tree.map(lambda leaf: np.asarray(leaf)[None], own.unit.nominal)
     exact = fit(
         like, seen, lambda name: without_equipment(name) and name.owner == "accelerometer",

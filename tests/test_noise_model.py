@@ -13,7 +13,7 @@ from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov, Quantisation, RandomWalk, White
 from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import Segmentation, observe
+from jaximu.recordings.segmentation import Segmentation, observed_poses
 
 G = 9.80665
 
@@ -281,7 +281,7 @@ def test_low_pass_filtered_output_is_not_taken_for_a_wrong_unit():
     random = np.random.default_rng(2)
     values = scipy.signal.lfilter([0.3], [1, -0.7], random.standard_normal((100 * 1800, 6)), axis=0)
     model = fit_noise(at_rest(0.01 * values[:, :3] + [0, 0, G], 3e-4 * values[:, 3:]))
-    observations = observe(white_poses(), G, noise=model)
+    observations = observed_poses(white_poses(), G, noise=model)
     variance = np.asarray(observations.poses.accelerometer_covariance)[0, 0, 0]
     assert variance == pytest.approx(model.accelerometer.covariance([0.0], [2.0])[0, 0, 0], rel=0.15)
 
@@ -359,7 +359,7 @@ def test_observations_carry_the_model():
     part = white_poses()
     slow = bank([0.02, 0.05], [30.0, 0.05], white=1e-5)
     rates = bank([3e-4], [20.0], white=1e-8)
-    observations = observe(part, G, noise=NoiseModel(slow, rates))
+    observations = observed_poses(part, G, noise=NoiseModel(slow, rates))
     a, b = part.intervals.T
     count = len(a)
     expected = slow.covariance(a, b)
@@ -390,7 +390,7 @@ def test_observations_carry_the_model():
 def test_counts_in_the_observations():
     """Outputs a hundred times as large have covariances ten thousand times as large."""
     model = NoiseModel(bank(0.02, 30.0, white=1e-5), bank(3e-4, 20.0, white=1e-8))
-    plain, counted = (observe(white_poses(scale=scale), G, noise=model) for scale in (1.0, 100.0))
+    plain, counted = (observed_poses(white_poses(scale=scale), G, noise=model) for scale in (1.0, 100.0))
     count = int(np.sum(plain.poses.mask))
     for name in ("accelerometer", "gyroscope"):
         first, second = (np.asarray(getattr(each.slow, name))[:, :count, :count] for each in (plain, counted))
@@ -403,12 +403,12 @@ def test_counts_in_the_observations():
 def test_two_recordings_are_not_tied_to_each_other():
     model = NoiseModel(bank(0.02, 300.0, white=1e-5), bank(3e-4, 200.0, white=1e-8))
     part = white_poses()
-    observations = observe([part, part], G, noise=model)
+    observations = observed_poses([part, part], G, noise=model)
     count = len(part.intervals)
     ties = np.asarray(observations.slow.accelerometer)
     np.testing.assert_array_equal(ties[:, :count, count : 2 * count], 0.0)
     np.testing.assert_allclose(ties[:, :count, :count], ties[:, count : 2 * count, count : 2 * count])
-    single = np.asarray(observe(part, G, noise=model).slow.gyroscope)
+    single = np.asarray(observed_poses(part, G, noise=model).slow.gyroscope)
     both = np.asarray(observations.slow.gyroscope)
     padded, alone = len(observations.poses.mask), single.shape[-1] - 4 * (count_turns(single, count) - 1)
     assert alone >= count
@@ -428,7 +428,7 @@ def test_a_recording_shifted_onto_the_first_does_not_tell_the_bias_again():
     model = NoiseModel(bank(0.02, 300.0, white=1e-5), bank(3e-4, 500.0, white=1e-9))
     part = white_poses()
     count = len(part.intervals)
-    observations = observe([part, part], G, noise=model)
+    observations = observed_poses([part, part], G, noise=model)
     claimed = np.asarray(observations.slow.gyroscope)[0, : 2 * count, : 2 * count]
     one = np.ones(2 * count)
     estimator = np.linalg.solve(claimed, one) / (one @ np.linalg.solve(claimed, one))
@@ -448,22 +448,22 @@ def count_turns(ties, poses):
 def test_a_model_that_does_not_fit_the_recording_is_refused():
     part = white_poses()
     good = NoiseModel(bank(0.02, 30.0, white=1e-6), bank(3e-4, 20.0, white=1e-9))
-    observe(part, G, noise=good)
+    observed_poses(part, G, noise=good)
     with pytest.raises(InputError, match="no gyroscope"):
-        observe(part, G, noise=NoiseModel(good.accelerometer))
+        observed_poses(part, G, noise=NoiseModel(good.accelerometer))
     # rounded to 1 mm/s² while the noise is said to be of nanometres: a noise in other units
     made = part.recording
     rounded = Signal(made.accelerometer.time, np.round(made.accelerometer.values, 3), "m/s^2")
     coarse = Segmentation(Recording(rounded, made.gyroscope), part.intervals, 1.0, (), ())
-    observe(coarse, G, noise=good)
+    observed_poses(coarse, G, noise=good)
     with pytest.raises(InputError, match="other units"):
-        observe(coarse, G, noise=NoiseModel(bank(0.0, 30.0, white=1e-18), good.gyroscope))
+        observed_poses(coarse, G, noise=NoiseModel(bank(0.0, 30.0, white=1e-18), good.gyroscope))
 
 
 def test_without_a_gyroscope_poses_alone_are_tied():
     part = white_poses()
     alone = Segmentation(Recording(part.recording.accelerometer), part.intervals, 1.0, (), ())
-    observations = observe(alone, G, noise=NoiseModel(bank(0.02, 30.0, white=1e-6)))
+    observations = observed_poses(alone, G, noise=NoiseModel(bank(0.02, 30.0, white=1e-6)))
     a, b = part.intervals.T
     np.testing.assert_allclose(
         np.asarray(observations.slow.accelerometer)[:, : len(a), : len(a)],

@@ -17,7 +17,7 @@ from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.problem import Parameters, Problem, without_equipment
 from jaximu.estimation.solver import solve
 from jaximu.ground.rotation import logarithm, multiply
-from jaximu.recordings.segmentation import observe, segment
+from jaximu.recordings.segmentation import observed_poses, segment
 
 angle_errors = jax.jit(turn_angle_errors, static_argnums=2)
 conditions_of = jax.jit(joint_conditions, static_argnums=2)
@@ -77,7 +77,7 @@ def test_runge_kutta_and_exponential_agree_for_fine_sampling():
     case = simulated(3, noise=0.0)
     coarse = apart(case.imu, case.observations.turns)  # 33 samples a second
     log, rests = recording(3, rates=(100.0, 500.0), density=(0.0, 0.0), poses=6)
-    data = observe(segment(log), GRAVITY)
+    data = observed_poses(segment(log), GRAVITY)
     fine = apart(case.imu, data.turns)
     assert int(data.turns.mask.sum()) == len(rests) - 1
     assert 1e-7 < coarse.max() < 1e-4

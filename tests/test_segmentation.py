@@ -14,7 +14,7 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import SegmentationOptions, observe, segment
+from jaximu.recordings.segmentation import SegmentationOptions, observed_poses, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import RateTable
 from jaximu.simulation.protocols.positions import directions
@@ -49,7 +49,7 @@ def test_finds_all_rests(seed):
 def test_rates_and_stamps_may_differ(rates, jitter):
     log, rests = recording(5, rates=rates, jitter=jitter, rest=3.0, turn=2.0)
     check_found(log, rests, 0.3 if min(rates) > 40 else 0.6)
-    data = observe(segment(log), GRAVITY)
+    data = observed_poses(segment(log), GRAVITY)
     assert int(data.poses.mask.sum()) == POSES
     assert int(data.turns.mask.sum()) == POSES - 1
     assert data.turns.output.shape[0] == data.poses.mask.shape[0] - 1
@@ -61,7 +61,7 @@ def test_rates_and_stamps_may_differ(rates, jitter):
 def test_observations_are_what_the_unit_felt():
     """Means, and turns carried by the true unit, agree with the truth within the stated noise."""
     log, rests = recording(6, poses=9)
-    data = observe(segment(log), GRAVITY)
+    data = observed_poses(segment(log), GRAVITY)
     imu, up = unit(6), spread_directions(9, 6)
     truth = GRAVITY * up @ np.asarray(imu.accelerometer.gain).T + np.asarray(imu.accelerometer.bias)
     error = np.asarray(data.poses.accelerometer_mean)[:9] - truth
@@ -82,7 +82,7 @@ def test_observations_are_what_the_unit_felt():
 
 def test_covariance_of_the_mean_is_that_of_white_noise():
     log, _ = recording(7, rest=8.0, density=(4e-6, 2e-8))
-    data = observe(segment(log), GRAVITY)
+    data = observed_poses(segment(log), GRAVITY)
     duration = np.asarray(data.poses.stop - data.poses.start)[:POSES]
     for covariance, density in (
         (data.poses.accelerometer_covariance, 4e-6),
@@ -150,7 +150,7 @@ def test_quantised_output(quantum):
     """Steps of many times the noise: the output at rest is constant, its variance zero in most windows."""
     log, rests = recording(11, quantum=quantum, density=(1e-6, 1e-9))
     check_found(log, rests, 0.4)
-    data = observe(segment(log), GRAVITY)
+    data = observed_poses(segment(log), GRAVITY)
     for covariance in (data.poses.accelerometer_covariance, data.poses.gyroscope_covariance):
         values = np.linalg.eigvalsh(np.asarray(covariance))
         assert np.all(values > 0)
@@ -181,7 +181,7 @@ def test_gaps():
     assert inside(result.intervals, *hole_in_rest) < 0.1
     for k in range(POSES):
         assert inside(result.intervals, *rests[k]) > (1.4 if k == 8 else 2.6)
-    data = observe(result, GRAVITY)
+    data = observed_poses(result, GRAVITY)
     used = int(data.poses.mask.sum())
     assert used == POSES
     mask = np.asarray(data.turns.mask)[: used - 1]
@@ -203,7 +203,7 @@ def test_without_a_gyroscope():
     alone = replace(log, gyroscope=None)
     found = segment(alone).intervals
     assert len(found) == len(rests)
-    data = observe(segment(alone), GRAVITY)
+    data = observed_poses(segment(alone), GRAVITY)
     assert not np.any(data.turns.mask)
     assert int(data.poses.mask.sum()) == POSES
 
@@ -213,7 +213,7 @@ def test_several_recordings_of_one_unit():
     first, _ = recording(15, poses=6)
     second, _ = recording(16, poses=7, imu=unit(15))
     moved = replace(second, gyroscope=replace(second.gyroscope, values=second.gyroscope.values + [0.01, -0.02, 0.005]))
-    data = observe([segment(first), segment(moved)], GRAVITY)
+    data = observed_poses([segment(first), segment(moved)], GRAVITY)
     assert int(data.poses.mask.sum()) == 13
     turns = np.asarray(data.turns.mask)
     assert turns[:12].tolist() == [True] * 5 + [False] + [True] * 6
@@ -230,7 +230,7 @@ def test_options():
     assert fixed.threshold == 6.0
     assert len(fixed.tried) == 1
     assert fixed.table() == f"{len(rests)} at 6x"
-    wide = observe(segment(log, SegmentationOptions(minimum_duration=0.6)), GRAVITY, bucket=(32, 256))
+    wide = observed_poses(segment(log, SegmentationOptions(minimum_duration=0.6)), GRAVITY, bucket=(32, 256))
     assert wide.turns.output.shape == (31, 256, 3)
 
 
@@ -238,7 +238,7 @@ def test_shapes_are_bucketed():
     shapes = set()
     for poses in (9, 10, 11, 12):
         log, _ = recording(18, poses=poses)
-        shapes.add(observe(segment(log), GRAVITY).turns.output.shape)
+        shapes.add(observed_poses(segment(log), GRAVITY).turns.output.shape)
     assert len(shapes) == 1
     assert simulated(18).observations.turns.output.shape[0] == POSES - 1
 

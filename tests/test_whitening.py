@@ -21,7 +21,7 @@ from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import BiasInstability, White
 from jaximu.recordings.observations import SlowNoise
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import Segmentation, observe
+from jaximu.recordings.segmentation import Segmentation, observed_poses
 
 covariance_of = jax.jit(condition_covariance)
 NONE = jnp.zeros(3)
@@ -198,7 +198,7 @@ def tied():
     truth = unit(31)
     made, rests = recording(31, poses=8, rest=2.0, turn=1.2, rates=(_RATE, _RATE), density=(1e-16, 1e-20), imu=truth)
     part = Segmentation(made, rests, 1.0, (), ())
-    return truth, part, observe(part, GRAVITY, bucket=(10, 64), noise=_MODEL)
+    return truth, part, observed_poses(part, GRAVITY, bucket=(10, 64), noise=_MODEL)
 
 
 @jax.jit

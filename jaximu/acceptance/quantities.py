@@ -158,7 +158,7 @@ def measure(units: Units, nominal: Mapping[str, tuple[FloatArray, FloatArray]], 
         some = stored.call(
             batched, description, units.numbers[rows], units.covariance[rows], units.gravity[rows], *arguments
         )
-        found.append([np.asarray(each)[: count - start] for each in some])
+        found.append([each[: count - start] for each in some])
     value, sigma, gravity, slope = (np.concatenate(each) for each in zip(*found, strict=True))
     names = (*_parameter_names(units.like), *(f"{each.key}[{axis}]" for each, _ in asked for axis in range(3)))
     sizes = flatten(typical_sizes(unflatten(units.like, np.median(units.numbers, axis=0))))[places]

@@ -28,7 +28,7 @@ from jaximu.ground.precision import require_float64
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
-from jaximu.recordings.segmentation import Segmentation, observe
+from jaximu.recordings.segmentation import Segmentation, observed_poses
 
 __all__ = ["LeftOutTurns", "Together", "fit_together", "leave_out_turns"]
 
@@ -132,10 +132,10 @@ def _observed(found: Array) -> Observations:
         rests = rests[(rests[:, 0] > time[0]) & (rests[:, 1] < time[-1])]
     parts = [_segmented(unit, rests) for unit in found.units]
     gravity = found.gravity.value
-    samples = max(observe(part, gravity).turns.output.shape[1] for part in parts)
+    samples = max(observed_poses(part, gravity).turns.output.shape[1] for part in parts)
     observed = []
     for part, unit in zip(parts, found.units, strict=True):
-        observations = observe(part, gravity, bucket=(len(rests), samples))
+        observations = observed_poses(part, gravity, bucket=(len(rests), samples))
         imu = unit.calibration.imu
         if effects := tuple(imu.all_effects().values()):
             observations = RecordedByHand((part,), observations).along(imu, effects).observations

@@ -13,12 +13,11 @@ import scipy
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
-from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
 from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, reference_sigmas
 from jaximu.data.field import white_noise
 from jaximu.estimation.fitting import Prior, fit
-from jaximu.estimation.problem import Loss, Name
+from jaximu.estimation.problem import Loss, Name, without_equipment_or_effects
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError

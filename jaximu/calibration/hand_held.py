@@ -12,7 +12,7 @@ import numpy as np
 from jaximu.data.poses import PosesAndTurns, condense, only
 from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.fitting import Fit, fit
-from jaximu.estimation.problem import TOLERANCE, Loss, Name, Parameters, without_equipment
+from jaximu.estimation.problem import TOLERANCE, Loss, Parameters, without_equipment
 from jaximu.ground import stored
 from jaximu.ground.errors import one_of
 from jaximu.ground.precision import require_float64
@@ -46,16 +46,12 @@ def fit_hand_held(nominal: Imu, observations: Observations, method: Method = "jo
     lift = (lambda leaf: np.asarray(leaf)[None]) if single else np.asarray
     nominal, observations = jax.tree.map(lift, (nominal, observations))
     if method == "joint":
-        found = fit(nominal, PosesAndTurns(observations), without_equipment, loss=loss)
+        found = fit(nominal, PosesAndTurns.of(observations), loss=loss)
     else:
-        found = fit(nominal, PosesAndTurns(observations, "norm"), _of_accelerometer, loss=loss)
+        found = fit(nominal, PosesAndTurns.of(observations, "norm"), loss=loss)
         if method != "accelerometer":
             found = _second_step(found, observations, "rk4" if method.endswith("rk4") else "exponential", loss)
     return jax.tree.map(lambda leaf: leaf[0], found) if single else found
-
-
-def _of_accelerometer(name: Name) -> bool:
-    return name.owner == "accelerometer" and without_equipment(name)
 
 
 def _second_step(first: Fit, observations: Observations, method: str, loss: str) -> Fit:
@@ -66,8 +62,8 @@ def _second_step(first: Fit, observations: Observations, method: str, loss: str)
     derivatives by the accelerometer's numbers, both steps are linear in c to first order: δa = L c, δg = G (c + D L c),
     so the covariance is T C Tᵀ, T = [L; G (1 + D L)].
     """
-    turning = PosesAndTurns(observations, "turning", first.excess[:, 0], method)
-    second = fit(first.model, turning, lambda name: name.owner == "gyroscope", loss=loss)
+    turning = PosesAndTurns.of(observations, "turning", accelerometer_excess=first.excess[:, 0], method=method)
+    second = fit(first.model, turning, loss=loss)
     excess = np.concatenate([first.excess[:, :1], second.excess[:, 1:]], axis=1)
 
     def block(a, b):
@@ -115,11 +111,11 @@ def _two_step_covariance(model: Imu, observations: Observations, excess: np.ndar
             one = step("norm", accelerometer)
             two = step("turning", gyroscope)
             both = jnp.concatenate([one, two + two @ slope[:, accelerometer] @ one])
-            return (both @ (covariance.used[:, None] * covariance.used * covariance.total(excess)) @ both.T,)
+            return both @ (covariance.used[:, None] * covariance.used * covariance.total(excess)) @ both.T
 
         return jax.lax.map(lane, units)
 
     units = (reference, observations, excess)
     size = np.asarray(parameters.size)
-    found = stored.call(batch, "two-step covariance", like, parameters, units, quick=count == 1)[0]
-    return np.asarray(found) * size[:, None] * size
+    found = stored.call(batch, "two-step covariance", like, parameters, units, quick=count == 1)
+    return found * size[:, None] * size

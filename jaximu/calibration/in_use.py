@@ -340,12 +340,11 @@ class FilterInUse:
             states = self.errors.states
             self._known.root[states:, states:] = np.linalg.qr(self.prior, mode="r")
         self._begin_field(sightings)
-        leaves = stored.call(
+        after, rows = stored.call(
             _rows_after, "in use", self.imu, self._numbers, self.gravity, part, self.errors, self._path
         )
-        attitude, velocity, before, after, shared, right = (np.asarray(each) for each in leaves)
         columns, states = np.append(self._index, len(self._numbers)), self.errors.states
-        known, _, innovation = advance(self._known, WhiteRows(before, after, shared[:, columns], right))
+        known, _, innovation = advance(self._known, rows._replace(shared=rows.shared[:, columns]))
         found, covariance = estimate(known)
         if not np.isfinite(found).all():
             raise NotPossibleError(
@@ -354,8 +353,8 @@ class FilterInUse:
         moved = found.copy()
         moved[6:states] = 0.0  # drift is no part of the path
         self._known = known._replace(right=known.right - known.root @ moved)
-        attitude = np.asarray(turned(attitude, found[:3]))
-        self._path = MotionPath(attitude, velocity + found[3:6])  # pyright: ignore[reportArgumentType]
+        attitude = np.asarray(turned(after.attitude, found[:3]))
+        self._path = MotionPath(attitude, after.velocity + found[3:6])  # pyright: ignore[reportArgumentType]
         self._numbers = self._numbers.copy()
         self._numbers[self._index] += found[states:-1]
         self.gravity += float(found[-1])

@@ -18,7 +18,7 @@ from jaximu.calibration.saturation import saturation
 from jaximu.data.drift import with_drift
 from jaximu.data.poses import EXCESS_NAMES, RecordedByHand, condensed
 from jaximu.estimation.fitting import Prior, fit
-from jaximu.estimation.problem import Loss, Name, without_equipment
+from jaximu.estimation.problem import Loss
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -32,7 +32,7 @@ from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, recordings_of, same_outputs
-from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, observe, segment
+from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, observed_poses, segment
 
 __all__ = [
     "Choices",
@@ -40,7 +40,6 @@ __all__ = [
     "calibrate_ready",
     "forces_and_angles",
     "residual_rms",
-    "without_equipment_or_effects",
 ]
 
 _ROUNDS = 4
@@ -214,7 +213,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
             "method, or leave the recording out."
         )
     noise = noise_of(static)
-    observations = observe(segmentations, gravity.value, noise=noise)
+    observations = observed_poses(segmentations, gravity.value, noise=noise)
     nominal, notes = nominal_imu(recordings[0])
     found = fit_hand_held(nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
@@ -233,7 +232,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         measurement = RecordedByHand(segmentations, observations)
         start = jax.tree.map(np.asarray, found.model).with_effects(*chosen)
         prior = Prior.of_effects(start, sigmas)
-        found = fit(start, measurement, without_equipment_or_effects, prior=prior, loss=loss, excess=found.excess)
+        found = fit(start, measurement, prior=prior, loss=loss, excess=found.excess)
         require_solved(found, where)
         refuse_undetermined(found, prior)
         observations = measurement.along(found.model, tuple(found.model.all_effects().values())).observations
@@ -259,11 +258,6 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
 def _headings_known(segmentations: Sequence[Segmentation], observations: Observations) -> bool:
     """Whether the gyroscope carries the heading through a whole recording, and there is no other one."""
     return len(segmentations) == 1 and int(np.sum(observations.turns.mask)) == len(segmentations[0].intervals) - 1
-
-
-def without_equipment_or_effects(name: Name) -> bool:
-    """Whether a number is free by hand: the numbers of effects, and gain and bias but for the frame."""
-    return name.effect is not None or without_equipment(name)
 
 
 def _mean_temperature(recordings: Sequence[Recording], observations: Observations) -> dict[str, float]:

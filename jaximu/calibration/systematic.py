@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaximu.calibration.attitude import Mounted, mounted_on, reference_summary
 from jaximu.calibration.calibration import Calibration, concluded, effect_named
 from jaximu.calibration.compensation import compensate
-from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms, without_equipment_or_effects
+from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms
 from jaximu.calibration.refusals import refuse_undetermined, require_solved
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.motion import (
@@ -30,7 +30,7 @@ from jaximu.data.motion import (
 from jaximu.data.poses import RecordedByHand
 from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.information_filter import Knowledge
-from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes
+from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes, without_equipment_or_effects
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import label, pose_advice
 from jaximu.ground.array_types import FloatArray
@@ -230,7 +230,7 @@ def calibrate_by_filter(
         known_before, prior = Prior.of_effects(imu, stated), Prior.of_effects(imu, plausible_sizes(imu) | stated)
         assert known_before is not None and prior is not None
         for _ in range(_ROUNDS):
-            found = fit(imu, measurement, without_equipment_or_effects, prior=prior, follow=True)
+            found = fit(imu, measurement, prior=prior, follow=True)
             if mounted is None:  # else the attitude tells what poses and turns leave open
                 _require_enough_turned(found, start, recording.name)
             require_solved(found, recording.name)

@@ -140,7 +140,7 @@ def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: b
         given = (np.repeat(each, tried, axis=0) for each in (stacked, targets))
         rows = (each.reshape(3 * tried, WEIGHTS) for each in lanes)
         found = stored.call(_solved, "thermal network", *given, *rows, inputs, data.shapes.origin)
-        return [np.asarray(each).reshape(3, tried, -1) for each in found]
+        return [each.reshape(3, tried, -1) for each in found]
 
     smooth, whole, size = [], [], []
     for axis in range(3):

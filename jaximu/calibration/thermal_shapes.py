@@ -104,7 +104,7 @@ class ThermalShapes:
         of, key = partial(_shapes, names, rows), f"thermal {','.join(names)} {rows}"
         recordings = [stored.call(of, key, track, *asked.values()) for track in self.tracks]
         for name, grid, *parts in zip(names, asked.values(), *recordings, strict=True):
-            for values, own in zip(grid, np.sum([np.asarray(part)[:, :count] for part in parts], axis=0), strict=True):
+            for values, own in zip(grid, np.sum([part[:, :count] for part in parts], axis=0), strict=True):
                 term = history(name, values[0]) if name in HISTORY else ThermalTerm(name)
                 for shape, column in enumerate(own.T):  # (3, n)
                     self._columns[term._replace(shape=shape) if name == LEARNED else term] = column

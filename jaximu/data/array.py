@@ -91,16 +91,13 @@ class UnitsOnOneBody(Data):
     def about(self, imu: Imu) -> About:
         """Return the conditions about one board, the leading axis of length one."""
         board = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
-        leaves = stored.call(_about, "units on one body", board, self.observations)
-        leaves = [np.asarray(leaf)[None] for leaf in leaves]
-        fields = len(HandHeldConditions.__dataclass_fields__)
-        basis, magnitude, measured, used, group, *factors = leaves[fields:]
-        conditions = SharedConditions(HandHeldConditions(*leaves[:fields]), basis, magnitude)
-        return About(conditions, Covariance(measured, tuple(factors), used, group), np.zeros((*used.shape, 0)))
+        found = stored.call(_about, "units on one body", board, self.observations)
+        conditions, covariance = jax.tree.map(lambda leaf: leaf[None], found)
+        return About(conditions, covariance, np.zeros((*covariance.used.shape, 0)))
 
 
-def _about(board: Board, observations: Observations) -> tuple:
-    """Return the conditions about a board, their covariance as measured, and the factors of its components."""
+def _about(board: Board, observations: Observations) -> tuple[SharedConditions, Covariance]:
+    """Return the conditions about a board and their covariance."""
 
     def lane(unit):
         conditions, covariance, integrated, _ = condense(*unit)
@@ -135,5 +132,4 @@ def _about(board: Board, observations: Observations) -> tuple:
         factors.append(jnp.einsum("nupi,uij->nupj", each, roots).reshape(len(used), -1))
     back = jnp.concatenate([jnp.eye(3)[None], rotation_matrix(exponential(_mountings(board))).swapaxes(1, 2)])
     together = jnp.einsum("nuti,uij,jk->ntk", last, back, mean_root(noise[0], turns.mask[0]))
-    return (*jax.tree.leaves(own), basis, observations.gravity[0], measured, used, group, *factors,
-            together.reshape(len(used), -1))  # fmt: skip
+    return conditions, Covariance(measured, (*factors, together.reshape(len(used), -1)), used, group)

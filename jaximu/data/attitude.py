@@ -457,15 +457,12 @@ class AgainstAttitude(Data):
             return conditions, spread, duration, leaning, columns, reactions
 
         description = f"against attitude {group} {' '.join(each.name for each in single.all_effects().values())}"
-        leaves = [
-            np.asarray(leaf)
-            for leaf in stored.call(compute, description, single, parameters, data, around, place, noise)
-        ]
-        fields = len(AttitudeConditions.__dataclass_fields__)
-        conditions = AttitudeConditions(*(leaf[None] for leaf in leaves[:fields]))
-        spread, duration, leaning, columns, *reactions = leaves[fields:]
+        conditions, spread, duration, leaning, columns, reactions = stored.call(
+            compute, description, single, parameters, data, around, place, noise
+        )
+        conditions = jax.tree.map(lambda leaf: leaf[None], conditions)
         covariance = self._covariance(conditions, spread, duration, leaning, white)
-        details = AttitudeDetails(duration, Reactions(*reactions), self, single)
+        details = AttitudeDetails(duration, reactions, self, single)
         return About(conditions, covariance, columns[None], details=details)
 
     def reactions(self, details: AttitudeDetails):

@@ -334,7 +334,7 @@ def _carried(gyroscope: Signal):
     steps = 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1]) * np.diff(gyroscope.time)[:, None]
     size = 1 << len(steps).bit_length()  # few shapes are compiled
     padded = np.concatenate([steps, np.zeros((size - len(steps), 3))])
-    running = np.asarray(stored.call(running_rotations, "carried attitude", padded)[0])[: len(steps)]
+    running = stored.call(running_rotations, "carried attitude", padded)[: len(steps)]
     whole = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], running])
     known = scipy.spatial.transform.Rotation.from_quat(whole, scalar_first=True)
     return scipy.spatial.transform.Slerp(gyroscope.time, known)

@@ -755,7 +755,7 @@ class IntervalsOfMotion(Data):
         """Return the intervals filtered about one unit, along the path that fits it best."""
         means = self._means(imu)
         if self.path is None:
-            self.path = MotionPath(*stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity))
+            self.path = stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity)
             self.anchor = np.asarray(self.path.attitude)[1:]
         states, seen = self.errors.states, self._absolute
         for number in range(_ROUNDS):
@@ -774,7 +774,7 @@ class IntervalsOfMotion(Data):
             change = _change(self.path, moved, seen)
             if change < _UNMOVED or number + 1 == _ROUNDS:
                 break
-            self.path = MotionPath(*(np.asarray(each) for each in stored.call(_moved, "moved path", self.path, moved)))
+            self.path = stored.call(_moved, "moved path", self.path, moved)
         return Filtered(last, self.path, float(innovations.sum()), rows)
 
     @property
@@ -792,14 +792,13 @@ class IntervalsOfMotion(Data):
                 continue
             part = self._part(np.resize(place, _bucket(len(place), 64)))
             small = part.length.size < _LARGE
-            leaves = stored.call(partial(_all_means, kind), kind.__name__, imu, part, self.errors, quick=small)
-            leaves = [np.asarray(leaf)[: len(place)] for leaf in leaves]
+            means = stored.call(partial(_all_means, kind), kind.__name__, imu, part, self.errors, quick=small)
             if merged is None:
-                merged = [np.zeros((len(rest), *leaf.shape[1:])) for leaf in leaves]
-            for whole, leaf in zip(merged, leaves, strict=True):
-                whole[place] = leaf
+                merged = jax.tree.map(lambda leaf: np.zeros((len(rest), *leaf.shape[1:])), means)
+            for whole, leaf in zip(jax.tree.leaves(merged), jax.tree.leaves(means), strict=True):
+                whole[place] = leaf[: len(place)]
         assert merged is not None
-        return _Means(*merged)
+        return merged
 
     def _part(self, place: NDArray[np.int64]) -> MotionIntervals:
         """Return some of the intervals, without the samples that none of them has."""
@@ -813,10 +812,9 @@ class IntervalsOfMotion(Data):
 
     def _rows(self, means: _Means) -> WhiteRows:
         """Return the white rows (N, r, …) of all intervals about the path."""
-        leaves = stored.call(
+        return stored.call(
             _along, "intervals about a path", means, self.intervals, self.errors, self.gravity, self.path, self.anchor
         )
-        return WhiteRows(*(np.asarray(leaf) for leaf in leaves))
 
     def followed(self, imu: Imu, index: Sequence[int], prior: Knowledge) -> FilterPass:
         """Return how a filter would have come to know free numbers, linearised about a unit and its path.

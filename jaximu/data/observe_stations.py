@@ -250,7 +250,7 @@ def scheme_stations(
     zero = np.zeros((len(entries), 3))
     stations = _assembled([zero, zero][: len(scale)], covariances, stimulus, span, turn, float(motion.gravity))
     means = stored.call(_mean_outputs, "station means", imu, stations)
-    means = [np.asarray(each) for each in means] + [np.zeros_like(stations.gyroscope_mean)] * (2 - len(means))
+    means += [np.zeros_like(stations.gyroscope_mean)] * (2 - len(means))
     return replace(stations, accelerometer_mean=means[0], gyroscope_mean=means[1])
 
 

@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,11 +31,14 @@ from jaximu.data.poses_covariance import (
 )
 from jaximu.data.track import Track, added, mean_outputs
 from jaximu.data.tracks_by_hand import tracks_by_hand, turn_samples
-from jaximu.estimation.covariance import BlockFactor, Covariance, component_covariance
+from jaximu.estimation.covariance import Covariance, component_covariance
 from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.rotation import (
     apply_matrix,
     conjugate,
@@ -44,10 +48,14 @@ from jaximu.ground.rotation import (
     multiply,
     rotate,
 )
+from jaximu.ground.tracing import array_module
+from jaximu.mistakes import prepared
 from jaximu.model.effects.base import Effect, Extent
+from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.observations import Observations, Turns
-from jaximu.recordings.segmentation import Segmentation
+from jaximu.recordings.recording import Recording, recordings_of
+from jaximu.recordings.segmentation import Segmentation, observed_poses, segment
 
 __all__ = [
     "COARSE_EXCESS",
@@ -62,9 +70,11 @@ __all__ = [
     "condensed",
     "extent_of",
     "missed_by_sampling",
+    "observe",
     "only",
     "pose_rows",
     "rest_shifts",
+    "stack",
 ]
 
 EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
@@ -165,63 +175,122 @@ def condensed(
     """Condense observations of units, compiled; `rows` and what follows as for `PosesAndTurns`."""
     count = len(imu.accelerometer.bias)
     excess = np.zeros(count) if accelerometer_excess is None else accelerometer_excess
+    observations = Observations(observations.poses, observations.turns, observations.gravity, observations.slow)
 
     def batch(imu, observations, excess):
         def lane(unit):
             imu, observations, excess = unit
             conditions, covariance, integrated, reaction = condense(imu, observations, method)
-            found = conditions, only(covariance, rows, excess), *_errors(conditions, imu)
-            return (*found, reaction, integrated.running) if count == 1 else found
+            single = (reaction, integrated.running) if count == 1 else (None, None)
+            return Condensed(conditions, only(covariance, rows, excess), *_errors(conditions, imu), *single)
 
         return jax.lax.map(lane, (imu, observations, excess))
 
-    leaves = stored.call(
+    found: Condensed = stored.call(
         batch, f"condensed {rows} {method}", imu.with_effects(), observations, excess, quick=count == 1
     )
-    leaves = [np.asarray(leaf) for leaf in leaves]
-    fields = len(HandHeldConditions.__dataclass_fields__)
-    conditions = HandHeldConditions(*leaves[:fields])
-    measured, *blocks, used, group, force, angle = leaves[fields : fields + 11]
-    factors = tuple(BlockFactor(*each) for each in zip(blocks[::2], blocks[1::2], strict=True))
-    covariance = Covariance(measured, factors, used, group)
-    if count > 1:
-        return Condensed(conditions, covariance, force, angle, None, None)
-    *reaction, running = (leaf[0] for leaf in leaves[fields + 11 :])
-    return Condensed(conditions, covariance, force, angle, Sensitivities(*reaction), running)
+    reaction, running = jax.tree.map(lambda leaf: leaf[0], (found.reaction, found.running))
+    return found._replace(reaction=reaction, running=running)
 
 
-class PosesAndTurns(Data):
-    """Observations of units, one leading axis on every array; their effects are not looked at.
+class PosesAndTurns(Observations, Data):
+    """What was observed of a unit, or of units with a leading axis on every array; their effects are not looked at.
 
     conditions: "all"; "norm", gravity's magnitude alone; or "turning", all but that, neighbouring turns taken as
-    independent and the accelerometer as known. accelerometer_excess (N,): of its poses, with "turning". method: how
-    rates are integrated.
+    independent and the accelerometer as known. accelerometer_excess: of its poses, with "turning". method: how rates
+    are integrated.
     """
+
+    accelerometer_excess: Float[Array, ...] | None = None
+    conditions: str = eqx.field(static=True, default="all")
+    method: str = eqx.field(static=True, default="exponential")
 
     excess_names = EXCESS_NAMES
     coarse = COARSE_EXCESS
 
-    def __init__(
-        self,
-        observations: Observations,
-        conditions: str = "all",
-        accelerometer_excess: FloatArray | None = None,
-        method: str = "exponential",
-    ):
-        self.observations, self.conditions, self.method = observations, conditions, method
-        self.accelerometer_excess = accelerometer_excess
+    @classmethod
+    def of(cls, observations: Observations, conditions: str = "all", **settings: Any) -> Self:
+        """Return what was observed as data of a fit."""
+        seen = observations.poses, observations.turns, observations.gravity, observations.slow
+        return cls(*seen, conditions=conditions, **settings)
 
-    def take(self, lanes: NDArray[np.int64]) -> PosesAndTurns:
-        """Return the measurement of some of the units."""
-        observations = jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self.observations)
-        excess = None if self.accelerometer_excess is None else self.accelerometer_excess[lanes]
-        return PosesAndTurns(observations, self.conditions, excess, self.method)
+    def free(self, name: Name) -> bool:
+        """Return whether a number is free: of the triads that the conditions tell of."""
+        owners = {"norm": ("accelerometer",), "turning": ("gyroscope",)}.get(self.conditions)
+        return super().free(name) and (owners is None or name.owner in owners)
+
+    def take(self, lanes: NDArray[np.int64]) -> Self:
+        """Return the data of some of the units."""
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self._by_unit())
+
+    def widened(self, poses: int, samples: int) -> Self:
+        """Return the data of a unit with padding up to so many poses, and samples in a turn."""
+
+        def longer(leaf: Array, *lengths: int) -> Array:
+            missing = [(0, length - have) for length, have in zip(lengths, leaf.shape, strict=False)]
+            missing += [(0, 0)] * (leaf.ndim - len(lengths))
+            # masks and durations of padding are zero; whatever else it holds must be finite
+            zero = leaf.dtype == bool or len(lengths) > 1
+            return array_module(leaf).pad(leaf, missing, mode="constant" if zero else "edge")
+
+        turns = {name: longer(getattr(self.turns, name), poses - 1) for name in ("basis", "mask")}
+        turns |= {name: longer(getattr(self.turns, name), poses - 1, samples) for name in ("output", "interval")}
+        wider = jax.tree.map(lambda leaf: longer(leaf, poses), self.poses), replace(self.turns, **turns)
+        return eqx.tree_at(lambda data: (data.poses, data.turns), self, wider)
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition of one unit is."""
+        return pose_rows(imu, self)
 
     def about(self, imu: Imu) -> About:
         """Return the conditions about units without effects."""
-        found = condensed(imu, self.observations, self.conditions, self.method, self.accelerometer_excess)
+        data = self._by_unit()
+        found = condensed(imu, data, self.conditions, self.method, data.accelerometer_excess)
         none = np.zeros((*found.covariance.used.shape, 0))
         return About(found.conditions, found.covariance, none, found)
+
+    def _by_unit(self) -> Self:
+        """Return the data with a leading axis."""
+        numerics = array_module(self)
+        return jax.tree.map(lambda leaf: numerics.asarray(leaf)[None], self) if np.ndim(self.gravity) == 0 else self
+
+
+def observe(
+    recordings: Recording | Sequence[Recording], gravity: Gravity = STANDARD, noise: NoiseModel | None = None
+) -> PosesAndTurns:
+    """Return poses and turns of recordings of one unit as data of a fit; chosen on the host, a PyTree of arrays.
+
+    **Arguments:** `gravity`: local gravity, m/s². `noise`: fitted to the unit at rest; without it the scatter within
+    the poses tells the noise. A fit starts at the data sheet's values, [`jaximu.recordings.nominal_imu`][].
+
+    Rows that are no measurement are left out. Raises `InputError` where gyroscopes are missing from some recordings,
+    and `NotPossibleError` where there are no poses.
+    """
+    given = recordings_of(recordings)
+    without = [recording.name for recording in given if recording.gyroscope is None]
+    if 0 < len(without) < len(given):
+        raise InputError(f"{without[0]} has no gyroscope and others have: observe them apart.")
+    with prepared(given, gyroscope=not without) as ready:
+        parts = [segment(each.recording) for each in ready]
+        seen = observed_poses(parts, as_gravity(gravity).value, noise=noise)
+    return PosesAndTurns.of(seen, "norm" if without else "all")
+
+
+def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
+    """Return data of units as one, with a leading axis: padded to as many poses and samples as the longest has.
+
+    Raises `InputError` where conditions differ, or where slow noise ties intervals whose numbers differ.
+    """
+    if not data:
+        raise InputError("nothing to stack: give the data of one unit or more.")
+    poses, samples = (max(each.turns.interval.shape[axis] for each in data) for axis in (0, 1))
+    wide = [each.widened(poses + 1, samples) for each in data]
+    shapes = [jax.tree.map(np.shape, each) for each in wide]
+    if any(each != shapes[0] for each in shapes):
+        raise InputError(
+            "these units' data differ in kind (gyroscope, slow noise or its intervals): stack those alike."
+        )
+    return jax.tree.map(lambda *leaves: array_module(leaves).stack(leaves), *wide)
 
 
 def pose_rows(imu: Imu, observations: Observations) -> Rows:

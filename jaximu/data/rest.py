@@ -111,7 +111,7 @@ def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -
             return of(kind(numbers[: kind.size], **inner)), derivatives_by_numbers(kind, of, numbers)
 
         recordings = [stored.call(means, f"rest {kind.name} {rows}", track, numbers) for track in tracks]
-        value, slope = (sum(np.asarray(part)[:count] for part in parts) for parts in zip(*recordings, strict=True))
+        value, slope = (sum(part[:count] for part in parts) for parts in zip(*recordings, strict=True))
         added = added + value
         slopes.append(np.asarray(slope))
     return added, np.concatenate(slopes, axis=2)

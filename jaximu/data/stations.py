@@ -160,6 +160,4 @@ def station_covariances(stations: Stations) -> Covariance:
     def batch(stations):
         return jax.lax.map(station_covariance, stations)
 
-    leaves = stored.call(batch, "station covariance", stations, quick=np.shape(stations.gravity)[0] == 1)
-    measured, *factors, used, group = (np.asarray(leaf) for leaf in leaves)
-    return Covariance(measured, tuple(factors), used, group)
+    return stored.call(batch, "station covariance", stations, quick=np.shape(stations.gravity)[0] == 1)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration, calibrate_against_attitude
-from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, AttitudeConditions
 from jaximu.data.track import Track
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine
@@ -24,7 +23,6 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.shapes import Shapes
 from jaximu.estimation.data import About
 from jaximu.estimation.fitting import Linear, Prior, effect_numbers
-from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import FloatArray
@@ -61,10 +59,6 @@ class MeasuredAttitude(Experiment):
     coarse = AgainstAttitude.coarse
     advice = staticmethod(station_advice)
     no_fixture = "how the reference is mounted, late and smoothed is estimated in any case"
-
-    def free(self, name: Name) -> bool:
-        """Return whether a number is free: the accelerometer's gain is lower triangular, which fixes the frame."""
-        return without_equipment_or_effects(name)
 
     def rows(self, imu: Imu) -> Rows:
         """Return what each condition is."""

@@ -32,7 +32,7 @@ from jaximu.model.noise_model import NoiseModel
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.observations import POWER_ON
 from jaximu.recordings.recording import Recording, recordings_of
-from jaximu.recordings.segmentation import SegmentationOptions, observe, segment
+from jaximu.recordings.segmentation import SegmentationOptions, observed_poses, segment
 
 __all__ = ["check"]
 
@@ -118,7 +118,7 @@ def _checked(
     notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]
 
     def made(known: NoiseModel) -> HandHeldExperiment:
-        return HandHeldExperiment(parts, observe(parts, gravity.value, noise=known), old.imu.with_effects())
+        return HandHeldExperiment(parts, observed_poses(parts, gravity.value, noise=known), old.imu.with_effects())
 
     if noise is None:
         own = own_noise(replace(calibration, segmentations=parts))

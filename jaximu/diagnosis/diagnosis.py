@@ -39,7 +39,7 @@ from jaximu.model.noise_model import NoiseModel
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, recordings_of
-from jaximu.recordings.segmentation import SegmentationOptions, observe
+from jaximu.recordings.segmentation import SegmentationOptions, observed_poses
 
 __all__ = ["Diagnosis", "Examination", "Named", "diagnose", "examine", "same_device"]
 
@@ -661,7 +661,7 @@ def _without_effects(found: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis
 
 
 def _experiment(calibration: Calibration, noise: NoiseModel, start: Calibration | None = None) -> HandHeldExperiment:
-    observations = observe(calibration.segmentations, calibration.gravity.value, noise=noise)
+    observations = observed_poses(calibration.segmentations, calibration.gravity.value, noise=noise)
     known = tuple(calibration.imu.all_effects().values())
     if known:  # the Earth's rotation, where the latitude is known
         whole = RecordedByHand(calibration.segmentations, observations)

@@ -105,10 +105,6 @@ class Experiment(Data):
         return self.rows(self.start).real()
 
     @abstractmethod
-    def free(self, name: Name) -> bool:
-        """Return whether a number is free."""
-
-    @abstractmethod
     def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
         """Return shapes without a cause and defects of single observations, not whitened, padding included."""
 

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaximu.calibration.recipe import residual_rms, without_equipment_or_effects
+from jaximu.calibration.recipe import residual_rms
 from jaximu.data.drift import drift_components, mean_output_reactions
 from jaximu.data.poses import RecordedByHand, extent_of
 from jaximu.data.track import Track
@@ -21,14 +21,13 @@ from jaximu.diagnosis.shapes import SIZES, Shapes, harmonics
 from jaximu.diagnosis.twin import twin_recordings
 from jaximu.estimation.data import About
 from jaximu.estimation.fitting import Linear
-from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
-from jaximu.recordings.segmentation import observe
+from jaximu.recordings.segmentation import observed_poses
 
 __all__ = ["HandHeldExperiment"]
 
@@ -77,10 +76,6 @@ class HandHeldExperiment(RecordedByHand, Experiment):
         drift = self.drift
         return [] if drift is None or drift.handling is None else findings(self, drift.handling, drift.sizes)
 
-    def free(self, name: Name) -> bool:
-        """Return whether a number is free: the accelerometer's gain is lower triangular, which fixes the frame."""
-        return without_equipment_or_effects(name)
-
     def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
         return residual_rms(imu, linear.details.observations)
@@ -109,7 +104,9 @@ class HandHeldExperiment(RecordedByHand, Experiment):
         """Return the recording as a fit without effects would have it, along the same motion, noise included."""
         made = twin_recordings(self, state, noise, seed)
         parts = tuple(replace(part, recording=each) for part, each in zip(self.segmentations, made, strict=True))
-        return HandHeldExperiment(parts, observe(parts, float(self.observations.gravity), noise=noise), state.imu)
+        return HandHeldExperiment(
+            parts, observed_poses(parts, float(self.observations.gravity), noise=noise), state.imu
+        )
 
     def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
         """Return what a triad put out (k, 3) in each still part, in SI, and its rate, Hz."""

@@ -29,7 +29,7 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, recordings_of
-from jaximu.recordings.segmentation import observe, segment
+from jaximu.recordings.segmentation import observed_poses, segment
 
 __all__ = ["HandHeldThermal", "calibrate_thermal_by_hand", "turned_by_hand"]
 
@@ -128,7 +128,7 @@ def calibrate_thermal_by_hand(
     calibration = calibrate(given, gravity)
 
     def made(known: NoiseModel) -> _Thermal:
-        observations = observe(calibration.segmentations, gravity.value, noise=known)
+        observations = observed_poses(calibration.segmentations, gravity.value, noise=known)
         return _Thermal(calibration.segmentations, observations, calibration.imu)
 
     if noise is None:

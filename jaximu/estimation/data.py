@@ -16,9 +16,11 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import Covariance
+from jaximu.estimation.problem import Name, without_equipment_or_effects
 from jaximu.estimation.rows import Rows
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.tracing import array_module
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu
 
@@ -76,6 +78,10 @@ class Data(ABC):
         """Return what each condition is; factors to SI and covariates are by a unit close to this one."""
         raise NotImplementedError
 
+    def free(self, name: Name) -> bool:
+        """Return whether a number is free: all but those of the accelerometer's gain that fix the frame."""
+        return without_equipment_or_effects(name)
+
     def take(self, lanes: NDArray[np.int64]) -> Data:
         """Return the measurement of some of the units; of a single one, itself."""
         return self
@@ -99,15 +105,13 @@ class Data(ABC):
             kind = type(effect)
 
             def derivatives(imu, part, numbers, kind=kind):
-                return (derivatives_by_numbers(kind, lambda varied: react(varied, imu, part), numbers),)
+                return derivatives_by_numbers(kind, lambda varied: react(varied, imu, part), numbers)
 
             inner = [float(getattr(effect, name)) for name in effect.inner]
             numbers = np.concatenate([np.asarray(effect.coefficients), inner])
-            own = [
-                stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers)[0] for part in parts
-            ]
-            found.append(-np.sum([np.asarray(each) for each in own], axis=0))
-        return np.concatenate(found, axis=1)
+            own = [stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers) for part in parts]
+            found += [-sum(own[1:], start=own[0])]
+        return array_module(found).concatenate(found, axis=1)
 
     def dormant_columns(
         self, imu: Imu, details: Any, asked: Mapping[type[Effect], Sequence[Mapping[str, float]]]
@@ -141,7 +145,7 @@ class Data(ABC):
         names = ",".join(kind.name for kind in kinds)
         key = f"{key} dormant {names}"
         found = [stored.call(derivatives, key, imu, part, *inner, quick=False) for part in parts]
-        sums = [np.sum([np.asarray(each) for each in own], axis=0) for own in zip(*found, strict=True)]
+        sums = [np.sum(own, axis=0) for own in zip(*found, strict=True)]
         return {kind: each[: len(asked[kind])] for kind, each in zip(kinds, sums, strict=True)}
 
 

@@ -12,16 +12,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu.estimation.covariance import placed, update_excess, whitened
+from jaximu.estimation.covariance import Covariance, placed, update_excess, whitened
 from jaximu.estimation.data import Conditions, Data
 from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, unflatten
 from jaximu.estimation.solver import MAX_STEPS, Failure, solve
@@ -29,6 +30,7 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
+from jaximu.ground.tracing import array_module, is_traced
 from jaximu.model.sensor import Imu
 
 __all__ = [
@@ -176,34 +178,37 @@ def informed(found: Fit, prior: Prior) -> Fit:
 # --- the effects' numbers ---------------------------------------------------------------------------------------------
 
 
-def effect_numbers(imu: Imu) -> tuple[tuple[Name, ...], FloatArray, FloatArray]:
-    """Return the names, values and typical sizes of the numbers of a unit's effects, effect by effect."""
-    names, values, sizes = [], [], []
+def effect_numbers(imu: Imu) -> tuple[tuple[Name, ...], Float[Array, "... q"], Float[Array, "... q"]]:
+    """Return the names, values and typical sizes of the numbers of units' effects, effect by effect."""
+    numerics = array_module(imu)
+    names, values, sizes = [], [numerics.zeros((*np.shape(imu.accelerometer.bias)[:-1], 0))], []
     for (owner, place), effect in imu.all_effects().items():
-        triad = imu.triads().get(owner, imu.accelerometer)
-        scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
+        gain = imu.triads().get(owner, imu.accelerometer).gain
+        scale = numerics.mean(numerics.linalg.norm(gain, axis=-1), axis=-1, keepdims=True)
+        typical = effect.typical_sizes(scale).coefficients
         names += [Name(owner, "coefficients", (k,), place) for k in range(effect.size)]
-        values += np.asarray(effect.coefficients).tolist()
-        sizes += np.asarray(effect.typical_sizes(scale).coefficients).tolist()
+        values.append(effect.coefficients)
+        sizes.append(numerics.broadcast_to(typical, np.shape(effect.coefficients)))
         for inner in effect.inner:
-            value = float(getattr(effect, inner))
+            value = numerics.asarray(getattr(effect, inner))[..., None]
             names.append(Name(owner, inner, (), place))
             values.append(value)
-            sizes.append(max(abs(value), 1e-9))
-    return tuple(names), np.array(values), np.array(sizes)
+            sizes.append(numerics.maximum(numerics.abs(value), 1e-9))
+    together = numerics.concatenate(values, axis=-1)
+    return tuple(names), together, numerics.concatenate([together[..., :0], *sizes], axis=-1)
 
 
-def _with_numbers(imu: Imu, values: FloatArray) -> Imu:
-    """Return the unit with its effects' numbers; an inner parameter moves by a factor of two at most, in its range."""
-    effects, first = [], 0
+def _with_numbers(imu: Imu, values: Float[Array, "... q"]) -> Imu:
+    """Return units with their effects' numbers; an inner parameter moves by a factor of two at most, in its range."""
+    numerics, effects, first = array_module(imu, values), [], 0
     for effect in imu.all_effects().values():
         inner = {}
         for place, (name, each) in enumerate(effect.inner.items()):
-            old = float(getattr(effect, name))
-            change = float(values[first + effect.size + place]) - old
-            moved = np.clip(old + np.clip(change, -0.5 * old, old), each.low, each.high)
-            inner[name] = np.float64(old if change == 0 else moved)  # one that is held may lie outside
-        effects.append(type(effect)(values[first : first + effect.size], **inner))
+            old = numerics.asarray(getattr(effect, name))
+            change = values[..., first + effect.size + place] - old
+            moved = numerics.clip(old + numerics.clip(change, -0.5 * old, old), each.low, each.high)
+            inner[name] = numerics.where(change == 0, old, moved)  # one that is held may lie outside
+        effects.append(type(effect)(values[..., first : first + effect.size], **inner))
         first += effect.size + len(effect.inner)
     return imu.with_effects(*effects)
 
@@ -252,15 +257,26 @@ def linearise(imu: Imu, measurement: Data, free: Callable[[Name], bool]) -> Line
 # --- a compiled pass --------------------------------------------------------------------------------------------------
 
 
-class _Pass(eqx.Module):
-    """What one pass returns; `start` is the cost before its step."""
+class _Evaluated(eqx.Module):
+    """A problem at a place: whitened residual and Jacobian, after the loss; what follows from them to first order.
 
-    z: Array
-    excess: Array
+    gradient: of half the sum of squares; excess: improved once. magnitude: how the numbers react to what is known and
+    uncertain.
+    """
+
     residual: Array
     jacobian: Array
+    gradient: Array
     covariance: Array
+    excess: Array
     magnitude: Array
+
+
+class _Pass(eqx.Module):
+    """What one pass returns: its step, and the problem there; `start` is the cost before it."""
+
+    z: Array
+    there: _Evaluated
     start: Array
     cost: Array
     steps: Array
@@ -302,73 +318,116 @@ def _robust_excess(residual: Array, groups: Array, excess: Array) -> Array:
     return jnp.where(jnp.isnan(spread), excess, jnp.maximum((1 + excess) * jnp.nan_to_num(spread) ** 2 - 1, 0.0))
 
 
-def _single_pass(loss: str, like: Imu, parameters: Parameters, unit) -> _Pass:
-    conditions, covariances, columns, mean, root, damping, excess = unit
-    edges = np.cumsum([0, *(len(each.factors) for each in covariances)])
-    parts = [excess[a:b] for a, b in pairwise(edges)]
-    weights = tuple(each.weights(part) for each, part in zip(covariances, parts, strict=True))
-    ends = np.cumsum([0, *(len(each.used) for each in covariances)])
-    split = [slice(a, b) for a, b in pairwise(ends)]
-    used = tuple(each.used for each in covariances)
-    white = jnp.concatenate([whitened(w, rows[:, None] * columns[part])
-                             for w, rows, part in zip(weights, used, split, strict=True)])  # fmt: skip
-    problem = _Whitened(like, parameters, conditions, weights, used, white, mean, root, damping, loss)
-    zero = jnp.zeros(len(mean))
+class _Unit(NamedTuple):
+    """What a pass knows of one unit: what was measured, and what is known beforehand."""
+
+    conditions: tuple[Conditions, ...]
+    covariances: tuple[Covariance, ...]
+    columns: Array
+    mean: Array
+    root: Array
+    damping: Array
+    excess: Array
+
+    def problem(self, loss: str, like: Imu, parameters: Parameters) -> _Whitened:
+        """Return the problem of a pass."""
+        edges = np.cumsum([0, *(len(each.factors) for each in self.covariances)])
+        parts = [self.excess[a:b] for a, b in pairwise(edges)]
+        weights = tuple(each.weights(part) for each, part in zip(self.covariances, parts, strict=True))
+        split = [slice(a, b) for a, b in pairwise(self._ends())]
+        used = tuple(each.used for each in self.covariances)
+        white = jnp.concatenate([whitened(w, rows[:, None] * self.columns[part])
+                                 for w, rows, part in zip(weights, used, split, strict=True)])  # fmt: skip
+        return _Whitened(
+            like, parameters, self.conditions, weights, used, white, self.mean, self.root, self.damping, loss
+        )
+
+    def evaluated(self, problem: _Whitened, z: Array, residual: Array, jacobian: Array) -> _Evaluated:
+        """Return what follows from residual and Jacobian at z."""
+        information = jacobian.T @ jacobian + self.root.T @ self.root
+        if problem.loss == "linear":
+            ends, weights = self._ends(), problem.weights
+            factors = [
+                placed(factor, int(first), int(ends[-1]))
+                for each, first in zip(self.covariances, ends[:-1], strict=True)
+                for factor in each.factors
+            ]
+            if all(each.ndim == 1 for each in weights):
+                whole = jnp.concatenate(weights)
+            else:
+                whole = jax.scipy.linalg.block_diag(*(jnp.diag(w) if w.ndim == 1 else w for w in weights))
+            better = update_excess(residual, jacobian, information, whole, tuple(factors), self.excess)
+        else:
+            edges = np.cumsum([0, *(len(each.factors) for each in self.covariances)])
+            groups = jnp.concatenate([each.group + a for each, a in zip(self.covariances, edges[:-1], strict=True)])
+            better = _robust_excess(problem.residuals(z), groups, self.excess)
+        covariance = jnp.linalg.inv(information)
+        gradient = jacobian.T @ residual + self.root.T @ (self.root @ (z - self.mean))
+
+        def of_magnitude(magnitude):
+            moved = tuple(each.at_magnitude(magnitude) for each in self.conditions)
+            return eqx.tree_at(lambda p: p.conditions, problem, moved).objective(z)[0]
+
+        magnitude = self.conditions[0].magnitude  # pyright: ignore[reportAttributeAccessIssue]
+        slope = jax.jvp(of_magnitude, (magnitude,), (jnp.ones_like(magnitude),))[1]
+        return _Evaluated(residual, jacobian, gradient, covariance, better, -covariance @ (jacobian.T @ slope))
+
+    def _ends(self) -> NDArray[np.int64]:
+        return np.cumsum([0, *(len(each.used) for each in self.covariances)])
+
+
+def _single_pass(loss: str, like: Imu, parameters: Parameters, unit: _Unit) -> _Pass:
+    problem = unit.problem(loss, like, parameters)
+    zero = jnp.zeros(len(unit.mean))
     before = problem.objective(zero)
     solution = solve(problem, zero, MAX_STEPS, _CLOSE)
-    information = solution.jacobian.T @ solution.jacobian + root.T @ root
-    if loss == "linear":
-        factors = [placed(factor, int(first), int(ends[-1]))
-                   for each, first in zip(covariances, ends[:-1], strict=True) for factor in each.factors]  # fmt: skip
-        if all(each.ndim == 1 for each in weights):
-            whole = jnp.concatenate(weights)
-        else:
-            whole = jax.scipy.linalg.block_diag(*(jnp.diag(w) if w.ndim == 1 else w for w in weights))
-        better = update_excess(solution.residual, solution.jacobian, information, whole, tuple(factors), excess)
-    else:
-        groups = jnp.concatenate([each.group + a for each, a in zip(covariances, edges[:-1], strict=True)])
-        better = _robust_excess(problem.residuals(solution.z), groups, excess)
-    covariance = jnp.linalg.inv(information)
-
-    def of_magnitude(magnitude):
-        moved = tuple(each.at_magnitude(magnitude) for each in conditions)
-        return eqx.tree_at(lambda p: p.conditions, problem, moved).objective(solution.z)[0]
-
-    magnitude = conditions[0].magnitude
-    slope = jax.jvp(of_magnitude, (magnitude,), (jnp.ones_like(magnitude),))[1]
-    reach = -covariance @ (solution.jacobian.T @ slope)
+    there = unit.evaluated(problem, solution.z, solution.residual, solution.jacobian)
     z = solution.z
     if loss == "linear":  # what the solver's tolerance leaves, taken off by a last Newton step
-        left = solution.jacobian.T @ solution.residual + root.T @ (root @ (z - mean))
-        z = jnp.where(damping == 0, z - covariance @ left, z)
+        z = jnp.where(unit.damping == 0, z - there.covariance @ there.gradient, z)
     return _Pass(
-        z, better, solution.residual, solution.jacobian, covariance, reach,
-        0.5 * sum(jnp.sum(each**2) for each in before), solution.cost, solution.steps, solution.converged,
+        z,
+        there,
+        0.5 * sum(jnp.sum(each**2) for each in before),
+        solution.cost,
+        solution.steps,
+        solution.converged,
         solution.finite,
-    )  # fmt: skip
+    )
 
 
-def _run(loss: str, like: Imu, parameters: Parameters, units) -> _Pass:
-    """Run one pass for a batch of units; a compiled function for each loss and shape.
+def _no_step(loss: str, like: Imu, parameters: Parameters, unit: _Unit) -> _Evaluated:
+    """Return the problem where the passes are."""
+    problem = unit.problem(loss, like, parameters)
+
+    def twice(z):
+        value = problem.objective(z)[0]
+        return value, value
+
+    zero = jnp.zeros(len(unit.mean))
+    jacobian, residual = jax.jacfwd(twice, has_aux=True)(zero)
+    return unit.evaluated(problem, zero, residual, jacobian)
+
+
+def _run(one: Callable, loss: str, like: Imu, parameters: Parameters, references: Array, units: _Unit) -> Any:
+    """Run `_single_pass` or `_no_step` for a batch of units; a compiled function for each loss and shape.
 
     On a CPU lanes run one after the other inside the compiled loop: a lane stops when it has converged, its matrices
     stay in the cache, and XLA's thread pool, which can lock up when large batched products nest in a loop on a CPU with
     few cores, is not drawn upon. On an accelerator lanes run side by side.
     """
-    count = units[1][-1].shape[0]
+    count = units.mean.shape[0]
 
-    def batch(like, parameters, units):
+    def batch(like, parameters, references, units):
         def lane(item):
             reference, unit = item
             own = eqx.tree_at(lambda p: p.reference, parameters, reference)
-            return _single_pass(loss, like, own, unit)
+            return one(loss, like, own, unit)
 
         lanes = None if jax.default_backend() == "cpu" else count
-        return jax.lax.map(lane, units, batch_size=lanes)
+        return jax.lax.map(lane, (references, units), batch_size=lanes)
 
-    description = f"pass {loss}"
-    leaves = stored.call(batch, description, like, parameters, units, quick=count == 1)
-    return jax.tree.map(np.asarray, _Pass(*leaves))
+    return stored.call(batch, f"{one.__name__} {loss}", like, parameters, references, units, quick=count == 1)
 
 
 # --- passes -----------------------------------------------------------------------------------------------------------
@@ -377,7 +436,7 @@ def _run(loss: str, like: Imu, parameters: Parameters, units) -> _Pass:
 def fit(
     imu: Imu,
     data: Data | Sequence[Data],
-    free: Callable[[Name], bool],
+    free: Callable[[Name], bool] | None = None,
     *,
     prior: Prior | None = None,
     loss: str = "linear",
@@ -409,194 +468,310 @@ def fit(
     one_of("loss", loss, tuple(LOSSES))
     require_float64()
     given = (data,) if isinstance(data, Data) else tuple(data)
+    numerics = array_module(imu, given, prior, excess)
     single = np.ndim(imu.accelerometer.bias) == 1
-    imu = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None] if single else np.asarray(leaf, float), imu)
-    count = len(imu.accelerometer.bias)
-    pieces = []
-    for first in range(0, count, _CHUNK):
-        lanes = np.arange(first, min(first + _CHUNK, count))
-        part = jax.tree.map(lambda leaf, lanes=lanes: leaf[lanes], imu)
-        passes = _Passes(part, tuple(each.take(lanes) for each in given), free, prior, loss, estimate_excess, follow)
-        begin = None if excess is None else np.asarray(excess, float)
-        begin = begin if begin is None or begin.ndim < 2 else begin[lanes]
-        pieces.append(passes.run(begin, np.inf if most is None else np.asarray(most, float), max_passes))
-    if single:
-        return jax.tree.map(lambda leaf: leaf[0], pieces[0])
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
+    imu = jax.tree.map(
+        lambda leaf: numerics.asarray(leaf, float)[None] if single else numerics.asarray(leaf, float), imu
+    )
+    farthest = np.inf if most is None else numerics.asarray(most, float)
+    begin = [size for each in given for size in each.coarse] if excess is None else excess
+    blunted = estimate_excess and (is_traced(begin) or bool(np.any(begin)))
+    passes = _Passes(
+        imu, given, free or given[0].free, prior, loss, estimate_excess, follow, farthest, max_passes, blunted
+    )
+    begin = numerics.asarray(begin, float)
+    begin = numerics.broadcast_to(begin, (len(imu.accelerometer.bias), begin.shape[-1]))
+    found = passes.traced(begin) if numerics is jnp else passes.run(begin)
+    return jax.tree.map(lambda leaf: leaf[0], found) if single else found
+
+
+class _Place(eqx.Module):
+    """Where the passes of units are, the leading axis N of every array.
+
+    reference: all numbers of gain and bias; numbers: of the effects; excess: to weight with next, used: the last one.
+    damping: of the next step. least: cost above which a step led astray, and before: where it began. share, taken: of
+    the last change of the excess. active: units whose passes go on; settled: those that stand.
+    """
+
+    reference: Float[Array, "N m"]
+    numbers: Float[Array, "N q"]
+    excess: Float[Array, "N k"]
+    used: Float[Array, "N k"]
+    damping: Float[Array, " N"]
+    least: Float[Array, " N"]
+    before: tuple[Float[Array, "N m"], Float[Array, "N q"]]
+    share: Float[Array, " N"]
+    taken: Float[Array, "N k"]
+    active: Bool[Array, " N"]
+    settled: Bool[Array, " N"]
 
 
 class _Passes:
-    """The passes of up to `_CHUNK` units, and where they are."""
+    """What stays the same in the passes of units: free numbers, data, what is known beforehand.
 
-    def __init__(self, imu: Imu, data: tuple[Data, ...], free, prior, loss: str, estimated: bool, follow: bool):
+    The same text runs on the host, pass by pass and with the units that still move, and under a trace, where a loop of
+    JAX does. There the result is differentiated as what solves the equations that it solves, not as what led to it.
+    """
+
+    def __init__(
+        self, imu: Imu, data: tuple[Data, ...], free: Callable[[Name], bool], prior: Prior | None, loss: str,
+        estimated: bool, follow: bool, most: FloatArray | float, max_passes: int, blunted: bool,
+    ):  # fmt: skip
         self.data, self.loss, self.estimated, self.follow = data, loss, estimated, follow
-        self.inside = data[0].effects_inside
-        like = jax.tree.map(lambda leaf: leaf[0], imu)
-        self.like = like if self.inside else like.with_effects()
-        self.full = like
+        self.prior, self.most, self.max_passes, self.blunted = prior, most, max_passes, blunted
+        self.numerics = array_module(imu, data, prior)
+        inside = data[0].effects_inside
+        self.full = imu
+        bare = imu if inside else imu.with_effects()
+        self.like = jax.tree.map(lambda leaf: leaf[0], bare)
         self.count = len(imu.accelerometer.bias)
         self.parameters = Parameters.select(self.like, free)
-        none = (), np.zeros(0), np.zeros(0)
-        names, self.numbers, sizes = none if self.inside else effect_numbers(like)
+        nothing = (), self.numerics.zeros((self.count, 0)), self.numerics.zeros((self.count, 0))
+        names, self.numbers, sizes = nothing if inside else effect_numbers(imu)
         self.kept = np.array([free(name) for name in names], bool)
         chosen = tuple(name for name, kept in zip(names, self.kept, strict=True) if kept)
         self.names = (*self.parameters.names, *chosen)
-        self.sizes = np.concatenate([np.asarray(self.parameters.size), sizes[self.kept]])
+        self.sizes = self.numerics.concatenate([self.parameters.size, sizes[0, self.kept]])
         self.base = len(self.parameters.names)
-        bare = imu if len(names) == 0 else jax.tree.map(lambda leaf: leaf[None], self.like)  # effects: of one unit
-        self.reference = np.concatenate([np.reshape(leaf, (self.count, -1)) for leaf in jax.tree.leaves(bare)], axis=1)
+        self.index = np.array(self.parameters.index, int)
+        leaves = [self.numerics.reshape(leaf, (self.count, -1)) for leaf in jax.tree.leaves(bare)]
+        self.reference = self.numerics.concatenate(leaves, axis=1)
         self.spare = 0
-        if self.count == 1 and not self.inside:
+        if self.count == 1 and not inside:
             needed = len(self.names) - self.base
             self.spare = next((size for size in _SPARE if size >= needed), needed) - needed
-        self.prior = prior
-        self.anchor = self.values()
-        for place, name in enumerate(self.names[self.base :], self.base):
-            if name.part == "coefficients":  # where the data do not say, an effect is absent, wherever the fit starts
-                self.anchor[:, place] = 0.0
+        # where the data do not say, an effect is absent, wherever the fit starts
+        absent = np.array([name.effect is not None and name.part == "coefficients" and place >= self.base
+                           for place, name in enumerate(self.names)], bool)  # fmt: skip
+        self.anchor = self.numerics.where(absent, 0.0, self.values(self.reference, self.numbers))
 
-    def values(self) -> FloatArray:
-        """Return the free numbers (N, p) where the passes are."""
-        base = self.reference[:, list(self.parameters.index)]
-        extra = np.broadcast_to(self.numbers[self.kept], (self.count, int(self.kept.sum())))
-        return np.concatenate([base, extra], axis=1)
+    def values(self, reference: Array, numbers: Array) -> Array:
+        """Return the free numbers (N, p)."""
+        return self.numerics.concatenate([reference[:, self.index], numbers[:, self.kept]], axis=1)
 
-    def model(self, lanes: NDArray[np.int64]) -> Imu:
-        """Return the units where the passes are."""
-        if not len(self.numbers):
-            return unflatten(self.like, self.reference[lanes])
-        effects = _with_numbers(self.full, self.numbers).all_effects().values()
-        single = unflatten(self.like, self.reference[0]).with_effects(*effects)
-        return jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], single)
+    def model(self, place: _Place, lanes: NDArray[np.int64]) -> Imu:
+        """Return units where the passes are; `place` is of `lanes`."""
+        bare = unflatten(self.like, place.reference)
+        if not self.numbers.shape[1]:
+            return bare
+        begun = jax.tree.map(lambda leaf: leaf[lanes], self.full)
+        return bare.with_effects(*_with_numbers(begun, place.numbers).all_effects().values())
 
-    def known(self, lanes: NDArray[np.int64], tolerance: float) -> tuple[FloatArray, FloatArray]:
-        """Return mean (N, p) and root (p, p) of what is known beforehand, about where the passes are, scaled."""
-        here = self.values()[lanes]
-        width = np.full(len(self.names), tolerance)
+    def known(self, place: _Place, lanes: NDArray[np.int64], first: bool | Array) -> tuple[Array, Array]:
+        """Return mean (N, p) and root (N, p, p) of what is known beforehand, about where the passes are, scaled."""
+        numerics, here = self.numerics, self.values(place.reference, place.numbers)
         effects = self.full.all_effects()
+        width = np.full(len(self.names), TOLERANCE)
         width[self.base :] = [
             effects[name.owner, name.effect].plausible if name.part == "coefficients" else TOLERANCE
             for name in self.names[self.base :]
         ]
-        root = np.diag(1 / width)
-        mean = np.zeros_like(here) if self.follow else (self.anchor[lanes] - here) / self.sizes
+        of_base = np.arange(len(width)) < self.base
+        root = numerics.diag(1 / numerics.where(of_base & numerics.asarray(first), _COARSE, width))
+        mean = numerics.zeros_like(here) if self.follow else (self.anchor[lanes] - here) / self.sizes
         if self.prior is not None:
-            places = np.array([self.names.index(name) for name in self.prior.names], int)
-            root[places] = 0.0
-            root[np.ix_(places, places)] = self.prior.root * self.sizes[places]
-            mean[:, places] = (self.prior.mean - here[:, places]) / self.sizes[places]
-        mean = np.pad(mean, [(0, 0), (0, self.spare)])
-        whole = np.eye(len(self.names) + self.spare)
-        whole[: len(root), : len(root)] = root
-        return mean, np.broadcast_to(whole, (len(lanes), *whole.shape)).copy()
+            chosen = np.zeros((len(self.prior.names), len(self.names)))
+            chosen[np.arange(len(chosen)), [self.names.index(name) for name in self.prior.names]] = 1.0
+            stated = chosen.sum(axis=0) > 0
+            sizes = chosen @ self.sizes
+            root = numerics.where(stated[:, None], 0.0, root) + chosen.T @ (self.prior.root * sizes) @ chosen
+            mean = numerics.where(stated, ((self.prior.mean - here @ chosen.T) / sizes) @ chosen, mean)
+        mean = numerics.pad(mean, [(0, 0), (0, self.spare)])
+        count = len(self.names)
+        whole = numerics.pad(root, [(0, self.spare), (0, self.spare)])
+        whole = whole + np.diag(np.arange(count + self.spare) >= count).astype(float)
+        return mean, numerics.broadcast_to(whole, (len(mean), *whole.shape))
 
-    def once(self, lanes: NDArray[np.int64], excess: FloatArray, damping: FloatArray, tolerance: float) -> _Pass:
-        """Evaluate the data where the passes are, and solve; `lanes` are padded to a shape by repetition."""
-        size = 1 if len(lanes) == 1 else 8 if len(lanes) <= 8 else _CHUNK
-        padded = np.concatenate([lanes, np.full(size - len(lanes), lanes[-1])])
-        imu = self.model(padded)
-        about = [each.take(padded).about(imu) for each in self.data]
-        columns = np.concatenate([each.columns for each in about], axis=1)
+    def once(self, one: Callable, place: _Place, lanes: NDArray[np.int64], first: bool | Array = False) -> Any:
+        """Evaluate the data where the passes are, and run `_single_pass` or `_no_step`; `place` is of `lanes`."""
+        imu = self.model(place, lanes)
+        data = self.data if self.numerics is jnp else [each.take(lanes) for each in self.data]
+        about = [each.about(imu) for each in data]
+        columns = self.numerics.concatenate([each.columns for each in about], axis=1)
         columns = columns[..., self.kept] * self.sizes[self.base :]
-        columns = np.pad(columns, [(0, 0), (0, 0), (0, self.spare)])
-        mean, root = self.known(padded, tolerance)
-        unit = (
-            tuple(each.conditions for each in about), tuple(each.covariance for each in about), columns, mean, root,
-            damping[padded], excess[padded],
+        columns = self.numerics.pad(columns, [(0, 0), (0, 0), (0, self.spare)])
+        unit = _Unit(
+            tuple(each.conditions for each in about), tuple(each.covariance for each in about), columns,
+            *self.known(place, lanes, first), place.damping, place.excess,
         )  # fmt: skip
-        out = _run(self.loss, self.like, self.parameters, (self.reference[padded], unit))
-        return jax.tree.map(lambda leaf: leaf[: len(lanes)], out)
+        return _run(one, self.loss, self.like, self.parameters, place.reference, unit)
 
-    def move(self, lanes: NDArray[np.int64], z: FloatArray) -> None:
-        """Take the step z (N, p) in typical sizes."""
-        self.reference[lanes[:, None], list(self.parameters.index)] += self.sizes[: self.base] * z[:, : self.base]
-        if self.kept.any() and len(lanes):
-            changed = np.array(self.numbers)
-            changed[self.kept] += self.sizes[self.base :] * z[0, self.base : len(self.names)]
-            here = _with_numbers(self.full, self.numbers)
-            self.numbers = effect_numbers(_with_numbers(here, changed))[1]
+    def start(self, excess: Array) -> _Place:
+        """Return where the passes begin."""
+        many, numerics = (self.count,), self.numerics
+        none, far, yes = numerics.zeros(many), numerics.full(many, np.inf), numerics.ones(many, bool)
+        return _Place(
+            self.reference, self.numbers, excess, excess, none, far, (self.reference, self.numbers), none + 1.0,
+            numerics.zeros_like(excess), yes, ~yes,
+        )  # fmt: skip
 
-    def run(self, excess, most, max_passes: int) -> Fit:
-        """Alternate until nothing moves, only the lanes that still do.
+    def advanced(
+        self, place: _Place, lanes: NDArray[np.int64], out: _Pass, number: int | Array
+    ) -> tuple[_Place, Array]:
+        """Return where the passes go from units that all are active, and which of them keep what a pass found.
 
         A pass solves a problem that is linear in what the turns rotate by and in what effects add. Where its step made
         the sum of squares larger after all, it is taken back, and the next one is damped.
         """
-        coarse = [size for each in self.data for size in each.coarse]
-        begin = np.array(coarse if excess is None else excess, float)
-        excess = np.tile(begin, (self.count, 1)) if begin.ndim == 1 else begin
-        blunted = self.estimated and bool(begin.any())
-        result: _Pass | None = None
-        active, settled = np.arange(self.count), np.zeros(self.count, bool)
-        used, damping, least = np.array(excess), np.zeros(self.count), np.full(self.count, np.inf)
-        share, taken = np.ones(self.count), np.zeros_like(excess)
-        before = np.array(self.reference), self.numbers
-        for number in range(max_passes):
-            first = blunted and number == 0
-            out = self.once(active, excess, damping, _COARSE if first else TOLERANCE)
-            worse = out.start > least[active]
-            if worse.any():
-                self.reference[active[worse]] = before[0][active[worse]]
-                self.numbers = before[1] if self.kept.any() else self.numbers
-                damping[active[worse]] = np.maximum(100 * damping[active[worse]], _DAMPING)  # ten times the last one
-                least[active[worse]] = np.inf  # evaluated again from where it was
-            if worse.all():
-                continue
-            lanes, out = active[~worse], jax.tree.map(lambda leaf, good=~worse: leaf[good], out)
-            result = out if result is None else jax.tree.map(partial(_put, lanes), result, out)
-            used[lanes] = excess[lanes]
-            way = np.minimum(out.excess, most) - excess[lanes] if self.estimated else np.zeros_like(out.excess)
-            # where a large component has drowned a small one for long, both count by their relative change
-            scale = 1 + excess[lanes] if number >= _DROWNED else np.ones_like(way)
-            leap = _LEAP if number >= _DROWNED else np.inf
-            likely = _secant(share[lanes], taken[lanes] / scale, way / scale, leap)
-            share[lanes] = 1.0 if number < _SWINGING else likely
-            taken[lanes] = way
-            better = np.clip(excess[lanes] + share[lanes, None] * way, 0.0, most)
-            change = (np.abs(better - excess[lanes]) / (1 + excess[lanes])).max(axis=1, initial=0.0)
-            length = np.linalg.norm(np.einsum("unp,up->un", out.jacobian, out.z), axis=1)
-            still = (change < _SETTLED) & (length < _STILL) & (damping[lanes] <= _MILD) & (not first)
-            if number >= _CREEPING:
-                creep = np.abs(way / scale).max(axis=1, initial=0.0)
-                still |= (creep < _CREEPS[0]) & (length < _CREEPS[1]) & (damping[lanes] <= _MILD)
-            before[0][lanes], before = self.reference[lanes], (before[0], self.numbers)
-            # the last pass takes no step that none after it would check
-            taking = still | (number + 1 < max_passes)
-            self.move(lanes[taking], out.z[taking])
-            settled[lanes] = still
-            # sums of squares compare where they are weighted alike
-            alike = (change < _SETTLED) & (not first) & (not self.follow)
-            least[lanes] = np.where(alike, 1.005 * out.start + 0.05, np.inf)
-            damping[lanes] = np.where(damping[lanes] > _DAMPING / 100, damping[lanes] / 10, 0.0)
+        numerics, first = self.numerics, (number == 0) & self.blunted
+        worse = out.start > place.least
+        fine, excess = ~worse, place.excess
+        way = numerics.minimum(out.there.excess, self.most) - excess if self.estimated else 0.0 * excess
+        # where a large component has drowned a small one for long, both count by their relative change
+        late = number >= _DROWNED
+        scale = numerics.where(late, 1 + excess, 1.0)
+        likely = _secant(place.share, place.taken / scale, way / scale, numerics.where(late, _LEAP, np.inf))
+        share = numerics.where(number < _SWINGING, 1.0, likely)
+        better = numerics.clip(excess + share[:, None] * way, 0.0, self.most)
+        change = (numerics.abs(better - excess) / (1 + excess)).max(axis=1, initial=0.0)
+        length = numerics.linalg.norm(numerics.einsum("unp,up->un", out.there.jacobian, out.z), axis=1)
+        creep = numerics.abs(way / scale).max(axis=1, initial=0.0)
+        still = (change < _SETTLED) & (length < _STILL)
+        still = still | ((number >= _CREEPING) & (creep < _CREEPS[0]) & (length < _CREEPS[1]))
+        still = still & (place.damping <= _MILD) & ~numerics.asarray(first)
+        # the last pass takes no step that none after it would check
+        taking = fine & (still | (number + 1 < self.max_passes))
+        reference, numbers = self.moved(place, lanes, numerics.where(taking[:, None], out.z, 0.0))
+        # sums of squares compare where they are weighted alike
+        alike = (change < _SETTLED) & (not self.follow) & ~numerics.asarray(first)
+        damped = numerics.where(place.damping > _DAMPING / 100, place.damping / 10, 0.0)
+        pick = partial(_where, numerics)
+        return _Place(
+            pick(worse, place.before[0], reference),
+            pick(worse, place.before[1], numbers),
             # a result goes with the excess that it was weighted with
-            excess[lanes] = np.where(still[:, None] | ~out.finite[:, None], excess[lanes], better)
-            active = np.sort(np.concatenate([active[worse], lanes[~still & out.finite]]))
-            if not len(active):
+            pick(worse | still | ~out.finite, excess, better),
+            pick(worse, place.used, excess),
+            pick(worse, numerics.maximum(100 * place.damping, _DAMPING), damped),  # ten times the last one
+            pick(~worse & alike, 1.005 * out.start + 0.05, numerics.full_like(place.least, np.inf)),
+            (pick(worse, place.before[0], place.reference), pick(worse, place.before[1], place.numbers)),
+            pick(worse, place.share, share),
+            pick(worse, place.taken, way),
+            worse | (~still & out.finite),
+            fine & still,
+        ), fine
+
+    def moved(self, place: _Place, lanes: NDArray[np.int64], z: Array) -> tuple[Array, Array]:
+        """Return reference and numbers after a step z (N, p) in typical sizes."""
+        base, wide = self.base, len(self.names)
+        step = self.sizes * z[:, :wide]
+        spread = np.zeros((base, place.reference.shape[1]))
+        spread[np.arange(base), self.index] = 1.0
+        reference = place.reference + step[:, :base] @ spread
+        if not self.kept.any():
+            return reference, place.numbers
+        spread = np.zeros((wide - base, len(self.kept)))
+        spread[np.arange(wide - base), np.flatnonzero(self.kept)] = 1.0
+        here = _with_numbers(jax.tree.map(lambda leaf: leaf[lanes], self.full), place.numbers)
+        return reference, effect_numbers(_with_numbers(here, place.numbers + step[:, base:] @ spread))[1]
+
+    def run(self, excess: FloatArray) -> Fit:
+        """Alternate until nothing moves, a chunk of the units that still do after the other, and only those."""
+        place, result = jax.tree.map(np.array, self.start(excess)), None
+        for number in range(self.max_passes):
+            lanes = np.flatnonzero(place.active)
+            for part in np.split(lanes, range(_CHUNK, len(lanes), _CHUNK)):
+                size = 1 if len(part) == 1 else 8 if len(part) <= 8 else _CHUNK
+                padded = np.concatenate([part, np.full(size - len(part), part[-1])])
+                here = jax.tree.map(lambda leaf, padded=padded: leaf[padded], place)
+                out = self.once(_single_pass, here, padded, self.blunted and number == 0)
+                here, out = jax.tree.map(lambda leaf, part=part: leaf[: len(part)], (here, out))
+                after, fine = self.advanced(here, part, out, number)
+                jax.tree.map(partial(_put, part), place, after)
+                kept, out = part[fine], jax.tree.map(lambda leaf, fine=fine: leaf[fine], out)
+                result = jax.tree.map(partial(_room, self.count), out) if result is None else result
+                jax.tree.map(partial(_put, kept), result, out)
+            if not place.active.any():
                 break
         assert result is not None
-        size = self.sizes
-        keep = len(size)
-        covariance = result.covariance[:, :keep, :keep] * size[:, None] * size
+        return self.fit(place, result.there, result.cost, result.steps, result.converged, result.finite)
+
+    def traced(self, excess: Array) -> Fit:
+        """Alternate until nothing moves, all units side by side, in a loop that JAX traces."""
+        lanes, begun = np.arange(self.count), self.start(excess)
+
+        def at(x: tuple[Array, Array, Array]) -> _Place:
+            free, numbers, own = x
+            changed = self.reference.at[:, self.index].set(free)
+            return eqx.tree_at(
+                lambda p: (p.reference, p.numbers, p.excess, p.used), begun, (changed, numbers, own, own)
+            )
+
+        def left(x):
+            """Return what a fit brings to zero: a Newton step, and the change of the excess."""
+            there = self.once(_no_step, at(x), lanes)
+            step = jnp.einsum("upq,uq->up", there.covariance, there.gradient)[:, : len(self.names)] * self.sizes
+            numbers = (x[1] - self.numbers).at[:, np.flatnonzero(self.kept)].set(step[:, self.base :])
+            way = x[2] - (jnp.clip(there.excess, 0.0, self.most) if self.estimated else excess)
+            return step[:, : self.base], numbers, way
+
+        def passes(_, x):
+            def step(state):
+                place, number, ended = state
+                out = self.once(_single_pass, place, lanes, (number == 0) & self.blunted)
+                after, fine = self.advanced(place, lanes, out, number)
+                after = jax.tree.map(partial(_where, jnp, place.active), after, place)
+                after = eqx.tree_at(lambda p: p.active, after, place.active & after.active)
+                ended = jax.tree.map(
+                    partial(_where, jnp, place.active & fine), (out.steps, out.converged, out.finite), ended
+                )
+                return after, number + 1, ended
+
+            def on(state):
+                return state[0].active.any() & (state[1] < self.max_passes)
+
+            none = jnp.zeros(self.count, int), jnp.zeros(self.count, bool), jnp.ones(self.count, bool)
+            place, _, ended = jax.lax.while_loop(on, step, (at(x), 0, none))
+            about = jax.tree.map(lambda leaf: leaf.astype(float), (*ended, place.settled))  # as derivatives need them
+            return (place.reference[:, self.index], place.numbers, place.used), about
+
+        def undo(linear, target):
+            flat, restore = ravel_pytree(target)
+            matrix = jax.vmap(lambda row: ravel_pytree(linear(restore(row)))[0], out_axes=1)(jnp.eye(len(flat)))
+            return restore(jnp.linalg.solve(matrix, flat))
+
+        first = self.reference[:, self.index], self.numbers, excess
+        x, about = jax.lax.custom_root(left, first, passes, undo, has_aux=True)
+        steps, (converged, finite, settled) = about[0].astype(int), (leaf > 0 for leaf in about[1:])
+        place = eqx.tree_at(lambda p: p.settled, at(x), settled)
+        there = self.once(_no_step, place, lanes)
+        cost = 0.5 * jnp.sum(there.residual**2, axis=-1)
+        return self.fit(place, there, cost, steps, converged, finite)
+
+    def fit(self, place: _Place, there: _Evaluated, cost: Array, steps: Array, converged: Array, finite: Array) -> Fit:
+        """Return the fit of units whose passes have ended."""
+        size, keep = self.sizes, len(self.names)
+        covariance = there.covariance[:, :keep, :keep] * size[:, None] * size
         return Fit(
-            self.model(np.arange(self.count)), self.names, np.tile(size, (self.count, 1)), self.values(), covariance,
-            result.magnitude[:, :keep] * size, result.residual, result.jacobian[..., :keep], used, result.cost,
-            result.steps, result.converged & settled, result.finite,
+            self.model(place, np.arange(self.count)), self.names, self.numerics.tile(size, (self.count, 1)),
+            self.values(place.reference, place.numbers), covariance, there.magnitude[:, :keep] * size, there.residual,
+            there.jacobian[..., :keep], place.used, cost, steps, converged & place.settled, finite,
         )  # pyright: ignore[reportCallIssue] # fmt: skip
 
 
-def _secant(share: FloatArray, before: FloatArray, now: FloatArray, leap: float) -> FloatArray:
+def _secant(share: Array, before: Array, now: Array, leap: Array | float) -> Array:
     """Return the share (N,) of the change `now` (N, k) to take, after that share of the change `before`.
 
     Components that trade with each other swing about the answer or creep towards it: the change shrinks by a factor
     1 − share · m along the way, and 1 / m ends it. Beyond the change itself no component goes by more than `leap`.
     """
-    length = np.maximum(np.sum(before**2, axis=1), 1e-300)
-    ratio = np.sum(before * now, axis=1) / length
-    farthest = np.clip(leap / np.maximum(np.abs(now).max(axis=1, initial=0.0), 1e-300), 1.0, _FARTHEST)
-    return np.clip(share / np.maximum(1 - ratio, share / _FARTHEST), 0.25, farthest)
+    numerics = array_module(share, now)
+    length = numerics.maximum(numerics.sum(before**2, axis=1), 1e-300)
+    ratio = numerics.sum(before * now, axis=1) / length
+    most = numerics.maximum(numerics.abs(now).max(axis=1, initial=0.0), 1e-300)
+    farthest = numerics.clip(leap / most, 1.0, _FARTHEST)
+    return numerics.clip(share / numerics.maximum(1 - ratio, share / _FARTHEST), 0.25, farthest)
 
 
-def _put(lanes, leaf, new):
-    leaf = np.array(leaf)
+def _where(numerics: Any, chosen: Array, one: Array, other: Array) -> Array:
+    """Return arrays unit by unit: `one` where the unit is chosen, else `other`."""
+    return numerics.where(chosen.reshape(-1, *[1] * (np.ndim(one) - 1)), one, other)
+
+
+def _room(count: int, leaf: FloatArray) -> FloatArray:
+    """Return room for what so many units find."""
+    return np.zeros((count, *leaf.shape[1:]), leaf.dtype)
+
+
+def _put(lanes: NDArray[np.int64], leaf: FloatArray, new: FloatArray) -> None:
     leaf[lanes] = new
-    return leaf

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float, PyTree
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Board, Imu, Triad
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "typical_sizes",
     "unflatten",
     "without_equipment",
+    "without_equipment_or_effects",
 ]
 
 
@@ -42,9 +44,10 @@ def typical_sizes(imu: Imu) -> Imu:
     """
 
     def sizes(triad: Triad, bias: float) -> Triad:
-        scale = np.linalg.norm(np.asarray(triad.gain), axis=-1)
-        effects = tuple(effect.typical_sizes(float(np.mean(scale))) for effect in triad.effects)
-        gain = 0.1 * np.broadcast_to(scale[:, None], (3, 3))
+        numerics = array_module(triad)
+        scale = numerics.linalg.norm(numerics.asarray(triad.gain), axis=-1)
+        effects = tuple(effect.typical_sizes(numerics.mean(scale)) for effect in triad.effects)
+        gain = 0.1 * numerics.broadcast_to(scale[:, None], (3, 3))
         return replace(triad, gain=gain, bias=bias * scale, effects=effects)
 
     gyroscope = None if imu.gyroscope is None else sizes(imu.gyroscope, 0.1)
@@ -57,20 +60,18 @@ def typical_sizes(imu: Imu) -> Imu:
     return Imu(accelerometer, gyroscope, setup, magnetometer)  # pyright: ignore[reportArgumentType]
 
 
-def flatten(model: Imu) -> np.ndarray:
-    """Return the numbers of a model in one NumPy vector, in the order of `jax.flatten_util.ravel_pytree`.
-
-    On the host: eager JAX operations on a handful of numbers each cost a compilation.
-    """
-    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(model)])
+def flatten(model: Imu) -> Float[Array, " m"]:
+    """Return the numbers of a model in one vector, in the order of `jax.flatten_util.ravel_pytree`."""
+    numerics = array_module(model)
+    return numerics.concatenate([numerics.ravel(leaf) for leaf in jax.tree.leaves(model)])
 
 
-def unflatten(like: Imu, flat: np.ndarray) -> Imu:
-    """Return models of the structure of `like` from vectors (..., m), with their leading axes, as NumPy arrays."""
+def unflatten(like: Imu, flat: Float[Array, "... m"]) -> Imu:
+    """Return models of the structure of `like` from vectors (..., m), with their leading axes."""
     leaves, structure = jax.tree.flatten(like)
-    sizes = np.cumsum([np.size(leaf) for leaf in leaves])
-    parts = np.split(flat, sizes[:-1], axis=-1)
-    shaped = [part.reshape(*flat.shape[:-1], *np.shape(leaf)) for part, leaf in zip(parts, leaves, strict=True)]
+    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)])
+    shaped = [flat[..., first:last].reshape(*flat.shape[:-1], *np.shape(leaf))
+              for first, last, leaf in zip(ends[:-1], ends[1:], leaves, strict=True)]  # fmt: skip
     return jax.tree.unflatten(structure, shaped)
 
 
@@ -129,7 +130,7 @@ class Parameters(eqx.Module):
         """Free every number of the model whose name `keep` accepts."""
         names = names_of(model)
         index = tuple(place for place, name in enumerate(names) if keep(name))
-        size = flatten(typical_sizes(model) if sizes is None else sizes)[list(index)]
+        size = flatten(typical_sizes(model) if sizes is None else sizes)[np.array(index, int)]
         return cls(flatten(model), size, index, tuple(names[place] for place in index))  # pyright: ignore[reportArgumentType]
 
     def model(self, like: Imu, z: Float[Array, " p"]) -> Imu:
@@ -153,6 +154,11 @@ def without_equipment(name: Name) -> bool:
     return name.part in ("gain", "bias") and not (
         name.owner == "accelerometer" and name.part == "gain" and name.axes in _UPPER
     )
+
+
+def without_equipment_or_effects(name: Name) -> bool:
+    """Whether a number is free by hand: the numbers of effects, and gain and bias but for the frame."""
+    return name.effect is not None or without_equipment(name)
 
 
 def _huber(residual, width=1.345):

@@ -21,7 +21,7 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import Segmentation, observe, rest_statistics
+from jaximu.recordings.segmentation import Segmentation, observed_poses, rest_statistics
 
 __all__ = ["FieldUnit", "field_row", "field_unit", "field_words"]
 
@@ -52,7 +52,7 @@ def field_unit(signal: Signal, found: Segmentation, strength: FieldStrength | No
     _, means, _ = rest_statistics(signal, rests)
     scale, centre, field, _ = field_start(means, signal.unit, strength, where)
     per_gravity = np.full(3, scale * field.value / STANDARD_GRAVITY)
-    observations = observe(replace(found, recording=Recording(signal), intervals=rests), STANDARD_GRAVITY)
+    observations = observed_poses(replace(found, recording=Recording(signal), intervals=rests), STANDARD_GRAVITY)
     nominal = Imu.nominal(tuple(per_gravity), tuple(centre), signal.unit)
     return FieldUnit(FleetUnit(observations, nominal, False), field, signal.unit, len(rests))
 

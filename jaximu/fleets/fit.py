@@ -194,12 +194,12 @@ def _fit_chunk(units: Sequence[FleetUnit], shape: Shape, passes: int, stacked: _
     scales = _scales([unit.nominal for unit in units])
     padded = [np.concatenate([each, np.repeat(each[-1:], size - len(units), axis=0)]) for each in scales]
     if devices > 1:
-        leaves = _over_devices(gyroscope, block)(np.asarray(passes), padded, batch)
+        found = _over_devices(gyroscope, block)(np.asarray(passes), padded, batch)
     else:
         description = f"fleet {gyroscope} {block}"
         program = partial(_program, gyroscope, block)
-        leaves = stored.call(program, description, np.asarray(passes), padded, batch, quick=False)
-    return _fitted(Lanes(*(np.asarray(leaf)[: len(units)] for leaf in leaves)), scales, units)
+        found = stored.call(program, description, np.asarray(passes), padded, batch, quick=False)
+    return _fitted(jax.tree.map(lambda leaf: np.asarray(leaf)[: len(units)], found), scales, units)
 
 
 @cache

@@ -27,7 +27,7 @@ from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording
-from jaximu.recordings.segmentation import Segmentation, observe, segment
+from jaximu.recordings.segmentation import Segmentation, observed_poses, segment
 
 __all__ = ["PARAMETERS", "SCHEMA", "ReadJob", "covariances", "finish", "free_places", "read_job", "require_table",
            "row_begun", "rows_of"]  # fmt: skip
@@ -153,7 +153,7 @@ def _noise(path: str, options: ReadOptions) -> NoiseModel:
 def _unit(
     recording: Recording, found: Segmentation, settings: Settings, noise: NoiseModel | None
 ) -> tuple[FleetUnit, tuple[str, ...]]:
-    observations = observe(found, settings.gravity.value, noise=noise)
+    observations = observed_poses(found, settings.gravity.value, noise=noise)
     nominal, notes = nominal_imu(recording)
     notes += () if noise is None else noise.notes
     return FleetUnit(observations, nominal, recording.gyroscope is not None), notes

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from jaximu.ground.errors import InputError
+from jaximu.ground.tracing import is_traced
 
 __all__ = ["call", "compiled", "folder", "forget", "prepare_process", "use_folder"]
 
@@ -29,6 +30,7 @@ _at_first: Callable[[], None] | None = None
 _loaded: dict[str, Callable] = {}
 _DIGEST = 16  # characters
 F = TypeVar("F", bound=Callable)
+Result = TypeVar("Result")
 
 
 def use_folder(folder: Path | None, at_first: Callable[[], None] | None = None) -> None:
@@ -112,31 +114,31 @@ def compiled(function: F, quick: bool = False) -> F:
 
     @wraps(function)
     def run(*arguments):
-        import jax
-        from jax.core import Tracer
-
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
-            return function(*arguments)
         return _called(function, description, *arguments, quick=quick)
 
     return cast(F, run)
 
 
-def call(function: Callable, description: str, *arguments, quick: bool = True) -> list:
-    """Return the leaves of `function(*arguments)`, from what was compiled before if it is kept.
+def call(function: Callable[..., Result], description: str, *arguments, quick: bool = True) -> Result:
+    """Return `function(*arguments)` with NumPy arrays, from what was compiled before if it is kept; traced arguments
+    are computed with as they are, within the program that is being traced.
 
     **Arguments:** `description` must tell apart all functions that differ in more than the structure, shapes and types
     of their arguments. `quick`: compile in little time, for what runs a few times.
     """
     import jax
+    import numpy as np
 
-    return jax.tree.leaves(_called(function, description, *arguments, quick=quick))
+    results = _called(function, description, *arguments, quick=quick)
+    return results if is_traced(arguments) else jax.tree.map(np.asarray, results)
 
 
 def _called(function: Callable, description: str, *arguments, quick: bool = True) -> Any:
     import jax
     import numpy as np
 
+    if is_traced(arguments):
+        return function(*arguments)
     leaves, structure = jax.tree.flatten(arguments)
     leaves = [np.asarray(leaf) for leaf in leaves]
     shapes = ";".join(f"{leaf.shape}{leaf.dtype.str}" for leaf in leaves)

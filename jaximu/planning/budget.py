@@ -250,7 +250,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     errors = [_paired(source) for source in sources]
     means = _recorded(scheme, np.concatenate(errors))
     fixed = stations, start, parameters, excess
-    solved = scale * _chunks(lambda rows: stored.call(_lanes, "budget solutions", *fixed, rows)[0], means)
+    solved = scale * _chunks(lambda rows: stored.call(_lanes, "budget solutions", *fixed, rows), means)
     solved -= np.concatenate(errors) @ truth.T
     parts = zip(sigma, errors, np.split(solved, len(errors)), strict=True)
     actual = np.stack([np.sqrt(np.maximum(linear**2 + _mean_square(whole) - _mean_square(drawn @ slope.T), 0.0))
@@ -415,7 +415,7 @@ def _reaction(scheme: ErrorScheme) -> FloatArray:
 
 
 def _simulated(scheme: ErrorScheme, both: FloatArray) -> FloatArray:
-    return _chunks(lambda rows: stored.call(_sessions, "budget sessions", scheme, rows)[0], both)
+    return _chunks(lambda rows: stored.call(_sessions, "budget sessions", scheme, rows), both)
 
 
 def _added(errors: FloatArray) -> FloatArray:

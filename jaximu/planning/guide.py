@@ -196,7 +196,7 @@ def _told(question: DesignQuestion, before: FloatArray, after: FloatArray) -> Fl
         return hand_held_information(question.imu, question.parameters, design, question.accuracy, question.gravity)
 
     every = jax.vmap(one, (None, 0))
-    return stored.call(every, f"{question.key} guide", question, pairs)[0][: len(after)]
+    return stored.call(every, f"{question.key} guide", question, pairs)[: len(after)]
 
 
 def _padded(after: FloatArray) -> FloatArray:

@@ -128,7 +128,7 @@ def _moved(design: Design, step: Step) -> Design:
 
 def covariance(question: DesignQuestion, design: Design) -> DesignCovariance:
     """Return the covariance that a design leaves, and its own information, both in typical sizes (NumPy)."""
-    return DesignCovariance(*stored.call(_covariance, f"{question.key} covariance", question, design))
+    return stored.call(_covariance, f"{question.key} covariance", question, design)
 
 
 def score(question: DesignQuestion, covariance: Float[Array, "p p"]) -> float:
@@ -137,7 +137,7 @@ def score(question: DesignQuestion, covariance: Float[Array, "p p"]) -> float:
     def value(question, covariance):
         return CRITERIA[question.criterion](covariance, question.weights)
 
-    return float(np.exp(stored.call(value, f"{question.key} score", question, np.asarray(covariance))[0]))
+    return float(np.exp(stored.call(value, f"{question.key} score", question, np.asarray(covariance))))
 
 
 def objective(question: DesignQuestion, design: Design, step: Step) -> tuple[float, Step]:
@@ -147,8 +147,8 @@ def objective(question: DesignQuestion, design: Design, step: Step) -> tuple[flo
         return CRITERIA[question.criterion](_covariance(question, _moved(design, step)).covariance, question.weights)
 
     slope = jax.value_and_grad(value, argnums=2)
-    found, *gradient = stored.call(slope, f"{question.key} slope", question, design, step)
-    return float(found), Step(*(np.asarray(each) for each in gradient))
+    logarithm, gradient = stored.call(slope, f"{question.key} slope", question, design, step)
+    return float(logarithm), gradient
 
 
 def _limited(question: DesignQuestion, design: Design, step: Step) -> tuple[FloatArray, FloatArray]:
@@ -159,8 +159,8 @@ def _limited(question: DesignQuestion, design: Design, step: Step) -> tuple[Floa
         return found, found
 
     slopes = jax.jacrev(of, argnums=2, has_aux=True)
-    *parts, found = stored.call(slopes, f"{question.key} limits", question, design, step)
-    return np.asarray(found), np.concatenate([np.asarray(each).reshape(len(found), -1) for each in parts], axis=1)
+    by_step, left = stored.call(slopes, f"{question.key} limits", question, design, step)
+    return left, np.concatenate([each.reshape(len(left), -1) for each in by_step], axis=1)
 
 
 def _descend(question: DesignQuestion, design: Design, fastest: float, iterations: int) -> tuple[float, Design]:
@@ -184,7 +184,7 @@ def _descend(question: DesignQuestion, design: Design, fastest: float, iteration
         limits = [{"type": "ineq", "fun": lambda x: known(x.tobytes())[0], "jac": lambda x: known(x.tobytes())[1]}]
     found = minimize(evaluate, start, jac=True, method="SLSQP", bounds=bounds, constraints=limits,
                      options={"maxiter": iterations, "ftol": _CLOSE})  # fmt: skip
-    return float(found.fun), Design(*map(np.asarray, stored.call(_moved, "plan moved", design, step(found.x))))  # pyright: ignore[reportArgumentType]
+    return float(found.fun), stored.call(_moved, "plan moved", design, step(found.x))
 
 
 def optimise(

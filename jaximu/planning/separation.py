@@ -29,7 +29,7 @@ from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
-from jaximu.recordings.segmentation import observe, segment
+from jaximu.recordings.segmentation import observed_poses, segment
 from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Positions, Protocol, RateTable
 from jaximu.simulation.protocols import HandHeld as TurnedByHand
@@ -149,7 +149,7 @@ def _experiment(diagnosis: Diagnosis, protocol: Protocol, environment: Environme
         stations, _ = observe_stations(recording, truth.schedule, gravity, noise)
         return Turntable(recording, stations, imu)
     part = segment(recording)
-    return HandHeldExperiment((part,), observe((part,), gravity, noise=noise), imu)
+    return HandHeldExperiment((part,), observed_poses((part,), gravity, noise=noise), imu)
 
 
 def _noisy(recording: Recording, noise: NoiseModel) -> Recording:

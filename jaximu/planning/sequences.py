@@ -19,7 +19,6 @@ from scipy.linalg import qr
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.calibration import effect_named
-from jaximu.calibration.recipe import without_equipment_or_effects
 from jaximu.calibration.systematic import (
     NEIGHBOURS,
     disturbances,
@@ -31,7 +30,7 @@ from jaximu.calibration.systematic import (
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.motion import Disturbances, IntervalsOfMotion, cut, first_knowledge, longest_rest
 from jaximu.estimation.information_filter import Knowledge, WhiteRows, estimate, run
-from jaximu.estimation.problem import Name, Parameters, flatten
+from jaximu.estimation.problem import Name, Parameters, flatten, without_equipment_or_effects
 from jaximu.estimation.uncertainty import spoken_amount, weak_directions
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
@@ -164,7 +163,7 @@ class Filter:
         """Return the logarithm of a criterion of all free numbers but the Earth's rotation."""
         kept = [place for place in range(len(self.names)) if place not in self.earth]
         spread = (self.numbers(known) / self.size[:, None] / self.size)[np.ix_(kept, kept)]
-        return float(stored.call(CRITERIA[criterion], f"sequence's {criterion}", spread, weights[kept])[0])
+        return float(stored.call(CRITERIA[criterion], f"sequence's {criterion}", spread, weights[kept]))
 
     def _rows(self, measurement: IntervalsOfMotion, part: slice) -> tuple[WhiteRows, Rotation]:
         """Return rows of some intervals about the free numbers and gravity, and the attitude where they begin."""

@@ -22,8 +22,8 @@ __all__ = [
     "Segmentation",
     "SegmentationOptions",
     "noise_by_model",
-    "observe",
     "observe_means",
+    "observed_poses",
     "require_model",
     "rest_statistics",
     "segment",
@@ -383,7 +383,7 @@ def _pad(array: FloatArray, length: int, fill: float | FloatArray = 0.0) -> Floa
     return padded
 
 
-def observe(
+def observed_poses(
     segmentations: Segmentation | Sequence[Segmentation],
     gravity: float,
     temperature_reference: float = 25.0,

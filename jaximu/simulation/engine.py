@@ -263,13 +263,10 @@ class Stream:
         }
         settings = self.length, self._halo, cases[0].plan.columns
         respond, description = partial(_respond_batch, *settings), f"respond {settings}"
-        names, remembered = sorted({*cases[0].imu.triads(), *cases[0].plan.columns}), sorted(memory)  # as JAX has them
         for first in range(0, self.samples, self.length):
             rows = np.arange(first, min(first + self.length, self.samples))
-            leaves = stored.call(respond, description, imus, motions, memory, float(first), self.rate, quick=False)
-            columns, memory = (
-                dict(zip(names, leaves, strict=False)),
-                dict(zip(remembered, leaves[len(names) :], strict=True)),
+            columns, memory = stored.call(
+                respond, description, imus, motions, memory, float(first), self.rate, quick=False
             )
             block = []
             for unit, case in enumerate(cases):

@@ -155,7 +155,7 @@ class Effect(eqx.Module):
         """Return plausible deviations of every number of this effect, for a triad of so many output units per SI."""
         size = self.typical * (scale if self.unit.startswith("output") else 1.0)
         like = {name: np.float64(each.typical) for name, each in self.inner.items()}
-        return type(self)(np.full(self.size, size), **like)
+        return type(self)(np.ones(self.size) * size, **like)
 
     def term(self, stimulus: Stimulus) -> Float[Array, "... 3"]:
         """Return the term (..., 3), in output units or SI as `refers_to` says, of stimuli with any leading axes."""
