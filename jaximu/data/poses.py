@@ -285,11 +285,8 @@ def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
         raise InputError("nothing to stack: give the data of one unit or more.")
     poses, samples = (max(each.turns.interval.shape[axis] for each in data) for axis in (0, 1))
     wide = [each.widened(poses + 1, samples) for each in data]
-    shapes = [jax.tree.map(np.shape, each) for each in wide]
-    if any(each != shapes[0] for each in shapes):
-        raise InputError(
-            "these units' data differ in kind (gyroscope, slow noise or its intervals): stack those alike."
-        )
+    if len({(jax.tree.structure(each), *map(np.shape, jax.tree.leaves(each))) for each in wide}) > 1:
+        raise InputError("these units' data differ in kind (gyroscope, slow noise, its intervals): stack those alike.")
     return jax.tree.map(lambda *leaves: array_module(leaves).stack(leaves), *wide)
 
 

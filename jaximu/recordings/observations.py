@@ -60,7 +60,7 @@ class Observations(eqx.Module):
 
     poses: Poses
     turns: Turns
-    gravity: Float[Array, ...]
+    gravity: Float[Array, "..."]
     slow: SlowNoise | None = None
 
 
