@@ -107,10 +107,11 @@ def main() -> None:
     if on_cpu and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     device = jax.local_devices()[0].device_kind
-    data = observed(8 if asked.small else 64)
-    many = jaximu.stack(data)
-    hosts = [jaximu.fit(NOMINAL, each) for each in data]
-    weights = [two_step_weights(fit.model, each, fit.excess)[:3] for fit, each in zip(hosts, data, strict=True)]
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        data = observed(8 if asked.small else 64)
+        many = jaximu.stack(data)
+        hosts = [jaximu.fit(NOMINAL, each) for each in data]
+        weights = [two_step_weights(fit.model, each, fit.excess)[:3] for fit, each in zip(hosts, data, strict=True)]
     known = (many, jax.tree.map(lambda *leaves: np.stack(leaves), *weights))
     count = len(data)
     single = [jax.tree.map(lambda leaf, unit=unit: leaf[unit], known) for unit in range(count)]
