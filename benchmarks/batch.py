@@ -113,7 +113,7 @@ def main() -> None:
         data = observed(8 if asked.small else 64)
         many = jaximu.stack(data)
         hosts = [jaximu.fit(NOMINAL, each) for each in data]
-        weights = [two_step_weights(fit.model, each, fit.excess)[:3] for fit, each in zip(hosts, data, strict=True)]
+        weights = [two_step_weights(fit.imu, each, fit.excess)[:3] for fit, each in zip(hosts, data, strict=True)]
     known = (many, jax.tree.map(lambda *leaves: np.stack(leaves), *weights))
     count = len(data)
     single = [jax.tree.map(lambda leaf, unit=unit: leaf[unit], known) for unit in range(count)]

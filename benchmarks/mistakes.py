@@ -95,7 +95,7 @@ def plain_fit(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | No
     try:
         observations = observed_poses(segment(recording), GRAVITY.value)
         found = fit_hand_held(nominal_imu(recording)[0], observations)
-        turns = residual_rms(found.model, observations)["gravity_direction"][0]
+        turns = residual_rms(found.imu, observations)["gravity_direction"][0]
     except (JaximuError, KeyError, ValueError, ArithmeticError):
         return None
     if not bool(found.converged) or not bool(found.finite):

@@ -63,7 +63,7 @@ def held_out_angles(nominal, observations, method: str) -> float:
     for fold in range(5):
         left = used & (np.cumsum(used) % 5 == fold)
         reduced = eqx.tree_at(lambda o: o.turns.mask, observations, used & ~left)
-        found.append(angles(fit_hand_held(nominal, reduced, method).model, observations, left))
+        found.append(angles(fit_hand_held(nominal, reduced, method).imu, observations, left))
     return rms(np.concatenate(found))
 
 
@@ -74,15 +74,15 @@ def xsens(folder):
     figures, rows, models = {}, [], {}
     for method in ("two-step", "two-step-rk4", "joint"):
         fit = fit_hand_held(nominal, observations, method)
-        models[method] = fit.model
-        row_norms = np.linalg.norm(fit.model.accelerometer.gain, axis=1)
+        models[method] = fit.imu
+        row_norms = np.linalg.norm(fit.imu.accelerometer.gain, axis=1)
         off = np.abs(row_norms / INDEPENDENT_ROWS.mean(axis=1) - 1).max()
         held = held_out_angles(nominal, observations, method)
         figures[method] = {
             "row_norms": row_norms.tolist(),
             "row_norm_deviation": float(off),
-            "pose_norm_rms": rms(norms(fit.model, observations)),
-            "angle_rms": rms(angles(fit.model, observations, observations.turns.mask)),
+            "pose_norm_rms": rms(norms(fit.imu, observations)),
+            "angle_rms": rms(angles(fit.imu, observations, observations.turns.mask)),
             "angle_rms_held_out": held,
             "excess": fit.excess.tolist(),
         }
@@ -123,10 +123,10 @@ def practice(folder):
         fit = calibration.fit
         truth = [answer["accel_gain"], answer["accel_bias"], answer["gyro_gain"], answer["gyro_bias"]]
         truth = np.concatenate([np.ravel(part) for part in truth])
-        z = (fit.values - truth[[names_of(fit.model).index(name) for name in fit.names]]) / fit.sigmas()
+        z = (fit.values - truth[[names_of(fit.imu).index(name) for name in fit.names]]) / fit.sigmas()
         held = read_recording(folder / f"../practice/{unit}.heldout.parquet")
         seen = observed_poses(segment(held), gravity.value)
-        held_norm, held_angle = rms(norms(fit.model, seen)), rms(angles(fit.model, seen, seen.turns.mask))
+        held_norm, held_angle = rms(norms(fit.imu, seen)), rms(angles(fit.imu, seen, seen.turns.mask))
         figures[unit] = {"z": z.tolist(), "largest_z": float(np.abs(z).max()), "excess": calibration.excess,
                          "heldout_norm_rms": held_norm, "heldout_angle_rms": held_angle,
                          "hidden": answer["effects"]}  # fmt: skip

@@ -248,7 +248,7 @@ def wrist(folder: Path, table: Table) -> dict[str, Any]:
                 return ggir_errors(means[inside], kelvin[inside], ggir_fit(means[fit], kelvin[fit], model))
             found = calibrate_norms(means[fit] * STANDARD_GRAVITY, kelvin[fit], model, gravity=STANDARD_GRAVITY)
             windows = means[inside] * STANDARD_GRAVITY, Stimulus(temperature=kelvin[inside])
-            return np.linalg.norm(found.model.accelerometer.recover(*windows), axis=1) / STANDARD_GRAVITY - 1.0
+            return np.linalg.norm(found.imu.accelerometer.recover(*windows), axis=1) / STANDARD_GRAVITY - 1.0
 
         every = np.ones(len(day), bool)
         own = 1e3 * float(np.mean(np.abs(errors(every, every))))

@@ -147,7 +147,7 @@ def schemes(units: int):
             recording, truth = simulate(imu, protocol, consumer_noise(), seed=unit)
             stations.append(observe_stations(recording, truth.schedule, STANDARD_GRAVITY)[0])
         fit = fit_turntable(stack([nominal] * units), stack(stations))
-        found = np.concatenate([np.reshape(leaf, (units, -1)) for leaf in jax.tree.leaves(fit.model)], axis=1)
+        found = np.concatenate([np.reshape(leaf, (units, -1)) for leaf in jax.tree.leaves(fit.imu)], axis=1)
         errors = found - np.stack([flatten(imu) for imu in truths])
         bound = fit_turntable(truths[0], scheme_stations(protocol, truths[0], NOISE)).sigmas()
         ratio = float(np.sqrt(np.mean((errors / bound) ** 2)))
@@ -201,7 +201,7 @@ def nonlinearity(units: int):
             curved = linear_least_squares(force, means)
             first = linear_least_squares(force, remove_curvature(force, means)[0])
             ratios = []
-            for gain, bias in (curved, first, (joint.model.accelerometer.gain, joint.model.accelerometer.bias)):
+            for gain, bias in (curved, first, (joint.imu.accelerometer.gain, joint.imu.accelerometer.bias)):
                 flat = np.concatenate([np.reshape(gain, (units, 9)), np.asarray(bias)], axis=1)
                 ratios.append(float(np.sqrt(np.mean(((flat - truth) / bound) ** 2))))
             table.add(name, f"{misalignment:g}", *(f"{each:.2f}" for each in ratios), "jointly ≤ 1.05")

@@ -77,10 +77,10 @@ def test_together_units_know_their_gyroscopes_better_and_state_it(found, togethe
 
 def test_the_units_own_conditions_have_the_covariance_that_they_have_alone(together):
     """Two ways to it: derivatives written down for one unit, and those of all conditions taken by JAX."""
-    board = jax.tree.map(lambda leaf: np.asarray(leaf)[None], together.together.model)
+    board = jax.tree.map(lambda leaf: np.asarray(leaf)[None], together.together.imu)
     whole = UnitsOnOneBody(together.observations).about(board).covariance
     alone = jax.tree.map(lambda *leaves: np.stack(leaves), *(each.with_effects() for each in
-                                                             together.together.model.units()))  # fmt: skip
+                                                             together.together.imu.units()))  # fmt: skip
     own = condensed(alone, together.observations).covariance
     size = own.used.shape[1]
     for unit in range(3):

@@ -39,7 +39,7 @@ def free_values(fit, imu) -> np.ndarray:
 
 def scores(fit, imu) -> np.ndarray:
     """Each free parameter's error in standard deviations."""
-    return (free_values(fit, fit.model) - free_values(fit, imu)) / fit.sigmas()
+    return (free_values(fit, fit.imu) - free_values(fit, imu)) / fit.sigmas()
 
 
 def lane(fit, k):
@@ -71,13 +71,13 @@ def test_batch_equals_single_fits(cases, joint):
     three = fit_many(cases[:3])
     for k in range(3):
         one = fit_hand_held(NOMINAL, cases[k].observations)
-        mine = free_values(one, one.model)
-        assert one.model.accelerometer.gain.shape == (3, 3)
+        mine = free_values(one, one.imu)
+        assert one.imu.accelerometer.gain.shape == (3, 3)
         for field in ("covariance", "magnitude_sensitivity", "excess", "cost"):
             values = getattr(one, field)
             np.testing.assert_allclose(getattr(three, field)[k], values, rtol=1e-6, atol=1e-8 * np.abs(values).max())
         np.testing.assert_allclose(free_values(one, lane(joint, k).model), mine, atol=1e-8)
-        of_three = jax.tree.map(lambda leaf, k=k: leaf[k], three.model)
+        of_three = jax.tree.map(lambda leaf, k=k: leaf[k], three.imu)
         np.testing.assert_allclose(free_values(one, of_three), mine, atol=1e-8)
 
 
@@ -88,9 +88,9 @@ def test_other_methods_recover_the_truth(cases, method):
     assert len(fit.names) == (9 if method == "accelerometer" else 21)
     assert np.abs(scores(fit, cases[0].imu)).max() < 4
     # the frame, and what the method does not touch
-    assert np.all(np.triu(fit.model.accelerometer.gain, 1) == 0)
+    assert np.all(np.triu(fit.imu.accelerometer.gain, 1) == 0)
     if method == "accelerometer":
-        np.testing.assert_array_equal(fit.model.gyroscope.gain, np.eye(3))
+        np.testing.assert_array_equal(fit.imu.gyroscope.gain, np.eye(3))
 
 
 def test_joint_is_no_less_sure_than_two_steps(cases, joint):
@@ -106,7 +106,7 @@ def test_gravity_moves_parameters_as_stated(cases, joint):
     step = 1e-3
     shifted = eqx.tree_at(lambda d: d.gravity, data, data.gravity + step)
     before, after = lane(joint, 1), fit_hand_held(NOMINAL, shifted)
-    moved = (free_values(before, after.model) - free_values(before, before.model)) / step
+    moved = (free_values(before, after.imu) - free_values(before, before.model)) / step
     allowed = 0.02 * np.abs(before.magnitude_sensitivity).max()
     np.testing.assert_allclose(moved, before.magnitude_sensitivity, atol=allowed)
     scale = [before.names.index(f"accelerometer.gain[{i},{i}]") for i in range(3)]
@@ -155,7 +155,7 @@ def test_padding_is_never_looked_at():
 
     plain, spoilt = fit_hand_held(NOMINAL, data), fit_hand_held(NOMINAL, spoil(data))
     assert plain.converged
-    np.testing.assert_allclose(free_values(plain, spoilt.model), free_values(plain, plain.model), atol=1e-10)
+    np.testing.assert_allclose(free_values(plain, spoilt.imu), free_values(plain, plain.imu), atol=1e-10)
     np.testing.assert_allclose(spoilt.covariance, plain.covariance, rtol=1e-8)
     assert np.abs(scores(plain, case.imu)).max() < 4
 
@@ -170,7 +170,7 @@ def test_poses_that_do_not_span_are_named():
     """Only what z reads is open when z is never up: its scale, and how it and x, y lean on each other."""
     fit = fit_hand_held(NOMINAL, simulated(41, directions=flat_directions()).observations)
     assert fit.finite
-    rank, weak = weak_directions(fit.jacobian, fit.names, fit.sizes, fit.model)
+    rank, weak = weak_directions(fit.jacobian, fit.names, fit.sizes, fit.imu)
     undetermined = [direction for direction in weak if not direction.determined]
     assert rank == 17
     assert len(undetermined) == 4
@@ -195,7 +195,7 @@ def test_poses_that_do_not_span_are_refused_in_plain_words():
 
 def test_poses_that_span_leave_nothing_weak(cases, joint):
     one = lane(joint, 0)
-    assert weak_directions(one.jacobian, one.names, one.sizes, one.model) == (21, ())
+    assert weak_directions(one.jacobian, one.names, one.sizes, one.imu) == (21, ())
 
 
 def test_fewer_residuals_than_parameters_are_no_rank():
@@ -225,7 +225,7 @@ def test_robust_loss_with_a_bumped_pose(loss):
     sigma = clean.sigmas()
 
     def off(fit):
-        return np.sqrt(np.mean(((free_values(clean, fit.model) - free_values(clean, case.imu)) / sigma) ** 2))
+        return np.sqrt(np.mean(((free_values(clean, fit.imu) - free_values(clean, case.imu)) / sigma) ** 2))
 
     assert robust.converged
     assert off(plain) > 8
@@ -246,8 +246,8 @@ def test_gyroscope_scale_is_checked_by_gravity_before_the_fit(factor):
         np.testing.assert_array_equal(nominal.gyroscope.gain, np.eye(3))
     fit = fit_hand_held(nominal, observed_poses(segment(log), GRAVITY, bucket=(POSES, 48)))
     assert fit.converged
-    np.testing.assert_allclose(fit.model.gyroscope.gain, imu.gyroscope.gain, atol=5e-3)
-    np.testing.assert_allclose(fit.model.accelerometer.gain, imu.accelerometer.gain, atol=2e-3)
+    np.testing.assert_allclose(fit.imu.gyroscope.gain, imu.gyroscope.gain, atol=5e-3)
+    np.testing.assert_allclose(fit.imu.accelerometer.gain, imu.accelerometer.gain, atol=2e-3)
 
 
 def test_one_bad_unit_does_not_stop_a_batch(cases, joint):
@@ -259,9 +259,7 @@ def test_one_bad_unit_does_not_stop_a_batch(cases, joint):
     assert not spoilt.converged[2]
     healthy = [k for k in range(8) if k != 2]
     assert np.all(spoilt.converged[healthy])
-    np.testing.assert_allclose(
-        spoilt.model.accelerometer.gain[healthy], joint.model.accelerometer.gain[healthy], atol=1e-9
-    )
+    np.testing.assert_allclose(spoilt.imu.accelerometer.gain[healthy], joint.imu.accelerometer.gain[healthy], atol=1e-9)
 
 
 def test_unknown_method():

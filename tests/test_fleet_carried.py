@@ -235,7 +235,7 @@ def test_units_alone_and_together_are_as_the_exact_path_has_them(gyroscope):
         np.testing.assert_allclose(alone.covariance, fitted.covariance, rtol=1e-9, atol=1e-18)
         sigma = np.sqrt(np.diagonal(fitted.covariance))
         index = [names_of(nominal).index(name) for name in exactly.names]
-        model = np.concatenate([np.ravel(np.asarray(leaf)[place]) for leaf in jax.tree.leaves(exactly.model)])[index]
+        model = np.concatenate([np.ravel(np.asarray(leaf)[place]) for leaf in jax.tree.leaves(exactly.imu)])[index]
         close = np.abs(fitted.excess - exactly.excess[place]).max() < 1e-4
         alike += close
         off = np.abs(fitted.numbers[index] - model) / sigma

@@ -162,15 +162,15 @@ def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(protoco
     found = fit(imu, measurement, _free, follow=True, estimate_excess=False, excess=(0.0,))
     assert found.converged
     if field is not None:
-        strength = np.linalg.norm(found.model.coefficients(CATALOGUE["setup.magnetic_field"]))
+        strength = np.linalg.norm(found.imu.coefficients(CATALOGUE["setup.magnetic_field"]))
         assert strength == pytest.approx(48.0, abs=0.3)
     if seen is not None:
-        setup = np.concatenate([np.asarray(each.coefficients) for each in found.model.setup])
+        setup = np.concatenate([np.asarray(each.coefficients) for each in found.imu.setup])
         np.testing.assert_allclose(setup, [*TURNED, LATE, *TILT], atol=5e-4)
-        np.testing.assert_allclose(found.model.coefficients(CATALOGUE["accel.lever_arm"]), ARM, atol=2e-3)
-    path = measurement.filtered(found.model).path
+        np.testing.assert_allclose(found.imu.coefficients(CATALOGUE["accel.lever_arm"]), ARM, atol=2e-3)
+    path = measurement.filtered(found.imu).path
     count = int(np.sum(intervals.real))
-    numbers = ravel_pytree(found.model)[0]
+    numbers = ravel_pytree(found.imu)[0]
     n, m = errors.states, len(found.names)
     index = [list(map(str, _names(imu))).index(name) for name in found.names]
 
@@ -199,7 +199,7 @@ def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(protoco
     step, sigma = (inverse @ pull)[-m:], np.sqrt(np.diagonal(inverse))[-m:]
     assert np.max(np.abs(step) / sigma) < 1e-2  # `fit` stops where its last step was below this, and takes it
     np.testing.assert_allclose(found.sigmas(), sigma, rtol=1e-4)
-    again = fit(found.model, measurement, _free, follow=True, estimate_excess=False, excess=(0.0,))
+    again = fit(found.imu, measurement, _free, follow=True, estimate_excess=False, excess=(0.0,))
     moved = (np.asarray(again.values) - np.asarray(found.values)) / sigma
     np.testing.assert_allclose(moved, step / sigma, atol=1e-6)
 

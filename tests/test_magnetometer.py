@@ -195,7 +195,7 @@ def test_what_a_data_sheet_says_joins_a_fit_as_two_normal_laws_do(calibrations):
     target = information @ found.values
     target[rows] += added[block] @ prior.mean
     np.testing.assert_allclose(joined.values, np.linalg.solve(information + added, target), rtol=1e-6, atol=1e-9)
-    assert joined.model.magnetometer.gain[names[0].axes] == joined.values[rows[0]]
+    assert joined.imu.magnetometer.gain[names[0].axes] == joined.values[rows[0]]
 
 
 def test_stamps_in_bursts_held_rows_and_spikes_are_mended(cases):

@@ -30,7 +30,7 @@ def windows():
 
 def errors_of(found, means, kelvin):
     """Gravity's norm in the windows as the fitted unit has it, less gravity."""
-    force = found.model.accelerometer.recover(means, Stimulus(temperature=kelvin))
+    force = found.imu.accelerometer.recover(means, Stimulus(temperature=kelvin))
     return np.linalg.norm(np.asarray(force), axis=1) - G
 
 
@@ -52,7 +52,7 @@ def test_windows_that_moved_hurt_a_robust_loss_less(windows):
     errors = []
     for loss in ("linear", "cauchy"):
         found = calibrate_norms(bad, kelvin, EFFECTS, loss, gravity=G)
-        errors.append(np.linalg.norm(np.asarray(found.model.accelerometer.bias) - np.asarray(triad.bias)))
+        errors.append(np.linalg.norm(np.asarray(found.imu.accelerometer.bias) - np.asarray(triad.bias)))
     assert errors[1] < 0.3 * errors[0]
 
 
@@ -69,5 +69,5 @@ def test_the_published_wrist_data(data_folder):
     data = np.loadtxt(data_folder / "ggir_wrist" / "spheredata.csv", delimiter=",", skiprows=1)
     means, kelvin = 9.80665 * data[:, 2:5], data[:, 8]
     found = calibrate_norms(means, kelvin, ("accel.temperature", "accel.temperature_squared"))
-    force = found.model.accelerometer.recover(means, Stimulus(temperature=kelvin))
+    force = found.imu.accelerometer.recover(means, Stimulus(temperature=kelvin))
     assert np.mean(np.abs(np.linalg.norm(np.asarray(force), axis=1) - 9.80665)) / 9.80665e-3 < 1.8

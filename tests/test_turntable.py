@@ -99,7 +99,7 @@ def test_all_solutions_agree_with_the_truth_to_rounding(protocol):
     stations = scheme_stations(protocol, imu)
     fit = fit_turntable(Imu.nominal(), stations)
     assert fit.converged and fit.finite
-    assert_allclose(numbers(fit.model), numbers(imu), rtol=0, atol=1e-12)
+    assert_allclose(numbers(fit.imu), numbers(imu), rtol=0, atol=1e-12)
     force, accelerometer, rate, gyroscope = used_means(stations)
     for (gain, bias), triad in (
         (linear_least_squares(force, accelerometer), imu.accelerometer),
@@ -181,7 +181,7 @@ def many():
 def test_intervals_cover_the_truth(many):
     made, fit = many
     assert fit.converged.all()
-    found = np.concatenate([np.reshape(leaf, (len(made), -1)) for leaf in jax.tree.leaves(fit.model)], axis=1)
+    found = np.concatenate([np.reshape(leaf, (len(made), -1)) for leaf in jax.tree.leaves(fit.imu)], axis=1)
     inside = np.abs(found - numbers(unit(1))) <= 1.96 * fit.sigmas()
     assert 0.93 < inside.mean() < 0.97
     # three times the noise is an excess of 3² − 1 = 8; 3 axes of 8 − 4 degrees each leave it open to 41 % a unit
@@ -192,7 +192,7 @@ def test_intervals_cover_the_truth(many):
 def test_a_batch_is_its_units(many):
     made, fit = many
     alone = fit_turntable(Imu.nominal(), made[7])
-    assert_allclose(alone.model.gyroscope.gain, fit.model.gyroscope.gain[7], rtol=0, atol=1e-9)
+    assert_allclose(alone.imu.gyroscope.gain, fit.imu.gyroscope.gain[7], rtol=0, atol=1e-9)
     assert_allclose(alone.sigmas(), fit.sigmas()[7], rtol=1e-3)
 
 
@@ -336,8 +336,8 @@ def test_nonlinear_gyroscope_in_turns():
     stations, _ = observe_stations(replace(recording, attitude=None), truth.schedule, STANDARD_GRAVITY)
     start = Imu.nominal().with_effects(CATALOGUE["gyro.quadratic"].dormant())
     fit = fit_turntable(start, stations, ("gyro.quadratic",))
-    assert_allclose(fit.model.gyroscope.effects[0].coefficients, effect.coefficients, rtol=0.02)
-    assert_allclose(fit.model.gyroscope.gain, unit(9).gyroscope.gain, atol=2e-5)
+    assert_allclose(fit.imu.gyroscope.effects[0].coefficients, effect.coefficients, rtol=0.02)
+    assert_allclose(fit.imu.gyroscope.gain, unit(9).gyroscope.gain, atol=2e-5)
 
 
 def test_linearising_first_is_as_good_in_pairs_and_not_elsewhere():

@@ -263,10 +263,10 @@ def _unit(
     name: str, calibration: Calibration, found: Fit, delay: float, motion: Stations
 ) -> tuple[ArrayUnit, FloatArray]:
     """Return what the fit says of a unit, and its errors in motion."""
-    mounting, covariance = fitted_mounting(found.model, found.names, found.covariance)
+    mounting, covariance = fitted_mounting(found.imu, found.names, found.covariance)
     turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation)
     own, back = np.asarray(right_jacobian(mounting.rotation)), turned.as_matrix()
-    errors = {each.name: each.error for each in station_errors(found.model, motion, np.zeros(3))}
+    errors = {each.name: each.error for each in station_errors(found.imu, motion, np.zeros(3))}
     length = np.asarray(motion.stop - motion.start)[np.asarray(motion.gyroscope_used)]
     both = np.concatenate([back @ errors["specific_force"], back @ (np.radians(errors["turn_angle"]) / length)]).T
     rms = [float(np.sqrt(np.mean(both[:, columns] ** 2))) for columns in (slice(3, 6), slice(3))]

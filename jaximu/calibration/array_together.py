@@ -51,12 +51,12 @@ class Together:
     def units_alone(self) -> tuple[Imu, ...]:
         """Return the units, each calibrated by itself."""
         count = len(self.observations.gravity)
-        return tuple(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], self.alone.model) for k in range(count))
+        return tuple(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], self.alone.imu) for k in range(count))
 
     def units_together(self) -> tuple[Imu, ...]:
         """Return the units calibrated together; `setup.reference_rotation` says how each is turned to the first."""
-        assert isinstance(self.together.model, Board)
-        return self.together.model.units()
+        assert isinstance(self.together.imu, Board)
+        return self.together.imu.units()
 
     @property
     def in_common(self) -> float:
@@ -152,7 +152,7 @@ def _fitted(found: Array, observations: Observations, left_out: Sequence[int] | 
     mask[:, list(left_out)] = False
     observations = eqx.tree_at(lambda each: each.turns.mask, observations, mask)
     alone = fit_hand_held(_stacked([unit.calibration.imu.with_effects() for unit in found.units]), observations)
-    units = [jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], alone.model) for k in range(len(found.units))]
+    units = [jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], alone.imu) for k in range(len(found.units))]
     back = Rotation.from_quat([unit.rotation for unit in found.units], scalar_first=True).inv()
     turned = [unit.with_effects(SetupReferenceRotation.make(vector))
               for unit, vector in zip(units, back.as_rotvec(), strict=True)]  # fmt: skip
@@ -168,8 +168,8 @@ def _most_in_common(alone: Fit, observations: Observations) -> float:
 
     A few turns would else do without a maximum of the likelihood: the gains that all units share run after this size.
     """
-    assert alone.model.gyroscope is not None
-    back = np.linalg.inv(np.asarray(alone.model.gyroscope.gain))
+    assert alone.imu.gyroscope is not None
+    back = np.linalg.inv(np.asarray(alone.imu.gyroscope.gain))
     noise = np.trace(back @ np.asarray(observations.turns.noise) @ back.swapaxes(1, 2), axis1=1, axis2=2)
     return float(np.max(np.asarray(alone.excess)[:, EXCESS_NAMES.index("turns")] * noise) / noise[0])
 

@@ -138,8 +138,8 @@ def calibrate_against_attitude(
             require_excited(found, where, f"{attitude.name} shows too few turns, which", _RECORD)
         require_solved(found, where)
         refuse_undetermined(found, prior)
-    before, after = (_rms(measurement, each) for each in (imu, found.model))
-    likeness = _same_unit(recording, begun, found.model)
+    before, after = (_rms(measurement, each) for each in (imu, found.imu))
+    likeness = _same_unit(recording, begun, found.imu)
     calibration = concluded(
         found, gravity=gravity, method="reference", loss=loss, advice=station_advice, excess_names=EXCESS_NAMES,
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},

@@ -262,11 +262,11 @@ def concluded(
     **working: Any,
 ) -> Calibration:
     """Return the calibration that a fit is: rank, weak directions, excess and covariance are those of its model."""
-    rank, weak = weak_directions(np.asarray(found.jacobian), found.names, found.sizes, found.model, advice)
+    rank, weak = weak_directions(np.asarray(found.jacobian), found.names, found.sizes, found.imu, advice)
     excess: dict[str, float] = dict(zip(excess_names, np.asarray(found.excess).tolist(), strict=False))
     clock = clock_sigma(working.get("segmentations", ()))
     return Calibration(
-        imu=jax.tree.map(np.asarray, found.model), names=found.names,
+        imu=jax.tree.map(np.asarray, found.imu), names=found.names,
         covariance=found.total_covariance(gravity.sigma, clock), gravity=gravity, method=method, loss=loss, rank=rank,
         weak=weak, excess=excess, solver=found.failure().value, notes=tuple(dict.fromkeys(notes)), fit=found, **working,
     )  # fmt: skip

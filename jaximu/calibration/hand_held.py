@@ -63,7 +63,7 @@ def _second_step(first: Fit, observations: Observations, method: str, loss: str)
     so the covariance is T C Tᵀ, T = [L; G (1 + D L)].
     """
     turning = PosesAndTurns.of(observations, "turning", accelerometer_excess=first.excess[:, 0], method=method)
-    second = fit(first.model, turning, loss=loss)
+    second = fit(first.imu, turning, loss=loss)
     excess = np.concatenate([first.excess[:, :1], second.excess[:, 1:]], axis=1)
 
     def block(a, b):
@@ -76,8 +76,8 @@ def _second_step(first: Fit, observations: Observations, method: str, loss: str)
         return np.concatenate([field(first), field(second)], axis=1)
 
     return Fit(
-        second.model, (*first.names, *second.names), beside(lambda f: f.sizes), beside(lambda f: f.values),
-        _two_step_covariance(second.model, observations, excess), beside(lambda f: f.magnitude_sensitivity),
+        second.imu, (*first.names, *second.names), beside(lambda f: f.sizes), beside(lambda f: f.values),
+        _two_step_covariance(second.imu, observations, excess), beside(lambda f: f.magnitude_sensitivity),
         beside(lambda f: f.residual), block(first.jacobian, second.jacobian), excess, first.cost + second.cost,
         np.maximum(first.steps, second.steps), first.converged & second.converged, first.finite & second.finite,
     )  # fmt: skip

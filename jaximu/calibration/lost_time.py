@@ -197,7 +197,7 @@ class _Recorded:
     def __init__(self, found: Calibration) -> None:
         assert found.fit is not None and found.observations is not None and found.imu.gyroscope is not None
         self.found, self.observations = found, found.observations
-        unit = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (found.fit.model.with_effects(), self.observations))
+        unit = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (found.fit.imu.with_effects(), self.observations))
         self.about: Condensed = condensed(*unit)
         assert self.about.reaction is not None and self.about.running is not None
         turns, gyroscope = self.observations.turns, found.imu.gyroscope

@@ -204,7 +204,7 @@ def _calibrated(
     found, windows, stretches = _undisturbed(start.with_effects(*effects), windows, field, full)
     if bool(found.finite) and field.dip is not None and _contradicted(found, windows, field):
         stated, field = field.dip, replace(field, dip=None)
-        found, windows, stretches = _undisturbed(found.model, whole, field, full)
+        found, windows, stretches = _undisturbed(found.imu, whole, field, full)
         off = abs((_dip(windows, found)[0] or 0.0) - np.radians(stated))
         field = replace(field, sigma=float(np.hypot(field.sigma, known * off)))
         said.append(
@@ -215,7 +215,7 @@ def _calibrated(
     if bool(found.finite):  # along directions left open a fit may creep until its steps run out
         _require_covered(found, windows, where)
     if bool(found.finite) and not bool(found.converged):
-        found = _fitted(found.model, windows, field, full, np.asarray(found.excess))
+        found = _fitted(found.imu, windows, field, full, np.asarray(found.excess))
         said.append(_UNSETTLED)
     _refuse_changed(found, windows, field, where)
     if not bool(found.converged):
@@ -239,7 +239,7 @@ def _calibrated(
     readings = (log.reading if log.recording is None else log.recording.reading for log in logs)
     own = concluded(
         found, gravity=gravity, method="magnetometer", loss="linear", excess_names=EXCESS_NAMES,
-        rms={"field_strength": (*(_spread(each, windows, known) for each in (start, found.model)), "uT")},
+        rms={"field_strength": (*(_spread(each, windows, known) for each in (start, found.imu)), "uT")},
         data=_data(logs, windows), nominal=start, advice=field_advice,
         notes=[*(note for each in logs for note in each.notes), *notes, *said, *stretches],
         reading=next(filter(None, readings), None if base is None else base.reading),
@@ -262,7 +262,7 @@ def _calibrated(
             "left_out": headings,
             "unit": "deg",
         },
-        "coverage": coverage(found.model, windows),
+        "coverage": coverage(found.imu, windows),
         "norm_spread": {"before": before, "after": after, "algebraic": algebraic, "noise": noise},
         "gyroscope_bias": _gyroscope_bias(own),
         "next": None if dip is None else next_directions(own, measurement, dip),
@@ -551,7 +551,7 @@ def _undisturbed(
     whole = windows
     found = _fitted(start, windows, field, full, loss="cauchy")  # else a stretch pulls the fit to where it hides
     for number in range(1 + _ROUNDS):
-        far = _disturbed(found.model, windows, whole) if bool(found.finite) else ~windows.used
+        far = _disturbed(found.imu, windows, whole) if bool(found.finite) else ~windows.used
         far = far if far.mean() <= _MOST_DISTURBED else ~windows.used
         if number and np.array_equal(far, ~windows.used):
             break
@@ -593,7 +593,7 @@ def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> NDArray[
 
 def _refuse_changed(found: Fit, windows: FieldWindows, field: FieldStrength, where: str) -> None:
     """Refuse a field that was of one strength first and of another then, as two places have it."""
-    seen = np.linalg.norm(windows.field(found.model), axis=1)[windows.used]
+    seen = np.linalg.norm(windows.field(found.imu), axis=1)[windows.used]
     least = max(len(seen) // 10, 2)
     if not np.isfinite(seen).all() or len(seen) < 4 * least:
         return
@@ -637,7 +637,7 @@ def _require_covered(found: Fit, windows: FieldWindows, where: str) -> None:
     left = int(np.sum(np.linalg.eigvalsh(covariance) > UNDETERMINED**2))
     iron = [place for place, name in enumerate(found.names) if name.owner == "magnetometer" and name.part == "bias"]
     iron_open = bool(np.linalg.eigvalsh(covariance[np.ix_(iron, iron)])[-1] > UNDETERMINED**2)
-    share = 100 * coverage(found.model, windows)
+    share = 100 * coverage(found.imu, windows)
     if iron_open or (windows.alone and left > len(found.names) // 3) or (not bool(found.converged) and share < 50):
         raise NotPossibleError(
             f"{where}: the field was seen from {share:.0f} % of all directions, which leaves "
@@ -670,15 +670,15 @@ def _left_out(
     fold = np.minimum(np.arange(len(windows)) * _FOLDS // len(windows), _FOLDS - 1)
     found: dict[str, list[FloatArray]] = {"before": [], "after": [], "algebraic": []}
     headings: dict[str, list[FloatArray]] = {"before": [], "after": []}
-    extended = bool(whole.model.all_effects())
+    extended = bool(whole.imu.all_effects())
     raw = replace(start, magnetometer=replace(start.magnetometer, bias=np.zeros(3)))  # pyright: ignore
     for place in range(_FOLDS):
         own = (fold == place) & windows.used
         rest = windows.without(fold == place)
         if not own.any() or rest.used.sum() < 12:
             continue
-        fitted = _fitted(whole.model, rest, field, full, np.asarray(whole.excess))
-        own_model = informed(fitted, _data_sheet(fitted, start)).model
+        fitted = _fitted(whole.imu, rest, field, full, np.asarray(whole.excess))
+        own_model = informed(fitted, _data_sheet(fitted, start)).imu
         for imu, errors in zip((raw, own_model), headings.values(), strict=True):
             errors.append(carried_headings(windows, imu, np.flatnonzero(fold == place)))
         output = np.concatenate([samples[k] for k in np.flatnonzero(own).tolist()])
@@ -753,7 +753,7 @@ def _dip(windows: FieldWindows, found: Fit) -> tuple[float | None, float]:
     calm = windows.level & (windows.off < _CALM)
     if not calm.any():
         return None, 0.0
-    field = windows.field(found.model)
+    field = windows.field(found.imu)
     sine = -np.sum(windows.up * field, axis=1)[calm] / np.linalg.norm(field, axis=1)[calm]
     dip = float(np.arcsin(np.clip(np.median(sine), -1, 1)))
     spread = 1.4826 * float(np.median(np.abs(sine - np.median(sine)))) / max(np.cos(dip), 0.05)

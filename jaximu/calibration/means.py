@@ -55,8 +55,8 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
         )
     require_solved(found, where)
     if method == "accelerometer":
-        found = replace(found, model=Imu(found.model.accelerometer, None))
-    before, after = (residual_rms(imu, observations, method == "joint") for imu in (nominal, found.model))
+        found = replace(found, imu=Imu(found.imu.accelerometer, None))
+    before, after = (residual_rms(imu, observations, method == "joint") for imu in (nominal, found.imu))
     stated = {"accelerometer": means.accelerometer_sigma is not None}
     if method == "joint":
         stated["gyroscope"] = means.gyroscope_sigma is not None

@@ -230,20 +230,20 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
             chosen, sigmas = [*chosen, earth], sigmas | {earth.name: spread}
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
-        start = jax.tree.map(np.asarray, found.model).with_effects(*chosen)
+        start = jax.tree.map(np.asarray, found.imu).with_effects(*chosen)
         prior = Prior.of_effects(start, sigmas)
         found = fit(start, measurement, prior=prior, loss=loss, excess=found.excess)
         require_solved(found, where)
         refuse_undetermined(found, prior)
-        observations = measurement.along(found.model, tuple(found.model.all_effects().values())).observations
+        observations = measurement.along(found.imu, tuple(found.imu.all_effects().values())).observations
     notes = (*(note for recording in recordings for note in recording.notes), *notes, *mixed,
              *(() if noise is None else noise.notes),
              *(note for part in segmentations for note in part.notes))  # fmt: skip
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)
-    after = residual_rms(found.model.with_effects(), observations, keep_gyroscope)
+    after = residual_rms(found.imu.with_effects(), observations, keep_gyroscope)
     calibration = concluded(
-        found if keep_gyroscope else replace(found, model=Imu(found.model.accelerometer, None)),
+        found if keep_gyroscope else replace(found, imu=Imu(found.imu.accelerometer, None)),
         gravity=gravity, method=method, loss=loss, excess_names=EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1],
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
         data=provenance(recordings) | {"poses": poses, "turns": turns} | _mean_temperature(recordings, observations),

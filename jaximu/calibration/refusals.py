@@ -28,7 +28,7 @@ def require_excited(found: Fit, where: str, said: str, record: str) -> None:
     """Refuse what is no calibration: of every triad more than half of the parameters left open."""
     covariance = relative_covariance(found)
     parts = []
-    for triad in found.model.triads():
+    for triad in found.imu.triads():
         rows = [place for place, name in enumerate(found.names) if name.owner == triad and name.effect is None]
         if not rows:
             continue
@@ -63,7 +63,7 @@ def refuse_undetermined(found: Fit, prior: Prior | None = None, wholly: bool = F
     """
     known = set() if prior is None else set(prior.names)
     jacobian = np.asarray(found.jacobian)
-    for (owner, place), effect in found.model.all_effects().items():
+    for (owner, place), effect in found.imu.all_effects().items():
         own = np.array([(name.owner, name.effect) == (owner, place) for name in found.names])
         if not own.any() or any(name in known for name, mine in zip(found.names, own, strict=True) if mine):
             continue
@@ -73,7 +73,7 @@ def refuse_undetermined(found: Fit, prior: Prior | None = None, wholly: bool = F
         if not least > 1e-6 * np.linalg.norm(columns):
             raise NotPossibleError(
                 f"{sentence(effect.title)} cannot be distinguished here from bias, scale and misalignment"
-                f"{' or from the other effects' if len(found.model.all_effects()) > 1 else ''}. Record "
+                f"{' or from the other effects' if len(found.imu.all_effects()) > 1 else ''}. Record "
                 f"{effect.excited_by}."
             )
         if 1 / least > UNDETERMINED:

@@ -234,7 +234,7 @@ def calibrate_by_filter(
             if mounted is None:  # else the attitude tells what poses and turns leave open
                 _require_enough_turned(found, start, recording.name)
             require_solved(found, recording.name)
-            imu = jax.tree.map(np.asarray, found.model)
+            imu = jax.tree.map(np.asarray, found.imu)
             followed, names = _followed(measurement, imu, prior, gravity, start)
             matched = _matched(measurement, followed)
             if matched is None:

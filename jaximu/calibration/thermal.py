@@ -303,12 +303,12 @@ def _calibration(
                 notes.append(
                     f"the calibration does not say at which temperature its biases hold: {reference:g} °C is assumed."
                 )
-        bias = found.model.triads()[name].bias if told else triad.bias - steady(fit.effects, at, 0.0, reference)[0][0]
+        bias = found.imu.triads()[name].bias if told else triad.bias - steady(fit.effects, at, 0.0, reference)[0][0]
         triads[name] = replace(triad, bias=np.asarray(bias), effects=(*kept, *fit.effects),
                                temperature_reference=reference)  # fmt: skip
         known = {number: row for row, number in enumerate(found.names) if told or number.part != "bias"}
         # a coefficient that its axis does without is zero, and known to be
-        rows = {number: known.get(number, -1) for number in (*effect_numbers(found.model)[0], *known)
+        rows = {number: known.get(number, -1) for number in (*effect_numbers(found.imu)[0], *known)
                 if number in known or number.part == "coefficients"}  # fmt: skip
         own = [number if number.effect is None else Name(name, number.part, number.axes, len(kept) + number.effect)
                for number in rows]  # fmt: skip

@@ -143,7 +143,7 @@ def _concluded(
     freedom = count - blocks.levels - chosen.numbers
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(chosen.model)])
     found = _fitted(data, chosen.model, np.maximum(misfit / freedom, 1.0))
-    effects = tuple(getattr(found.model, data.name).effects)
+    effects = tuple(getattr(found.imu, data.name).effects)
     added = mean_terms(effects, data.shapes.tracks, count)[0] / getattr(blocks.recordings[0], data.name).nominal_scale
     rest = data.means - added
     level = np.stack([np.linalg.lstsq(data.levels[axis], data.root[axis] @ rest[:, axis], rcond=None)[0]

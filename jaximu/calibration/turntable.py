@@ -188,7 +188,7 @@ def calibrate_turntable(
     require_solved(found, where)
     refuse_undetermined(found)
     found = _at_rest_where_open(found, start)
-    before, after = station_rms(start, stations), station_rms(found.model, stations)
+    before, after = station_rms(start, stations), station_rms(found.imu, stations)
     notes = (
         *(note for recording in recordings for note in recording.notes), *(() if noise is None else noise.notes), *said,
         *mixed,
@@ -216,7 +216,7 @@ def _at_rest_where_open(found: Fit, start: Imu) -> Fit:
         return found
     back = moved - free.T @ (free @ moved)
     model = jax.tree.map(np.asarray, parameters.model(start, jnp.asarray(back)))
-    return replace(found, model=model, values=values + found.sizes * back)
+    return replace(found, imu=model, values=values + found.sizes * back)
 
 
 def _require_headings(recordings: Sequence[Recording], references: Sequence[Sequence[Entry]]) -> None:

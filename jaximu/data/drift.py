@@ -139,7 +139,7 @@ def with_drift(
     excess are estimated together. `found`: of a linear loss, to poses and turns or to poses alone; `observations`: with
     what its effects add taken off.
     """
-    model = found.model
+    model = found.imu
     rows = "all" if model.gyroscope is not None else "norm"
     full = model if model.gyroscope is not None else Imu(model.accelerometer, Imu.nominal().gyroscope)
     unit, measured = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))

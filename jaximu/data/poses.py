@@ -211,8 +211,8 @@ class PosesAndTurns(Observations, Data):
     @classmethod
     def of(cls, observations: Observations, conditions: str = "all", **settings: Any) -> Self:
         """Return what was observed as data of a fit."""
-        seen = observations.poses, observations.turns, observations.gravity, observations.slow
-        return cls(*seen, conditions=conditions, **settings)
+        fields = observations.poses, observations.turns, observations.gravity, observations.slow
+        return cls(*fields, conditions=conditions, **settings)
 
     def free(self, name: Name) -> bool:
         """Return whether a number is free: of the triads that the conditions tell of."""
@@ -266,14 +266,14 @@ def observe(
     Rows that are no measurement are left out. Raises `InputError` where gyroscopes are missing from some recordings,
     and `NotPossibleError` where there are no poses.
     """
-    given = recordings_of(recordings)
-    without = [recording.name for recording in given if recording.gyroscope is None]
-    if 0 < len(without) < len(given):
+    parts = recordings_of(recordings)
+    without = [recording.name for recording in parts if "gyroscope" not in recording.signals]
+    if 0 < len(without) < len(parts):
         raise InputError(f"{without[0]} has no gyroscope and others have: observe them apart.")
-    with prepared(given, gyroscope=not without) as ready:
-        parts = [segment(each.recording) for each in ready]
-        seen = observed_poses(parts, as_gravity(gravity).value, noise=noise)
-    return PosesAndTurns.of(seen, "norm" if without else "all")
+    with prepared(parts, gyroscope=not without) as ready:
+        segmentations = [segment(one.recording) for one in ready]
+        observations = observed_poses(segmentations, as_gravity(gravity).value, noise=noise)
+    return PosesAndTurns.of(observations, "norm" if without else "all")
 
 
 def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
@@ -283,9 +283,9 @@ def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
     """
     if not data:
         raise InputError("nothing to stack: give the data of one unit or more.")
-    poses, samples = (max(each.turns.interval.shape[axis] for each in data) for axis in (0, 1))
-    wide = [each.widened(poses + 1, samples) for each in data]
-    if len({(jax.tree.structure(each), *map(np.shape, jax.tree.leaves(each))) for each in wide}) > 1:
+    poses, samples = (max(unit.turns.interval.shape[axis] for unit in data) for axis in (0, 1))
+    wide = [unit.widened(poses + 1, samples) for unit in data]
+    if len({(jax.tree.structure(unit), *map(np.shape, jax.tree.leaves(unit))) for unit in wide}) > 1:
         raise InputError("these units' data differ in kind (gyroscope, slow noise, its intervals): stack those alike.")
     return jax.tree.map(lambda *leaves: array_module(leaves).stack(leaves), *wide)
 

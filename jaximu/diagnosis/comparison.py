@@ -198,7 +198,7 @@ class Fresh:
             old.imu if begin is None else begin, measurement, experiment.free, prior=prior,
             excess=np.zeros(len(measurement.coarse)), estimate_excess=False, max_passes=_PASSES,
         )  # fmt: skip
-        imu, spread = jax.tree.map(np.asarray, found.model), np.asarray(found.covariance)
+        imu, spread = jax.tree.map(np.asarray, found.imu), np.asarray(found.covariance)
         conditions, columns, covariance = measurement.predict(imu)
         # the share that is no cause's, of the conditions and of their covariance
         share = np.eye(len(conditions)) - measurement.causes @ np.linalg.solve(covariance, measurement.causes).T

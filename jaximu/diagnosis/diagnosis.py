@@ -345,8 +345,8 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
     )
     found = fit(state.model, experiment, lambda name: experiment.free(name) and name not in held, prior=state.prior,
                 excess=np.zeros(len(experiment.coarse)))  # fmt: skip
-    linear = experiment.linearise(found.model)
-    after = experiment.rms(found.model.with_effects(), linear)
+    linear = experiment.linearise(found.imu)
+    after = experiment.rms(found.imu.with_effects(), linear)
     known = {name: (size, unit) for name, (size, _, unit) in calibration.rms.items() if name in after}
     before = (
         known if len(known) == len(after) else experiment.rms(experiment.start, experiment.linearise(experiment.start))

@@ -242,7 +242,7 @@ class Experiment(Data):
 
         found = fit(start, self, free, prior=prior, excess=np.zeros(len(self.coarse)), estimate_excess=False,
                     max_passes=16)  # fmt: skip
-        linear, used = self.linearise(found.model), self.used
+        linear, used = self.linearise(found.imu), self.used
         covariance = np.zeros((len(linear.names),) * 2)
         places = [linear.names.index(name) for name in found.names]
         covariance[np.ix_(places, places)] = found.covariance
@@ -251,7 +251,7 @@ class Experiment(Data):
         )
         columns = np.concatenate([linear.slope, linear.columns * linear.sizes[linear.slope.shape[1] :]], axis=1)
         jacobian = weights @ columns[np.ix_(used, np.sort(places))]
-        model = jax.tree.map(np.asarray, found.model)
+        model = jax.tree.map(np.asarray, found.imu)
         fitted = {effect.name for effect in model.all_effects().values()}
         blocks, blind = self._blocks(model.with_effects(), linear, weights, fitted, asking)
         noise = None

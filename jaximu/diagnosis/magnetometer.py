@@ -103,7 +103,7 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
     found, windows = calibration.fit, measurement.windows
     assert found is not None
     kept = set(found.names)
-    model = jax.tree.map(np.asarray, found.model)
+    model = jax.tree.map(np.asarray, found.imu)
     linear = linearise(model, measurement, lambda name: name in kept)
     about = measurement.about(jax.tree.map(lambda leaf: leaf[None], model))
     covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)

@@ -71,16 +71,15 @@ _MILD = 10.0
 """Damping that holds back what data do not determine and nothing else: a step that is still under it is at rest."""
 
 
-@dataclass(frozen=True)
-class Prior:
+class Prior(eqx.Module):
     """What is known of some numbers beforehand, in place of a data sheet's tolerance: root · (x − mean) is white.
 
-    mean (k,), root (k, k): in the numbers' own units.
+    mean, root: in the numbers' own units.
     """
 
-    names: tuple[Name, ...]
-    mean: FloatArray
-    root: FloatArray
+    names: tuple[Name, ...] = eqx.field(static=True)
+    mean: Float[Array, " k"]
+    root: Float[Array, "k k"]
 
     @classmethod
     def of_effects(cls, imu: Imu, sigmas: Mapping[str, float | FloatArray] | None = None) -> Prior | None:
@@ -108,13 +107,13 @@ class Prior:
 class Fit(eqx.Module):
     """A solved problem, or with leading axes N a batch of them.
 
-    `model` has the effects as fitted. `covariance` is of the free numbers `names` in their own units, without the known
+    `imu` has the effects as fitted. `covariance` is of the free numbers `names` in their own units, without the known
     magnitude's uncertainty, to which each reacts by `magnitude_sensitivity` (per m/s², or µT). `excess` is the variance
     of each component, beyond the measured noise and in multiples of it: above zero, the model or the noise misses
     something. `residual` and `jacobian` are whitened, the latter with respect to numbers in typical `sizes`.
     """
 
-    model: Imu
+    imu: Imu
     names: tuple[Name, ...] = eqx.field(static=True)
     sizes: Float[Array, "... p"]
     values: Float[Array, "... p"]
@@ -161,16 +160,16 @@ def informed(found: Fit, prior: Prior) -> Fit:
     keep = np.eye(len(values))
     keep[:, rows] -= share
     moved = values + share @ (prior.mean - values[rows])
-    bare = found.model.with_effects()
+    bare = found.imu.with_effects()
     place = {name: k for k, name in enumerate(names_of(bare))}
     flat = flatten(bare)
     for name, value in zip(found.names, moved, strict=True):
         if name.effect is None:
             flat[place[name]] = value
-    model = unflatten(bare, flat).with_effects(*found.model.all_effects().values())
+    model = unflatten(bare, flat).with_effects(*found.imu.all_effects().values())
     values = np.where([name.effect is None for name in found.names], moved, values)
     return replace(
-        found, model=model, values=values, covariance=keep @ spread,
+        found, imu=model, values=values, covariance=keep @ spread,
         magnitude_sensitivity=keep @ np.asarray(found.magnitude_sensitivity),
     )  # fmt: skip
 
@@ -331,11 +330,11 @@ class _Unit(NamedTuple):
 
     def problem(self, loss: str, like: Imu, parameters: Parameters) -> _Whitened:
         """Return the problem of a pass."""
-        edges = np.cumsum([0, *(len(each.factors) for each in self.covariances)])
+        edges = np.cumsum([0, *(len(kind.factors) for kind in self.covariances)])
         parts = [self.excess[a:b] for a, b in pairwise(edges)]
-        weights = tuple(each.weights(part) for each, part in zip(self.covariances, parts, strict=True))
+        weights = tuple(kind.weights(part) for kind, part in zip(self.covariances, parts, strict=True))
         split = [slice(a, b) for a, b in pairwise(self._ends())]
-        used = tuple(each.used for each in self.covariances)
+        used = tuple(kind.used for kind in self.covariances)
         white = jnp.concatenate([whitened(w, rows[:, None] * self.columns[part])
                                  for w, rows, part in zip(weights, used, split, strict=True)])  # fmt: skip
         return _Whitened(
@@ -349,23 +348,23 @@ class _Unit(NamedTuple):
             ends, weights = self._ends(), problem.weights
             factors = [
                 placed(factor, int(first), int(ends[-1]))
-                for each, first in zip(self.covariances, ends[:-1], strict=True)
-                for factor in each.factors
+                for kind, first in zip(self.covariances, ends[:-1], strict=True)
+                for factor in kind.factors
             ]
-            if all(each.ndim == 1 for each in weights):
+            if all(weight.ndim == 1 for weight in weights):
                 whole = jnp.concatenate(weights)
             else:
                 whole = jax.scipy.linalg.block_diag(*(jnp.diag(w) if w.ndim == 1 else w for w in weights))
             better = update_excess(residual, jacobian, information, whole, tuple(factors), self.excess)
         else:
-            edges = np.cumsum([0, *(len(each.factors) for each in self.covariances)])
-            groups = jnp.concatenate([each.group + a for each, a in zip(self.covariances, edges[:-1], strict=True)])
+            edges = np.cumsum([0, *(len(kind.factors) for kind in self.covariances)])
+            groups = jnp.concatenate([kind.group + a for kind, a in zip(self.covariances, edges[:-1], strict=True)])
             better = _robust_excess(problem.residuals(z), groups, self.excess)
         covariance = jnp.linalg.inv(information)
         gradient = jacobian.T @ residual + self.root.T @ (self.root @ (z - self.mean))
 
         def of_magnitude(magnitude):
-            moved = tuple(each.at_magnitude(magnitude) for each in self.conditions)
+            moved = tuple(kind.at_magnitude(magnitude) for kind in self.conditions)
             return eqx.tree_at(lambda p: p.conditions, problem, moved).objective(z)[0]
 
         magnitude = self.conditions[0].magnitude  # pyright: ignore[reportAttributeAccessIssue]
@@ -373,7 +372,7 @@ class _Unit(NamedTuple):
         return _Evaluated(residual, jacobian, gradient, covariance, better, -covariance @ (jacobian.T @ slope))
 
     def _ends(self) -> NDArray[np.int64]:
-        return np.cumsum([0, *(len(each.used) for each in self.covariances)])
+        return np.cumsum([0, *(len(kind.used) for kind in self.covariances)])
 
 
 def _single_pass(loss: str, like: Imu, parameters: Parameters, unit: _Unit) -> _Pass:
@@ -388,7 +387,7 @@ def _single_pass(loss: str, like: Imu, parameters: Parameters, unit: _Unit) -> _
     return _Pass(
         z,
         there,
-        0.5 * sum(jnp.sum(each**2) for each in before),
+        0.5 * sum(jnp.sum(part**2) for part in before),
         solution.cost,
         solution.steps,
         solution.converged,
@@ -467,25 +466,25 @@ def fit(
     """
     one_of("loss", loss, tuple(LOSSES))
     require_float64()
-    given = (data,) if isinstance(data, Data) else tuple(data)
-    numerics = array_module(imu, given, prior, excess)
+    measured = (data,) if isinstance(data, Data) else tuple(data)
+    numerics = array_module(imu, measured, prior, excess)
     single = np.ndim(imu.accelerometer.bias) == 1
     imu = jax.tree.map(
         lambda leaf: numerics.asarray(leaf, float)[None] if single else numerics.asarray(leaf, float), imu
     )
     farthest = np.inf if most is None else numerics.asarray(most, float)
-    begin = [size for each in given for size in each.coarse] if excess is None else excess
+    begin = [size for kind in measured for size in kind.coarse] if excess is None else excess
     blunted = estimate_excess and (is_traced(begin) or bool(np.any(begin)))
     passes = _Passes(
-        imu, given, free or given[0].free, prior, loss, estimate_excess, follow, farthest, max_passes, blunted
+        imu, measured, free or measured[0].free, prior, loss, estimate_excess, follow, farthest, max_passes, blunted
     )
     begin = numerics.asarray(begin, float)
     begin = numerics.broadcast_to(begin, (len(imu.accelerometer.bias), begin.shape[-1]))
-    found = passes.traced(begin) if numerics is jnp else passes.run(begin)
-    return jax.tree.map(lambda leaf: leaf[0], found) if single else found
+    fitted = passes.traced(begin) if numerics is jnp else passes.run(begin)
+    return jax.tree.map(lambda leaf: leaf[0], fitted) if single else fitted
 
 
-class _Place(eqx.Module):
+class _State(eqx.Module):
     """Where the passes of units are, the leading axis N of every array.
 
     reference: all numbers of gain and bias; numbers: of the effects; excess: to weight with next, used: the last one.
@@ -541,25 +540,25 @@ class _Passes:
             needed = len(self.names) - self.base
             self.spare = next((size for size in _SPARE if size >= needed), needed) - needed
         # where the data do not say, an effect is absent, wherever the fit starts
-        absent = np.array([name.effect is not None and name.part == "coefficients" and place >= self.base
-                           for place, name in enumerate(self.names)], bool)  # fmt: skip
+        coefficients = [name.part == "coefficients" for name in chosen]
+        absent = np.array([False] * self.base + coefficients, bool)
         self.anchor = self.numerics.where(absent, 0.0, self.values(self.reference, self.numbers))
 
     def values(self, reference: Array, numbers: Array) -> Array:
         """Return the free numbers (N, p)."""
         return self.numerics.concatenate([reference[:, self.index], numbers[:, self.kept]], axis=1)
 
-    def model(self, place: _Place, lanes: NDArray[np.int64]) -> Imu:
-        """Return units where the passes are; `place` is of `lanes`."""
-        bare = unflatten(self.like, place.reference)
+    def model(self, state: _State, lanes: NDArray[np.int64]) -> Imu:
+        """Return units where the passes are; `state` is of `lanes`."""
+        bare = unflatten(self.like, state.reference)
         if not self.numbers.shape[1]:
             return bare
-        begun = jax.tree.map(lambda leaf: leaf[lanes], self.full)
-        return bare.with_effects(*_with_numbers(begun, place.numbers).all_effects().values())
+        start = jax.tree.map(lambda leaf: leaf[lanes], self.full)
+        return bare.with_effects(*_with_numbers(start, state.numbers).all_effects().values())
 
-    def known(self, place: _Place, lanes: NDArray[np.int64], first: bool | Array) -> tuple[Array, Array]:
+    def known(self, state: _State, lanes: NDArray[np.int64], first: bool | Array) -> tuple[Array, Array]:
         """Return mean (N, p) and root (N, p, p) of what is known beforehand, about where the passes are, scaled."""
-        numerics, here = self.numerics, self.values(place.reference, place.numbers)
+        numerics, here = self.numerics, self.values(state.reference, state.numbers)
         effects = self.full.all_effects()
         width = np.full(len(self.names), TOLERANCE)
         width[self.base :] = [
@@ -582,45 +581,45 @@ class _Passes:
         whole = whole + np.diag(np.arange(count + self.spare) >= count).astype(float)
         return mean, numerics.broadcast_to(whole, (len(mean), *whole.shape))
 
-    def once(self, one: Callable, place: _Place, lanes: NDArray[np.int64], first: bool | Array = False) -> Any:
-        """Evaluate the data where the passes are, and run `_single_pass` or `_no_step`; `place` is of `lanes`."""
-        imu = self.model(place, lanes)
-        data = self.data if self.numerics is jnp else [each.take(lanes) for each in self.data]
-        about = [each.about(imu) for each in data]
-        columns = self.numerics.concatenate([each.columns for each in about], axis=1)
+    def once(self, one: Callable, state: _State, lanes: NDArray[np.int64], first: bool | Array = False) -> Any:
+        """Evaluate the data where the passes are, and run `_single_pass` or `_no_step`; `state` is of `lanes`."""
+        imu = self.model(state, lanes)
+        data = self.data if self.numerics is jnp else [kind.take(lanes) for kind in self.data]
+        about = [kind.about(imu) for kind in data]
+        columns = self.numerics.concatenate([kind.columns for kind in about], axis=1)
         columns = columns[..., self.kept] * self.sizes[self.base :]
         columns = self.numerics.pad(columns, [(0, 0), (0, 0), (0, self.spare)])
         unit = _Unit(
-            tuple(each.conditions for each in about), tuple(each.covariance for each in about), columns,
-            *self.known(place, lanes, first), place.damping, place.excess,
+            tuple(kind.conditions for kind in about), tuple(kind.covariance for kind in about), columns,
+            *self.known(state, lanes, first), state.damping, state.excess,
         )  # fmt: skip
-        return _run(one, self.loss, self.like, self.parameters, place.reference, unit)
+        return _run(one, self.loss, self.like, self.parameters, state.reference, unit)
 
-    def start(self, excess: Array) -> _Place:
+    def start(self, excess: Array) -> _State:
         """Return where the passes begin."""
         many, numerics = (self.count,), self.numerics
         none, far, yes = numerics.zeros(many), numerics.full(many, np.inf), numerics.ones(many, bool)
-        return _Place(
+        return _State(
             self.reference, self.numbers, excess, excess, none, far, (self.reference, self.numbers), none + 1.0,
             numerics.zeros_like(excess), yes, ~yes,
         )  # fmt: skip
 
     def advanced(
-        self, place: _Place, lanes: NDArray[np.int64], out: _Pass, number: int | Array
-    ) -> tuple[_Place, Array]:
+        self, state: _State, lanes: NDArray[np.int64], out: _Pass, number: int | Array
+    ) -> tuple[_State, Array]:
         """Return where the passes go from units that all are active, and which of them keep what a pass found.
 
         A pass solves a problem that is linear in what the turns rotate by and in what effects add. Where its step made
         the sum of squares larger after all, it is taken back, and the next one is damped.
         """
         numerics, first = self.numerics, (number == 0) & self.blunted
-        worse = out.start > place.least
-        fine, excess = ~worse, place.excess
+        worse = out.start > state.least
+        fine, excess = ~worse, state.excess
         way = numerics.minimum(out.there.excess, self.most) - excess if self.estimated else 0.0 * excess
         # where a large component has drowned a small one for long, both count by their relative change
-        late = number >= _DROWNED
-        scale = numerics.where(late, 1 + excess, 1.0)
-        likely = _secant(place.share, place.taken / scale, way / scale, numerics.where(late, _LEAP, np.inf))
+        drowning = number >= _DROWNED
+        scale = numerics.where(drowning, 1 + excess, 1.0)
+        likely = _secant(state.share, state.taken / scale, way / scale, numerics.where(drowning, _LEAP, np.inf))
         share = numerics.where(number < _SWINGING, 1.0, likely)
         better = numerics.clip(excess + share[:, None] * way, 0.0, self.most)
         change = (numerics.abs(better - excess) / (1 + excess)).max(axis=1, initial=0.0)
@@ -628,73 +627,73 @@ class _Passes:
         creep = numerics.abs(way / scale).max(axis=1, initial=0.0)
         still = (change < _SETTLED) & (length < _STILL)
         still = still | ((number >= _CREEPING) & (creep < _CREEPS[0]) & (length < _CREEPS[1]))
-        still = still & (place.damping <= _MILD) & ~numerics.asarray(first)
+        still = still & (state.damping <= _MILD) & ~numerics.asarray(first)
         # the last pass takes no step that none after it would check
         taking = fine & (still | (number + 1 < self.max_passes))
-        reference, numbers = self.moved(place, lanes, numerics.where(taking[:, None], out.z, 0.0))
+        reference, numbers = self.moved(state, lanes, numerics.where(taking[:, None], out.z, 0.0))
         # sums of squares compare where they are weighted alike
         alike = (change < _SETTLED) & (not self.follow) & ~numerics.asarray(first)
-        damped = numerics.where(place.damping > _DAMPING / 100, place.damping / 10, 0.0)
+        damped = numerics.where(state.damping > _DAMPING / 100, state.damping / 10, 0.0)
         pick = partial(_where, numerics)
-        return _Place(
-            pick(worse, place.before[0], reference),
-            pick(worse, place.before[1], numbers),
+        return _State(
+            pick(worse, state.before[0], reference),
+            pick(worse, state.before[1], numbers),
             # a result goes with the excess that it was weighted with
             pick(worse | still | ~out.finite, excess, better),
-            pick(worse, place.used, excess),
-            pick(worse, numerics.maximum(100 * place.damping, _DAMPING), damped),  # ten times the last one
-            pick(~worse & alike, 1.005 * out.start + 0.05, numerics.full_like(place.least, np.inf)),
-            (pick(worse, place.before[0], place.reference), pick(worse, place.before[1], place.numbers)),
-            pick(worse, place.share, share),
-            pick(worse, place.taken, way),
+            pick(worse, state.used, excess),
+            pick(worse, numerics.maximum(100 * state.damping, _DAMPING), damped),  # ten times the last one
+            pick(~worse & alike, 1.005 * out.start + 0.05, numerics.full_like(state.least, np.inf)),
+            (pick(worse, state.before[0], state.reference), pick(worse, state.before[1], state.numbers)),
+            pick(worse, state.share, share),
+            pick(worse, state.taken, way),
             worse | (~still & out.finite),
             fine & still,
         ), fine
 
-    def moved(self, place: _Place, lanes: NDArray[np.int64], z: Array) -> tuple[Array, Array]:
+    def moved(self, state: _State, lanes: NDArray[np.int64], z: Array) -> tuple[Array, Array]:
         """Return reference and numbers after a step z (N, p) in typical sizes."""
         base, wide = self.base, len(self.names)
         step = self.sizes * z[:, :wide]
-        spread = np.zeros((base, place.reference.shape[1]))
+        spread = np.zeros((base, state.reference.shape[1]))
         spread[np.arange(base), self.index] = 1.0
-        reference = place.reference + step[:, :base] @ spread
+        reference = state.reference + step[:, :base] @ spread
         if not self.kept.any():
-            return reference, place.numbers
+            return reference, state.numbers
         spread = np.zeros((wide - base, len(self.kept)))
         spread[np.arange(wide - base), np.flatnonzero(self.kept)] = 1.0
-        here = _with_numbers(jax.tree.map(lambda leaf: leaf[lanes], self.full), place.numbers)
-        return reference, effect_numbers(_with_numbers(here, place.numbers + step[:, base:] @ spread))[1]
+        here = _with_numbers(jax.tree.map(lambda leaf: leaf[lanes], self.full), state.numbers)
+        return reference, effect_numbers(_with_numbers(here, state.numbers + step[:, base:] @ spread))[1]
 
     def run(self, excess: FloatArray) -> Fit:
         """Alternate until nothing moves, a chunk of the units that still do after the other, and only those."""
-        place, result = jax.tree.map(np.array, self.start(excess)), None
+        state, result = jax.tree.map(np.array, self.start(excess)), None
         for number in range(self.max_passes):
-            lanes = np.flatnonzero(place.active)
+            lanes = np.flatnonzero(state.active)
             for part in np.split(lanes, range(_CHUNK, len(lanes), _CHUNK)):
                 size = 1 if len(part) == 1 else 8 if len(part) <= 8 else _CHUNK
                 padded = np.concatenate([part, np.full(size - len(part), part[-1])])
-                here = jax.tree.map(lambda leaf, padded=padded: leaf[padded], place)
+                here = jax.tree.map(lambda leaf, padded=padded: leaf[padded], state)
                 out = self.once(_single_pass, here, padded, self.blunted and number == 0)
                 here, out = jax.tree.map(lambda leaf, part=part: leaf[: len(part)], (here, out))
                 after, fine = self.advanced(here, part, out, number)
-                jax.tree.map(partial(_put, part), place, after)
+                jax.tree.map(partial(_put, part), state, after)
                 kept, out = part[fine], jax.tree.map(lambda leaf, fine=fine: leaf[fine], out)
                 result = jax.tree.map(partial(_room, self.count), out) if result is None else result
                 jax.tree.map(partial(_put, kept), result, out)
-            if not place.active.any():
+            if not state.active.any():
                 break
         assert result is not None
-        return self.fit(place, result.there, result.cost, result.steps, result.converged, result.finite)
+        return self.fit(state, result.there, result.cost, result.steps, result.converged, result.finite)
 
     def traced(self, excess: Array) -> Fit:
         """Alternate until nothing moves, all units side by side, in a loop that JAX traces."""
-        lanes, begun = np.arange(self.count), self.start(excess)
+        lanes, first_state = np.arange(self.count), self.start(excess)
 
-        def at(x: tuple[Array, Array, Array]) -> _Place:
+        def at(x: tuple[Array, Array, Array]) -> _State:
             free, numbers, own = x
             changed = self.reference.at[:, self.index].set(free)
             return eqx.tree_at(
-                lambda p: (p.reference, p.numbers, p.excess, p.used), begun, (changed, numbers, own, own)
+                lambda p: (p.reference, p.numbers, p.excess, p.used), first_state, (changed, numbers, own, own)
             )
 
         def left(x):
@@ -706,24 +705,24 @@ class _Passes:
             return step[:, : self.base], numbers, way
 
         def passes(_, x):
-            def step(state):
-                place, number, ended = state
-                out = self.once(_single_pass, place, lanes, (number == 0) & self.blunted)
-                after, fine = self.advanced(place, lanes, out, number)
-                after = jax.tree.map(partial(_where, jnp, place.active), after, place)
-                after = eqx.tree_at(lambda p: p.active, after, place.active & after.active)
+            def step(loop):
+                state, number, ended = loop
+                out = self.once(_single_pass, state, lanes, (number == 0) & self.blunted)
+                after, fine = self.advanced(state, lanes, out, number)
+                after = jax.tree.map(partial(_where, jnp, state.active), after, state)
+                after = eqx.tree_at(lambda p: p.active, after, state.active & after.active)
                 ended = jax.tree.map(
-                    partial(_where, jnp, place.active & fine), (out.steps, out.converged, out.finite), ended
+                    partial(_where, jnp, state.active & fine), (out.steps, out.converged, out.finite), ended
                 )
                 return after, number + 1, ended
 
-            def on(state):
-                return state[0].active.any() & (state[1] < self.max_passes)
+            def on(loop):
+                return loop[0].active.any() & (loop[1] < self.max_passes)
 
             none = jnp.zeros(self.count, int), jnp.zeros(self.count, bool), jnp.ones(self.count, bool)
-            place, _, ended = jax.lax.while_loop(on, step, (at(x), 0, none))
-            about = jax.tree.map(lambda leaf: leaf.astype(float), (*ended, place.settled))  # as derivatives need them
-            return (place.reference[:, self.index], place.numbers, place.used), about
+            state, _, ended = jax.lax.while_loop(on, step, (at(x), 0, none))
+            about = jax.tree.map(lambda leaf: leaf.astype(float), (*ended, state.settled))  # as derivatives need them
+            return (state.reference[:, self.index], state.numbers, state.used), about
 
         def undo(linear, target):
             flat, restore = ravel_pytree(target)
@@ -733,19 +732,19 @@ class _Passes:
         first = self.reference[:, self.index], self.numbers, excess
         x, about = jax.lax.custom_root(left, first, passes, undo, has_aux=True)
         steps, (converged, finite, settled) = about[0].astype(int), (leaf > 0 for leaf in about[1:])
-        place = eqx.tree_at(lambda p: p.settled, at(x), settled)
-        there = self.once(_no_step, place, lanes)
+        state = eqx.tree_at(lambda p: p.settled, at(x), settled)
+        there = self.once(_no_step, state, lanes)
         cost = 0.5 * jnp.sum(there.residual**2, axis=-1)
-        return self.fit(place, there, cost, steps, converged, finite)
+        return self.fit(state, there, cost, steps, converged, finite)
 
-    def fit(self, place: _Place, there: _Evaluated, cost: Array, steps: Array, converged: Array, finite: Array) -> Fit:
+    def fit(self, state: _State, there: _Evaluated, cost: Array, steps: Array, converged: Array, finite: Array) -> Fit:
         """Return the fit of units whose passes have ended."""
         size, keep = self.sizes, len(self.names)
         covariance = there.covariance[:, :keep, :keep] * size[:, None] * size
         return Fit(
-            self.model(place, np.arange(self.count)), self.names, self.numerics.tile(size, (self.count, 1)),
-            self.values(place.reference, place.numbers), covariance, there.magnitude[:, :keep] * size, there.residual,
-            there.jacobian[..., :keep], place.used, cost, steps, converged & place.settled, finite,
+            self.model(state, np.arange(self.count)), self.names, self.numerics.tile(size, (self.count, 1)),
+            self.values(state.reference, state.numbers), covariance, there.magnitude[:, :keep] * size, there.residual,
+            there.jacobian[..., :keep], state.used, cost, steps, converged & state.settled, finite,
         )  # pyright: ignore[reportCallIssue] # fmt: skip
 
 

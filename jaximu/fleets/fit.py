@@ -272,12 +272,12 @@ def _fit_by_recipe(unit: FleetUnit) -> Fitted:
     """Fit one unit by `fit_hand_held`, which integrates every sample in every step and knows of slow noise."""
     fit = fit_hand_held(unit.nominal, unit.observations, "joint" if unit.gyroscope else "accelerometer")
     kinds = ("gravity_norm", "gravity_direction", "static_gyroscope")
-    rms = residual_rms(fit.model, unit.observations, unit.gyroscope)
+    rms = residual_rms(fit.imu, unit.observations, unit.gyroscope)
     jacobian = np.asarray(fit.jacobian)
     return Fitted(
         unit.nominal,
         unit.gyroscope,
-        np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fit.model)]),
+        np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(fit.imu)]),
         fit.names,
         np.asarray(fit.covariance),
         np.asarray(fit.magnitude_sensitivity),

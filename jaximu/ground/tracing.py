@@ -1,5 +1,6 @@
 """One text for arrays on the host and for arrays that are being traced."""
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,8 @@ __all__ = ["array_module", "is_traced"]
 
 def is_traced(*trees: Any) -> bool:
     """Return whether JAX is tracing any array of these."""
+    if "jax" not in sys.modules:
+        return False
     import jax
     from jax.core import Tracer
 

@@ -20,6 +20,7 @@ from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.quantities import unit_text
 from jaximu.ground.reexport import later
 from jaximu.ground.summary import Block, Described, Summary, data_frame, sentence
+from jaximu.ground.tracing import is_traced
 from jaximu.ground.units import PREFIXES, SENSORS
 from jaximu.recordings.alignment import Turning, turning, turns_backwards
 
@@ -54,6 +55,11 @@ class Signal:
     clock_sigma: float = 0.0
 
     def __post_init__(self) -> None:
+        if is_traced(self.time, self.values):
+            raise InputError(
+                "a recording cannot be traced: what is read, cut into poses and searched for mistakes is on the host. "
+                "Observe it there (jaximu.observe), and trace what follows (jaximu.fit)."
+            )
         # column by column: sums over the samples, the bulk of all work on a recording, are three times quicker
         values = np.asarray(self.values, np.float64, order="F")
         values = values[:, None] if values.ndim == 1 else values

@@ -44,13 +44,13 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
     used = turns if calibration.imu.gyroscope is not None else np.zeros_like(turns)
     force_before, angle_before = forces_and_angles(nominal, observations)
-    force, angle_after = forces_and_angles(fit.model, observations)
+    force, angle_after = forces_and_angles(fit.imu, observations)
     length = np.linalg.norm(force, axis=1)
     directions = force / length[:, None]
     gravity, excess = float(observations.gravity), np.asarray(fit.excess)
 
     # noise of each mean in m/s²: along gravity it reaches the norm, across gravity the direction
-    inverse = np.linalg.inv(np.asarray(fit.model.accelerometer.gain))
+    inverse = np.linalg.inv(np.asarray(fit.imu.accelerometer.gain))
     covariance = inverse @ np.asarray(observations.poses.accelerometer_covariance) @ inverse.T
     extended = covariance + excess[0] * covariance[poses].mean(axis=0)
 
@@ -62,9 +62,9 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
         return tilt[1:] + tilt[:-1]
 
     noise, total = tilts(covariance), tilts(extended)
-    if used.any() and fit.model.gyroscope is not None:
+    if used.any() and fit.imu.gyroscope is not None:
         # rotating the rate's white noise along the turn keeps its mean over the three axes
-        inverse = np.linalg.inv(np.asarray(fit.model.gyroscope.gain))
+        inverse = np.linalg.inv(np.asarray(fit.imu.gyroscope.gain))
         density = float(np.trace(inverse @ np.asarray(observations.turns.noise) @ inverse.T)) / 3
         turned = density * np.asarray(observations.turns.interval).sum(axis=1)
         noise, total = noise + turned, total + turned + excess[1] * turned[used].mean()

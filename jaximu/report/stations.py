@@ -76,7 +76,7 @@ def _figure(calibration: Calibration) -> Figure:
     """Draw each station's errors after calibration, by axis, with the standard deviation of its mean."""
     fit, stations = calibration.fit, calibration.stations
     assert fit is not None and stations is not None
-    panels = [panel for panel in station_errors(fit.model, stations, np.asarray(fit.excess)) if len(panel.place)]
+    panels = [panel for panel in station_errors(fit.imu, stations, np.asarray(fit.excess)) if len(panel.place)]
     figure = new_figure(2.3 * len(panels))
     grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
     for axes, panel in zip(grid, panels, strict=True):

@@ -1,0 +1,156 @@
+"""A fit under `jax.jit`, `jax.vmap` and `jax.grad`: the host's numbers, and derivatives that differences confirm."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from synthetic import GRAVITY, recording, simulated
+
+import jaximu
+from jaximu.data.poses import PosesAndTurns
+from jaximu.estimation.problem import Name, without_equipment
+from jaximu.recordings.segmentation import segment
+
+NOMINAL = jax.tree.map(np.asarray, jaximu.Imu.nominal())
+EXCESS = np.array([0.5, 0.5, 0.5])
+
+
+def data_of(seed: int, poses: int = 12) -> PosesAndTurns:
+    """Return the data of a simulated unit."""
+    return PosesAndTurns.of(jax.tree.map(np.asarray, simulated(seed, poses=poses).observations))
+
+
+def off(fit, other) -> float:
+    """Return the largest difference of two fits' numbers, in standard deviations."""
+    return float(np.max(np.abs((np.asarray(fit.values) - other.values) / other.sigmas())))
+
+
+@pytest.fixture(scope="module")
+def data() -> list[PosesAndTurns]:
+    """Data of three units, the last with fewer poses."""
+    return [data_of(30), data_of(31), data_of(32, poses=10)]
+
+
+@pytest.fixture(scope="module")
+def hosts(data):
+    """Return the same fitted on the host."""
+    return [jaximu.fit(NOMINAL, each) for each in data]
+
+
+@pytest.fixture(scope="module")
+def batched():
+    """Return a compiled fit of many units side by side."""
+    return jax.jit(jax.vmap(lambda data: jaximu.fit(NOMINAL, data)))
+
+
+def test_a_fit_can_be_compiled_with_what_it_starts_from(data, hosts):
+    fit = jax.jit(jaximu.fit)(NOMINAL, data[0])
+    assert off(fit, hosts[0]) < 1e-9
+    np.testing.assert_allclose(fit.excess, hosts[0].excess, rtol=1e-9, atol=1e-12)
+    assert float(np.max(np.abs(fit.covariance / hosts[0].covariance - 1))) < 1e-2  # taken anew where the fit ended
+    assert fit.converged
+    assert fit.finite
+    assert fit.imu.accelerometer.gain.shape == (3, 3)
+
+
+def test_units_side_by_side_are_what_each_is_alone(data, hosts, batched):
+    """One that is not finite, and one of three poses, leave the others as they are."""
+    spoilt = eqx.tree_at(lambda d: d.poses.accelerometer_mean, data[1], np.full((12, 3), np.nan))
+    few = data_of(33, poses=3)
+    fits = batched(jaximu.stack([*data, spoilt, few]))
+    assert max(off(jax.tree.map(lambda leaf, k=k: leaf[k], fits), hosts[k]) for k in range(3)) < 1e-9
+    assert fits.converged.tolist()[:3] == [True, True, True]
+    assert fits.finite.tolist() == [True, True, True, False, True]
+    assert not fits.converged[3]
+    assert np.all(np.isfinite(fits.values[4]))
+    assert fits.sigmas()[4].max() > 100 * fits.sigmas()[0].max()  # three poses tell little, and it says so
+
+
+def test_a_leading_axis_on_the_host_is_the_same(data, hosts):
+    three = jax.tree.map(lambda leaf: np.stack([leaf] * 3), NOMINAL)
+    fits = jaximu.fit(three, jaximu.stack(data))
+    assert max(off(jax.tree.map(lambda leaf, k=k: leaf[k], fits), hosts[k]) for k in range(3)) < 1e-9
+
+
+def test_derivatives_of_a_fit_are_right(data):
+    """By gravity, a pose's force and one sample of the gyroscope; reverse as forward."""
+
+    def values(change):
+        gravity, force, sample = change
+        fields = (
+            data[0].gravity + gravity,
+            jnp.asarray(data[0].poses.accelerometer_mean).at[3, 1].add(force),
+            jnp.asarray(data[0].turns.output).at[4, 20, 2].add(sample),
+        )
+        moved = eqx.tree_at(lambda d: (d.gravity, d.poses.accelerometer_mean, d.turns.output), data[0], fields)
+        return jaximu.fit(NOMINAL, moved, excess=EXCESS, estimate_excess=False).values
+
+    none, compiled = jnp.zeros(3), jax.jit(values)
+    forward = jax.jit(jax.jacfwd(values))(none)
+    for place, most in enumerate((1e-8, 1e-4, 1e-3)):
+        step = none.at[place].set(1e-4)
+        slope = (compiled(step) - compiled(-step)) / 2e-4
+        assert float(np.max(np.abs(forward[:, place] - slope)) / np.max(np.abs(slope))) < most
+    weights = np.random.default_rng(0).normal(size=len(forward))
+    reverse = jax.jit(jax.grad(lambda change: weights @ values(change)))(none)
+    np.testing.assert_allclose(reverse, weights @ forward, rtol=1e-12)
+
+
+def test_a_prior_can_be_differentiated(data, hosts):
+    """As the closed form of two normal laws has it, for a prior that moves nothing else."""
+    name, place = hosts[0].names[0], 0
+    width = float(hosts[0].sigmas()[place])
+
+    def value(mean):
+        prior = jaximu.Prior((name,), mean[None], jnp.eye(1) / width)
+        return jaximu.fit(NOMINAL, data[0], prior=prior, excess=EXCESS, estimate_excess=False).values[place]
+
+    at = float(hosts[0].values[place])
+    slope = jax.jit(jax.grad(value))(at)
+    compiled = jax.jit(value)
+    assert slope == pytest.approx(float(compiled(at + width) - compiled(at - width)) / (2 * width), rel=1e-4)
+    assert 0.2 < slope < 0.9  # as much as it weighs beside the data
+
+
+def test_what_a_user_writes_of_logs():
+    """Observed, stacked and fitted, from recordings of different length and with no gyroscope."""
+    logs = [recording(seed, poses=poses)[0] for seed, poses in ((1, 12), (2, 14))]
+    data = [jaximu.observe(log, GRAVITY) for log in logs]
+    assert float(data[0].gravity) == GRAVITY
+    many = jaximu.stack(data)
+    assert many.turns.output.shape[0] == 2
+    fit = jaximu.fit(NOMINAL, data[0])
+    calibration = jaximu.calibrate(logs[0], GRAVITY)
+    assert off(fit, calibration.fit) < 1e-6
+    alone = jaximu.observe(jaximu.Recording(logs[0].accelerometer), GRAVITY)
+    found = jaximu.fit(NOMINAL, alone)
+    assert {name.owner for name in found.names} == {"accelerometer"}
+    with pytest.raises(jaximu.InputError, match="stack those alike"):
+        jaximu.stack([data[0], alone])
+    with pytest.raises(jaximu.InputError, match="nothing to stack"):
+        jaximu.stack([])
+    with pytest.raises(jaximu.InputError, match="has no gyroscope and others have"):
+        jaximu.observe([logs[0], jaximu.Recording(logs[0].accelerometer)], GRAVITY)
+
+
+def test_free_numbers_can_be_chosen_under_a_trace(data):
+    def of_gyroscope(name: Name) -> bool:
+        return without_equipment(name) and name.owner == "gyroscope"
+
+    host = jaximu.fit(NOMINAL, data[0], of_gyroscope)
+    traced = jax.jit(lambda each: jaximu.fit(NOMINAL, each, of_gyroscope))(data[0])
+    assert off(traced, host) < 1e-9
+    np.testing.assert_array_equal(traced.imu.accelerometer.gain, np.eye(3))
+
+
+def test_what_is_host_by_nature_says_so():
+    log = recording(1)[0]
+
+    def observed(values):
+        return segment(replace(log, accelerometer=replace(log.accelerometer, values=values))).intervals
+
+    with pytest.raises(jaximu.InputError, match=r"cannot be traced.*observe"):
+        jax.jit(observed)(log.accelerometer.values)
