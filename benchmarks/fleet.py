@@ -69,7 +69,7 @@ def end_to_end(files: int, workers: int, folder: Path) -> dict[str, float]:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     (folder / "logs").mkdir()
     (folder / "cache").mkdir()
-    stored.use_folder(folder / "cache")
+    stored.cache(folder / "cache")
     for seed in range(8):
         recording, _ = simulate(draw_imu(seed), HandHeld(40, 11.3), consumer_noise(), seed=seed)
         write_recording(recording, folder / "logs" / f"{seed:04d}.parquet")
@@ -93,7 +93,7 @@ def end_to_end(files: int, workers: int, folder: Path) -> dict[str, float]:
     whole = time.perf_counter() - began
     assert statuses == {"ok": files}
     (first, at_first), (last, at_last) = seen[1], seen[-1]
-    stored.use_folder(None)
+    stored.cache(None)
     processor = (spent() - at_start - for_few) / (files - len(few))
     return {"rows": rows, "files": files, "workers": workers, "whole": files / whole, "processor": processor,
             "steady": (at_last - at_first) / max(last - first, 1e-9)}  # fmt: skip

@@ -59,7 +59,7 @@ def trial(task):
     """Hide, diagnose: what was said. No name: nothing is hidden. size: norm of the effect's coefficients."""
     seed, name, size, cache = task
     begun = time.process_time()
-    stored.use_folder(Path(cache))
+    stored.cache(Path(cache))
     hidden, row = (), {"seed": seed, "hidden": name}
     if name:
         effect = hidden_effects.draw_effect(seed, name, hidden_effects.Protocol(seed, temperature=True))

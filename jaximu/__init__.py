@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from jaximu.estimation.solver import solve
     from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
     from jaximu.ground.gravity import LocalGravity, parse_gravity, wgs84_gravity
+    from jaximu.ground.stored import cache
     from jaximu.model.effects import CATALOGUE, Effect
     from jaximu.model.sensor import Imu, Triad
     from jaximu.model.stimulus import Stimulus
@@ -57,6 +58,7 @@ __all__ = [
     "Stimulus",
     "Triad",
     "__version__",
+    "cache",
     "calibrate",
     "check",
     "compensate",

@@ -30,7 +30,7 @@ def pytest_collection_finish():
     gc.freeze()
     folder = Path(os.environ["XDG_CACHE_HOME"]) / "jaximu"
     folder.mkdir(mode=0o700, exist_ok=True)
-    stored.use_folder(folder)
+    stored.cache(folder)
 
 
 @pytest.fixture(scope="session")

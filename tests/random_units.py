@@ -1388,7 +1388,7 @@ def prepare_process() -> None:
     jax.config.update("jax_enable_x64", True)
     folder = Path(os.environ["XDG_CACHE_HOME"]) / "jaximu"
     folder.mkdir(mode=0o700, exist_ok=True)
-    stored.use_folder(folder)
+    stored.cache(folder)
 
 
 def main() -> None:

@@ -20,9 +20,9 @@ from jaximu.model.sensor import Triad
 def folder(tmp_path):
     """A folder of its own for what is compiled here."""
     before = stored.folder()
-    stored.use_folder(tmp_path)
+    stored.cache(tmp_path)
     yield tmp_path
-    stored.use_folder(before)
+    stored.cache(before)
 
 
 def factor(matrix, beside):
@@ -165,10 +165,10 @@ def test_jax_own_cache_has_no_part_in_it(folder):
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(folder))
     try:
-        stored.use_folder(None)
+        stored.cache(None)
         right = result()
         assert list(folder.glob("*-cache"))  # JAX's own has it now
-        stored.use_folder(folder)
+        stored.cache(folder)
         assert result() == right
         written = times(folder, "program")
         assert [result(), result()] == [right] * 2 and times(folder, "program") == written

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaximu.estimation.problem import Problem
 from jaximu.ground.array_types import Array
+from jaximu.ground.precision import require_float64
 
 __all__ = ["MAX_STEPS", "Failure", "Solution", "solve"]
 
@@ -102,10 +103,14 @@ def solve(
     start: Float[Array, " p"],
     limit: int | Int[Array, ""] = MAX_STEPS,
     tolerance: float = 1e-9,
+    solver: Any = None,
 ) -> Solution:
     """Solve one problem from z = `start`; traceable, so that callers jit and vmap it.
 
-    **Arguments:** `problem`: a `Problem`, or another module with its `objective`.
+    **Arguments:** `problem`: a `Problem`, or another module with its `objective`. `solver`: an optimistix least-squares
+    solver in place of ours.
+
+    Raises `InputError` unless JAX computes in double precision.
 
     `limit` is the number of steps allowed, at most `MAX_STEPS`. Parameters are of order one in `z` and residuals
     whitened, so one absolute tolerance (a billionth of a typical size) suits all.
@@ -116,11 +121,12 @@ def solve(
 
     from jaximu.estimation.levenberg_marquardt import LevenbergMarquardt
 
+    require_float64()
     # Cholesky of the normal equations: the tolerance rows keep them well conditioned, and QR costs four times as much.
-    solver = LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()))  # pyright: ignore[reportCallIssue]
+    usual = LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()))  # pyright: ignore[reportCallIssue]
     found = optx.least_squares(
         _objective,
-        solver,
+        usual if solver is None else solver,
         start,
         args=problem,
         options={"limit": jnp.asarray(limit)},

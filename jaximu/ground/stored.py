@@ -8,6 +8,7 @@ contents: it would run what a flipped bit made of a program. Off unless a folder
 importing the library neither reads nor writes files.
 """
 
+import functools
 import hashlib
 import os
 import pickle
@@ -15,7 +16,7 @@ import sys
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache, wraps
+from functools import wraps
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -23,7 +24,7 @@ from typing import Any, TypeVar, cast
 from jaximu.ground.errors import InputError
 from jaximu.ground.tracing import is_traced
 
-__all__ = ["call", "compiled", "folder", "forget", "prepare_process", "use_folder"]
+__all__ = ["cache", "call", "compiled", "folder", "forget", "prepare_process"]
 
 _folder: Path | None = None
 _at_first: Callable[[], None] | None = None
@@ -33,18 +34,21 @@ F = TypeVar("F", bound=Callable)
 Result = TypeVar("Result")
 
 
-def use_folder(folder: Path | None, at_first: Callable[[], None] | None = None) -> None:
-    """Keep traced functions in a folder that only the user can write to (what lies there is run); None stops it.
+def cache(folder: str | os.PathLike[str] | None, at_first: Callable[[], None] | None = None) -> None:
+    """Keep compiled programs in a folder, so that the next process need not compile them; None stops it.
 
-    `at_first` is called once, before a function is traced where the folder holds none of this version.
+    Of a folder that only you can write to: what lies there is run. `at_first` is called once, before a function is
+    traced where the folder holds none of this version.
     """
     global _folder, _at_first
-    _folder, _at_first = folder, at_first
+    if folder is not None:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    _folder, _at_first = None if folder is None else Path(folder), at_first
 
 
 def prepare_process(folder: Path | None, at_first: Callable[[], None] | None = None) -> None:
-    """Make a process of one's own ready to compute: double precision, compiled code kept in a folder (`use_folder`)."""
-    use_folder(folder, at_first)
+    """Make a process of one's own ready to compute: double precision, compiled code kept in a folder (`cache`)."""
+    cache(folder, at_first)
     if "jax" in sys.modules:
         sys.modules["jax"].config.update("jax_enable_x64", True)
     else:  # which takes half a second to load, and may not be needed
@@ -61,7 +65,7 @@ def forget() -> None:
     _loaded.clear()
 
 
-@cache
+@functools.cache
 def _code() -> str:
     """A digest of the library's source and of what it is compiled with and for: any change makes a new entry."""
     digest = hashlib.sha256(repr(_machine()).encode())
@@ -70,7 +74,7 @@ def _code() -> str:
     return digest.hexdigest()
 
 
-@cache
+@functools.cache
 def _machine() -> tuple:
     """What compiles, and for what."""
     import jax
@@ -92,7 +96,7 @@ _QUICK: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False, "xl
 large."""
 
 
-@cache
+@functools.cache
 def _options(quick: bool) -> dict[str, bool | int | str]:
     """The compile options that this XLA knows; it refuses a program over one that it does not know."""
     import jax
@@ -237,7 +241,7 @@ def _load(path: Path, count: int) -> Callable:
     return deserialize_and_load(program, *structures, execution_devices=jax.local_devices()[:1])
 
 
-@cache
+@functools.cache
 def _prepare_linear_algebra() -> None:
     """Have JAX find the functions of LAPACK, which it does where a program that needs one is lowered."""
     import jax

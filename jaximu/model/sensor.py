@@ -40,8 +40,8 @@ class Triad(eqx.Module):
     and `time_reference` (s) are where gain and bias hold.
     """
 
-    gain: Float[Array, "3 3"]
-    bias: Float[Array, 3]
+    gain: Float[Array, "... 3 3"]
+    bias: Float[Array, "... 3"]
     effects: tuple[Effect, ...] = ()
     quantity: str = eqx.field(static=True, default="specific_force")
     output_unit: str = eqx.field(static=True, default="m/s^2")

@@ -56,7 +56,7 @@ class Effect(eqx.Module):
     alike for outputs in SI and in counts; those of an input effect are in SI.
     """
 
-    coefficients: Float[Array, " q"]
+    coefficients: Float[Array, "... q"]
 
     name: ClassVar[str]  # catalogue name, "accel.…", "gyro.…", "mag.…" or "setup.…"
     owner: ClassVar[str]  # "accelerometer", "gyroscope", "magnetometer" or "setup", as the name says
@@ -151,7 +151,7 @@ class Effect(eqx.Module):
             "scope": self.scope,
         }
 
-    def typical_sizes(self, scale: float) -> Effect:
+    def typical_sizes(self, scale: float | Float[Array, "..."]) -> Effect:
         """Return plausible deviations of every number of this effect, for a triad of so many output units per SI."""
         size = self.typical * (scale if self.unit.startswith("output") else 1.0)
         like = {name: np.float64(each.typical) for name, each in self.inner.items()}

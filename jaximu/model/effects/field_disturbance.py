@@ -20,8 +20,8 @@ class SetupFieldDisturbance(SetupEffect):
     and duration are zero nearly everywhere.
     """
 
-    onset: Float[Array, ""] | float
-    duration: Float[Array, ""] | float
+    onset: Float[Array, "..."] | float
+    duration: Float[Array, "..."] | float
 
     name = "setup.field_disturbance"
     formula = "h = h_said + Rᵀ c for t0 ≤ t < t0 + d"

@@ -106,8 +106,8 @@ class Learned(Effect):
 
 
 class _Between(Learned):
-    low: Float[Array, ""] | float
-    high: Float[Array, ""] | float
+    low: Float[Array, "..."] | float
+    high: Float[Array, "..."] | float
 
     size = 3 * (SPLINES - 1)
 
@@ -120,7 +120,7 @@ class _Between(Learned):
 
 
 class _Around(Learned):
-    reach: Float[Array, ""] | float
+    reach: Float[Array, "..."] | float
 
     def interval(self):
         return -self.reach, self.reach

@@ -33,9 +33,9 @@ class _LearnedNetwork(Effect):
     largest one; beyond these the function stays as it is at their bounds.
     """
 
-    low: Float[Array, ""] | float
-    high: Float[Array, ""] | float
-    reach: Float[Array, ""] | float
+    low: Float[Array, "..."] | float
+    high: Float[Array, "..."] | float
+    reach: Float[Array, "..."] | float
 
     cause = False
     formula = "Σ_k v_ik tanh(a_ik x + b_ik r + c_ik), less that at T_ref and dT/dt = 0"

@@ -17,7 +17,7 @@ class _ScaleStep(Effect):
     The derivative by the onset is zero nearly everywhere: a fit searches it on a grid.
     """
 
-    onset: Float[Array, ""] | float
+    onset: Float[Array, "..."] | float
 
     formula = "c_i {u}_i for t ≥ t0, else 0"
     unit = "output/({SI})"

@@ -17,7 +17,7 @@ class _Step(Effect):
     The derivative by the onset is zero nearly everywhere: a fit searches it on a grid.
     """
 
-    onset: Float[Array, ""] | float
+    onset: Float[Array, "..."] | float
 
     common_name = "bias step"
     formula = "c_i for t ≥ t0, else 0"

@@ -19,7 +19,7 @@ class _ThermalHysteresis(Effect):
     middle. As w → 0 this is a bias in proportion to temperature.
     """
 
-    half_width: Float[Array, ""] | float
+    half_width: Float[Array, "..."] | float
 
     formula = "c_i p, p the play of half-width w on T − T_ref"
     unit = "output/K"

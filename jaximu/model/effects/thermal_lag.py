@@ -19,7 +19,7 @@ class _ThermalLag(Effect):
     As τ → 0 this is a bias in proportion to temperature; for ramps it is that and one in proportion to −τ Ṫ.
     """
 
-    time_constant: Float[Array, ""] | float
+    time_constant: Float[Array, "..."] | float
 
     formula = "c_i T_lag, τ Ṫ_lag = (T − T_ref) − T_lag"
     unit = "output/K"

@@ -14,7 +14,7 @@ __all__ = ["EFFECTS", "AccelWarmUp", "GyroWarmUp"]
 class _WarmUp(Effect):
     """A bias that dies away with a time constant, from c at the reference time, which is power-on."""
 
-    time_constant: Float[Array, ""] | float
+    time_constant: Float[Array, "..."] | float
 
     common_name = "warm-up"
     formula = "c_i e^(−t/τ)"
