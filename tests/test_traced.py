@@ -6,11 +6,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from synthetic import GRAVITY, recording, simulated
 
 import jaximu
 from jaximu.data.poses import PosesAndTurns
+from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.recordings.segmentation import segment
 
@@ -144,6 +146,32 @@ def test_free_numbers_can_be_chosen_under_a_trace(data):
     traced = jax.jit(lambda each: jaximu.fit(NOMINAL, each, of_gyroscope))(data[0])
     assert off(traced, host) < 1e-9
     np.testing.assert_array_equal(traced.imu.accelerometer.gain, np.eye(3))
+
+
+def test_effects_need_samples(data):
+    unit = NOMINAL.with_effects(jaximu.CATALOGUE["accel.asymmetry"].dormant())
+    with pytest.raises(jaximu.InputError, match=r"accel.asymmetry cannot be fitted.*jaximu.calibrate"):
+        jaximu.fit(unit, data[0])
+
+
+def test_another_solver_finds_the_same(data):
+    """Of a problem of one's own; single precision is refused where computing begins."""
+    parameters = jaximu.Parameters.select(NOMINAL, lambda name: name.owner == "gyroscope" and name.part == "bias")
+    weights = np.full((12, 3, 3), np.eye(3) * 1e4)
+    problem = jaximu.Problem(
+        NOMINAL, parameters, data[0], lambda imu, seen: static_gyroscope(imu, seen, weights), tolerance=1e3
+    )
+    ours = jaximu.solve(problem, jnp.zeros(3))
+    solver = optx.GaussNewton(rtol=1e-9, atol=1e-9)
+    other = jaximu.solve(problem, jnp.zeros(3), solver=solver)
+    assert other.converged
+    np.testing.assert_allclose(other.z, ours.z, rtol=0, atol=1e-9)
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(jaximu.InputError, match="double precision"):
+            jaximu.solve(problem, jnp.zeros(3))
+    finally:
+        jax.config.update("jax_enable_x64", True)
 
 
 def test_what_is_host_by_nature_says_so():

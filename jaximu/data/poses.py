@@ -243,7 +243,13 @@ class PosesAndTurns(Observations, Data):
         return pose_rows(imu, self)
 
     def about(self, imu: Imu) -> About:
-        """Return the conditions about units without effects."""
+        """Return the conditions about units without effects; raise `InputError` for a unit that has some."""
+        if effects := imu.all_effects():
+            names = ", ".join(effect.name for effect in effects.values())
+            raise InputError(
+                f"{names} cannot be fitted to poses and turns alone, which hold no samples along which effects act: "
+                "name them as effects of jaximu.calibrate."
+            )
         data = self._by_unit()
         found = condensed(imu, data, self.conditions, self.method, data.accelerometer_excess)
         none = np.zeros((*found.covariance.used.shape, 0))

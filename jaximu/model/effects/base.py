@@ -151,7 +151,7 @@ class Effect(eqx.Module):
             "scope": self.scope,
         }
 
-    def typical_sizes(self, scale: float | Float[Array, "..."]) -> Effect:
+    def typical_sizes(self, scale: float | Array) -> Effect:
         """Return plausible deviations of every number of this effect, for a triad of so many output units per SI."""
         size = self.typical * (scale if self.unit.startswith("output") else 1.0)
         like = {name: np.float64(each.typical) for name, each in self.inner.items()}
