@@ -778,6 +778,8 @@ def check(draw: Draw) -> None:
     if draw.chance("changed", 0.3):
         unit.document["seed"] += 1
         draw.plain = False
+    if "gyroscope" in unit.without:  # of which a check says that it needs one
+        draw.plain = False
     new = unit.another("new", 1)
     line = ["check", str(calibration), str(new), *unit.options]
     if draw.chance("static", 0.3):

@@ -20,7 +20,7 @@ __all__ = ["saturation"]
 _LIMITS = 1.01, 1.03, 1.08, 1.2, 1.4
 """Limits that are tried, over the greatest rate of all turns."""
 _COARSE = 500.0
-"""Excess variance of turns, over their noise, below which nothing saturates."""
+"""Variance of turns, in multiples of their noise, below which nothing saturates."""
 _TIMES, _RIVAL = 10.0, 2.0
 """Times by which that variance must fall with a limit, and be below that with a cube."""
 
@@ -30,8 +30,8 @@ def saturation(found: Calibration) -> list[Finding]:
     gyroscope, observations, nominal = found.imu.gyroscope, found.observations, found.nominal
     assert gyroscope is not None and observations is not None and found.fit is not None
     assert nominal is not None and nominal.gyroscope is not None
-    turns, excess = observations.turns, float(np.asarray(found.fit.excess)[1])
-    if excess < _COARSE:
+    turns, variance = observations.turns, 1.0 + float(np.asarray(found.fit.excess)[1])
+    if variance < _COARSE:
         return []
     # the limit is the output's: the fitted gain is wrong by what it bends
     scale = np.linalg.norm(np.asarray(nominal.gyroscope.gain), axis=1)
@@ -41,12 +41,13 @@ def saturation(found: Calibration) -> list[Finding]:
 
     def scatter(changed) -> float:
         fitted = fit_hand_held(nominal, replace(observations, turns=replace(turns, output=bias + scale * changed)))
-        return float(np.asarray(fitted.excess)[1]) if bool(fitted.converged) and bool(fitted.finite) else np.inf
+        solved = bool(fitted.converged) and bool(fitted.finite)
+        return 1.0 + float(np.asarray(fitted.excess)[1]) if solved else np.inf
 
     limits = greatest * np.array(_LIMITS)
     bent = [scatter(limit * np.arctanh(rate / limit)) for limit in limits]
     best = int(np.argmin(bent))
-    if bent[best] * _TIMES > excess:
+    if bent[best] * _TIMES > variance:
         return []
     cubes = [scatter(rate + rate**3 / (3 * limit**2)) for limit in greatest * np.array([0.6, 0.8, 1.0, 1.3])]
     if bent[best] * _RIVAL > min(cubes):
@@ -54,7 +55,7 @@ def saturation(found: Calibration) -> list[Finding]:
     return [Finding(
         "data.saturation", (),
         f"gyroscope: its output bends towards a limit of about {np.degrees(limits[best]):.3g} °/s: straightened, it "
-        f"carries gravity over the turns {np.sqrt(excess / bent[best]):.2g} times better. Quick turns read too little, "
+        f"carries gravity over the turns {np.sqrt(variance / bent[best]):.2g} times better. Quick turns read too little, "
         "and the gain is wrong. Choose a larger range, or turn more slowly, and record again.",
         rivals=("gyro.cubic",), spoils=True,
     )]  # fmt: skip
