@@ -55,7 +55,7 @@ def saturation(found: Calibration) -> list[Finding]:
     return [Finding(
         "data.saturation", (),
         f"gyroscope: its output bends towards a limit of about {np.degrees(limits[best]):.3g} °/s: straightened, it "
-        f"carries gravity over the turns {np.sqrt(variance / bent[best]):.2g} times better. Quick turns read too little, "
-        "and the gain is wrong. Choose a larger range, or turn more slowly, and record again.",
+        f"carries gravity over the turns {np.sqrt(variance / bent[best]):.2g} times better. Quick turns read too "
+        "little, and the gain is wrong. Choose a larger range, or turn more slowly, and record again.",
         rivals=("gyro.cubic",), spoils=True,
     )]  # fmt: skip
