@@ -30,7 +30,7 @@ def saturation(found: Calibration) -> list[Finding]:
     gyroscope, observations, nominal = found.imu.gyroscope, found.observations, found.nominal
     assert gyroscope is not None and observations is not None and found.fit is not None
     assert nominal is not None and nominal.gyroscope is not None
-    turns, variance = observations.turns, 1.0 + float(np.asarray(found.fit.excess)[1])
+    turns, variance = observations.turns, 1.0 + float(found.fit.excess[1])
     if variance < _COARSE:
         return []
     # the limit is the output's: the fitted gain is wrong by what it bends
@@ -41,8 +41,7 @@ def saturation(found: Calibration) -> list[Finding]:
 
     def scatter(changed) -> float:
         fitted = fit_hand_held(nominal, replace(observations, turns=replace(turns, output=bias + scale * changed)))
-        solved = bool(fitted.converged) and bool(fitted.finite)
-        return 1.0 + float(np.asarray(fitted.excess)[1]) if solved else np.inf
+        return 1.0 + float(fitted.excess[1]) if fitted.converged and fitted.finite else np.inf
 
     limits = greatest * np.array(_LIMITS)
     bent = [scatter(limit * np.arctanh(rate / limit)) for limit in limits]
