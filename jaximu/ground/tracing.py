@@ -3,8 +3,6 @@
 import sys
 from typing import Any
 
-import numpy as np
-
 __all__ = ["array_module", "is_traced"]
 
 
@@ -20,6 +18,7 @@ def is_traced(*trees: Any) -> bool:
 
 def array_module(*trees: Any) -> Any:
     """Return `jax.numpy` where any array of these is being traced, else NumPy: eager JAX compiles every operation."""
-    import jax
+    import jax.numpy
+    import numpy
 
-    return jax.numpy if is_traced(*trees) else np
+    return jax.numpy if is_traced(*trees) else numpy
