@@ -467,7 +467,7 @@ def fit(
     one_of("loss", loss, tuple(LOSSES))
     require_float64()
     measured = (data,) if isinstance(data, Data) else tuple(data)
-    numerics = array_module(imu, measured, prior, excess)
+    numerics = array_module(imu, measured, prior, excess, most)
     single = np.ndim(imu.accelerometer.bias) == 1
     imu = jax.tree.map(
         lambda leaf: numerics.asarray(leaf, float)[None] if single else numerics.asarray(leaf, float), imu
@@ -476,7 +476,17 @@ def fit(
     begin = [size for kind in measured for size in kind.coarse] if excess is None else excess
     blunted = estimate_excess and (is_traced(begin) or bool(np.any(begin)))
     passes = _Passes(
-        imu, measured, free or measured[0].free, prior, loss, estimate_excess, follow, farthest, max_passes, blunted
+        imu,
+        measured,
+        free or measured[0].free,
+        prior,
+        loss,
+        estimate_excess,
+        follow,
+        farthest,
+        max_passes,
+        blunted,
+        numerics,
     )
     begin = numerics.asarray(begin, float)
     begin = numerics.broadcast_to(begin, (len(imu.accelerometer.bias), begin.shape[-1]))
@@ -514,11 +524,11 @@ class _Passes:
 
     def __init__(
         self, imu: Imu, data: tuple[Data, ...], free: Callable[[Name], bool], prior: Prior | None, loss: str,
-        estimated: bool, follow: bool, most: FloatArray | float, max_passes: int, blunted: bool,
+        estimated: bool, follow: bool, most: FloatArray | float, max_passes: int, blunted: bool, numerics: Any,
     ):  # fmt: skip
         self.data, self.loss, self.estimated, self.follow = data, loss, estimated, follow
         self.prior, self.most, self.max_passes, self.blunted = prior, most, max_passes, blunted
-        self.numerics = array_module(imu, data, prior)
+        self.numerics = numerics
         inside = data[0].effects_inside
         self.full = imu
         bare = imu if inside else imu.with_effects()
