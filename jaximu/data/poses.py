@@ -267,7 +267,7 @@ def observe(
     """Return poses and turns of recordings of one unit as data of a fit; chosen on the host, a PyTree of arrays.
 
     **Arguments:** `gravity`: local gravity, m/s². `noise`: fitted to the unit at rest; without it the scatter within
-    the poses tells the noise. A fit starts at the data sheet's values, [`jaximu.recordings.nominal_imu`][].
+    the poses tells the noise. A fit starts at the data sheet's values, [`jaximu.calibration.nominal_imu`][].
 
     Rows that are no measurement are left out. Raises `InputError` where gyroscopes are missing from some recordings,
     and `NotPossibleError` where there are no poses.
