@@ -96,7 +96,7 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
         variance = jnp.diagonal(station_covariance(stations).total(excess)).reshape(-1, 6).T
         return turntable_error(imu, stations), jnp.sqrt(variance)
 
-    error, sigma = stored.call(compute, "station errors", imu, stations, excess)
+    error, sigma = map(np.asarray, stored.call(compute, "station errors", imu, stations, excess))
     scale = [np.linalg.norm(np.asarray(triad.gain), axis=1)[:, None] for triad in imu.triads().values()]
     gyroscope, turn = np.asarray(stations.gyroscope_used), np.asarray(stations.turn)
     degrees = np.degrees(np.asarray(stations.stop) - np.asarray(stations.start))
