@@ -73,6 +73,7 @@ __all__ = [
     "observe",
     "only",
     "pose_rows",
+    "resized",
     "rest_shifts",
     "stack",
 ]
@@ -225,14 +226,7 @@ class PosesAndTurns(Observations, Data):
 
     def widened(self, poses: int, samples: int) -> Self:
         """Return the data of a unit with padding up to so many poses, and samples in a turn."""
-
-        def longer(leaf: Array, *lengths: int) -> Array:
-            missing = [(0, length - have) for length, have in zip(lengths, leaf.shape, strict=False)]
-            missing += [(0, 0)] * (leaf.ndim - len(lengths))
-            # masks and durations of padding are zero; whatever else it holds must be finite
-            zero = leaf.dtype == bool or len(lengths) > 1
-            return array_module(leaf).pad(leaf, missing, mode="constant" if zero else "edge")
-
+        longer = partial(resized, numerics=array_module(self))
         turns = {name: longer(getattr(self.turns, name), poses - 1) for name in ("basis", "mask")}
         turns |= {name: longer(getattr(self.turns, name), poses - 1, samples) for name in ("output", "interval")}
         wider = jax.tree.map(lambda leaf: longer(leaf, poses), self.poses), replace(self.turns, **turns)
@@ -294,6 +288,18 @@ def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
     if len({(jax.tree.structure(unit), *map(np.shape, jax.tree.leaves(unit))) for unit in wide}) > 1:
         raise InputError("these units' data differ in kind (gyroscope, slow noise, its intervals): stack those alike.")
     return jax.tree.map(lambda *leaves: array_module(leaves).stack(leaves), *wide)
+
+
+def resized(leaf: Array, *lengths: int, numerics: Any = np) -> Array:
+    """Return an array of observations with padding cut off or added, to one or two leading lengths."""
+    leaf = leaf[tuple(slice(length) for length in lengths)]
+    if leaf.shape[: len(lengths)] == lengths:
+        return leaf
+    missing = [(0, length - have) for length, have in zip(lengths, leaf.shape, strict=False)]
+    missing += [(0, 0)] * (leaf.ndim - len(lengths))
+    # masks and durations of padding are zero; whatever else it holds must be finite
+    zero = leaf.dtype == bool or len(lengths) > 1
+    return numerics.pad(leaf, missing) if zero else numerics.pad(leaf, missing, mode="edge")
 
 
 def pose_rows(imu: Imu, observations: Observations) -> Rows:

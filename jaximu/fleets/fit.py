@@ -20,6 +20,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaximu.calibration import fit_hand_held, residual_rms
+from jaximu.data.poses import resized
 from jaximu.estimation.problem import Name, Parameters, without_equipment
 from jaximu.fleets.lanes import Lanes, fit_lanes
 from jaximu.ground import stored
@@ -234,23 +235,13 @@ def _arrays(observations: Observations, gyroscope: bool, count: int, samples: in
     """What a fit needs of a unit, with padding cut off or added: P poses, S samples a turn."""
     poses, turns = _get(observations, "poses"), _get(observations, "turns")
     found = [_get(observations, "gravity")]
-    found += [_cut(_get(poses, name), count) for name in ("mask", "accelerometer_mean", "accelerometer_covariance")]
+    found += [resized(_get(poses, name), count) for name in ("mask", "accelerometer_mean", "accelerometer_covariance")]
     if gyroscope:
         steps = count - 1
-        found += [_cut(_get(poses, name), count) for name in ("gyroscope_mean", "gyroscope_covariance")]
-        found += [_get(turns, "noise"), *(_cut(_get(turns, name), steps) for name in ("mask", "basis"))]
-        found += [_cut(_get(turns, name), steps, samples) for name in ("interval", "output")]
+        found += [resized(_get(poses, name), count) for name in ("gyroscope_mean", "gyroscope_covariance")]
+        found += [_get(turns, "noise"), *(resized(_get(turns, name), steps) for name in ("mask", "basis"))]
+        found += [resized(_get(turns, name), steps, samples) for name in ("interval", "output")]
     return found
-
-
-def _cut(leaf: np.ndarray, *lengths: int) -> np.ndarray:
-    leaf = leaf[tuple(slice(length) for length in lengths)]
-    if leaf.shape[: len(lengths)] == lengths:
-        return leaf
-    missing = [(0, length - have) for length, have in zip(lengths, leaf.shape, strict=False)]
-    missing += [(0, 0)] * (leaf.ndim - len(lengths))
-    # masks and durations of padding are zero; whatever else it holds must be finite
-    return np.pad(leaf, missing) if leaf.dtype == bool or len(lengths) > 1 else np.pad(leaf, missing, mode="edge")
 
 
 def _program(gyroscope: bool, block: int, passes, scales, batch) -> Lanes:
