@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from synthetic import GRAVITY, recording, simulated
+from synthetic import GRAVITY, POSES, SAMPLES, recording, simulated
 
 import jaximu
 from jaximu.data.poses import PosesAndTurns
@@ -20,9 +20,12 @@ NOMINAL = jax.tree.map(np.asarray, jaximu.Imu.nominal())
 EXCESS = np.array([0.5, 0.5, 0.5])
 
 
-def data_of(seed: int, poses: int = 12) -> PosesAndTurns:
-    """Return the data of a simulated unit."""
-    return PosesAndTurns.of(jax.tree.map(np.asarray, simulated(seed, poses=poses).observations))
+def data_of(seed: int, poses: int = POSES, samples: int = SAMPLES) -> PosesAndTurns:
+    """Return the data of a simulated unit, without padding."""
+    made = simulated(seed, poses=poses, used_samples=samples, padded=poses).observations
+    data = PosesAndTurns.of(jax.tree.map(np.asarray, made))
+    turns = replace(data.turns, output=data.turns.output[:, :samples], interval=data.turns.interval[:, :samples])
+    return replace(data, turns=turns)
 
 
 def off(fit, other) -> float:
@@ -32,8 +35,8 @@ def off(fit, other) -> float:
 
 @pytest.fixture(scope="module")
 def data() -> list[PosesAndTurns]:
-    """Data of three units, the last with fewer poses."""
-    return [data_of(30), data_of(31), data_of(32, poses=10)]
+    """Data of three units, the last with fewer poses and samples."""
+    return [data_of(30), data_of(31), data_of(32, poses=10, samples=40)]
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +63,7 @@ def test_a_fit_can_be_compiled_with_what_it_starts_from(data, hosts):
 
 def test_units_side_by_side_are_what_each_is_alone(data, hosts, batched):
     """One that is not finite, and one of three poses, leave the others as they are."""
-    spoilt = eqx.tree_at(lambda d: d.poses.accelerometer_mean, data[1], np.full((12, 3), np.nan))
+    spoilt = eqx.tree_at(lambda d: d.poses.accelerometer_mean, data[1], np.full((POSES, 3), np.nan))
     few = data_of(33, poses=3)
     fits = batched(jaximu.stack([*data, spoilt, few]))
     assert max(off(jax.tree.map(lambda leaf, k=k: leaf[k], fits), hosts[k]) for k in range(3)) < 1e-9
@@ -159,7 +162,7 @@ def test_effects_need_samples(data):
 def test_another_solver_finds_the_same(data):
     """Of a problem of one's own; single precision is refused where computing begins."""
     parameters = jaximu.Parameters.select(NOMINAL, lambda name: name.owner == "gyroscope" and name.part == "bias")
-    weights = np.full((12, 3, 3), np.eye(3) * 1e4)
+    weights = np.full((POSES, 3, 3), np.eye(3) * 1e4)
     problem = jaximu.Problem(
         NOMINAL, parameters, data[0], lambda imu, seen: static_gyroscope(imu, seen, weights), tolerance=1e3
     )
