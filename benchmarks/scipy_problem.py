@@ -161,7 +161,7 @@ def scipy_fit(accelerometer, gyroscope):
 @jax.jit
 def two_step_weights(model, observations, excess):
     """What the two-step problems hold fixed: weights of norms, turns and means at rest, and directions of gravity."""
-    total = condition_covariance(model, observations).total(excess)
+    total = condition_covariance(model, observations).dense().total(excess)
     poses, turns = len(observations.poses.mask), len(observations.turns.mask)
 
     def weights(first, count, size):

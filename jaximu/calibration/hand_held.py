@@ -101,7 +101,7 @@ def _two_step_covariance(model: Imu, observations: Observations, excess: np.ndar
 
             def step(rows, columns):
                 """How numbers react to the conditions in a step that looks at some rows only."""
-                part = only(covariance, rows, excess[0])
+                part = only(covariance, rows, excess[0]).dense()
                 weights = inverse_cholesky(part.total(excess)) * part.used
                 jacobian = weights @ slope[:, columns]
                 known = jnp.eye(jacobian.shape[1]) / TOLERANCE**2
@@ -111,7 +111,7 @@ def _two_step_covariance(model: Imu, observations: Observations, excess: np.ndar
             one = step("norm", accelerometer)
             two = step("turning", gyroscope)
             both = jnp.concatenate([one, two + two @ slope[:, accelerometer] @ one])
-            return both @ (covariance.used[:, None] * covariance.used * covariance.total(excess)) @ both.T
+            return both @ (covariance.used[:, None] * covariance.used * covariance.dense().total(excess)) @ both.T
 
         return jax.lax.map(lane, units)
 

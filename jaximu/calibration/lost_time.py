@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.data.poses import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
-from jaximu.estimation.covariance import component_covariance
 from jaximu.estimation.fitting import effect_numbers, linearise
 from jaximu.estimation.problem import without_equipment
 from jaximu.ground.array_types import FloatArray
@@ -202,11 +201,9 @@ class _Recorded:
         assert self.about.reaction is not None and self.about.running is not None
         turns, gyroscope = self.observations.turns, found.imu.gyroscope
         self.turns: Turns = turns
-        covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.about.covariance)
+        covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.about.covariance).dense()
         self.used = used = covariance.used > 0
-        poses, turned, means = (
-            component_covariance(factor, len(used))[np.ix_(used, used)] for factor in covariance.factors
-        )
+        poses, turned, means = (covariance.component(number)[np.ix_(used, used)] for number in range(3))
         excess = np.asarray(found.fit.excess)
         known = covariance.measured[np.ix_(used, used)] + excess[0] * poses + excess[2] * means
         root = np.linalg.cholesky(known + excess[1] * turned)

@@ -15,7 +15,6 @@ from scipy.linalg import cho_solve
 
 from jaximu.data.poses import condensed
 from jaximu.data.poses_covariance import Sensitivities
-from jaximu.estimation.covariance import component_covariance
 from jaximu.estimation.fitting import Fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
@@ -145,11 +144,11 @@ def with_drift(
     unit, measured = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))
     about = condensed(unit, measured, rows)
     assert about.reaction is not None
-    covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)
+    covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance).dense()
     used = covariance.used > 0
     bare = covariance.measured[np.ix_(used, used)]
     present = [k for k in range(len(covariance.factors)) if np.any(covariance.group[used] == k)]
-    excess = [component_covariance(covariance.factors[k], len(used))[np.ix_(used, used)] for k in present]
+    excess = [covariance.component(k)[np.ix_(used, used)] for k in present]
     fitted = bare + np.einsum("k,kij->ij", np.asarray(found.excess)[present], np.stack(excess))
     root = np.linalg.cholesky(fitted)
     noise = _noise_of_scatter(observations, segmentations[0].recording)

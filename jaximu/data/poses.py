@@ -31,7 +31,7 @@ from jaximu.data.poses_covariance import (
 )
 from jaximu.data.track import Track, added, mean_outputs
 from jaximu.data.tracks_by_hand import tracks_by_hand, turn_samples
-from jaximu.estimation.covariance import Covariance, component_covariance
+from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
@@ -159,7 +159,7 @@ class Condensed(NamedTuple):
     """
 
     conditions: HandHeldConditions
-    covariance: Covariance
+    covariance: Covariance | Chain
     force: FloatArray
     angle: FloatArray
     reaction: Sensitivities | None
@@ -495,23 +495,18 @@ def _change(before: dict[str, FloatArray] | None, after: dict[str, FloatArray]) 
     return max(shares)
 
 
-def only(covariance: Covariance, rows: str, excess: Array) -> Covariance:
-    """Return the covariance with rows left out; with "turning" of each turn by itself, the poses' excess given."""
-    if rows == "all":
-        return covariance
-    wanted = covariance.used * ((covariance.group == 0) if rows == "norm" else (covariance.group > 0))
-    measured = covariance.measured
-    poses, turns, means = covariance.factors
+def only(covariance: Covariance | Chain, rows: str, excess: Array) -> Covariance | Chain:
+    """Return the covariance with rows left out; with "turning" of each turn by itself, the poses' excess given.
+
+    Raises `InputError` for "turning" where slow noise ties turns.
+    """
+    if rows == "norm":
+        return covariance.of_rows(covariance.used * (covariance.group == 0))
     if rows == "turning":
-        measured = measured + excess * component_covariance(poses, len(wanted))
-        place = jnp.arange(len(wanted))
-        count = len(poses.rows)
-        turn = jnp.where(covariance.group == 1, (place - count) // 2, -1 - place)
-        together = (turn[:, None] == turn) | ((covariance.group == 2)[:, None] & (covariance.group == 2))
-        measured = jnp.where(together, measured, 0.0)
-        poses = poses.of_rows(jnp.zeros_like(wanted))
-    factors = tuple(each.of_rows(wanted) for each in (poses, turns, means))
-    return Covariance(wanted[:, None] * wanted * measured, factors, wanted, covariance.group)
+        if not isinstance(covariance, Chain):
+            raise InputError("turns that slow noise ties cannot be taken one by one: fit them jointly.")
+        return covariance.turn_by_turn(excess).of_rows(covariance.used * (covariance.group > 0))
+    return covariance
 
 
 def _errors(conditions: HandHeldConditions, imu: Imu) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from jaximu.data.gravity_direction import unit_vectors
 from jaximu.data.gravity_norm import recover_specific_force, recovery_jacobian
 from jaximu.data.preintegration import turned_by_rates
-from jaximu.estimation.covariance import BlockFactor, Covariance, mean_root
+from jaximu.estimation.covariance import BlockFactor, Chain, Covariance, mean_root
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import (
     conjugate,
@@ -141,6 +141,37 @@ def condition_covariance(imu: Imu, observations: Observations, integrated: Integ
         )
     )  # fmt: skip
     group = jnp.repeat(jnp.arange(3), jnp.array([count, 2 * steps, 3 * count]), total_repeat_length=size)
+
+    if slow is None:
+        earlier = jnp.concatenate([jnp.zeros_like(after[:1]), after])
+        before = jnp.concatenate([before, jnp.zeros_like(before[:1])])
+        lever = jnp.concatenate([lever, jnp.zeros_like(lever[:1])])
+        real, real_turn = used[:count], jnp.concatenate([used[count : count + 2 * steps : 2], jnp.zeros(1)])
+        blank = jnp.zeros_like(norm[:, None])
+        own = jnp.concatenate([norm[:, None] * real[:, None, None], before * real_turn[:, None, None]], axis=1)
+        shifted = jnp.concatenate([jnp.zeros(1), real_turn[:-1]])
+        earlier = jnp.concatenate([blank, earlier * shifted[:, None, None]], axis=1)
+        turned = jnp.concatenate([blank, lever * real_turn[:, None, None]], axis=1)
+        noise = jnp.concatenate([integrated.noise, jnp.zeros_like(integrated.noise[:1])])
+        at_pose, at_turn = (
+            mean_root(covariance, mask)
+            for covariance, mask in ((poses.accelerometer_covariance, poses.mask), (integrated.noise, turns.mask))
+        )
+        reached = earlier @ poses.accelerometer_covariance @ earlier.swapaxes(1, 2)
+        diagonal = own @ poses.accelerometer_covariance @ own.swapaxes(1, 2)
+        diagonal += jnp.concatenate([reached[1:], jnp.zeros_like(reached[:1])]) + turned @ noise @ turned.swapaxes(1, 2)
+        rested = jnp.broadcast_to(mean_root(poses.gyroscope_covariance, poses.mask), (count, 3, 3))
+        return Chain(
+            diagonal,
+            own @ poses.accelerometer_covariance @ earlier.swapaxes(1, 2),
+            real[:, None, None] * poses.gyroscope_covariance,
+            own @ at_pose,
+            earlier @ at_pose,
+            turned @ at_turn,
+            real[:, None, None] * rested,
+            used,
+            group,
+        )
 
     def spread(total, blocks, covariance):
         """Add to the covariance (n, n) of all conditions what blocks reach of covariances (B, 3, 3)."""

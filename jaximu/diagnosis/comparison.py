@@ -159,9 +159,11 @@ class Widened(Data):
     def about(self, imu: Imu) -> About:
         """Return the recording about the unit."""
         found, real = self.experiment.about(imu), np.ix_(self.used, self.used)
-        measured = np.array(found.covariance.measured)
-        measured[0][real] = self.widen(measured[0][real])
-        return replace(found, covariance=eqx.tree_at(lambda each: each.measured, found.covariance, measured))
+        covariance = jax.tree.map(lambda leaf: leaf[0], found.covariance).dense()
+        measured = np.array(covariance.measured)
+        measured[real] = self.widen(measured[real])
+        covariance = replace(covariance, measured=measured)
+        return replace(found, covariance=jax.tree.map(lambda leaf: leaf[None], covariance))
 
     def predict(self, imu: Imu) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the conditions (n,) of a unit with its effects, their columns (n, p) and covariance (n, n)."""

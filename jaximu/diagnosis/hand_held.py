@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -56,8 +55,9 @@ class HandHeldExperiment(RecordedByHand, Experiment):
         found = super().about(imu)
         if self.drift is None:
             return found
-        measured = np.asarray(found.covariance.measured) + np.diag(self.drift.by_hand)
-        return replace(found, covariance=eqx.tree_at(lambda each: each.measured, found.covariance, measured))
+        covariance = jax.tree.map(lambda leaf: leaf[0], found.covariance).dense()
+        covariance = replace(covariance, measured=covariance.measured + np.diag(self.drift.by_hand))
+        return replace(found, covariance=jax.tree.map(lambda leaf: leaf[None], covariance))
 
     def drifts(self, noise: NoiseModel, linear: Linear, within: bool) -> tuple[dict[str, AxisNoise], FloatArray]:
         """Return drifts of the biases by name, at a size of one, and the covariance (k, n, n) that each adds."""

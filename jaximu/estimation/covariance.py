@@ -4,6 +4,11 @@ Noise is measured or known from a model, and has an excess: what the model misse
 component of the excess is a variance, in multiples of a mean measured covariance.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,16 +16,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.tracing import array_module
 
 __all__ = [
     "BlockFactor",
+    "Chain",
+    "ChainWeights",
     "Covariance",
+    "Weights",
     "component_covariance",
     "inverse_cholesky",
     "mean_root",
-    "placed",
     "update_excess",
-    "whitened",
 ]
 
 _SMALL = 6
@@ -41,14 +48,14 @@ class BlockFactor(eqx.Module):
         found = jnp.einsum("bmc,bmq->bcq", self.values, matrix[self.rows])
         return found.reshape(-1, matrix.shape[1])
 
+    def times(self, matrix: Float[Array, "_ q"], size: int) -> Float[Array, "n q"]:
+        """Return F, of so many rows, times a matrix."""
+        reached = self.values @ matrix.reshape(len(self.values), self.values.shape[-1], -1)
+        return jnp.zeros((size, matrix.shape[1])).at[self.rows].add(reached)
+
     def component(self, size: int) -> Float[Array, "n n"]:
         """Return F Fᵀ, of so many rows; of NumPy's arrays one of NumPy's."""
-        own, at = self.values @ self.values.swapaxes(1, 2), (self.rows[:, :, None], self.rows[:, None, :])
-        if isinstance(own, np.ndarray):
-            whole = np.zeros((size, size))
-            np.add.at(whole, at, own)
-            return whole  # pyright: ignore[reportReturnType]
-        return jnp.zeros((size, size)).at[at].add(own)
+        return _placed(self.rows, self.rows, _squared(self.values), size)
 
     def of_rows(self, used: Float[Array, " n"]) -> "BlockFactor":
         """Return the factor of the rows that are used alone."""
@@ -56,6 +63,20 @@ class BlockFactor(eqx.Module):
 
 
 Factor = Float[Array, "... n _"] | Float[Array, "... n"] | BlockFactor
+
+
+class Weights(eqx.Module):
+    """A root W of an inverse covariance, W C Wᵀ = I: a matrix, or its diagonal where conditions are independent."""
+
+    root: Float[Array, "n n"] | Float[Array, " n"]
+
+    def whiten(self, rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        """Return W times rows."""
+        return self.root @ rows if self.root.ndim == 2 else (self.root * rows.T).T
+
+    def back(self, rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        """Return Wᵀ times whitened rows."""
+        return self.root.T @ rows if self.root.ndim == 2 else (self.root * rows.T).T
 
 
 class Covariance(eqx.Module):
@@ -71,20 +92,248 @@ class Covariance(eqx.Module):
     used: Float[Array, "... n"]
     group: Int[Array, "... n"]  # the component whose size a row's scatter tells
 
+    @property
+    def components(self) -> int:
+        """How many components there are."""
+        return len(self.factors)
+
+    def dense(self) -> "Covariance":
+        """Return the same with whole matrices."""
+        return self
+
+    def of_rows(self, used: Float[Array, " n"]) -> "Covariance":
+        """Return the covariance with only these rows used; factors by blocks."""
+        factors = tuple(factor.of_rows(used) for factor in self.factors)  # pyright: ignore[reportAttributeAccessIssue]
+        return Covariance(used[:, None] * used * self.measured, factors, used, self.group)
+
+    def component(self, number: int) -> Float[Array, "n n"]:
+        """Return the covariance of a component at a size of one."""
+        return component_covariance(self.factors[number], len(self.used))
+
     def total(self, excess: Float[Array, " k"]) -> Float[Array, "n n"]:
         """Return the covariance at the given excess, with ones on the diagonal of padding rows."""
         total = self.measured + jnp.diag(1 - self.used)
-        for size, factor in zip(excess, self.factors, strict=True):
-            total = total + size * component_covariance(factor, len(self.used))
+        for number, size in enumerate(excess):
+            total = total + size * self.component(number)
         return total
 
-    def weights(self, excess: Float[Array, " k"]) -> Float[Array, "n n"] | Float[Array, " n"]:
-        """Return W with W C Wᵀ = I at the given excess, of independent conditions its diagonal."""
+    def weights(self, excess: Float[Array, " k"]) -> Weights:
+        """Return what whitens the conditions at the given excess."""
         if self.measured.ndim == 2:
-            return inverse_cholesky(self.total(excess))
-        return 1 / jnp.sqrt(
-            self.measured + sum(size * root**2 for size, root in zip(excess, self.factors, strict=True))  # pyright: ignore[reportOperatorIssue]
+            return Weights(inverse_cholesky(self.total(excess)))
+        variance = self.measured + sum(size * root**2 for size, root in zip(excess, self.factors, strict=True))  # pyright: ignore[reportOperatorIssue]
+        return Weights(1 / jnp.sqrt(variance))
+
+    def spread(self, number: int, rows: Float[Array, "n q"]) -> Float[Array, "n q"]:
+        """Return the covariance of a component, at an excess of one, times rows."""
+        factor = self.factors[number]
+        if isinstance(factor, BlockFactor):
+            return factor.times(factor.transposed(rows), len(rows))
+        return (factor**2 * rows.T).T if factor.ndim == 1 else factor @ (factor.T @ rows)
+
+    def traces(self, excess: Float[Array, " k"], weights: Weights) -> tuple[Float[Array, " k"], Float[Array, "k k"]]:
+        """Return tr C⁻¹V_i and tr C⁻¹V_i C⁻¹V_j of the components V_i at the excess that the weights are of."""
+        roots = [factor for factor in self.factors if not isinstance(factor, BlockFactor) and factor.ndim == 1]
+        if weights.root.ndim == 1:
+            squares = jnp.stack(roots) ** 2 * weights.root**2
+            return jnp.sum(squares, axis=1), squares @ squares.T
+        inverse = weights.root.T @ weights.root
+        if len(roots) == len(self.factors):
+            squares = jnp.stack(roots) ** 2
+            return squares @ jnp.diagonal(inverse), squares @ inverse**2 @ squares.T
+
+        def transposed(factor, matrix):
+            """Return Fᵀ times a matrix (n, q)."""
+            return (
+                factor.transposed(matrix)
+                if isinstance(factor, BlockFactor)
+                else (factor.T * matrix.T).T
+                if factor.ndim == 1
+                else factor.T @ matrix
+            )
+
+        beside = [transposed(factor, inverse).T for factor in self.factors]  # C⁻¹ F_i
+        entries = [[transposed(factor, other) for other in beside] for factor in self.factors]
+        first = jnp.stack([jnp.trace(entries[k][k]) for k in range(len(beside))])
+        return first, jnp.stack([jnp.stack([jnp.sum(entry**2) for entry in row]) for row in entries])
+
+
+class ChainWeights(eqx.Module):
+    """Weights of a chain: the inverses of the diagonal blocks of its Cholesky factor, and the blocks below them."""
+
+    inverse: Float[Array, "P 3 3"]
+    below: Float[Array, "P 3 3"]
+    means: Float[Array, "P 3 3"]
+
+    def whiten(self, rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        """Return W times rows."""
+        chain, means = _blocks(rows.reshape(len(rows), -1), len(self.means))
+
+        def step(before, block):
+            inverse, below, right = block
+            white = inverse @ (right - below @ before)
+            return white, white
+
+        white = jax.lax.scan(step, jnp.zeros_like(chain[0]), (self.inverse, self.below, chain))[1]
+        return _rows(white, self.means @ means).reshape(rows.shape)
+
+    def back(self, rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        """Return Wᵀ times whitened rows."""
+        chain, means = _blocks(rows.reshape(len(rows), -1), len(self.means))
+
+        def step(after, block):
+            inverse, below, right = block
+            solved = inverse.T @ (right - after)
+            return below.T @ solved, solved
+
+        solved = jax.lax.scan(step, jnp.zeros_like(chain[0]), (self.inverse, self.below, chain), reverse=True)[1]
+        return _rows(solved, self.means.swapaxes(1, 2) @ means).reshape(rows.shape)
+
+
+class Chain(eqx.Module):
+    """Covariance of conditions along P poses of which neighbours share noise: block tridiagonal, never n × n.
+
+    A block has a pose's norm and the two components of the turn after it, beside it three means at rest that are
+    independent of all others. Components: a pose's noise reaches its own block and the one before it; a turn's its own;
+    the means' theirs. In the order of conditions norms come first, then turns, then means at rest.
+
+    diagonal, below: what was measured, a block and its covariance with the block before it. own, earlier, turned: roots
+    of the components.
+    """
+
+    diagonal: Float[Array, "... P 3 3"]
+    below: Float[Array, "... P 3 3"]
+    means: Float[Array, "... P 3 3"]
+    own: Float[Array, "... P 3 3"]
+    earlier: Float[Array, "... P 3 3"]
+    turned: Float[Array, "... P 3 3"]
+    rested: Float[Array, "... P 3 3"]
+    used: Float[Array, "... n"]
+    group: Int[Array, "... n"]
+
+    components: ClassVar[int] = 3
+
+    def _total(self, excess) -> tuple[Array, Array]:
+        """Return the blocks of the chain at an excess of poses and turns, ones on the diagonal of padding."""
+        padding = 1 - _blocks(self.used[:, None], len(self.means))[0]
+        last = jnp.zeros_like(self.earlier[:1])
+        reached = _squared(self.own) + jnp.concatenate([_squared(self.earlier)[1:], last])
+        diagonal = self.diagonal + excess[0] * reached + excess[1] * _squared(self.turned) + padding * jnp.eye(3)
+        return diagonal, self.below + excess[0] * self.own @ self.earlier.swapaxes(1, 2)
+
+    def _factored(self, excess) -> tuple[Array, Array]:
+        def step(before, block):
+            diagonal, below = block
+            below = below @ before.T
+            inverse = inverse_cholesky(diagonal - below @ below.T)
+            return inverse, (inverse, below)
+
+        return jax.lax.scan(step, jnp.eye(3), self._total(excess))[1]
+
+    def _rest(self, excess) -> Array:
+        padding = 1 - _blocks(self.used[:, None], len(self.means))[1]
+        return inverse_cholesky(self.means + excess[2] * _squared(self.rested) + padding * jnp.eye(3))
+
+    def weights(self, excess: Float[Array, " k"]) -> ChainWeights:
+        """Return what whitens the conditions at the given excess."""
+        return ChainWeights(*self._factored(excess), self._rest(excess))
+
+    def dense(self) -> Covariance:
+        """Return the same with whole matrices."""
+        poses = self.means.shape[-3]
+        pose = np.arange(poses)
+        turn = np.where(pose + 1 < poses, poses + 2 * pose, 0)[:, None]  # the last pose's turn is none, and zero
+        block = np.concatenate([pose[:, None], turn, turn + 1], axis=1)
+        before = np.concatenate([block[:1], block[:-1]])
+        rest = 3 * poses - 2 + 3 * pose[:, None] + np.arange(3)
+        values = array_module(self).concatenate([self.own, self.earlier], axis=1)
+        factors = (
+            BlockFactor(np.concatenate([block, before], axis=1), values),
+            BlockFactor(block, self.turned),
+            BlockFactor(rest, self.rested),
         )
+        size = len(self.used)
+        measured = _placed(block, block, self.diagonal, size) + _placed(rest, rest, self.means, size)
+        beside = _placed(block, before, self.below, size)
+        return Covariance(measured + beside + beside.T, factors, self.used, self.group)
+
+    def of_rows(self, used: Float[Array, " n"]) -> "Chain":
+        """Return the covariance with only these rows used."""
+        chain, means = _blocks(used[:, None], len(self.means))
+        before = jnp.concatenate([jnp.zeros_like(chain[:1]), chain[:-1]])
+        return Chain(
+            chain * self.diagonal * chain.swapaxes(1, 2), chain * self.below * before.swapaxes(1, 2),
+            means * self.means * means.swapaxes(1, 2), chain * self.own, before * self.earlier, chain * self.turned,
+            means * self.rested, used, self.group,
+        )  # fmt: skip
+
+    def turn_by_turn(self, excess: Float[Array, ""]) -> "Chain":
+        """Return the covariance with turns independent of each other, the excess of the poses known."""
+        none = jnp.zeros_like(self.own)
+        diagonal = self._total(excess * jnp.array([1.0, 0.0]))[0]
+        return replace(self, diagonal=diagonal, below=none, own=none, earlier=none)
+
+    def spread(self, number: int, rows: Float[Array, "n q"]) -> Float[Array, "n q"]:
+        """Return the covariance of a component, at an excess of one, times rows."""
+        chain, means = _blocks(rows, len(self.means))
+        if number == 2:
+            return _rows(jnp.zeros_like(chain), _squared(self.rested) @ means)
+        if number == 1:
+            return _rows(_squared(self.turned) @ chain, jnp.zeros_like(means))
+        before = jnp.concatenate([jnp.zeros_like(chain[:1]), chain[:-1]])
+        noise = self.own.swapaxes(1, 2) @ chain + self.earlier.swapaxes(1, 2) @ before
+        after = jnp.concatenate([(self.earlier @ noise)[1:], jnp.zeros_like(chain[:1])])
+        return _rows(self.own @ noise + after, jnp.zeros_like(means))
+
+    def traces(
+        self, excess: Float[Array, " k"], weights: ChainWeights
+    ) -> tuple[Float[Array, " k"], Float[Array, "k k"]]:
+        """Return tr C⁻¹V_i and tr C⁻¹V_i C⁻¹V_j of the components V_i at the excess that the weights are of.
+
+        They are the slopes and, but for the sign, the curvature of log |C| by the excess.
+        """
+
+        def volume(sizes):
+            inverse, _ = self._factored(sizes)
+            return -2 * jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=1, axis2=2)))
+
+        def slope(sizes):
+            slopes = jax.jacfwd(volume)(sizes)
+            return slopes, slopes
+
+        curvature, slopes = jax.jacfwd(slope, has_aux=True)(excess[:2])
+        white = weights.means @ self.rested
+        rest = jnp.sum(white**2)
+        first = jnp.concatenate([slopes, rest[None]])
+        second = jnp.zeros((3, 3)).at[:2, :2].set(-curvature).at[2, 2].set(jnp.sum((white.swapaxes(1, 2) @ white) ** 2))
+        return first, second
+
+
+def _placed(rows: Int[Array, "B m"], columns: Int[Array, "B k"], values: Float[Array, "B m k"], size: int) -> Array:
+    """Return a matrix of so many rows to which blocks add up; of NumPy's arrays one of NumPy's."""
+    at = rows[:, :, None], columns[:, None, :]
+    if isinstance(values, np.ndarray):
+        whole = np.zeros((size, size))
+        np.add.at(whole, at, values)
+        return whole
+    return jnp.zeros((size, size)).at[at].add(values)
+
+
+def _squared(factor: Float[Array, "... 3 q"]) -> Float[Array, "... 3 3"]:
+    return factor @ factor.swapaxes(-1, -2)
+
+
+def _blocks(rows: Float[Array, "n q"], poses: int) -> tuple[Float[Array, "P 3 q"], Float[Array, "P 3 q"]]:
+    """Return rows of a chain's conditions as blocks, the last of which has no turn, and as means at rest."""
+    norms, turns, means = jnp.split(rows, [poses, 3 * poses - 2])
+    turns = jnp.concatenate([turns, jnp.zeros_like(turns[:2])]).reshape(poses, 2, -1)
+    return jnp.concatenate([norms[:, None], turns], axis=1), means.reshape(poses, 3, -1)
+
+
+def _rows(chain: Float[Array, "P 3 q"], means: Float[Array, "P 3 q"]) -> Float[Array, "n q"]:
+    """Return blocks as rows in the order of conditions."""
+    turns, columns = chain[:-1, 1:], chain.shape[-1]
+    return jnp.concatenate([chain[:, 0], turns.reshape(-1, columns), means.reshape(-1, columns)])
 
 
 def component_covariance(factor: Factor, size: int) -> Float[Array, "n n"]:
@@ -92,13 +341,6 @@ def component_covariance(factor: Factor, size: int) -> Float[Array, "n n"]:
     if isinstance(factor, BlockFactor):
         return factor.component(size)
     return jnp.diag(factor**2) if factor.ndim == 1 else factor @ factor.T  # pyright: ignore[reportReturnType]
-
-
-def placed(factor: Factor, first: int, size: int) -> Float[Array, "_ ..."] | BlockFactor:
-    """Return a factor of some of the rows, the first of which has a place, among so many."""
-    if isinstance(factor, BlockFactor):
-        return BlockFactor(factor.rows + first, factor.values)
-    return jnp.zeros((size, *factor.shape[1:])).at[first : first + len(factor)].set(factor)
 
 
 def mean_root(covariance: Float[Array, "k n n"], mask: Bool[Array, " k"]) -> Float[Array, "n n"]:
@@ -133,61 +375,42 @@ def _eliminated(covariance: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
     return rows[..., size:]
 
 
-def whitened(weights: Float[Array, "m n"] | Float[Array, " n"], rows: Float[Array, "n ..."]) -> Float[Array, "_ ..."]:
-    """Return W times rows (n, …); `weights`: W, or its diagonal."""
-    return weights @ rows if weights.ndim == 2 else (weights * rows.T).T
-
-
 def update_excess(
+    covariances: Sequence[Covariance | Chain],
+    weights: Sequence[Weights | ChainWeights],
     residual: Float[Array, " n"],
     jacobian: Float[Array, "n p"],
     information: Float[Array, "p p"],
-    weights: Float[Array, "n n"] | Float[Array, " n"],
-    factors: tuple[Factor, ...],
     excess: Float[Array, " k"],
 ) -> Float[Array, " k"]:
     """Return improved variance components, none below zero, by one step of Fisher scoring.
 
     With residual r and Jacobian J whitened by W, information N of the parameters (JᵀJ and what is known beforehand) and
-    components V_i = F_i F_iᵀ, the restricted likelihood has the gradient ½ (uᵀ V_i u − tr P V_i) and the information
+    components V_i, the restricted likelihood has the gradient ½ (uᵀ V_i u − tr P V_i) and the information
     ½ tr(P V_i P V_j), P = Wᵀ M W, u = Wᵀ M r, M = I − J N⁻¹ Jᵀ (variance components; Förstner and Wrobel,
-    Photogrammetric Computer Vision, 2016, sec. 4.2.4). Of a component that is diagonal, F_i is its roots (n,), and so
-    is W its diagonal where conditions are independent.
+    Photogrammetric Computer Vision, 2016, sec. 4.2.4). With Q Qᵀ = Wᵀ J N⁻¹ Jᵀ W, that is P = C⁻¹ − Q Qᵀ, no matrix of
+    all conditions is needed.
     """
     basis = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(information), jacobian.T, lower=True)
     left = residual - basis.T @ (basis @ residual)
-    roots = [factor for factor in factors if not isinstance(factor, BlockFactor) and factor.ndim == 1]
-    if weights.ndim == 1:  # no matrix of all conditions: P = W² − SᵀS
-        squares, seen = jnp.stack(roots) ** 2 * weights**2, basis
-        within = jnp.einsum("kn,pn,qn->kpq", squares, seen, seen)
-        gradient = squares @ (left**2 - 1 + jnp.sum(seen**2, axis=0))
-        scoring = jnp.einsum("kpq,lpq->kl", within, within)
-        scoring += (squares * (1 - 2 * jnp.sum(seen**2, axis=0))) @ squares.T
-        return _scored(excess, gradient, scoring)
-    seen = basis @ weights
-    inverse = weights.T @ weights - seen.T @ seen
-    pull = weights.T @ left
-    if len(roots) == len(factors):
-        squares = jnp.stack(roots) ** 2
-        gradient = squares @ (pull**2 - jnp.diagonal(inverse))
-        scoring = squares @ inverse**2 @ squares.T
-        return _scored(excess, gradient, scoring)
-
-    def transposed(factor, matrix):
-        """Return Fᵀ times a matrix (n, q)."""
-        return factor.transposed(matrix) if isinstance(factor, BlockFactor) else whitened(factor.T, matrix)
-
-    pulled = [transposed(factor, pull[:, None]) for factor in factors]
-    beside = [transposed(factor, inverse).T for factor in factors]  # P F_i
-    gradient, entries = [], {}
-    for k, factor in enumerate(factors):
-        for other in range(k + 1):  # of tr(P V_i P V_j) = |F_iᵀ P F_j|² one half is enough
-            product = transposed(factor, beside[other])
-            entries[k, other] = entries[other, k] = jnp.sum(product**2)
-        gradient.append(jnp.sum(pulled[k] ** 2) - jnp.trace(product))
-    count = range(len(factors))
-    scoring = jnp.stack([jnp.stack([entries[k, other] for other in count]) for k in count])
-    return _scored(excess, jnp.stack(gradient), scoring)
+    ends = np.cumsum([0, *(len(kind.used) for kind in covariances)])
+    edges = np.cumsum([0, *(kind.components for kind in covariances)])
+    gradient, within, scoring = [], [], jnp.zeros((len(excess),) * 2)
+    for kind, root, rows, numbers in zip(covariances, weights, pairwise(ends), pairwise(edges), strict=True):
+        part = slice(*rows)
+        back = root.back(jnp.concatenate([left[part, None], basis[:, part].T], axis=1))
+        pull, seen = back[:, 0], back[:, 1:]
+        first, second = kind.traces(excess[slice(*numbers)], root)
+        moved = [kind.spread(number, back) for number in range(kind.components)]
+        own = [seen.T @ rows[:, 1:] for rows in moved]
+        gradient += [pull @ rows[:, 0] - trace + jnp.trace(inner)
+                     for rows, trace, inner in zip(moved, first, own, strict=True)]  # fmt: skip
+        white = jnp.stack([root.whiten(rows[:, 1:]) for rows in moved])
+        second = second - 2 * jnp.einsum("inp,jnp->ij", white, white)
+        scoring = scoring.at[slice(*numbers), slice(*numbers)].add(second)
+        within += own
+    inner = jnp.stack(within)
+    return _scored(excess, jnp.stack(gradient), scoring + jnp.einsum("ipq,jqp->ij", inner, inner))
 
 
 def _scored(excess: Float[Array, " k"], gradient: Float[Array, " k"], scoring: Float[Array, "k k"]):

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from jaximu.estimation.covariance import Covariance
+from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.problem import Name, without_equipment_or_effects
 from jaximu.estimation.rows import Rows
 from jaximu.ground import stored
@@ -54,7 +54,7 @@ class About:
     """
 
     conditions: Conditions
-    covariance: Covariance
+    covariance: Covariance | Chain
     columns: FloatArray
     details: Any = None
 

@@ -22,7 +22,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu.estimation.covariance import Covariance, placed, update_excess, whitened
+from jaximu.estimation.covariance import Chain, ChainWeights, Covariance, Weights, update_excess
 from jaximu.estimation.data import Conditions, Data
 from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, unflatten
 from jaximu.estimation.solver import MAX_STEPS, Failure, solve
@@ -246,9 +246,10 @@ def linearise(imu: Imu, measurement: Data, free: Callable[[Name], bool]) -> Line
         slope, value = jax.jacfwd(twice, has_aux=True)(jnp.zeros(len(parameters.index)))
         return value, slope
 
+    covariance = jax.tree.map(lambda leaf: np.asarray(leaf[0]), about.covariance).dense()
     value, slope = stored.call(both, "linearised", like, parameters, conditions)
     return Linear(
-        np.asarray(value), np.asarray(slope), about.columns[0], np.asarray(about.covariance.measured[0]),
+        np.asarray(value), np.asarray(slope), about.columns[0], covariance.measured,
         (*parameters.names, *names), np.concatenate([np.asarray(parameters.size), sizes]), about.details,
     )  # fmt: skip
 
@@ -289,7 +290,7 @@ class _Whitened(eqx.Module):
     like: Imu
     parameters: Parameters
     conditions: tuple[Conditions, ...]
-    weights: tuple[Array, ...]
+    weights: tuple[Weights | ChainWeights, ...]
     used: tuple[Array, ...]
     columns: Array
     mean: Array
@@ -300,7 +301,7 @@ class _Whitened(eqx.Module):
     def residuals(self, z):
         count = len(self.parameters.index)
         model = self.parameters.model(self.like, z[:count])
-        plain = jnp.concatenate([whitened(w, used * each(model)) for w, used, each in
+        plain = jnp.concatenate([w.whiten(used * each(model)) for w, used, each in
                                  zip(self.weights, self.used, self.conditions, strict=True)])  # fmt: skip
         return plain + self.columns @ z[count:]
 
@@ -321,7 +322,7 @@ class _Unit(NamedTuple):
     """What a pass knows of one unit: what was measured, and what is known beforehand."""
 
     conditions: tuple[Conditions, ...]
-    covariances: tuple[Covariance, ...]
+    covariances: tuple[Covariance | Chain, ...]
     columns: Array
     mean: Array
     root: Array
@@ -330,12 +331,12 @@ class _Unit(NamedTuple):
 
     def problem(self, loss: str, like: Imu, parameters: Parameters) -> _Whitened:
         """Return the problem of a pass."""
-        edges = np.cumsum([0, *(len(kind.factors) for kind in self.covariances)])
+        edges = np.cumsum([0, *(kind.components for kind in self.covariances)])
         parts = [self.excess[a:b] for a, b in pairwise(edges)]
         weights = tuple(kind.weights(part) for kind, part in zip(self.covariances, parts, strict=True))
         split = [slice(a, b) for a, b in pairwise(self._ends())]
         used = tuple(kind.used for kind in self.covariances)
-        white = jnp.concatenate([whitened(w, rows[:, None] * self.columns[part])
+        white = jnp.concatenate([w.whiten(rows[:, None] * self.columns[part])
                                  for w, rows, part in zip(weights, used, split, strict=True)])  # fmt: skip
         return _Whitened(
             like, parameters, self.conditions, weights, used, white, self.mean, self.root, self.damping, loss
@@ -345,19 +346,9 @@ class _Unit(NamedTuple):
         """Return what follows from residual and Jacobian at z."""
         information = jacobian.T @ jacobian + self.root.T @ self.root
         if problem.loss == "linear":
-            ends, weights = self._ends(), problem.weights
-            factors = [
-                placed(factor, int(first), int(ends[-1]))
-                for kind, first in zip(self.covariances, ends[:-1], strict=True)
-                for factor in kind.factors
-            ]
-            if all(weight.ndim == 1 for weight in weights):
-                whole = jnp.concatenate(weights)
-            else:
-                whole = jax.scipy.linalg.block_diag(*(jnp.diag(w) if w.ndim == 1 else w for w in weights))
-            better = update_excess(residual, jacobian, information, whole, tuple(factors), self.excess)
+            better = update_excess(self.covariances, problem.weights, residual, jacobian, information, self.excess)
         else:
-            edges = np.cumsum([0, *(len(kind.factors) for kind in self.covariances)])
+            edges = np.cumsum([0, *(kind.components for kind in self.covariances)])
             groups = jnp.concatenate([kind.group + a for kind, a in zip(self.covariances, edges[:-1], strict=True)])
             better = _robust_excess(problem.residuals(z), groups, self.excess)
         covariance = jnp.linalg.inv(information)
