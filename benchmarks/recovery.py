@@ -65,7 +65,7 @@ def bounds(imus, observations, index):
 
     def one(imu, observations):
         observations = true_noise(observations)
-        weights = inverse_cholesky(condition_covariance(imu, observations).total(jnp.zeros(3)))
+        weights = inverse_cholesky(condition_covariance(imu, observations).dense().total(jnp.zeros(3)))
         flat, unravel = ravel_pytree(imu)
 
         def residual(free):

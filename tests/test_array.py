@@ -81,7 +81,7 @@ def test_the_units_own_conditions_have_the_covariance_that_they_have_alone(toget
     whole = UnitsOnOneBody(together.observations).about(board).covariance
     alone = jax.tree.map(lambda *leaves: np.stack(leaves), *(each.with_effects() for each in
                                                              together.together.imu.units()))  # fmt: skip
-    own = condensed(alone, together.observations).covariance
+    own = jax.vmap(lambda each: each.dense())(condensed(alone, together.observations).covariance)
     size = own.used.shape[1]
     for unit in range(3):
         part = slice(unit * size, (unit + 1) * size)

@@ -170,7 +170,7 @@ def test_linear_problem_is_that_of_the_dense_path(case):
     def dense(z):
         conditions = joint_conditions(parameters.model(like, z), observations)
         jacobian = jax.jacfwd(lambda z: joint_conditions(parameters.model(like, z), observations))(z)
-        covariance = condition_covariance(parameters.model(like, z), observations)
+        covariance = condition_covariance(parameters.model(like, z), observations).dense()
         joint = len(conditions)
         return conditions, jacobian, covariance.total(jnp.array([*excess, 0.0]))[:joint, :joint]
 

@@ -98,7 +98,7 @@ def test_information_by_hand_is_that_of_the_real_problem():
 
     @jax.jit
     def real(observations):
-        whole = condition_covariance(plain, observations).total(ACCURACY.excess)
+        whole = condition_covariance(plain, observations).dense().total(ACCURACY.excess)
         joint = len(whole) - 3 * len(observations.poses.mask)  # norms and turns
         weights = inverse_cholesky(whole[:joint, :joint])
         rest = inverse_cholesky((1 + ACCURACY.excess[2]) * observations.poses.gyroscope_covariance)

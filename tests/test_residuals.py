@@ -96,7 +96,7 @@ def joint_residual(imu, data):
 @jax.jit
 def eliminated(imu, parameters, observations):
     """The library's problem: attitudes eliminated, weights at the truth."""
-    whole = condition_covariance(imu, observations).total(jnp.zeros(3))
+    whole = condition_covariance(imu, observations).dense().total(jnp.zeros(3))
     joint = len(whole) - 3 * len(observations.poses.mask)  # norms and turns
     weights = inverse_cholesky(whole[:joint, :joint])
     rest = inverse_cholesky(observations.poses.gyroscope_covariance)

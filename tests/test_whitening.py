@@ -15,7 +15,7 @@ from synthetic import GRAVITY, POSES, recording, simulated, unit
 from jaximu.calibration import calibrate
 from jaximu.data import joint_conditions, static_gyroscope_error
 from jaximu.data.poses_covariance import condition_covariance, integrate_turns, sensitivities
-from jaximu.estimation.covariance import Covariance, component_covariance, inverse_cholesky, update_excess, whitened
+from jaximu.estimation.covariance import Covariance, Weights, inverse_cholesky, update_excess
 from jaximu.model import Noise
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import BiasInstability, White
@@ -23,7 +23,14 @@ from jaximu.recordings.observations import SlowNoise
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation, observed_poses
 
-covariance_of = jax.jit(condition_covariance)
+chain_of = jax.jit(condition_covariance)
+
+
+@jax.jit
+def covariance_of(imu, data):
+    return condition_covariance(imu, data).dense()
+
+
 NONE = jnp.zeros(3)
 
 
@@ -89,7 +96,7 @@ def test_parts_of_the_covariance(case):
     data = case.observations
     covariance = covariance_of(case.imu, data)
     size = jnp.array([0.5, 2.0, 3.0])
-    parts = [np.asarray(component_covariance(factor, len(covariance.used))) for factor in covariance.factors]
+    parts = [np.asarray(covariance.component(number)) for number in range(covariance.components)]
     expected = covariance.measured + np.einsum("k,kij->ij", size, parts) + np.diag(1 - covariance.used)
     np.testing.assert_allclose(covariance.total(size), expected, rtol=1e-12, atol=1e-22)
     for part in (np.asarray(covariance.measured), *parts):
@@ -106,27 +113,26 @@ def test_parts_of_the_covariance(case):
 
 def test_excess_is_found_again(case):
     """Noise of three times the stated variance in the poses and five times in the turns: excess 2 and 4."""
-    covariance = covariance_of(case.imu, case.observations)
-    joint = len(covariance.used) - 3 * POSES  # norms and turns
-    used = covariance.used[:joint]
+    whole = chain_of(case.imu, case.observations)
+    joint = len(whole.used) - 3 * POSES  # norms and turns; of means at rest there are no rows
+    chain = whole.of_rows(whole.used * (np.arange(len(whole.used)) < joint))
     # as if parameters had been fitted: any Jacobian will do, residuals are projected off it
-    jacobian = jnp.asarray(np.random.default_rng(0).standard_normal((joint, 10))) * used[:, None]
+    jacobian = jnp.asarray(np.random.default_rng(0).standard_normal((len(chain.used), 10))) * chain.used[:, None]
     information = jacobian.T @ jacobian
-    factors = covariance.factors[:2]  # of means at rest there are no rows
 
     @jax.jit
     @jax.vmap
     def iterate(conditions, excess):
-        weights = inverse_cholesky(covariance.total(jnp.append(excess, 0.0))[:joint, :joint])
-        residual = weights @ conditions
+        weights = chain.weights(excess)
+        residual = weights.whiten(jnp.pad(conditions, (0, 3 * POSES)))
         residual = residual - jacobian @ jnp.linalg.solve(information, jacobian.T @ residual)
-        return update_excess(residual, jacobian, information, weights, tuple(factors), excess)
+        return update_excess([chain], [weights], residual, jacobian, information, excess)
 
     def found(values, rounds=8):
-        excess = jnp.ones((len(values), 2))
+        excess = jnp.tile(jnp.array([1.0, 1.0, 0.0]), (len(values), 1))
         for _ in range(rounds):
             excess = iterate(jnp.asarray(values), excess)
-        return np.asarray(excess)
+        return np.asarray(excess)[:, :2]
 
     noisy = found(drawn(case, 100, 1, accelerometer=3.0, turns=5.0))
     assert np.all(noisy >= 0)
@@ -136,9 +142,37 @@ def test_excess_is_found_again(case):
     assert np.median(honest, axis=0).max() < 0.3
 
 
+def scored(covariance, weights, residual, jacobian, excess):
+    """One improvement of the excess; residual and Jacobian are whitened."""
+    return update_excess([covariance], [weights], residual, jacobian, jacobian.T @ jacobian, jnp.asarray(excess))
+
+
+@pytest.mark.parametrize("left_out", [(), (3, POSES + 4, POSES + 5, POSES + 8)])
+def test_a_chain_does_what_the_whole_matrix_does(case, left_out):
+    chain = chain_of(case.imu, case.observations)
+    chain = chain.of_rows(np.asarray(chain.used) * ~np.isin(np.arange(len(chain.used)), left_out))
+    dense, size, excess = chain.dense(), len(chain.used), jnp.array([0.3, 0.7, 0.2])
+    weights, whole = chain.weights(excess), dense.weights(excess)
+    np.testing.assert_allclose(chain.dense().total(excess), dense.total(excess), rtol=1e-12)
+    root = np.asarray(weights.whiten(jnp.eye(size)))
+    np.testing.assert_allclose(root @ np.asarray(dense.total(excess)) @ root.T, np.eye(size), atol=1e-10)
+    np.testing.assert_allclose(weights.back(jnp.eye(size)), root.T, rtol=1e-12, atol=1e-9 * np.abs(root).max())
+    for number in range(chain.components):
+        known = np.asarray(dense.component(number))
+        found = chain.spread(number, jnp.eye(size))
+        np.testing.assert_allclose(found, known, rtol=1e-10, atol=1e-12 * np.abs(known).max())
+    for one, other in zip(chain.traces(excess, weights), dense.traces(excess, whole), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+    random = np.random.default_rng(6)
+    rows = jnp.asarray(random.standard_normal((size, 13))) * chain.used[:, None]
+    found = [scored(kind, root, root.whiten(rows[:, 0]), root.whiten(rows[:, 1:]), excess)
+             for kind, root in ((chain, weights), (dense, whole))]  # fmt: skip
+    np.testing.assert_allclose(*found, rtol=1e-8)
+
+
 def test_a_part_without_rows_stays_as_it_is():
-    factors = jnp.eye(6), jnp.zeros((6, 6))
-    excess = update_excess(jnp.ones(6), jnp.eye(6)[:, :2], jnp.eye(2), jnp.eye(6), factors, jnp.array([1.0, 7.0]))
+    covariance = Covariance(jnp.eye(6), (jnp.eye(6), jnp.zeros((6, 6))), jnp.ones(6), jnp.zeros(6, int))
+    excess = scored(covariance, Weights(jnp.eye(6)), jnp.ones(6), jnp.eye(6)[:, :2], [1.0, 7.0])
     assert excess[1] == 7.0
     assert np.isfinite(excess[0])
 
@@ -146,13 +180,15 @@ def test_a_part_without_rows_stays_as_it_is():
 def test_diagonal_components_are_scored_as_any_others():
     random = np.random.default_rng(3)
     residual, jacobian = jnp.asarray(random.standard_normal(8)), jnp.asarray(random.standard_normal((8, 2)))
-    weights, roots = jnp.asarray(np.tril(random.standard_normal((8, 8)))), jnp.asarray(random.uniform(0, 1, (2, 8)))
-    given = residual, jacobian, jacobian.T @ jacobian, weights
-    found = update_excess(*given, tuple(roots), jnp.ones(2))
-    np.testing.assert_allclose(found, update_excess(*given, tuple(map(jnp.diag, roots)), jnp.ones(2)), rtol=1e-9)
+    root, roots = jnp.asarray(np.tril(random.standard_normal((8, 8)))), jnp.asarray(random.uniform(0, 1, (2, 8)))
+
+    def found(*factors):
+        covariance = Covariance(jnp.eye(8), factors, jnp.ones(8), jnp.zeros(8, int))
+        return scored(covariance, Weights(root), residual, jacobian, jnp.ones(2))
+
+    np.testing.assert_allclose(found(*roots), found(*map(jnp.diag, roots)), rtol=1e-9)
     whole = jnp.asarray(random.standard_normal((8, 3)))
-    mixed = [update_excess(*given, (one, whole), jnp.ones(2)) for one in (roots[0], jnp.diag(roots[0]))]
-    np.testing.assert_allclose(*mixed, rtol=1e-9)
+    np.testing.assert_allclose(found(roots[0], whole), found(jnp.diag(roots[0]), whole), rtol=1e-9)
 
 
 def test_independent_conditions_are_scored_as_any_others():
@@ -161,9 +197,10 @@ def test_independent_conditions_are_scored_as_any_others():
     variances, roots = jnp.asarray(random.uniform(1, 2, 8)), tuple(jnp.asarray(random.uniform(0, 1, (2, 8))))
     both = [Covariance(each, roots, jnp.ones(8), jnp.zeros(8, int)) for each in (variances, jnp.diag(variances))]
     weights = [each.weights(jnp.array([0.5, 2.0])) for each in both]
-    np.testing.assert_allclose(np.diag(weights[0]), weights[1], rtol=1e-12)
-    np.testing.assert_allclose(whitened(weights[0], jacobian), whitened(weights[1], jacobian), rtol=1e-12)
-    found = [update_excess(residual, jacobian, jacobian.T @ jacobian, each, roots, jnp.ones(2)) for each in weights]
+    np.testing.assert_allclose(weights[1].root, np.diag(weights[0].root), rtol=1e-12)
+    for turned in (lambda each: each.whiten(jacobian), lambda each: each.back(residual)):
+        np.testing.assert_allclose(*map(turned, weights), rtol=1e-12)
+    found = [scored(kind, each, residual, jacobian, jnp.ones(2)) for kind, each in zip(both, weights, strict=True)]
     np.testing.assert_allclose(*found, rtol=1e-9)
 
 
@@ -323,7 +360,7 @@ def test_padding_and_parts_with_slow_bias(tied):
     truth, part, data = tied
     covariance = covariance_of(truth, data)
     padding = 1 - np.asarray(covariance.used)
-    parts = [np.asarray(component_covariance(factor, len(covariance.used))) for factor in covariance.factors]
+    parts = [np.asarray(covariance.component(number)) for number in range(covariance.components)]
     for each in (covariance.measured, *parts):
         np.testing.assert_allclose(each, each.T, atol=1e-20)
         np.testing.assert_array_equal(np.asarray(each) * padding, 0.0)

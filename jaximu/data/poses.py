@@ -132,7 +132,7 @@ class HandHeldConditions(Conditions):
 
 def condense(
     imu: Imu, observations: Observations, method: str = "exponential"
-) -> tuple[HandHeldConditions, Covariance, IntegratedTurns, Sensitivities]:
+) -> tuple[HandHeldConditions, Covariance | Chain, IntegratedTurns, Sensitivities]:
     """Return the conditions about a unit, without its effects, their covariance, and what both were made of."""
     imu, poses, turns = imu.with_effects(), observations.poses, observations.turns
     gyroscope = imu.gyroscope

@@ -9,6 +9,8 @@ Weights are computed at a model close to the solution and held fixed while it is
 changes them by 1 %, and the efficiency of the estimate by its square.
 """
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
@@ -16,7 +18,7 @@ from jaxtyping import Float
 from jaximu.data.gravity_direction import unit_vectors
 from jaximu.data.gravity_norm import recover_specific_force, recovery_jacobian
 from jaximu.data.preintegration import turned_by_rates
-from jaximu.estimation.covariance import BlockFactor, Chain, Covariance, mean_root
+from jaximu.estimation.covariance import Chain, Covariance, following, in_order, mean_root
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import (
     conjugate,
@@ -106,103 +108,60 @@ def sensitivities(imu: Imu, observations: Observations, integrated: IntegratedTu
     return Sensitivities(norm, after, before, (lever[:, None] @ integrated.transport @ inverse).swapaxes(1, 2))
 
 
-def condition_covariance(imu: Imu, observations: Observations, integrated: IntegratedTurns | None = None) -> Covariance:
+def condition_covariance(
+    imu: Imu, observations: Observations, integrated: IntegratedTurns | None = None
+) -> Covariance | Chain:
     """Propagate the covariances of what was measured into the conditions at the given model.
 
     Conditions: norms of P poses, two components of each of T turns, three of each mean gyroscope output at rest.
-    Components of the excess: poses, turns, means at rest. `integrated`: the turns at this model, where at hand.
+    Components of the excess: poses, turns, means at rest. A chain, or a whole matrix where slow noise ties all of them.
+    `integrated`: the turns at this model, where at hand.
     """
     poses, turns, slow = observations.poses, observations.turns, observations.slow
-    count, steps = poses.mask.shape[0], turns.mask.shape[0]
     integrated = integrate_turns(imu, turns) if integrated is None else integrated
     norm, after, before, lever = _pose_sensitivities(imu, observations, integrated.rotation)
-
-    pose, step = jnp.arange(count), jnp.arange(steps)
-    rows = count + 2 * step[:, None] + jnp.arange(2)
-    at_rest = count + 2 * steps + 3 * pose[:, None] + jnp.arange(3)
-    size = 4 * count + 2 * steps
+    real, moved = poses.mask[:, None, None], turns.mask[:, None, None]
+    none = jnp.zeros((1, 2, 3))
+    # what a pose reaches: its norm and the turn after it, of which the last has none, and the turn before it
+    own = jnp.concatenate([real * norm[:, None], jnp.concatenate([moved * before, none])], axis=1)
+    earlier = jnp.pad(jnp.concatenate([none, moved * after]), ((0, 0), (1, 0), (0, 0)))
+    turned = jnp.pad(jnp.concatenate([moved * lever, none]), ((0, 0), (1, 0), (0, 0)))
+    noise = jnp.concatenate([integrated.noise, jnp.zeros((1, 3, 3))])
+    force, rest = (real * each for each in (poses.accelerometer_covariance, poses.gyroscope_covariance))
+    roots = mean_root(force, poses.mask), mean_root(integrated.noise, turns.mask), mean_root(rest, poses.mask)
     used = jnp.concatenate([poses.mask, jnp.repeat(turns.mask, 2), jnp.repeat(poses.mask, 3)]).astype(norm.dtype)
-    # what a pose reaches: its norm, the turn before it and the turn after it, of which the ends have one alone
-    before_it, after_it = ((1, 0), (0, 0)), ((0, 1), (0, 0))
-    no_axis = ((0, 0),)
-    reached = BlockFactor(
-        jnp.concatenate([pose[:, None], jnp.pad(rows, before_it), jnp.pad(rows, after_it)], axis=1),
-        jnp.concatenate(
-            [norm[:, None], jnp.pad(after, (*before_it, *no_axis)), jnp.pad(before, (*after_it, *no_axis))], axis=1
-        ),
-    ).of_rows(used)
-    turned = BlockFactor(rows, lever).of_rows(used)
-    means = BlockFactor(at_rest, jnp.broadcast_to(jnp.eye(3), (count, 3, 3))).of_rows(used)
-    factors = tuple(
-        BlockFactor(each.rows, each.values @ mean_root(covariance, mask))
-        for each, covariance, mask in (
-            (reached, poses.accelerometer_covariance, poses.mask), (turned, integrated.noise, turns.mask),
-            (means, poses.gyroscope_covariance, poses.mask),
-        )
+    counts = len(norm), 2 * len(lever), 3 * len(norm)
+    group = jnp.repeat(jnp.arange(3), jnp.array(counts), total_repeat_length=sum(counts))
+    white = 1.0 if slow is None else 0.0  # slow noise has that of the means in it
+    chain = Chain(
+        white * (own @ force @ own.swapaxes(1, 2) + following(earlier @ force @ earlier.swapaxes(1, 2)))
+        + turned @ noise @ turned.swapaxes(1, 2),
+        white * own @ force @ earlier.swapaxes(1, 2), white * rest,
+        own @ roots[0], earlier @ roots[0], turned @ roots[1], real * roots[2], used, group,
     )  # fmt: skip
-    group = jnp.repeat(jnp.arange(3), jnp.array([count, 2 * steps, 3 * count]), total_repeat_length=size)
-
     if slow is None:
-        earlier = jnp.concatenate([jnp.zeros_like(after[:1]), after])
-        before = jnp.concatenate([before, jnp.zeros_like(before[:1])])
-        lever = jnp.concatenate([lever, jnp.zeros_like(lever[:1])])
-        real, real_turn = used[:count], jnp.concatenate([used[count : count + 2 * steps : 2], jnp.zeros(1)])
-        blank = jnp.zeros_like(norm[:, None])
-        own = jnp.concatenate([norm[:, None] * real[:, None, None], before * real_turn[:, None, None]], axis=1)
-        shifted = jnp.concatenate([jnp.zeros(1), real_turn[:-1]])
-        earlier = jnp.concatenate([blank, earlier * shifted[:, None, None]], axis=1)
-        turned = jnp.concatenate([blank, lever * real_turn[:, None, None]], axis=1)
-        noise = jnp.concatenate([integrated.noise, jnp.zeros_like(integrated.noise[:1])])
-        at_pose, at_turn = (
-            mean_root(covariance, mask)
-            for covariance, mask in ((poses.accelerometer_covariance, poses.mask), (integrated.noise, turns.mask))
-        )
-        reached = earlier @ poses.accelerometer_covariance @ earlier.swapaxes(1, 2)
-        diagonal = own @ poses.accelerometer_covariance @ own.swapaxes(1, 2)
-        diagonal += jnp.concatenate([reached[1:], jnp.zeros_like(reached[:1])]) + turned @ noise @ turned.swapaxes(1, 2)
-        rested = jnp.broadcast_to(mean_root(poses.gyroscope_covariance, poses.mask), (count, 3, 3))
-        return Chain(
-            diagonal,
-            own @ poses.accelerometer_covariance @ earlier.swapaxes(1, 2),
-            real[:, None, None] * poses.gyroscope_covariance,
-            own @ at_pose,
-            earlier @ at_pose,
-            turned @ at_turn,
-            real[:, None, None] * rested,
-            used,
-            group,
-        )
-
-    def spread(total, blocks, covariance):
-        """Add to the covariance (n, n) of all conditions what blocks reach of covariances (B, 3, 3)."""
-        own = blocks.values @ covariance @ blocks.values.swapaxes(1, 2)
-        return total.at[blocks.rows[:, :, None], blocks.rows[:, None, :]].add(own)
-
-    measured = spread(jnp.zeros((size, size)), turned, integrated.noise)
-    if slow is None:
-        own = jnp.where(poses.mask[:, None, None], poses.gyroscope_covariance, 0.0)
-        measured = spread(spread(measured, means, own), reached, poses.accelerometer_covariance)
-        return Covariance(measured, factors, used, group)
-
-    intervals = slow.gyroscope.shape[-1]
-    parts = (intervals - count) // steps
-    inverse = inverse_matrix(imu.gyroscope.gain)  # pyright: ignore[reportOptionalMemberAccess]
-    member = (slow.part[..., None] == jnp.arange(parts)).astype(norm.dtype)
-    transport = jnp.einsum("tsb,tsij->tbij", member, integrated.transport)
-    by_part = (lever[:, None] @ transport @ inverse).swapaxes(1, 2)
+        return chain
 
     def by_forces(matrix, axis):
         """Return what conditions (n, q) react to an axis' mean forces (P, q) with."""
-        values = reached.values[..., axis, None] * matrix[:, None]
-        return jnp.zeros((size, matrix.shape[1])).at[reached.rows].add(values)
+        at = own[..., axis, None] * matrix[:, None] + following(earlier[..., axis, None] * matrix[:, None])
+        return in_order(at, jnp.zeros_like(at))
+
+    inverse = inverse_matrix(imu.gyroscope.gain)  # pyright: ignore[reportOptionalMemberAccess]
+    member = slow.part[..., None] == jnp.arange((slow.gyroscope.shape[-1] - len(norm)) // len(lever))
+    transport = jnp.einsum("tsb,tsij->tbij", member.astype(norm.dtype), integrated.transport)
+    by_part = (lever[:, None] @ transport @ inverse).swapaxes(1, 2)
 
     def by_rates(matrix, axis):
         """The same to an axis' mean rates (I, q), of all poses and then of the parts of each turn."""
-        during = matrix[count:].reshape(steps, parts, -1)
-        found = jnp.zeros((size, matrix.shape[1])).at[rows].set(jnp.einsum("tkb,tbq->tkq", by_part[..., axis], during))
-        return used[:, None] * found.at[at_rest[:, axis]].set(matrix[:count])
+        means, during = jnp.split(matrix, [len(norm)])
+        during = jnp.einsum("tkb,tbq->tkq", by_part[..., axis], during.reshape(len(lever), -1, matrix.shape[1]))
+        at = jnp.pad(during, ((0, 1), (1, 0), (0, 0)))
+        return used[:, None] * in_order(at, jnp.eye(3)[axis][:, None] * means[:, None])
 
+    tied = chain.dense()
+    measured = tied.measured
     for axis in range(3):
         measured += by_forces(by_forces(slow.accelerometer[axis], axis).T, axis)
         measured += by_rates(by_rates(slow.gyroscope[axis], axis).T, axis)
-    return Covariance(measured, factors, used, group)
+    return replace(tied, measured=measured)

@@ -7,6 +7,7 @@ component of the excess is a variance, in multiples of a mean measured covarianc
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from math import prod
 from typing import ClassVar
 
 import equinox as eqx
@@ -24,7 +25,8 @@ __all__ = [
     "ChainWeights",
     "Covariance",
     "Weights",
-    "component_covariance",
+    "following",
+    "in_order",
     "inverse_cholesky",
     "mean_root",
     "update_excess",
@@ -108,7 +110,10 @@ class Covariance(eqx.Module):
 
     def component(self, number: int) -> Float[Array, "n n"]:
         """Return the covariance of a component at a size of one."""
-        return component_covariance(self.factors[number], len(self.used))
+        factor = self.factors[number]
+        if isinstance(factor, BlockFactor):
+            return factor.component(len(self.used))
+        return jnp.diag(factor**2) if factor.ndim == 1 else factor @ factor.T
 
     def total(self, excess: Float[Array, " k"]) -> Float[Array, "n n"]:
         """Return the covariance at the given excess, with ones on the diagonal of padding rows."""
@@ -167,7 +172,7 @@ class ChainWeights(eqx.Module):
 
     def whiten(self, rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         """Return W times rows."""
-        chain, means = _blocks(rows.reshape(len(rows), -1), len(self.means))
+        chain, means = _blocks(rows.reshape(len(rows), prod(rows.shape[1:])), len(self.means))
 
         def step(before, block):
             inverse, below, right = block
@@ -175,11 +180,11 @@ class ChainWeights(eqx.Module):
             return white, white
 
         white = jax.lax.scan(step, jnp.zeros_like(chain[0]), (self.inverse, self.below, chain))[1]
-        return _rows(white, self.means @ means).reshape(rows.shape)
+        return in_order(white, self.means @ means).reshape(rows.shape)
 
     def back(self, rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         """Return Wᵀ times whitened rows."""
-        chain, means = _blocks(rows.reshape(len(rows), -1), len(self.means))
+        chain, means = _blocks(rows.reshape(len(rows), prod(rows.shape[1:])), len(self.means))
 
         def step(after, block):
             inverse, below, right = block
@@ -187,7 +192,7 @@ class ChainWeights(eqx.Module):
             return below.T @ solved, solved
 
         solved = jax.lax.scan(step, jnp.zeros_like(chain[0]), (self.inverse, self.below, chain), reverse=True)[1]
-        return _rows(solved, self.means.swapaxes(1, 2) @ means).reshape(rows.shape)
+        return in_order(solved, self.means.swapaxes(1, 2) @ means).reshape(rows.shape)
 
 
 class Chain(eqx.Module):
@@ -216,8 +221,7 @@ class Chain(eqx.Module):
     def _total(self, excess) -> tuple[Array, Array]:
         """Return the blocks of the chain at an excess of poses and turns, ones on the diagonal of padding."""
         padding = 1 - _blocks(self.used[:, None], len(self.means))[0]
-        last = jnp.zeros_like(self.earlier[:1])
-        reached = _squared(self.own) + jnp.concatenate([_squared(self.earlier)[1:], last])
+        reached = _squared(self.own) + following(_squared(self.earlier))
         diagonal = self.diagonal + excess[0] * reached + excess[1] * _squared(self.turned) + padding * jnp.eye(3)
         return diagonal, self.below + excess[0] * self.own @ self.earlier.swapaxes(1, 2)
 
@@ -260,7 +264,7 @@ class Chain(eqx.Module):
     def of_rows(self, used: Float[Array, " n"]) -> "Chain":
         """Return the covariance with only these rows used."""
         chain, means = _blocks(used[:, None], len(self.means))
-        before = jnp.concatenate([jnp.zeros_like(chain[:1]), chain[:-1]])
+        before = _preceding(chain)
         return Chain(
             chain * self.diagonal * chain.swapaxes(1, 2), chain * self.below * before.swapaxes(1, 2),
             means * self.means * means.swapaxes(1, 2), chain * self.own, before * self.earlier, chain * self.turned,
@@ -277,13 +281,11 @@ class Chain(eqx.Module):
         """Return the covariance of a component, at an excess of one, times rows."""
         chain, means = _blocks(rows, len(self.means))
         if number == 2:
-            return _rows(jnp.zeros_like(chain), _squared(self.rested) @ means)
+            return in_order(jnp.zeros_like(chain), _squared(self.rested) @ means)
         if number == 1:
-            return _rows(_squared(self.turned) @ chain, jnp.zeros_like(means))
-        before = jnp.concatenate([jnp.zeros_like(chain[:1]), chain[:-1]])
-        noise = self.own.swapaxes(1, 2) @ chain + self.earlier.swapaxes(1, 2) @ before
-        after = jnp.concatenate([(self.earlier @ noise)[1:], jnp.zeros_like(chain[:1])])
-        return _rows(self.own @ noise + after, jnp.zeros_like(means))
+            return in_order(_squared(self.turned) @ chain, jnp.zeros_like(means))
+        noise = self.own.swapaxes(1, 2) @ chain + self.earlier.swapaxes(1, 2) @ _preceding(chain)
+        return in_order(self.own @ noise + following(self.earlier @ noise), jnp.zeros_like(means))
 
     def traces(
         self, excess: Float[Array, " k"], weights: ChainWeights
@@ -319,28 +321,32 @@ def _placed(rows: Int[Array, "B m"], columns: Int[Array, "B k"], values: Float[A
     return jnp.zeros((size, size)).at[at].add(values)
 
 
-def _squared(factor: Float[Array, "... 3 q"]) -> Float[Array, "... 3 3"]:
+def _squared(factor: Float[Array, "... m q"]) -> Float[Array, "... m m"]:
     return factor @ factor.swapaxes(-1, -2)
 
 
 def _blocks(rows: Float[Array, "n q"], poses: int) -> tuple[Float[Array, "P 3 q"], Float[Array, "P 3 q"]]:
     """Return rows of a chain's conditions as blocks, the last of which has no turn, and as means at rest."""
     norms, turns, means = jnp.split(rows, [poses, 3 * poses - 2])
-    turns = jnp.concatenate([turns, jnp.zeros_like(turns[:2])]).reshape(poses, 2, -1)
-    return jnp.concatenate([norms[:, None], turns], axis=1), means.reshape(poses, 3, -1)
+    turns = jnp.concatenate([turns, jnp.zeros_like(turns[:2])]).reshape(poses, 2, rows.shape[1])
+    return jnp.concatenate([norms[:, None], turns], axis=1), means.reshape(poses, 3, rows.shape[1])
 
 
-def _rows(chain: Float[Array, "P 3 q"], means: Float[Array, "P 3 q"]) -> Float[Array, "n q"]:
+def _preceding(blocks: Float[Array, "P m q"]) -> Float[Array, "P m q"]:
+    return jnp.concatenate([jnp.zeros_like(blocks[:1]), blocks[:-1]])
+
+
+def following(blocks: Float[Array, "P m q"]) -> Float[Array, "P m q"]:
+    """Return of each block what the next one has; of the last, zeros."""
+    return jnp.concatenate([blocks[1:], jnp.zeros_like(blocks[:1])])
+
+
+def in_order(chain: Float[Array, "P 3 q"], means: Float[Array, "P 3 q"]) -> Float[Array, "n q"]:
     """Return blocks as rows in the order of conditions."""
     turns, columns = chain[:-1, 1:], chain.shape[-1]
-    return jnp.concatenate([chain[:, 0], turns.reshape(-1, columns), means.reshape(-1, columns)])
-
-
-def component_covariance(factor: Factor, size: int) -> Float[Array, "n n"]:
-    """Return the covariance of a variance component at a size of one, of so many rows."""
-    if isinstance(factor, BlockFactor):
-        return factor.component(size)
-    return jnp.diag(factor**2) if factor.ndim == 1 else factor @ factor.T  # pyright: ignore[reportReturnType]
+    return jnp.concatenate(
+        [chain[:, 0], turns.reshape(2 * len(turns), columns), means.reshape(3 * len(means), columns)]
+    )
 
 
 def mean_root(covariance: Float[Array, "k n n"], mask: Bool[Array, " k"]) -> Float[Array, "n n"]:
@@ -400,7 +406,7 @@ def update_excess(
         part = slice(*rows)
         back = root.back(jnp.concatenate([left[part, None], basis[:, part].T], axis=1))
         pull, seen = back[:, 0], back[:, 1:]
-        first, second = kind.traces(excess[slice(*numbers)], root)
+        first, second = kind.traces(excess[slice(*numbers)], root)  # pyright: ignore[reportArgumentType]
         moved = [kind.spread(number, back) for number in range(kind.components)]
         own = [seen.T @ rows[:, 1:] for rows in moved]
         gradient += [pull @ rows[:, 0] - trace + jnp.trace(inner)

@@ -164,7 +164,7 @@ def hand_held_information(
 
     jacobian = jax.jacfwd(found)(jnp.zeros(len(parameters.names)))
     observed = _observed(unit, design.attitude, accuracy, gravity)
-    covariance = condition_covariance(unit, observed).total(accuracy.excess)[:conditions, :conditions]
+    covariance = condition_covariance(unit, observed).dense().total(accuracy.excess)[:conditions, :conditions]
     whitened = _whiten(covariance, jacobian)
     return whitened.T @ whitened
 
