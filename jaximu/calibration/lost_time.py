@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.data.poses import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
-from jaximu.estimation.fitting import effect_numbers, linearise
+from jaximu.estimation.fitting import effect_numbers, linearise, unwhitened
 from jaximu.estimation.problem import without_equipment
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
@@ -201,13 +201,13 @@ class _Recorded:
         assert self.about.reaction is not None and self.about.running is not None
         turns, gyroscope = self.observations.turns, found.imu.gyroscope
         self.turns: Turns = turns
-        covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.about.covariance).dense()
+        chain = jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.about.covariance)
+        residual, slope = (rows[np.asarray(chain.used) > 0] for rows in unwhitened(found.fit, chain))
+        covariance = chain.dense()
         self.used = used = covariance.used > 0
         poses, turned, means = (covariance.component(number)[np.ix_(used, used)] for number in range(3))
         excess = np.asarray(found.fit.excess)
         known = covariance.measured[np.ix_(used, used)] + excess[0] * poses + excess[2] * means
-        root = np.linalg.cholesky(known + excess[1] * turned)
-        residual, slope = (root @ np.asarray(each)[used] for each in (found.fit.residual, found.fit.jacobian))
         inverse = np.linalg.inv(known)
         seen = inverse @ slope
         self.projector = inverse - seen @ np.linalg.pinv(slope.T @ seen, rcond=1e-12, hermitian=True) @ seen.T

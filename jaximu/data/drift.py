@@ -15,7 +15,7 @@ from scipy.linalg import cho_solve
 
 from jaximu.data.poses import condensed
 from jaximu.data.poses_covariance import Sensitivities
-from jaximu.estimation.fitting import Fit
+from jaximu.estimation.fitting import Fit, unwhitened
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -144,24 +144,22 @@ def with_drift(
     unit, measured = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))
     about = condensed(unit, measured, rows)
     assert about.reaction is not None
-    covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance).dense()
+    chain = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)
+    residual, jacobian = unwhitened(found, chain)
+    covariance = chain.dense()
     used = covariance.used > 0
     bare = covariance.measured[np.ix_(used, used)]
     present = [k for k in range(len(covariance.factors)) if np.any(covariance.group[used] == k)]
     excess = [covariance.component(k)[np.ix_(used, used)] for k in present]
     fitted = bare + np.einsum("k,kij->ij", np.asarray(found.excess)[present], np.stack(excess))
-    root = np.linalg.cholesky(fitted)
     noise = _noise_of_scatter(observations, segmentations[0].recording)
     drifts, components = drift_components(noise, observations, segmentations, about.reaction)
     priors = [_USUAL_EXCESS] * len(excess) + [USUAL_DRIFT[name.partition(" ")[2]] for name in drifts]
-    white = np.asarray(found.jacobian)[used]
     components = np.concatenate([np.stack(excess), components[:, used][:, :, used]])
-    log_size, _ = restricted_likelihood(
-        root @ np.asarray(found.residual)[used], root @ white, bare, components, *_beforehand(priors)
-    )
+    log_size, _ = restricted_likelihood(residual[used], jacobian[used], bare, components, *_beforehand(priors))
     changed = bare + np.einsum("k,kij->ij", np.exp(log_size), components) - fitted
     sizes = np.asarray(found.sizes)
-    react = np.asarray(found.covariance) / sizes @ np.linalg.solve(root.T, white).T
+    react = np.asarray(found.covariance) / sizes @ np.linalg.solve(fitted, jacobian[used]).T
     told = dict(zip(drifts, np.exp(log_size[len(excess) :] / 2), strict=True))
     total = np.asarray(found.covariance) + react @ changed @ react.T
     return replace(found, covariance=total), (drift_text(told), *power_on_text(drifts, told))

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import inverse_matrix
 from jaximu.ground.tracing import array_module
 
 __all__ = [
@@ -79,6 +80,10 @@ class Weights(eqx.Module):
     def back(self, rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         """Return Wᵀ times whitened rows."""
         return self.root.T @ rows if self.root.ndim == 2 else (self.root * rows.T).T
+
+    def unwhiten(self, rows: Float[Array, "n q"]) -> Float[Array, "n q"]:
+        """Return the rows that were whitened."""
+        return jnp.linalg.solve(self.root, rows) if self.root.ndim == 2 else rows / self.root[:, None]
 
 
 class Covariance(eqx.Module):
@@ -193,6 +198,12 @@ class ChainWeights(eqx.Module):
 
         solved = jax.lax.scan(step, jnp.zeros_like(chain[0]), (self.inverse, self.below, chain), reverse=True)[1]
         return in_order(solved, self.means.swapaxes(1, 2) @ means).reshape(rows.shape)
+
+    def unwhiten(self, rows: Float[Array, "n q"]) -> Float[Array, "n q"]:
+        """Return the rows that were whitened."""
+        chain, means = _blocks(rows, len(self.means))
+        chain = inverse_matrix(self.inverse) @ chain + self.below @ _preceding(chain)
+        return in_order(chain, inverse_matrix(self.means) @ means)
 
 
 class Chain(eqx.Module):

@@ -41,6 +41,7 @@ __all__ = [
     "fit",
     "informed",
     "linearise",
+    "unwhitened",
 ]
 
 _CHUNK = 64
@@ -146,6 +147,20 @@ class Fit(eqx.Module):
         turning = [name.owner == "gyroscope" and name.part == "gain" for name in self.names]
         clock = np.where(turning, np.asarray(self.values), 0.0) * clock_sigma
         return sum((each[..., :, None] * each[..., None, :] for each in (reach, clock)), np.asarray(self.covariance))
+
+
+def unwhitened(found: Fit, covariance: Covariance | Chain) -> tuple[FloatArray, FloatArray]:
+    """Return the residual (n,) and Jacobian (n, p) of an unbatched fit of one kind of data, in its conditions' units.
+
+    **Arguments:** `covariance`: of the conditions, close to where the fit ended.
+    """
+
+    def rows(covariance, excess, white):
+        return covariance.weights(excess).unwhiten(white)
+
+    white = np.concatenate([np.asarray(found.residual)[:, None], found.jacobian], axis=1)
+    conditions = np.asarray(stored.call(rows, "unwhitened", covariance, np.asarray(found.excess), white))
+    return conditions[:, 0], conditions[:, 1:]
 
 
 def informed(found: Fit, prior: Prior) -> Fit:
