@@ -242,7 +242,6 @@ def evaluated(
     before, after = true[:-1], true[1:]
     target = multiply(conjugate(before), after)
     with_one = jnp.concatenate([turns.output, jnp.ones_like(held)[..., None]], axis=-1)
-    slope = jnp.einsum("tsij,tsk->tijk", whole.transport, with_one)
 
     # in the middle of a sample the frame stands half way
     start = jnp.zeros_like(whole.running[:, :1]).at[..., 0].set(1.0)
@@ -252,8 +251,7 @@ def evaluated(
     sensed = jnp.concatenate([(data.force - force)[place], jnp.ones_like(held)[..., None]], axis=-1)
     summed = jnp.einsum("ts,tsij,tsk->tijk", held, rotation_matrix(middle), sensed)
     local = jnp.einsum("tsij,tsj->tsi", rotation_matrix(middle), sensed @ bare.accelerometer.inverse().T)
-    turned_by = rotation_matrix(whole.rotation)[:, None] @ whole.transport
-    swinging = swing(held[..., None] * local, turned_by)
+    swinging = swing(held[..., None] * local, whole.turned)
     swung = jnp.einsum("tsij,tsk->tijk", swinging, with_one)
     duration = jnp.sum(held, axis=1) * data.used
     windows = len(place) // group
@@ -268,13 +266,14 @@ def evaluated(
     lever = jnp.einsum("tijk,jk->ti", summed, bare.accelerometer.inverse())
     gained = rotate(mounting.tilted, jnp.sum(data.velocity.reshape(windows, group, 3), axis=1))
     conditions = AttitudeConditions(
-        whole.rotation, target, slope, bare.gyroscope.inverse(), by_window(summed), by_window(swung),
-        gained / safe[:, None], data.used, complete, data.gravity, jnp.zeros(3 * (len(place) + windows)),
+        whole.rotation, target, whole.slope(turns.output), bare.gyroscope.inverse(), by_window(summed),
+        by_window(swung), gained / safe[:, None], data.used, complete, data.gravity,
+        jnp.zeros(3 * (len(place) + windows)),
     )  # fmt: skip
     share = (upright * (jnp.repeat(complete / safe, group) * data.used)[:, None, None])[:, None]
     leaning = share[:, 0] @ jnp.cross(jnp.eye(3), lever[:, None]).swapaxes(1, 2)
     reactions = Reactions(
-        whole.transport * data.used[:, None, None, None], share @ swinging,
+        whole.back[:, None] @ whole.turned * data.used[:, None, None, None], share @ swinging,
         share @ (held[..., None, None] * rotation_matrix(middle)), place,
     )  # fmt: skip
     return conditions, whole.noise, duration, leaning, reactions

@@ -141,11 +141,9 @@ def condense(
     rotation = integrated.rotation
     if method != "exponential":
         rotation = integrate_rates(gyroscope.recover(turns.output), turns.interval, method)
-    with_one = jnp.concatenate([turns.output, jnp.ones_like(turns.output[..., :1])], axis=-1)
-    slope = jnp.einsum("tsij,tsk->tijk", integrated.transport, with_one)
     conditions = HandHeldConditions(
-        poses.accelerometer_mean, poses.gyroscope_mean, poses.mask, turns.mask, turns.basis, rotation, slope,
-        gyroscope.inverse(), observations.gravity,
+        poses.accelerometer_mean, poses.gyroscope_mean, poses.mask, turns.mask, turns.basis, rotation,
+        integrated.slope(turns.output), gyroscope.inverse(), observations.gravity,
     )  # fmt: skip
     covariance = condition_covariance(imu, observations, integrated)
     return conditions, covariance, integrated, sensitivities(imu, observations, integrated)

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from jaximu.data.gravity_direction import unit_vectors
@@ -39,19 +40,32 @@ __all__ = [
     "sensitivities",
 ]
 
+_STRIDE = 5
+"""Samples of a turn, an odd number, that turn its noise as the one in their middle."""
+
 
 class IntegratedTurns(eqx.Module):
     """Turns integrated at one gyroscope calibration.
 
-    rotation: quaternion from the last body frame to the first; running: after every sample. transport: how the last
-    body frame's rotation vector reacts to the rate of every sample (s). noise: covariance (rad²) of that rotation
-    vector by white noise.
+    rotation: quaternion from the last body frame to the first; running: after every sample. turned: how the rate of
+    every sample turns the frames after it (s), in the first frame. noise: covariance (rad²) of the last body frame's
+    rotation vector by white noise.
     """
 
     rotation: Float[Array, "T 4"]
     running: Float[Array, "T S 4"]
-    transport: Float[Array, "T S 3 3"]
+    turned: Float[Array, "T S 3 3"]
     noise: Float[Array, "T 3 3"]
+
+    @property
+    def back(self) -> Float[Array, "T 3 3"]:
+        """Return the matrix of each rotation from the first body frame to the last."""
+        return rotation_matrix(conjugate(self.rotation))
+
+    def slope(self, output: Float[Array, "T S 3"]) -> Float[Array, "T 3 3 4"]:
+        """Return how the last body frame's rotation vector reacts to (A | c), of rates that are A y + c."""
+        with_one = jnp.concatenate([output, jnp.ones_like(output[..., :1])], axis=-1)
+        return jnp.einsum("tij,tjkl->tikl", self.back, jnp.einsum("tsij,tsk->tijk", self.turned, with_one))
 
 
 class Sensitivities(eqx.Module):
@@ -66,20 +80,23 @@ class Sensitivities(eqx.Module):
 def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
     """Integrate the turns with the gyroscope's gain and bias.
 
-    How the last frame reacts to the rates: `turned_by_rates`. White rate noise of density N in each sample turns the
-    end of the turn by R_k K⁻¹ n dt: the sum of R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame.
+    How frames react to the rates: `turned_by_rates`. White rate noise of density N in each sample turns the end of the
+    turn by R_k K⁻¹ n dt: the sum of R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame. Of the R_k every
+    `_STRIDE`th stands for its neighbours: where these turn by θ against it, what is left out is θ² of what differs
+    between the axes' noise.
     """
     assert imu.gyroscope is not None
     vectors = rotation_vectors(imu.gyroscope.recover(turns.output), turns.interval)
     running = running_rotations(vectors)
     final = running[..., -1, :]
-    back = rotation_matrix(conjugate(final))
-    toward = back[:, None] @ rotation_matrix(running)
+    count = vectors.shape[1]
+    spans = jnp.pad(turns.interval, ((0, 0), (0, -count % _STRIDE))).reshape(len(vectors), -1, _STRIDE).sum(axis=-1)
+    middle = np.minimum(np.arange(spans.shape[1]) * _STRIDE + _STRIDE // 2, count - 1)
+    toward = rotation_matrix(conjugate(final))[:, None] @ rotation_matrix(running[:, middle])
     inverse = inverse_matrix(imu.gyroscope.gain)
     density = inverse @ turns.noise @ inverse.T
-    noise = jnp.einsum("tsij,tslj,ts->til", toward @ density, toward, turns.interval)
-    transport = back[:, None] @ turned_by_rates(running, vectors, turns.interval)
-    return IntegratedTurns(final, running, transport, noise)
+    noise = jnp.einsum("tsij,tslj,ts->til", toward @ density, toward, spans)
+    return IntegratedTurns(final, running, turned_by_rates(running, vectors, turns.interval), noise)
 
 
 def _pose_sensitivities(imu: Imu, observations: Observations, rotations: Float[Array, "T 4"]):
@@ -105,7 +122,9 @@ def sensitivities(imu: Imu, observations: Observations, integrated: IntegratedTu
     assert imu.gyroscope is not None
     norm, after, before, lever = _pose_sensitivities(imu, observations, integrated.rotation)
     inverse = inverse_matrix(imu.gyroscope.gain)
-    return Sensitivities(norm, after, before, (lever[:, None] @ integrated.transport @ inverse).swapaxes(1, 2))
+    return Sensitivities(
+        norm, after, before, ((lever @ integrated.back)[:, None] @ integrated.turned @ inverse).swapaxes(1, 2)
+    )
 
 
 def condition_covariance(
@@ -149,8 +168,8 @@ def condition_covariance(
 
     inverse = inverse_matrix(imu.gyroscope.gain)  # pyright: ignore[reportOptionalMemberAccess]
     member = slow.part[..., None] == jnp.arange((slow.gyroscope.shape[-1] - len(norm)) // len(lever))
-    transport = jnp.einsum("tsb,tsij->tbij", member.astype(norm.dtype), integrated.transport)
-    by_part = (lever[:, None] @ transport @ inverse).swapaxes(1, 2)
+    turned = jnp.einsum("tsb,tsij->tbij", member.astype(norm.dtype), integrated.turned)
+    by_part = ((lever @ integrated.back)[:, None] @ turned @ inverse).swapaxes(1, 2)
 
     def by_rates(matrix, axis):
         """The same to an axis' mean rates (I, q), of all poses and then of the parts of each turn."""
