@@ -3,8 +3,8 @@
 
 Units differ in poses, in noise and in how long they rest; one in a hundred has a pose that does not belong. scipy gets
 the whitened two-step problem of `scipy_problem.py` with the weights already computed; the fleet's fit is whole
-(joint maximum likelihood, weights, excess variances, covariances, stragglers). Times of fits are of the processor,
-which other work on the machine disturbs less than the clock. With `--devices`, one local device against two instead.
+(joint maximum likelihood, weights, excess variances, covariances). Times of fits are of the processor,
+which other work on the machine disturbs less than the clock.
 """
 
 import os
@@ -12,13 +12,9 @@ import os
 os.environ["JAX_PLATFORMS"] = "cpu"
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[name] = "1"
-for name in ("NPROC", "PJRT_NPROC"):
-    os.environ.setdefault(name, "1")  # --devices sets them for its own processes
+os.environ["NPROC"] = os.environ["PJRT_NPROC"] = "1"
 
-import argparse
 import resource
-import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -30,7 +26,7 @@ from common import Table, arguments, finish, least
 from scipy.optimize import least_squares
 from scipy_problem import check_jacobians, numpy_problems, scipy_fit, two_step_weights
 
-from jaximu.calibration import fit_hand_held, nominal_imu
+from jaximu.calibration import nominal_imu
 from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
@@ -102,7 +98,7 @@ def end_to_end(files: int, workers: int, folder: Path) -> dict[str, float]:
 def agreement(made: list[FleetUnit]) -> float:
     """Largest step, in standard deviations, of the exact path from the fleet's answers."""
     worst = 0.0
-    for unit, fitted in zip(made, fit_units(made), strict=True):
+    for unit, (fitted, _) in zip(made, fit_units(made), strict=True):
         seen = PosesAndTurns.of(jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.observations))
         exact = fit(fitted.imu, seen, without_equipment, excess=fitted.excess, estimate_excess=False, max_passes=1)
         step = exact.values - flatten(fitted.imu)[[names_of(fitted.imu).index(name) for name in exact.names]]
@@ -113,7 +109,7 @@ def agreement(made: list[FleetUnit]) -> float:
 def against_scipy(made: list[FleetUnit], repetitions: int) -> dict[str, float]:
     problems = [
         numpy_problems(unit.observations, two_step_weights(fitted.imu, unit.observations, fitted.excess))
-        for unit, fitted in zip(made, fit_units(made), strict=True)
+        for unit, (fitted, _) in zip(made, fit_units(made), strict=True)
     ]
     check_jacobians(*problems[0])
     options = {"method": "lm", "xtol": 1e-9, "ftol": 1e-9, "gtol": 1e-9, "x_scale": 1.0}
@@ -138,85 +134,8 @@ def against_scipy(made: list[FleetUnit], repetitions: int) -> dict[str, float]:
     return {name: min(values) for name, values in times.items()}
 
 
-def on_devices() -> None:
-    """Fit the same units again for every line read, and say how many seconds each time took by the clock."""
-    made = units(32) * 8
-    fit_units(made)
-    for _ in sys.stdin:
-        began = time.perf_counter()
-        fit_units(made)
-        print(time.perf_counter() - began, flush=True)
-
-
-def devices(small: bool) -> None:
-    """One local device against two, in turns, the one on one thread; and two processes of one device at once.
-
-    The last is what the machine can give: cores that share caches or a clock do less together than alone twice.
-    """
-    load, names = os.getloadavg()[0], ("one", "other", "both")
-    running = {}
-    for name in names:
-        flags = f"--xla_force_host_platform_device_count={2 if name == 'both' else 1}"
-        # of one CPU, XLA's devices share a chunk where its pool has four threads each
-        threads = dict.fromkeys(("NPROC", "PJRT_NPROC"), "8" if name == "both" else "1")
-        running[name] = subprocess.Popen(
-            [sys.executable, __file__, "--worker"], env=os.environ | {"XLA_FLAGS": flags} | threads, text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        )  # fmt: skip
-
-    def together(*which: str) -> float:
-        for name in which:
-            print(file=running[name].stdin, flush=True)
-        return max(float(running[name].stdout.readline()) for name in which)
-
-    cases = {"one device": ("one",), "two devices": ("both",), "two processes, twice the units": ("one", "other")}
-    for name in names:  # compiled before anything is measured
-        together(name)
-    times = {case: [] for case in cases}
-    for _ in range(3 if small else 15):
-        for case, which in cases.items():
-            times[case].append(together(*which))
-    for process in running.values():
-        process.communicate()
-    seconds = {case: min(each) for case, each in times.items()}
-    alone = seconds["one device"]
-    table = Table(
-        "Fit of 256 units (36 to 40 poses, turns of up to 150 samples) on local devices",
-        ["", "s", "times one device", "goal"],
-        "Least of several times by the clock, taken in turns. Two processes at once, each with a device of its own and "
-        f"all units, are what two cores of this machine can give. Load at the start: {load:.1f}. By `--devices`.",
-    )
-    for case, value in seconds.items():
-        times_one = alone / value * (2 if case.startswith("two processes") else 1)
-        table.add(case, f"{value:.3f}", f"{times_one:.2f}", "≥ 1.8" if case == "two devices" else "")
-    finish("fleet_devices", [table], {"load": load, "seconds": seconds}, keep=not small, script="fleet")
-
-
-def of_the_core(made: list[FleetUnit]) -> dict[str, float]:
-    """Seconds a unit of the core's fit, for units of one shape: one after the other, and as a batch."""
-
-    def shapes(unit: FleetUnit) -> list[tuple[int, ...]]:
-        return [np.shape(leaf) for leaf in jax.tree.leaves(unit.observations)]
-
-    alike = [unit for unit in made if shapes(unit) == shapes(made[0])][:64]
-    nominal, observations = (jax.tree.map(lambda *leaves: np.stack(leaves), *each)
-                             for each in ([u.nominal for u in alike], [u.observations for u in alike]))  # fmt: skip
-    jobs = {
-        "core, one by one": lambda: [fit_hand_held(unit.nominal, unit.observations) for unit in alike],
-        f"core, batch of {len(alike)}": lambda: fit_hand_held(nominal, observations),
-    }
-    for job in jobs.values():
-        job()
-    return {name: least(job, 2) / len(alike) for name, job in jobs.items()}
-
-
 def main() -> None:
-    asked = arguments(__doc__, devices="one local device against two", worker=argparse.SUPPRESS)
-    if asked.worker:
-        return on_devices()
-    if asked.devices:
-        return devices(asked.small)
-    small = asked.small
+    small = arguments(__doc__).small
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as scratch:  # JAX writes to it for as long as this process lives
         measure(small, load, end_to_end(300 if small else 1000, 2, Path(scratch)))
@@ -227,7 +146,7 @@ def measure(small: bool, load: float, rows: dict[str, float]) -> None:
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     made = units(16 if small else 256)
     worst = agreement(made[: 16 if small else 64])
-    seconds = against_scipy(made, 2 if small else 3) | of_the_core(made)
+    seconds = against_scipy(made, 2 if small else 3)
 
     one = [replace(unit, gyroscope=False) for unit in made]
     growth, memory = {}, {}
@@ -244,8 +163,10 @@ def measure(small: bool, load: float, rows: dict[str, float]) -> None:
         f"The exact path's step from the fleet's answers: at most {worst:.1e} standard deviations (goal: "
         f"1e-3). scipy solves one weighted problem. Load of the machine at the start: {load:.1f}.",
     )
-    goals = {"jaximu, both triads": "≤ 0.8 ms, ≥ 55 times", "jaximu, accelerometer": "≤ 0.012 ms",
-             "core, one by one": "≤ 5 ms"}  # fmt: skip
+    goals = {
+        "jaximu, both triads": "≤ 0.8 ms, ≥ 55 times",
+        "jaximu, accelerometer": "≤ 0.012 ms",
+    }
     for name, value in seconds.items():
         against = "accelerometer" if name.endswith("accelerometer") else "both triads"
         ratio = "" if name.startswith("scipy") else f"{seconds[f'scipy, {against}'] / value:.2f}"

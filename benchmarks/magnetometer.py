@@ -314,7 +314,7 @@ def fleet(small: bool) -> None:
             many = (units * (count // len(units) + 1))[:count]
             began = time.process_time()
             for first in range(0, count, 1024):  # as a run takes them
-                assert all(each.converged for each in fit_units(many[first : first + 1024]))
+                assert all(each.converged for each, _ in fit_units(many[first : first + 1024]))
             spent[name].append((time.process_time() - began) / count)
     table = Table(
         f"A fleet of {count} units, 36 to 40 rests: ms of the processor a unit",

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -15,7 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from jaximu.calibration import nominal_imu
+from jaximu.calibration import fit_hand_held, nominal_imu, residual_rms
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.cli import main
 from jaximu.data.poses import PosesAndTurns
@@ -30,7 +31,8 @@ from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import observed_poses, segment
-from jaximu.simulation import draw_imu
+from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
 
 UNITS, POSES = 30, 12
 NUMBERS = ("accel_gain", "accel_bias", "gyro_gain", "gyro_bias")
@@ -127,21 +129,41 @@ def test_agrees_with_the_calibration_of_one_recording(folder, table):
     assert row["accel_rms"] == pytest.approx(single.rms["gravity_norm"][1], rel=0.05)
 
 
-def test_preintegrated_answer_is_the_exact_one(folder):
-    """The exact path's step from the fleet's answer: a thousandth of a standard deviation at most.
-
-    It integrates every sample with its derivatives; the fleet's derivatives are of blocks of four samples.
-    """
+def test_the_answer_is_where_a_step_from_it_ends(folder):
+    """A step of the data evaluated anew at the answer: a thousandth of a standard deviation at most."""
     recording = read_recording(folder / "unit005.parquet")
     unit = FleetUnit(observed_poses(segment(recording), 9.80665), nominal_imu(recording)[0], True)
-    (fitted,) = fit_units([unit])
+    ((fitted, _),) = fit_units([unit])
     observations = PosesAndTurns.of(jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.observations))
     exact = fit(fitted.imu, observations, without_equipment, excess=fitted.excess, estimate_excess=False, max_passes=1)
     sigma = np.sqrt(np.diagonal(fitted.covariance))
     step = exact.values - flatten(fitted.imu)[[names_of(fitted.imu).index(name) for name in exact.names]]
     assert exact.names == fitted.names
-    assert 0 < np.abs(step / sigma).max() < 1e-3
+    assert np.abs(step / sigma).max() < 1e-3
     np.testing.assert_allclose(exact.sigmas(), sigma, rtol=1e-3)
+
+
+def test_units_of_other_scales_and_shapes_are_fitted_as_if_alone():
+    """Two shapes, two output units, one without gyroscope: each as the recipe for one unit has it."""
+    cases = [(seed, poses, scale, seed != 3) for seed, (poses, scale) in
+             enumerate([(12, 1.0), (12, 1.0), (9, 1.0), (12, 1.0), (12, 1000.0)])]  # fmt: skip
+    units = []
+    for seed, poses, scale, gyroscope in cases:
+        recording, _ = simulate(draw_imu(seed), HandHeld(poses, 1.5), consumer_noise(), seed=seed)
+        force = recording.accelerometer
+        other = Signal(force.time, force.values / 9.80665 * scale, "mg") if scale > 1 else force
+        recording = replace(recording, accelerometer=other)
+        observations = observed_poses(segment(recording), 9.80665)
+        units.append(FleetUnit(observations, nominal_imu(recording)[0], gyroscope))
+    for unit, (fitted, rms) in zip(units, fit_units(units), strict=True):
+        single = fit_hand_held(unit.nominal, unit.observations, "joint" if unit.gyroscope else "accelerometer")
+        assert fitted.names == single.names and fitted.converged == single.converged
+        sigma = single.sigmas()
+        np.testing.assert_allclose((fitted.values - single.values) / sigma, 0.0, atol=1e-6)
+        np.testing.assert_allclose(fitted.sigmas(), sigma, rtol=1e-6)
+        np.testing.assert_allclose(fitted.excess, single.excess, rtol=1e-6, atol=1e-6)
+        known = residual_rms(single.imu, unit.observations, unit.gyroscope)
+        np.testing.assert_allclose(rms[: 1 + 2 * unit.gyroscope], [value for value, _ in known.values()], rtol=1e-6)
 
 
 def test_a_row_does_not_depend_on_its_batch(folder, table):

@@ -76,15 +76,15 @@ def test_is_the_core_s_fit_of_the_same_means(cases, rows):
     """The core from the same start, weighted alike: what is left is where each of the two stops."""
     found = segment(cases[4][0])
     own = field_unit(cases[4][0].magnetometer, found, FieldStrength(STRENGTH), "unit")
-    (fitted,) = fit_units([own.unit])
-    np.testing.assert_allclose(field_row(own, fitted)["mag_bias"], rows[4]["mag_bias"], rtol=0, atol=1e-12)
+    ((fitted, rms),) = fit_units([own.unit])
+    np.testing.assert_allclose(field_row(own, fitted, rms[0])["mag_bias"], rows[4]["mag_bias"], rtol=0, atol=1e-12)
     seen = PosesAndTurns.of(jax.tree.map(lambda leaf: np.asarray(leaf)[None], own.unit.observations), "norm")
     like = jax.tree.map(lambda leaf: np.asarray(leaf)[None], own.unit.nominal)
     exact = fit(
         like, seen, lambda name: without_equipment(name) and name.owner == "accelerometer",
         excess=fitted.excess[None], estimate_excess=False, max_passes=12,
     )  # fmt: skip
-    values = fitted.numbers[[0, 3, 4, 6, 7, 8, 9, 10, 11]]
+    values = fitted.values
     step = np.abs(exact.values[0] - values) / np.sqrt(np.diagonal(fitted.covariance))
     assert step.max() < 1e-4
 
@@ -105,8 +105,8 @@ def test_agrees_with_the_magnitude_recipe_of_one_recording(cases, rows):
 def test_a_field_of_which_nothing_is_known_widens_scale_alone(cases):
     found = segment(cases[0][0])
     known, free = (field_unit(cases[0][0].magnetometer, found, each, "u") for each in (FieldStrength(STRENGTH), None))
-    first, second = (field_row(own, each) for own, each in zip((known, free), fit_units([known.unit, free.unit]),
-                                                               strict=True))  # fmt: skip
+    fits = fit_units([known.unit, free.unit])
+    first, second = (field_row(own, each, rms[0]) for own, (each, rms) in zip((known, free), fits, strict=True))
     assert second["mag_field_sigma"] == pytest.approx(0.05 * second["mag_field"])
     np.testing.assert_allclose(second["mag_bias"], first["mag_bias"], atol=1e-4)
     np.testing.assert_allclose(second["mag_gain"] * second["mag_field"], first["mag_gain"] * STRENGTH, rtol=1e-4)

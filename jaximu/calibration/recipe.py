@@ -49,10 +49,18 @@ _NO_DRIFT = (
 )
 
 
-def residual_rms(imu: Imu, observations: Observations, gyroscope: bool = True) -> dict[str, tuple[float, str]]:
-    """Return the rms of each kind of residual in units a person knows: m/s², degrees, rad/s (all unweighted)."""
+def residual_rms(
+    imu: Imu,
+    observations: Observations,
+    gyroscope: bool = True,
+    seen: tuple[FloatArray, FloatArray] | None = None,
+) -> dict[str, tuple[float, str]]:
+    """Return the rms of each kind of residual in units a person knows: m/s², degrees, rad/s (all unweighted).
+
+    `seen`: forces and angles of the unit, where at hand.
+    """
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
-    force, angle = forces_and_angles(imu, observations)
+    force, angle = forces_and_angles(imu, observations) if seen is None else seen
     norm = np.linalg.norm(force[poses], axis=1) - float(observations.gravity)
     found = {"gravity_norm": (_rms(norm), "m/s^2")}
     if imu.gyroscope is None or not gyroscope:

@@ -8,7 +8,7 @@ estimate went, until nothing moves.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import Chain, ChainWeights, Covariance, Weights, update_excess
 from jaximu.estimation.data import Conditions, Data
-from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, unflatten
+from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, typical_sizes, unflatten
 from jaximu.estimation.solver import MAX_STEPS, Failure, solve
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -44,12 +44,15 @@ __all__ = [
     "unwhitened",
 ]
 
-_CHUNK = 64
-"""Units that are in memory together, with the covariances of their conditions."""
+_CHUNK = 16
+"""Units of a batch that a compiled pass takes: as many as make calling it cheap, and no more are fitted in vain."""
 _SPARE = (12, 36, 84)
 """Numbers of effects that share a compiled pass: rows of zeros fill up to the next."""
 _STILL = 1e-2
 """Standard deviations below which a step ends the passes: what it leaves is its square."""
+_NEAR = 0.1
+"""Standard deviations that a unit may move before its data are evaluated anew: conditions and weights taken so far off
+move the answer by less than 1e-4."""
 _CLOSE = 1e-6
 """Typical sizes below which a step ends a pass: a Newton step takes off what it leaves, and another pass may follow."""
 _SWINGING = 5
@@ -308,6 +311,7 @@ class _Whitened(eqx.Module):
     weights: tuple[Weights | ChainWeights, ...]
     used: tuple[Array, ...]
     columns: Array
+    shift: Array
     mean: Array
     root: Array
     damping: Array
@@ -318,7 +322,7 @@ class _Whitened(eqx.Module):
         model = self.parameters.model(self.like, z[:count])
         plain = jnp.concatenate([w.whiten(used * each(model)) for w, used, each in
                                  zip(self.weights, self.used, self.conditions, strict=True)])  # fmt: skip
-        return plain + self.columns @ z[count:]
+        return plain + self.columns @ (z[count:] + self.shift)
 
     def objective(self, z):
         beforehand = jnp.concatenate([self.root @ (z - self.mean), self.damping * z])
@@ -333,12 +337,29 @@ def _robust_excess(residual: Array, groups: Array, excess: Array) -> Array:
     return jnp.where(jnp.isnan(spread), excess, jnp.maximum((1 + excess) * jnp.nan_to_num(spread) ** 2 - 1, 0.0))
 
 
+class _Seen(eqx.Module):
+    """Data evaluated about units, the leading axis of every array.
+
+    columns: the conditions' derivatives by the free numbers of effects, in typical sizes. numbers: of all effects, at
+    which they were evaluated.
+    """
+
+    conditions: tuple[Conditions, ...]
+    covariances: tuple[Covariance | Chain, ...]
+    columns: Float[Array, "N n q"]
+    numbers: Float[Array, "N a"]
+
+
 class _Unit(NamedTuple):
-    """What a pass knows of one unit: what was measured, and what is known beforehand."""
+    """What a pass knows of one unit: what was measured, and what is known beforehand.
+
+    shift: of the effects' numbers since the data were evaluated.
+    """
 
     conditions: tuple[Conditions, ...]
     covariances: tuple[Covariance | Chain, ...]
     columns: Array
+    shift: Array
     mean: Array
     root: Array
     damping: Array
@@ -354,7 +375,17 @@ class _Unit(NamedTuple):
         white = jnp.concatenate([w.whiten(rows[:, None] * self.columns[part])
                                  for w, rows, part in zip(weights, used, split, strict=True)])  # fmt: skip
         return _Whitened(
-            like, parameters, self.conditions, weights, used, white, self.mean, self.root, self.damping, loss
+            like,
+            parameters,
+            self.conditions,
+            weights,
+            used,
+            white,
+            self.shift,
+            self.mean,
+            self.root,
+            self.damping,
+            loss,
         )
 
     def evaluated(self, problem: _Whitened, z: Array, residual: Array, jacobian: Array) -> _Evaluated:
@@ -414,7 +445,9 @@ def _no_step(loss: str, like: Imu, parameters: Parameters, unit: _Unit) -> _Eval
     return unit.evaluated(problem, zero, residual, jacobian)
 
 
-def _run(one: Callable, loss: str, like: Imu, parameters: Parameters, references: Array, units: _Unit) -> Any:
+def _run(
+    one: Callable, loss: str, like: Imu, parameters: Parameters, references: Array, sizes: Array, units: _Unit
+) -> Any:
     """Run `_single_pass` or `_no_step` for a batch of units; a compiled function for each loss and shape.
 
     On a CPU lanes run one after the other inside the compiled loop: a lane stops when it has converged, its matrices
@@ -423,16 +456,16 @@ def _run(one: Callable, loss: str, like: Imu, parameters: Parameters, references
     """
     count = units.mean.shape[0]
 
-    def batch(like, parameters, references, units):
+    def batch(like, parameters, references, sizes, units):
         def lane(item):
-            reference, unit = item
-            own = eqx.tree_at(lambda p: p.reference, parameters, reference)
+            reference, size, unit = item
+            own = eqx.tree_at(lambda p: (p.reference, p.size), parameters, (reference, size))
             return one(loss, like, own, unit)
 
         lanes = None if jax.default_backend() == "cpu" else count
-        return jax.lax.map(lane, (references, units), batch_size=lanes)
+        return jax.lax.map(lane, (references, sizes, units), batch_size=lanes)
 
-    return stored.call(batch, f"{one.__name__} {loss}", like, parameters, references, units, quick=count == 1)
+    return stored.call(batch, f"{one.__name__} {loss}", like, parameters, references, sizes, units, quick=count == 1)
 
 
 # --- passes -----------------------------------------------------------------------------------------------------------
@@ -505,7 +538,8 @@ class _State(eqx.Module):
 
     reference: all numbers of gain and bias; numbers: of the effects; excess: to weight with next, used: the last one.
     damping: of the next step. least: cost above which a step led astray, and before: where it began. share, taken: of
-    the last change of the excess. active: units whose passes go on; settled: those that stand.
+    the last change of the excess. away: what a unit moved since its data were evaluated. active: units whose passes go
+    on; settled: those that stand.
     """
 
     reference: Float[Array, "N m"]
@@ -517,6 +551,7 @@ class _State(eqx.Module):
     before: tuple[Float[Array, "N m"], Float[Array, "N q"]]
     share: Float[Array, " N"]
     taken: Float[Array, "N k"]
+    away: Float[Array, " N"]
     active: Bool[Array, " N"]
     settled: Bool[Array, " N"]
 
@@ -546,11 +581,14 @@ class _Passes:
         self.kept = np.array([free(name) for name in names], bool)
         chosen = tuple(name for name, kept in zip(names, self.kept, strict=True) if kept)
         self.names = (*self.parameters.names, *chosen)
-        self.sizes = self.numerics.concatenate([self.parameters.size, sizes[0, self.kept]])
         self.base = len(self.parameters.names)
         self.index = np.array(self.parameters.index, int)
-        leaves = [self.numerics.reshape(leaf, (self.count, -1)) for leaf in jax.tree.leaves(bare)]
-        self.reference = self.numerics.concatenate(leaves, axis=1)
+        self.reference = self._beside(bare)
+        own = numerics.tile(self.parameters.size, (self.count, 1))
+        if not bare.all_effects():  # units may have other scales
+            own = self._beside(typical_sizes(bare))[:, self.index]
+        self.sizes = self.numerics.concatenate([own, sizes[:, self.kept]], axis=1)
+        self.bent = any(name.part != "coefficients" for name in chosen)  # inner numbers do not act by columns
         self.spare = 0
         if self.count == 1 and not inside:
             needed = len(self.names) - self.base
@@ -559,6 +597,11 @@ class _Passes:
         coefficients = [name.part == "coefficients" for name in chosen]
         absent = np.array([False] * self.base + coefficients, bool)
         self.anchor = self.numerics.where(absent, 0.0, self.values(self.reference, self.numbers))
+
+    def _beside(self, imu: Imu) -> Array:
+        """Return the numbers (N, m) of units."""
+        leaves = [self.numerics.reshape(leaf, (self.count, -1)) for leaf in jax.tree.leaves(imu)]
+        return self.numerics.concatenate(leaves, axis=1)
 
     def values(self, reference: Array, numbers: Array) -> Array:
         """Return the free numbers (N, p)."""
@@ -583,33 +626,45 @@ class _Passes:
         ]
         of_base = np.arange(len(width)) < self.base
         root = numerics.diag(1 / numerics.where(of_base & numerics.asarray(first), _COARSE, width))
-        mean = numerics.zeros_like(here) if self.follow else (self.anchor[lanes] - here) / self.sizes
+        mean = numerics.zeros_like(here) if self.follow else (self.anchor[lanes] - here) / self.sizes[lanes]
         if self.prior is not None:
             chosen = np.zeros((len(self.prior.names), len(self.names)))
             chosen[np.arange(len(chosen)), [self.names.index(name) for name in self.prior.names]] = 1.0
             stated = chosen.sum(axis=0) > 0
-            sizes = chosen @ self.sizes
-            root = numerics.where(stated[:, None], 0.0, root) + chosen.T @ (self.prior.root * sizes) @ chosen
+            sizes = self.sizes[lanes] @ chosen.T
+            known = chosen.T @ (self.prior.root * sizes[:, None]) @ chosen
+            root = numerics.where(stated[:, None], 0.0, root) + known
             mean = numerics.where(stated, ((self.prior.mean - here @ chosen.T) / sizes) @ chosen, mean)
         mean = numerics.pad(mean, [(0, 0), (0, self.spare)])
         count = len(self.names)
-        whole = numerics.pad(root, [(0, self.spare), (0, self.spare)])
+        root = numerics.broadcast_to(root, (len(mean), count, count))
+        whole = numerics.pad(root, [(0, 0), (0, self.spare), (0, self.spare)])
         whole = whole + np.diag(np.arange(count + self.spare) >= count).astype(float)
-        return mean, numerics.broadcast_to(whole, (len(mean), *whole.shape))
+        return mean, whole
 
-    def once(self, one: Callable, state: _State, lanes: NDArray[np.int64], first: bool | Array = False) -> Any:
-        """Evaluate the data where the passes are, and run `_single_pass` or `_no_step`; `state` is of `lanes`."""
+    def seen(self, state: _State, lanes: NDArray[np.int64]) -> _Seen:
+        """Evaluate the data where the passes are; `state` is of `lanes`."""
         imu = self.model(state, lanes)
         data = self.data if self.numerics is jnp else [kind.take(lanes) for kind in self.data]
         about = [kind.about(imu) for kind in data]
         columns = self.numerics.concatenate([kind.columns for kind in about], axis=1)
-        columns = columns[..., self.kept] * self.sizes[self.base :]
+        columns = columns[..., self.kept] * self.sizes[lanes][:, None, self.base :]
         columns = self.numerics.pad(columns, [(0, 0), (0, 0), (0, self.spare)])
+        return _Seen(
+            tuple(kind.conditions for kind in about), tuple(kind.covariance for kind in about), columns, state.numbers
+        )
+
+    def once(
+        self, one: Callable, state: _State, lanes: NDArray[np.int64], seen: _Seen, first: bool | Array = False
+    ) -> Any:
+        """Run `_single_pass` or `_no_step` where the passes are; `state` and `seen` are of `lanes`."""
+        shift = (state.numbers - seen.numbers)[:, self.kept] / self.sizes[lanes][:, self.base :]
         unit = _Unit(
-            tuple(kind.conditions for kind in about), tuple(kind.covariance for kind in about), columns,
+            seen.conditions, seen.covariances, seen.columns, self.numerics.pad(shift, [(0, 0), (0, self.spare)]),
             *self.known(state, lanes, first), state.damping, state.excess,
         )  # fmt: skip
-        return _run(one, self.loss, self.like, self.parameters, state.reference, unit)
+        sizes = self.sizes[lanes][:, : self.base]
+        return _run(one, self.loss, self.like, self.parameters, state.reference, sizes, unit)
 
     def start(self, excess: Array) -> _State:
         """Return where the passes begin."""
@@ -617,7 +672,7 @@ class _Passes:
         none, far, yes = numerics.zeros(many), numerics.full(many, np.inf), numerics.ones(many, bool)
         return _State(
             self.reference, self.numbers, excess, excess, none, far, (self.reference, self.numbers), none + 1.0,
-            numerics.zeros_like(excess), yes, ~yes,
+            numerics.zeros_like(excess), far, yes, ~yes,
         )  # fmt: skip
 
     def advanced(
@@ -662,6 +717,7 @@ class _Passes:
             (pick(worse, state.before[0], state.reference), pick(worse, state.before[1], state.numbers)),
             pick(worse, state.share, share),
             pick(worse, state.taken, way),
+            pick(worse | numerics.asarray(first) | self.bent, numerics.full_like(length, np.inf), state.away + length),
             worse | (~still & out.finite),
             fine & still,
         ), fine
@@ -669,7 +725,7 @@ class _Passes:
     def moved(self, state: _State, lanes: NDArray[np.int64], z: Array) -> tuple[Array, Array]:
         """Return reference and numbers after a step z (N, p) in typical sizes."""
         base, wide = self.base, len(self.names)
-        step = self.sizes * z[:, :wide]
+        step = self.sizes[lanes] * z[:, :wide]
         spread = np.zeros((base, state.reference.shape[1]))
         spread[np.arange(base), self.index] = 1.0
         reference = state.reference + step[:, :base] @ spread
@@ -682,24 +738,32 @@ class _Passes:
 
     def run(self, excess: FloatArray) -> Fit:
         """Alternate until nothing moves, a chunk of the units that still do after the other, and only those."""
-        state, result = jax.tree.map(np.array, self.start(excess)), None
+        state, seen, result = jax.tree.map(np.array, self.start(excess)), None, None
         for number in range(self.max_passes):
-            lanes = np.flatnonzero(state.active)
-            for part in np.split(lanes, range(_CHUNK, len(lanes), _CHUNK)):
-                size = 1 if len(part) == 1 else 8 if len(part) <= 8 else _CHUNK
-                padded = np.concatenate([part, np.full(size - len(part), part[-1])])
-                here = jax.tree.map(lambda leaf, padded=padded: leaf[padded], state)
-                out = self.once(_single_pass, here, padded, self.blunted and number == 0)
-                here, out = jax.tree.map(lambda leaf, part=part: leaf[: len(part)], (here, out))
+            for part, padded in self.chunks(state.active & (state.away >= _NEAR)):
+                new = self.seen(_of(state, padded), padded)
+                seen = jax.tree.map(partial(_room, self.count), new) if seen is None else seen
+                jax.tree.map(partial(_put, part), seen, _of(new, slice(len(part))))
+                state.away[part] = 0.0
+            for part, padded in self.chunks(state.active):
+                here = _of(state, padded)
+                out = self.once(_single_pass, here, padded, _of(seen, padded), self.blunted and number == 0)
+                here, out = _of((here, out), slice(len(part)))
                 after, fine = self.advanced(here, part, out, number)
                 jax.tree.map(partial(_put, part), state, after)
-                kept, out = part[fine], jax.tree.map(lambda leaf, fine=fine: leaf[fine], out)
                 result = jax.tree.map(partial(_room, self.count), out) if result is None else result
-                jax.tree.map(partial(_put, kept), result, out)
+                jax.tree.map(partial(_put, part[fine]), result, _of(out, fine))
             if not state.active.any():
                 break
         assert result is not None
         return self.fit(state, result.there, result.cost, result.steps, result.converged, result.finite)
+
+    def chunks(self, chosen: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Yield the units that are chosen, a chunk after the other, and the same filled up with the last of them."""
+        lanes, size = np.flatnonzero(chosen), 1 if self.count == 1 else _CHUNK
+        for part in np.split(lanes, range(size, len(lanes), size)):
+            if len(part):
+                yield part, np.concatenate([part, np.full(size - len(part), part[-1])])
 
     def traced(self, excess: Array) -> Fit:
         """Alternate until nothing moves, all units side by side, in a loop that JAX traces."""
@@ -714,29 +778,38 @@ class _Passes:
 
         def left(x):
             """Return what a fit brings to zero: a Newton step, and the change of the excess."""
-            there = self.once(_no_step, at(x), lanes)
+            there = self.once(_no_step, at(x), lanes, self.seen(at(x), lanes))
             step = jnp.einsum("upq,uq->up", there.covariance, there.gradient)[:, : len(self.names)] * self.sizes
             numbers = (x[1] - self.numbers).at[:, np.flatnonzero(self.kept)].set(step[:, self.base :])
             way = x[2] - (jnp.clip(there.excess, 0.0, self.most) if self.estimated else excess)
             return step[:, : self.base], numbers, way
 
         def passes(_, x):
+            def evaluated(state, seen):
+                stale = state.active & (state.away >= _NEAR)
+                new = jax.tree.map(partial(_where, jnp, stale), self.seen(state, lanes), seen)
+                return eqx.tree_at(lambda p: p.away, state, jnp.where(stale, 0.0, state.away)), new
+
             def step(loop):
-                state, number, ended = loop
-                out = self.once(_single_pass, state, lanes, (number == 0) & self.blunted)
+                state, seen, number, ended = loop
+                stale = state.active & (state.away >= _NEAR)
+                state, seen = jax.lax.cond(stale.any(), evaluated, lambda *same: same, state, seen)
+                out = self.once(_single_pass, state, lanes, seen, (number == 0) & self.blunted)
                 after, fine = self.advanced(state, lanes, out, number)
                 after = jax.tree.map(partial(_where, jnp, state.active), after, state)
                 after = eqx.tree_at(lambda p: p.active, after, state.active & after.active)
                 ended = jax.tree.map(
                     partial(_where, jnp, state.active & fine), (out.steps, out.converged, out.finite), ended
                 )
-                return after, number + 1, ended
+                return after, seen, number + 1, ended
 
             def on(loop):
-                return loop[0].active.any() & (loop[1] < self.max_passes)
+                return loop[0].active.any() & (loop[2] < self.max_passes)
 
             none = jnp.zeros(self.count, int), jnp.zeros(self.count, bool), jnp.ones(self.count, bool)
-            state, _, ended = jax.lax.while_loop(on, step, (at(x), 0, none))
+            like = jax.eval_shape(lambda: self.seen(first_state, lanes))
+            blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
+            state, _, _, ended = jax.lax.while_loop(on, step, (at(x), blank, 0, none))
             about = jax.tree.map(lambda leaf: leaf.astype(float), (*ended, state.settled))  # as derivatives need them
             return (state.reference[:, self.index], state.numbers, state.used), about
 
@@ -749,16 +822,16 @@ class _Passes:
         x, about = jax.lax.custom_root(left, first, passes, undo, has_aux=True)
         steps, (converged, finite, settled) = about[0].astype(int), (leaf > 0 for leaf in about[1:])
         state = eqx.tree_at(lambda p: p.settled, at(x), settled)
-        there = self.once(_no_step, state, lanes)
+        there = self.once(_no_step, state, lanes, self.seen(state, lanes))
         cost = 0.5 * jnp.sum(there.residual**2, axis=-1)
         return self.fit(state, there, cost, steps, converged, finite)
 
     def fit(self, state: _State, there: _Evaluated, cost: Array, steps: Array, converged: Array, finite: Array) -> Fit:
         """Return the fit of units whose passes have ended."""
         size, keep = self.sizes, len(self.names)
-        covariance = there.covariance[:, :keep, :keep] * size[:, None] * size
+        covariance = there.covariance[:, :keep, :keep] * size[:, :, None] * size[:, None]
         return Fit(
-            self.model(state, np.arange(self.count)), self.names, self.numerics.tile(size, (self.count, 1)),
+            self.model(state, np.arange(self.count)), self.names, size,
             self.values(state.reference, state.numbers), covariance, there.magnitude[:, :keep] * size, there.residual,
             there.jacobian[..., :keep], state.used, cost, steps, converged & state.settled, finite,
         )  # pyright: ignore[reportCallIssue] # fmt: skip
@@ -781,6 +854,11 @@ def _secant(share: Array, before: Array, now: Array, leap: Array | float) -> Arr
 def _where(numerics: Any, chosen: Array, one: Array, other: Array) -> Array:
     """Return arrays unit by unit: `one` where the unit is chosen, else `other`."""
     return numerics.where(chosen.reshape(-1, *[1] * (np.ndim(one) - 1)), one, other)
+
+
+def _of(tree: Any, lanes: NDArray[np.int64] | slice) -> Any:
+    """Return arrays of some of the units."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], tree)
 
 
 def _room(count: int, leaf: FloatArray) -> FloatArray:

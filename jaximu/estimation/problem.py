@@ -39,6 +39,8 @@ recordings labelled with another range are common, and a tighter tolerance would
 def typical_sizes(imu: Imu) -> Imu:
     """Return an Imu of plausible deviations from a data sheet: they scale the fit, and bound what data cannot tell.
 
+    Of units, with a leading axis on every array, too, unless they have effects.
+
     Gain 10 % of the axis's scale, accelerometer bias 1 m/s², gyroscope bias 0.1 rad/s, hard iron 20 µT, effects as
     they state.
     """
@@ -47,7 +49,7 @@ def typical_sizes(imu: Imu) -> Imu:
         numerics = array_module(triad)
         scale = numerics.linalg.norm(numerics.asarray(triad.gain), axis=-1)
         effects = tuple(effect.typical_sizes(numerics.mean(scale)) for effect in triad.effects)
-        gain = 0.1 * numerics.broadcast_to(scale[:, None], (3, 3))
+        gain = 0.1 * numerics.broadcast_to(scale[..., None], (*scale.shape, 3))
         return replace(triad, gain=gain, bias=bias * scale, effects=effects)
 
     gyroscope = None if imu.gyroscope is None else sizes(imu.gyroscope, 0.1)

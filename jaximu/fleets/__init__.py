@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
-    from jaximu.fleets.fit import Fitted, FleetUnit, fit_units
+    from jaximu.fleets.fit import FleetUnit, fit_units
     from jaximu.fleets.jobs import Job, Settings, find_jobs
     from jaximu.fleets.rows import PARAMETERS, SCHEMA, rows_of
     from jaximu.fleets.run import run_fleet
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 __all__ = [
     "PARAMETERS",
     "SCHEMA",
-    "Fitted",
     "FleetUnit",
     "Job",
     "Settings",

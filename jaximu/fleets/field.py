@@ -16,7 +16,8 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from jaximu.calibration.magnetometer import FieldStrength, field_start
-from jaximu.fleets.fit import Fitted, FleetUnit
+from jaximu.estimation.fitting import Fit
+from jaximu.fleets.fit import FleetUnit
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
@@ -57,16 +58,17 @@ def field_unit(signal: Signal, found: Segmentation, strength: FieldStrength | No
     return FieldUnit(FleetUnit(observations, nominal, False), field, signal.unit, len(rests))
 
 
-def field_row(own: FieldUnit, fitted: Fitted) -> dict[str, Any]:
-    """Return what a table says of a fitted magnetometer, per µT."""
+def field_row(own: FieldUnit, fit: Fit, rms: float) -> dict[str, Any]:
+    """Return what a table says of a fitted magnetometer, per µT; `rms`: of its norm, m/s²."""
     factor = STANDARD_GRAVITY / own.field.value
     sigma = np.zeros(12)
-    places = [3 * name.axes[0] + name.axes[1] if name.part == "gain" else 9 + name.axes[0] for name in fitted.names]
-    sigma[places] = np.sqrt(np.diagonal(fitted.total_covariance(factor * own.field.sigma)))
+    triad = fit.imu.accelerometer
+    places = [3 * name.axes[0] + name.axes[1] if name.part == "gain" else 9 + name.axes[0] for name in fit.names]
+    sigma[places] = np.sqrt(np.diagonal(fit.total_covariance(factor * own.field.sigma)))
     return {
-        "mag_gain": factor * fitted.numbers[:9], "mag_gain_sigma": factor * sigma[:9],
-        "mag_bias": fitted.numbers[9:12], "mag_bias_sigma": sigma[9:],
-        "mag_rms": float(fitted.rms[0] / factor), "mag_field": own.field.value, "mag_field_sigma": own.field.sigma,
+        "mag_gain": factor * np.ravel(triad.gain), "mag_gain_sigma": factor * sigma[:9],
+        "mag_bias": triad.bias, "mag_bias_sigma": sigma[9:],
+        "mag_rms": rms / factor, "mag_field": own.field.value, "mag_field_sigma": own.field.sigma,
         "mag_unit": own.output_unit,
     }  # fmt: skip
 

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import nominal_imu, require_spanning
 from jaximu.data.poses import EXCESS_NAMES
-from jaximu.estimation.problem import TOLERANCE, names_of, without_equipment
+from jaximu.estimation.fitting import Fit
+from jaximu.estimation.problem import names_of, without_equipment
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import weak_directions
 from jaximu.fleets.field import FieldUnit, field_row, field_unit
-from jaximu.fleets.fit import Fitted, FleetUnit, fit_units, parameter_set
+from jaximu.fleets.fit import FleetUnit, fit_units
 from jaximu.fleets.jobs import Job, Settings
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
@@ -205,8 +207,8 @@ def finish(prepared: Sequence[ReadJob], settings: Settings) -> list[dict[str, An
     """Fit what was prepared, in one batch, and return its rows in the same order."""
     units = [each.unit for each in prepared if each.unit is not None]
     fits = iter(fit_units([*units, *(each.field.unit for each in prepared if each.field is not None)]))
-    rows = [each.row if each.unit is None else _row(each, next(fits), settings) for each in prepared]
-    return [row if each.field is None else row | _field(each.field, next(fits), row["file"])
+    rows = [each.row if each.unit is None else _row(each, *next(fits), settings) for each in prepared]
+    return [row if each.field is None else row | _field(each.field, *next(fits), row["file"])
             for row, each in zip(rows, prepared, strict=True)]  # fmt: skip
 
 
@@ -215,54 +217,50 @@ def rows_of(jobs: Sequence[Job], settings: Settings) -> list[dict[str, Any]]:
     return finish([read_job(job, settings) for job in jobs], settings)
 
 
-def _row(prepared: ReadJob, fitted: Fitted, settings: Settings) -> dict[str, Any]:
+def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> dict[str, Any]:
     row, unit = prepared.row, prepared.unit
     assert unit is not None
-    like, parameters = parameter_set(unit.gyroscope)
     try:
-        root = _required(fitted, row["poses"], row["file"], "accelerometer")
+        _require(fit, row["poses"], row["file"], "accelerometer")
     except NotPossibleError as error:
         return row | _failure(error)
-    rank, weak = weak_directions(root, parameters.names, np.asarray(parameters.size), like)
+    rank, weak = weak_directions(fit.jacobian, fit.names, fit.sizes, unit.nominal)
     kinds = len(EXCESS_NAMES) if unit.gyroscope else 1
     whole = np.zeros((len(PARAMETERS), len(PARAMETERS)))
-    places = [PARAMETERS.index(name) for name in fitted.names]
-    whole[np.ix_(places, places)] = fitted.covariance
+    places = [PARAMETERS.index(name) for name in fit.names]
+    whole[np.ix_(places, places)] = fit.covariance
     total = np.zeros_like(whole)
-    total[np.ix_(places, places)] = fitted.total_covariance(settings.gravity.sigma)
+    total[np.ix_(places, places)] = fit.total_covariance(settings.gravity.sigma)
     sigma = np.sqrt(np.diagonal(total))
     row = row | {
         "status": "ok",
-        "accel_rms": float(fitted.rms[0]),
+        "accel_rms": float(rms[0]),
         "covariance": whole[_TRIANGLE],
-        "excess": [*np.asarray(fitted.excess[:kinds]).tolist(), *[None] * (3 - kinds)],
+        "excess": [*np.asarray(fit.excess[:kinds]).tolist(), *[None] * (3 - kinds)],
         "rank": rank,
         "weak": [each.text for each in weak],
     }
     if unit.gyroscope and row["turns"]:
-        row["gyro_rms"] = float(fitted.rms[1])
-    for name, start in (("accel", 0), ("gyro", 12))[: 1 + unit.gyroscope]:
-        gain, bias = slice(start, start + 9), slice(start + 9, start + 12)
-        row[f"{name}_gain"], row[f"{name}_bias"] = fitted.numbers[gain], fitted.numbers[bias]
+        row["gyro_rms"] = float(rms[1])
+    for name, triad, start in (("accel", "accelerometer", 0), ("gyro", "gyroscope", 12))[: 1 + unit.gyroscope]:
+        gain, bias, known = slice(start, start + 9), slice(start + 9, start + 12), fit.imu.triads()[triad]
+        row[f"{name}_gain"], row[f"{name}_bias"] = np.ravel(known.gain), known.bias
         row[f"{name}_gain_sigma"], row[f"{name}_bias_sigma"] = sigma[gain], sigma[bias]
     return row
 
 
-def _required(fitted: Fitted, poses: int, where: str, sensor: str) -> NDArray[np.float64]:
-    """Return a root (p, p) of JᵀJ, as good as the Jacobian to whom only that matters; refuse what is no calibration."""
-    if not fitted.finite:
+def _require(fit: Fit, poses: int, where: str, sensor: str) -> None:
+    """Raise `NotPossibleError` for what is no calibration."""
+    if not fit.finite:
         raise NotPossibleError(f"{where}: {Failure.NONFINITE.value}.")
-    values, vectors = np.linalg.eigh(fitted.information)
-    covariance = (vectors / (np.maximum(values, 0.0) + 1 / TOLERANCE**2)) @ vectors.T
-    require_spanning(covariance, fitted.names, poses, where, sensor)
-    if not fitted.converged:
+    require_spanning(fit.covariance / fit.sizes[:, None] / fit.sizes, fit.names, poses, where, sensor)
+    if not fit.converged:
         raise NotPossibleError(f"{where}: {Failure.MAX_STEPS.value}.")
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 
-def _field(own: FieldUnit, fitted: Fitted, where: str) -> dict[str, Any]:
+def _field(own: FieldUnit, fit: Fit, rms: FloatArray, where: str) -> dict[str, Any]:
     try:
-        _required(fitted, own.poses, where, "magnetometer")
+        _require(fit, own.poses, where, "magnetometer")
     except NotPossibleError as error:
         return {"mag_message": _sentence(error)}
-    return field_row(own, fitted)
+    return field_row(own, fit, float(rms[0]))

@@ -7,6 +7,8 @@ element by element, because under `jax.vmap` and `jax.jacfwd` stacks of small ma
 CPU.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
@@ -24,9 +26,12 @@ __all__ = [
     "logarithm",
     "multiply",
     "neighbours",
+    "product",
     "right_jacobian",
+    "right_jacobian_rows",
     "rotate",
     "rotation_matrix",
+    "rotation_rows",
     "rotation_vectors",
     "running_rotations",
 ]
@@ -50,7 +55,8 @@ def inverse_matrix(matrix: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
     return jnp.stack(columns, axis=-1) / determinant[..., None, None]
 
 
-def _multiply(p, q):
+def product(p: Sequence[Array], q: Sequence[Array]) -> tuple[Array, Array, Array, Array]:
+    """Return the Hamilton product p ⊗ q of quaternions by component."""
     pw, px, py, pz = p
     qw, qx, qy, qz = q
     return (
@@ -67,7 +73,7 @@ def _parts(array):
 
 def multiply(p: Float[Array, "... 4"], q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
     """Return the Hamilton product p ⊗ q."""
-    return jnp.stack(_multiply(_parts(p), _parts(q)), axis=-1)
+    return jnp.stack(product(_parts(p), _parts(q)), axis=-1)
 
 
 def conjugate(q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
@@ -75,15 +81,19 @@ def conjugate(q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
     return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
 
 
-def rotation_matrix(q: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
-    """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`."""
-    w, x, y, z = _parts(q)
-    rows = [
+def rotation_rows(quaternion: Sequence[Array]) -> list[list[Array]]:
+    """Return the rows of the rotation matrix of a unit quaternion, all by component."""
+    w, x, y, z = quaternion
+    return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rotation_matrix(q: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
+    """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`."""
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rotation_rows(_parts(q))], axis=-2)
 
 
 def rotate(q: Float[Array, "... 4"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
@@ -130,13 +140,18 @@ def right_jacobian(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 
     angle = jnp.sqrt(safe)
     first = jnp.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - jnp.cos(angle)) / safe)
     second = jnp.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - jnp.sin(angle)) / (safe * angle))
-    x, y, z = _parts(rotation_vector)
-    rows = [
+    rows = right_jacobian_rows(_parts(rotation_vector), first, second)
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def right_jacobian_rows(vector: Sequence[Array], first: Array, second: Array) -> list[list[Array]]:
+    """Return the rows of J_r by component, from (1 − cos θ)/θ² and (θ − sin θ)/θ³."""
+    x, y, z = vector
+    return [
         [1 - second * (y * y + z * z), first * z + second * x * y, -first * y + second * x * z],
         [-first * z + second * x * y, 1 - second * (x * x + z * z), first * x + second * y * z],
         [first * y + second * x * z, -first * x + second * y * z, 1 - second * (x * x + y * y)],
     ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _normalised(parts):
@@ -148,7 +163,7 @@ def _prefixes(rotation_vectors):
     """Return exp(θ_1)…exp(θ_k) for every k as four (S, ...) arrays."""
     cosine, sine = _half_angle(rotation_vectors)
     parts = (cosine, *(sine * component for component in _parts(rotation_vectors)))
-    return _normalised(running(_multiply, tuple(jnp.moveaxis(part, -1, 0) for part in parts)))
+    return _normalised(running(product, tuple(jnp.moveaxis(part, -1, 0) for part in parts)))
 
 
 def running_rotations(rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... S 4"]:
@@ -228,7 +243,7 @@ def _integrate_rk4(rates, intervals):
     first, last = (before + rates) / 2, jnp.where(after_used, (rates + after) / 2, rates)
 
     def derivative(q, rate):
-        return tuple(part / 2 for part in _multiply(q, (jnp.zeros_like(rate[0]), *rate)))
+        return tuple(part / 2 for part in product(q, (jnp.zeros_like(rate[0]), *rate)))
 
     def add(q, slope, step):
         return tuple(a + step * b for a, b in zip(q, slope, strict=True))

@@ -12,7 +12,7 @@ the north, 8e-9 h, is left out). Coning and sculling are in the samples' increme
 are pre-integrated in the body frame and then put into the level frame at once, with its rates, radii and gravity half
 way. Near the poles longitude is not defined: latitudes within ±85° are meant.
 
-Like `jaximu.data.carried`, a step is written by component, so that a CPU computes draws and units side by side.
+A step is written by component, so that a CPU computes draws and units side by side.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu.data.carried import cross, matvec, product, right_jacobian_rows, rotation_rows, transpose, turn
 from jaximu.ground.array_types import Array
 from jaximu.ground.gravity import EQUATOR_RADIUS, SQUARED_ECCENTRICITY, normal_gravity
-from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply
+from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, product, rotation_rows
 from jaximu.model.effects.earth_rotation import EARTH_RATE
+from jaximu.navigation.by_component import cross, matvec, right_jacobian, transpose, turn
 
 __all__ = ["Navigation", "deviation", "linearised", "mechanise", "mechanise_increments"]
 
@@ -81,7 +81,7 @@ def _none_yet(like: Array) -> _Sums:
 def _add(sums: _Sums, rotation: list[Array], gained: list[Array], interval: Array) -> _Sums:
     """Add one sample: `jaximu.data.preintegration`'s sums, one term at a time."""
     rows = rotation_rows(sums.rotation)
-    pushed = matvec(rows, matvec(transpose(right_jacobian_rows(rotation)), gained))
+    pushed = matvec(rows, matvec(transpose(right_jacobian(rotation)), gained))
     inside = matvec(rows, [g / 2 + c / 6 for g, c in zip(gained, cross(rotation, gained), strict=True)])
     position = [p + (v + d) * interval for p, v, d in zip(sums.position, sums.velocity, inside, strict=True)]
     velocity = [v + d for v, d in zip(sums.velocity, pushed, strict=True)]
