@@ -501,8 +501,6 @@ def only(covariance: Covariance | Chain, rows: str, excess: Array) -> Covariance
     if rows == "norm":
         return covariance.of_rows(covariance.used * (covariance.group == 0))
     if rows == "turning":
-        if not isinstance(covariance, Chain):
-            raise InputError("turns that slow noise ties cannot be taken one by one: fit them jointly.")
         return covariance.turn_by_turn(excess).of_rows(covariance.used * (covariance.group > 0))
     return covariance
 

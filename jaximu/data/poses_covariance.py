@@ -40,7 +40,7 @@ __all__ = [
     "sensitivities",
 ]
 
-_STRIDE = 5
+_STRIDE = 3
 """Samples of a turn, an odd number, that turn its noise as the one in their middle."""
 
 
@@ -82,7 +82,7 @@ def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
 
     How frames react to the rates: `turned_by_rates`. White rate noise of density N in each sample turns the end of the
     turn by R_k K⁻¹ n dt: the sum of R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame. Of the R_k every
-    `_STRIDE`th stands for its neighbours: where these turn by θ against it, what is left out is θ² of what differs
+    `_STRIDE`rd stands for its neighbours: where these turn by θ against it, what is left out is θ² of what differs
     between the axes' noise.
     """
     assert imu.gyroscope is not None

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import inverse_matrix
 from jaximu.ground.tracing import array_module
 
@@ -112,6 +113,10 @@ class Covariance(eqx.Module):
         """Return the covariance with only these rows used; factors by blocks."""
         factors = tuple(factor.of_rows(used) for factor in self.factors)  # pyright: ignore[reportAttributeAccessIssue]
         return Covariance(used[:, None] * used * self.measured, factors, used, self.group)
+
+    def turn_by_turn(self, excess: Float[Array, ""]) -> "Covariance":
+        """Raise `InputError`: slow noise ties turns that are not neighbours."""
+        raise InputError("turns that slow noise ties cannot be taken one by one: fit them jointly.")
 
     def component(self, number: int) -> Float[Array, "n n"]:
         """Return the covariance of a component at a size of one."""

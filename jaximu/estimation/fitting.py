@@ -50,9 +50,6 @@ _SPARE = (12, 36, 84)
 """Numbers of effects that share a compiled pass: rows of zeros fill up to the next."""
 _STILL = 1e-2
 """Standard deviations below which a step ends the passes: what it leaves is its square."""
-_NEAR = 0.1
-"""Standard deviations that a unit may move before its data are evaluated anew: conditions and weights taken so far off
-move the answer by less than 1e-4."""
 _CLOSE = 1e-6
 """Typical sizes below which a step ends a pass: a Newton step takes off what it leaves, and another pass may follow."""
 _SWINGING = 5
@@ -311,7 +308,6 @@ class _Whitened(eqx.Module):
     weights: tuple[Weights | ChainWeights, ...]
     used: tuple[Array, ...]
     columns: Array
-    shift: Array
     mean: Array
     root: Array
     damping: Array
@@ -322,7 +318,7 @@ class _Whitened(eqx.Module):
         model = self.parameters.model(self.like, z[:count])
         plain = jnp.concatenate([w.whiten(used * each(model)) for w, used, each in
                                  zip(self.weights, self.used, self.conditions, strict=True)])  # fmt: skip
-        return plain + self.columns @ (z[count:] + self.shift)
+        return plain + self.columns @ z[count:]
 
     def objective(self, z):
         beforehand = jnp.concatenate([self.root @ (z - self.mean), self.damping * z])
@@ -337,29 +333,12 @@ def _robust_excess(residual: Array, groups: Array, excess: Array) -> Array:
     return jnp.where(jnp.isnan(spread), excess, jnp.maximum((1 + excess) * jnp.nan_to_num(spread) ** 2 - 1, 0.0))
 
 
-class _Seen(eqx.Module):
-    """Data evaluated about units, the leading axis of every array.
-
-    columns: the conditions' derivatives by the free numbers of effects, in typical sizes. numbers: of all effects, at
-    which they were evaluated.
-    """
-
-    conditions: tuple[Conditions, ...]
-    covariances: tuple[Covariance | Chain, ...]
-    columns: Float[Array, "N n q"]
-    numbers: Float[Array, "N a"]
-
-
 class _Unit(NamedTuple):
-    """What a pass knows of one unit: what was measured, and what is known beforehand.
-
-    shift: of the effects' numbers since the data were evaluated.
-    """
+    """What a pass knows of one unit: what was measured, and what is known beforehand."""
 
     conditions: tuple[Conditions, ...]
     covariances: tuple[Covariance | Chain, ...]
     columns: Array
-    shift: Array
     mean: Array
     root: Array
     damping: Array
@@ -375,17 +354,7 @@ class _Unit(NamedTuple):
         white = jnp.concatenate([w.whiten(rows[:, None] * self.columns[part])
                                  for w, rows, part in zip(weights, used, split, strict=True)])  # fmt: skip
         return _Whitened(
-            like,
-            parameters,
-            self.conditions,
-            weights,
-            used,
-            white,
-            self.shift,
-            self.mean,
-            self.root,
-            self.damping,
-            loss,
+            like, parameters, self.conditions, weights, used, white, self.mean, self.root, self.damping, loss
         )
 
     def evaluated(self, problem: _Whitened, z: Array, residual: Array, jacobian: Array) -> _Evaluated:
@@ -538,8 +507,7 @@ class _State(eqx.Module):
 
     reference: all numbers of gain and bias; numbers: of the effects; excess: to weight with next, used: the last one.
     damping: of the next step. least: cost above which a step led astray, and before: where it began. share, taken: of
-    the last change of the excess. away: what a unit moved since its data were evaluated. active: units whose passes go
-    on; settled: those that stand.
+    the last change of the excess. active: units whose passes go on; settled: those that stand.
     """
 
     reference: Float[Array, "N m"]
@@ -551,7 +519,6 @@ class _State(eqx.Module):
     before: tuple[Float[Array, "N m"], Float[Array, "N q"]]
     share: Float[Array, " N"]
     taken: Float[Array, "N k"]
-    away: Float[Array, " N"]
     active: Bool[Array, " N"]
     settled: Bool[Array, " N"]
 
@@ -588,7 +555,6 @@ class _Passes:
         if not bare.all_effects():  # units may have other scales
             own = self._beside(typical_sizes(bare))[:, self.index]
         self.sizes = self.numerics.concatenate([own, sizes[:, self.kept]], axis=1)
-        self.bent = any(name.part != "coefficients" for name in chosen)  # inner numbers do not act by columns
         self.spare = 0
         if self.count == 1 and not inside:
             needed = len(self.names) - self.base
@@ -642,25 +608,16 @@ class _Passes:
         whole = whole + np.diag(np.arange(count + self.spare) >= count).astype(float)
         return mean, whole
 
-    def seen(self, state: _State, lanes: NDArray[np.int64]) -> _Seen:
-        """Evaluate the data where the passes are; `state` is of `lanes`."""
+    def once(self, one: Callable, state: _State, lanes: NDArray[np.int64], first: bool | Array = False) -> Any:
+        """Evaluate the data where the passes are, and run `_single_pass` or `_no_step`; `state` is of `lanes`."""
         imu = self.model(state, lanes)
         data = self.data if self.numerics is jnp else [kind.take(lanes) for kind in self.data]
         about = [kind.about(imu) for kind in data]
         columns = self.numerics.concatenate([kind.columns for kind in about], axis=1)
         columns = columns[..., self.kept] * self.sizes[lanes][:, None, self.base :]
         columns = self.numerics.pad(columns, [(0, 0), (0, 0), (0, self.spare)])
-        return _Seen(
-            tuple(kind.conditions for kind in about), tuple(kind.covariance for kind in about), columns, state.numbers
-        )
-
-    def once(
-        self, one: Callable, state: _State, lanes: NDArray[np.int64], seen: _Seen, first: bool | Array = False
-    ) -> Any:
-        """Run `_single_pass` or `_no_step` where the passes are; `state` and `seen` are of `lanes`."""
-        shift = (state.numbers - seen.numbers)[:, self.kept] / self.sizes[lanes][:, self.base :]
         unit = _Unit(
-            seen.conditions, seen.covariances, seen.columns, self.numerics.pad(shift, [(0, 0), (0, self.spare)]),
+            tuple(kind.conditions for kind in about), tuple(kind.covariance for kind in about), columns,
             *self.known(state, lanes, first), state.damping, state.excess,
         )  # fmt: skip
         sizes = self.sizes[lanes][:, : self.base]
@@ -672,7 +629,7 @@ class _Passes:
         none, far, yes = numerics.zeros(many), numerics.full(many, np.inf), numerics.ones(many, bool)
         return _State(
             self.reference, self.numbers, excess, excess, none, far, (self.reference, self.numbers), none + 1.0,
-            numerics.zeros_like(excess), far, yes, ~yes,
+            numerics.zeros_like(excess), yes, ~yes,
         )  # fmt: skip
 
     def advanced(
@@ -717,7 +674,6 @@ class _Passes:
             (pick(worse, state.before[0], state.reference), pick(worse, state.before[1], state.numbers)),
             pick(worse, state.share, share),
             pick(worse, state.taken, way),
-            pick(worse | numerics.asarray(first) | self.bent, numerics.full_like(length, np.inf), state.away + length),
             worse | (~still & out.finite),
             fine & still,
         ), fine
@@ -738,16 +694,11 @@ class _Passes:
 
     def run(self, excess: FloatArray) -> Fit:
         """Alternate until nothing moves, a chunk of the units that still do after the other, and only those."""
-        state, seen, result = jax.tree.map(np.array, self.start(excess)), None, None
+        state, result = jax.tree.map(np.array, self.start(excess)), None
         for number in range(self.max_passes):
-            for part, padded in self.chunks(state.active & (state.away >= _NEAR)):
-                new = self.seen(_of(state, padded), padded)
-                seen = jax.tree.map(partial(_room, self.count), new) if seen is None else seen
-                jax.tree.map(partial(_put, part), seen, _of(new, slice(len(part))))
-                state.away[part] = 0.0
             for part, padded in self.chunks(state.active):
                 here = _of(state, padded)
-                out = self.once(_single_pass, here, padded, _of(seen, padded), self.blunted and number == 0)
+                out = self.once(_single_pass, here, padded, self.blunted and number == 0)
                 here, out = _of((here, out), slice(len(part)))
                 after, fine = self.advanced(here, part, out, number)
                 jax.tree.map(partial(_put, part), state, after)
@@ -778,38 +729,29 @@ class _Passes:
 
         def left(x):
             """Return what a fit brings to zero: a Newton step, and the change of the excess."""
-            there = self.once(_no_step, at(x), lanes, self.seen(at(x), lanes))
+            there = self.once(_no_step, at(x), lanes)
             step = jnp.einsum("upq,uq->up", there.covariance, there.gradient)[:, : len(self.names)] * self.sizes
             numbers = (x[1] - self.numbers).at[:, np.flatnonzero(self.kept)].set(step[:, self.base :])
             way = x[2] - (jnp.clip(there.excess, 0.0, self.most) if self.estimated else excess)
             return step[:, : self.base], numbers, way
 
         def passes(_, x):
-            def evaluated(state, seen):
-                stale = state.active & (state.away >= _NEAR)
-                new = jax.tree.map(partial(_where, jnp, stale), self.seen(state, lanes), seen)
-                return eqx.tree_at(lambda p: p.away, state, jnp.where(stale, 0.0, state.away)), new
-
             def step(loop):
-                state, seen, number, ended = loop
-                stale = state.active & (state.away >= _NEAR)
-                state, seen = jax.lax.cond(stale.any(), evaluated, lambda *same: same, state, seen)
-                out = self.once(_single_pass, state, lanes, seen, (number == 0) & self.blunted)
+                state, number, ended = loop
+                out = self.once(_single_pass, state, lanes, (number == 0) & self.blunted)
                 after, fine = self.advanced(state, lanes, out, number)
                 after = jax.tree.map(partial(_where, jnp, state.active), after, state)
                 after = eqx.tree_at(lambda p: p.active, after, state.active & after.active)
                 ended = jax.tree.map(
                     partial(_where, jnp, state.active & fine), (out.steps, out.converged, out.finite), ended
                 )
-                return after, seen, number + 1, ended
+                return after, number + 1, ended
 
             def on(loop):
-                return loop[0].active.any() & (loop[2] < self.max_passes)
+                return loop[0].active.any() & (loop[1] < self.max_passes)
 
             none = jnp.zeros(self.count, int), jnp.zeros(self.count, bool), jnp.ones(self.count, bool)
-            like = jax.eval_shape(lambda: self.seen(first_state, lanes))
-            blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like)
-            state, _, _, ended = jax.lax.while_loop(on, step, (at(x), blank, 0, none))
+            state, _, ended = jax.lax.while_loop(on, step, (at(x), 0, none))
             about = jax.tree.map(lambda leaf: leaf.astype(float), (*ended, state.settled))  # as derivatives need them
             return (state.reference[:, self.index], state.numbers, state.used), about
 
@@ -822,7 +764,7 @@ class _Passes:
         x, about = jax.lax.custom_root(left, first, passes, undo, has_aux=True)
         steps, (converged, finite, settled) = about[0].astype(int), (leaf > 0 for leaf in about[1:])
         state = eqx.tree_at(lambda p: p.settled, at(x), settled)
-        there = self.once(_no_step, state, lanes, self.seen(state, lanes))
+        there = self.once(_no_step, state, lanes)
         cost = 0.5 * jnp.sum(there.residual**2, axis=-1)
         return self.fit(state, there, cost, steps, converged, finite)
 
