@@ -81,9 +81,9 @@ def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
     """Integrate the turns with the gyroscope's gain and bias.
 
     How frames react to the rates: `turned_by_rates`. White rate noise of density N in each sample turns the end of the
-    turn by R_k K⁻¹ n dt: the sum of R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame. Of the R_k every
-    `_STRIDE`rd stands for its neighbours: where these turn by θ against it, what is left out is θ² of what differs
-    between the axes' noise.
+    turn by R_k K⁻¹ n dt: the sum of R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame. Of `_STRIDE`
+    samples the R_k of the one in the middle stands for all: where they turn by θ against it, what is left out is θ² of
+    what differs between the axes' noise.
     """
     assert imu.gyroscope is not None
     vectors = rotation_vectors(imu.gyroscope.recover(turns.output), turns.interval)
