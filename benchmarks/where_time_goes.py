@@ -2,12 +2,12 @@
 """Where the time of a unit goes: each kernel against the least that its arithmetic and its memory traffic could take.
 
 Host kernels (parse, segment, observe) work on a log of 50 000 rows, compiled ones on the observations of 40 poses and
-39 turns of up to 150 samples, 32 units side by side as in the fit of a fleet. Operations of compiled kernels are
-counted by XLA (`cost_analysis`, which counts a loop's body once and nothing inside LAPACK: loops are counted by their
-length here), those of host kernels by hand; memory traffic is the least possible, every input read and every output
-written once. The floor is the longer of operations over the measured speed of a matrix product and bytes over the
-measured speed of a copy. No kernel here is a large matrix product: the distance to the floor is what scalar code,
-latency and passing over arrays several times cost.
+39 turns of up to 150 samples, sixteen units one after the other as in the fit of a fleet. Operations of compiled
+kernels are counted by XLA (`cost_analysis`, which counts a loop's body once and nothing inside LAPACK: the loop over
+units is counted by its length here, those over poses and samples are not), those of host kernels by hand; memory
+traffic is the least possible, every input read and every output written once. The floor is the longer of operations
+over the measured speed of a matrix product and bytes over the measured speed of a copy. No kernel here is a large
+matrix product: the distance to the floor is what scalar code, latency and passing over arrays several times cost.
 """
 
 import os
@@ -25,10 +25,11 @@ import jax
 import numpy as np
 from common import Table, arguments, finish, least
 
-from jaximu.data.carried import carry, compress, matmul, moved, rotate_samples, transpose
+from jaximu.data.poses import PosesAndTurns, condense
+from jaximu.data.poses_covariance import condition_covariance, integrate_turns
+from jaximu.estimation.covariance import update_excess
+from jaximu.estimation.problem import TOLERANCE, Parameters, without_equipment
 from jaximu.fleets import FleetUnit, fit_units
-from jaximu.fleets import lanes as fleet_lanes
-from jaximu.fleets.fit import parameter_set
 from jaximu.model.sensor import Imu
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
@@ -37,7 +38,7 @@ from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
 
 jax.config.update("jax_enable_x64", True)
-LANES, BLOCK = 32, 16  # units side by side, samples that slopes take together
+LANES = 16
 SEGMENT_OPERATIONS, OBSERVE_OPERATIONS = 6 * 5, 6 * 4
 """A row: mean off, square, two running sums and a comparison of six channels; sums and block means of six channels."""
 
@@ -56,14 +57,18 @@ def size_of(tree) -> int:
     return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(tree))
 
 
-def compiled(function, repetitions: int, length: int, *inputs) -> tuple[tuple[float, float, int], Any]:
-    """Seconds a unit, operations and least bytes of a function of all units' arrays whose loops have a length."""
-    made = jax.jit(function).lower(*inputs).compile()
+def compiled(function, repetitions: int, *inputs) -> tuple[tuple[float, float, int], Any]:
+    """Seconds a unit, operations and least bytes of a function of one unit, of all units one after the other."""
+
+    def batch(*inputs):
+        return jax.lax.map(lambda unit: function(*unit), inputs)
+
+    made = jax.jit(batch).lower(*inputs).compile()
     cost = made.cost_analysis()
     assert cost is not None
     seconds = least(lambda: jax.block_until_ready(made(*inputs)), repetitions) / LANES
     result = made(*inputs)
-    return (seconds, length * float(cost["flops"]) / LANES, (size_of(inputs) + size_of(result)) // LANES), result
+    return (seconds, float(cost["flops"]), (size_of(inputs) + size_of(result)) // LANES), result
 
 
 def main() -> None:
@@ -87,44 +92,36 @@ def main() -> None:
     found["observe"] = least(lambda: observed_poses(poses, 9.80665), repetitions), rows * OBSERVE_OPERATIONS, arrays
 
     recording, _ = simulate(draw_imu(1), HandHeld(40, 1.5), consumer_noise(), seed=1)
-    seen = observed_poses(segment(recording), 9.80665)
-    _, parameters = parameter_set(True)
+    seen = PosesAndTurns.of(observed_poses(segment(recording), 9.80665))
+    imu = jax.tree.map(np.asarray, Imu.nominal())
+    parameters = Parameters.select(imu, without_equipment)
     batch = jax.tree.map(lambda leaf: np.stack([leaf] * LANES), seen)
-    z = np.zeros((len(parameters.index), LANES))
-    lanes, at = fleet_lanes._seen(batch), fleet_lanes._triads(parameters, z)
-    density = matmul(matmul(at.inverse_g, lanes.noise), transpose(at.inverse_g))
+    z, excess = np.zeros((LANES, len(parameters.index))), np.ones((LANES, 3))
 
-    def measured(name: str, function, length: int, *inputs):
-        found[name], result = compiled(function, repetitions, length, *inputs)
+    def measured(name: str, function, *inputs):
+        found[name], result = compiled(function, repetitions, *inputs)
         return result
 
-    def prepared(interval, output):
-        interval = interval.transpose(2, 1, 0)
-        moments = [*(interval * output[..., i].transpose(2, 1, 0) for i in range(3)), interval]
-        return moments, compress(moments, BLOCK)
+    def whitened(weights, conditions, z):
+        def twice(z):
+            value = weights.whiten(conditions(parameters.model(imu, z)))
+            return value, value
 
-    def sloped(inverse, offset, blocks, density):
-        single = jax.tree.map(lambda leaf: leaf.astype(np.float32), (inverse, offset, blocks, density))
-        return jax.tree.map(lambda leaf: leaf.astype(float), carry(*single, BLOCK))
+        return jax.jacfwd(twice, has_aux=True)(z)
 
-    def passed(seen, carried, at, z, excess):
-        return fleet_lanes._joint_pass(parameters, seen, carried, at, z, excess, 5.0)
+    def improved(covariance, weights, residual, jacobian, excess):
+        information = jacobian.T @ jacobian + np.eye(z.shape[1]) / TOLERANCE**2
+        return update_excess([covariance], [weights], residual, jacobian, information, excess)
 
-    samples, blocks = measured("blocks of samples", prepared, 1, batch.turns.interval, batch.turns.output)
-    steps, poses = len(samples[3]), lanes.pose.shape[0]
-    measured("integrate turns sample by sample", rotate_samples, steps, at.inverse_g, at.offset_g, samples)
-    carried = measured(f"integrate turns by blocks of {BLOCK}, with slopes", sloped, steps // BLOCK, at.inverse_g,
-                       at.offset_g, blocks, density)  # fmt: skip
-    measured("move rotations by their slopes", moved, 1, carried, at.inverse_g, at.offset_g)
-    linear = measured("residual and Jacobian", partial(fleet_lanes._linearise, parameters), 1, lanes, at, carried)
-    whitened = linear, lanes.covariance_a, carried.covariance, (lanes.pose, lanes.turn)
-    measured("weights: block Cholesky, C⁻¹(J, r)", fleet_lanes._whiten, poses, *whitened)
-    square = np.stack([np.eye(len(z)) + 0.1] * LANES)
-    newton = partial(fleet_lanes._newton, tolerance=np.asarray(5.0))
-    measured("step and covariance of the parameters", newton, 1, square, np.zeros((LANES, len(z))), z)
-    measured("a whole pass without integration", passed, 1, lanes, carried, at, z, np.ones((3, LANES)))
+    integrated = measured("integrate turns, with noise and reactions", partial(integrate_turns, imu), batch.turns)
+    measured("condense turns", lambda data: condense(imu, data)[:2], batch)
+    conditions, _ = jax.jit(jax.vmap(lambda data: condense(imu, data)[:2]))(batch)
+    covariance = measured("covariance", partial(condition_covariance, imu), batch, integrated)
+    weights = measured("weights: Cholesky along the chain", lambda one, size: one.weights(size), covariance, excess)
+    jacobian, residual = measured("whitened residual and Jacobian", whitened, weights, conditions, z)
+    measured("improve the excess", improved, covariance, weights, residual, jacobian, excess)
 
-    unit = FleetUnit(seen, jax.tree.map(np.asarray, Imu.nominal()), True)
+    unit = FleetUnit(seen, imu, True)
     whole = least(lambda: fit_units([unit] * LANES), repetitions) / LANES
 
     table = Table(
@@ -132,7 +129,7 @@ def main() -> None:
         ["kernel", "measured, µs", "operations", "bytes", "floor, µs", "bound by", "measured / floor"],
         f"Measured speeds: {peak / 1e9:.1f} · 10⁹ operations a second (matrix product of 768), "
         f"{bandwidth / 1e9:.1f} · 10⁹ bytes a second (copy of 128 MB). The whole fit of this unit in a batch takes "
-        f"{1e6 * whole:.0f} µs: four to six passes, two with slopes of turns, one of these by samples as well. "
+        f"{1e6 * whole:.0f} µs: four to six passes, each of which condenses turns anew. "
         f"Load of the machine at the start: {load:.1f}.",
     )
     figures = {}

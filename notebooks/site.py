@@ -44,7 +44,6 @@ MODULES = (
     "jaximu.data.gravity_norm",
     "jaximu.data.gravity_direction",
     "jaximu.data.joint",
-    "jaximu.data.carried",
     "jaximu.data.station_error",
     "jaximu.data.poses_covariance",
     "jaximu.estimation.uncertainty",
