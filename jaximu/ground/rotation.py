@@ -8,6 +8,7 @@ CPU.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +56,7 @@ def inverse_matrix(matrix: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
     return jnp.stack(columns, axis=-1) / determinant[..., None, None]
 
 
-def product(p: Sequence[Array], q: Sequence[Array]) -> tuple[Array, Array, Array, Array]:
+def product(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
     """Return the Hamilton product p ⊗ q of quaternions by component."""
     pw, px, py, pz = p
     qw, qx, qy, qz = q
@@ -81,7 +82,7 @@ def conjugate(q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
     return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
 
 
-def rotation_rows(quaternion: Sequence[Array]) -> list[list[Array]]:
+def rotation_rows(quaternion: Sequence[Any]) -> list[list[Any]]:
     """Return the rows of the rotation matrix of a unit quaternion, all by component."""
     w, x, y, z = quaternion
     return [
@@ -144,7 +145,7 @@ def right_jacobian(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def right_jacobian_rows(vector: Sequence[Array], first: Array, second: Array) -> list[list[Array]]:
+def right_jacobian_rows(vector: Sequence[Any], first: Any, second: Any) -> list[list[Any]]:
     """Return the rows of J_r by component, from (1 − cos θ)/θ² and (θ − sin θ)/θ³."""
     x, y, z = vector
     return [
