@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
 from jaximu.data.gravity_direction import unit_vectors
@@ -39,9 +38,6 @@ __all__ = [
     "integrate_turns",
     "sensitivities",
 ]
-
-_STRIDE = 3
-"""Samples of a turn, an odd number, that turn its noise as the one in their middle."""
 
 
 class IntegratedTurns(eqx.Module):
@@ -81,21 +77,16 @@ def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
     """Integrate the turns with the gyroscope's gain and bias.
 
     How frames react to the rates: `turned_by_rates`. White rate noise of density N in each sample turns the end of the
-    turn by R_k K⁻¹ n dt: the sum of R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame. Of `_STRIDE`
-    samples the R_k of the one in the middle stands for all: where they turn by θ against it, what is left out is θ² of
-    what differs between the axes' noise.
+    turn by R_k K⁻¹ n dt: the sum of R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame.
     """
     assert imu.gyroscope is not None
     vectors = rotation_vectors(imu.gyroscope.recover(turns.output), turns.interval)
     running = running_rotations(vectors)
     final = running[..., -1, :]
-    count = vectors.shape[1]
-    spans = jnp.pad(turns.interval, ((0, 0), (0, -count % _STRIDE))).reshape(len(vectors), -1, _STRIDE).sum(axis=-1)
-    middle = np.minimum(np.arange(spans.shape[1]) * _STRIDE + _STRIDE // 2, count - 1)
-    toward = rotation_matrix(conjugate(final))[:, None] @ rotation_matrix(running[:, middle])
+    forward, back = rotation_matrix(running), rotation_matrix(conjugate(final))
     inverse = inverse_matrix(imu.gyroscope.gain)
     density = inverse @ turns.noise @ inverse.T
-    noise = jnp.einsum("tsij,tslj,ts->til", toward @ density, toward, spans)
+    noise = back @ jnp.einsum("tsij,tslj,ts->til", forward @ density, forward, turns.interval) @ back.swapaxes(1, 2)
     return IntegratedTurns(final, running, turned_by_rates(running, vectors, turns.interval), noise)
 
 
