@@ -187,3 +187,17 @@ def test_what_is_host_by_nature_says_so():
 
     with pytest.raises(jaximu.InputError, match=r"cannot be traced.*observe"):
         jax.jit(observed)(log.accelerometer.values)
+
+
+@pytest.mark.parametrize("solver", [optx.Dogleg, optx.LevenbergMarquardt], ids=lambda solver: solver.__name__)
+def test_any_least_squares_solver_of_optimistix_ends_where_ours_does(solver, data, hosts):
+    fit = jaximu.fit(NOMINAL, data[0], solver=solver(rtol=1e-9, atol=1e-9))
+    assert fit.converged
+    assert off(fit, hosts[0]) < 1e-6
+    assert int(fit.steps) != int(hosts[0].steps) or solver is optx.LevenbergMarquardt
+
+
+def test_a_solver_that_does_not_converge_says_so(data):
+    """Steps a millionth as long as they should be: it is this solver that is used."""
+    fit = jaximu.fit(NOMINAL, data[0], solver=optx.GradientDescent(learning_rate=1e-6, rtol=1e-9, atol=1e-9))
+    assert not fit.converged

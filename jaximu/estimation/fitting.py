@@ -8,6 +8,9 @@ estimate went, until nothing moves.
 
 from __future__ import annotations
 
+import hashlib
+import pickle
+import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -381,14 +384,31 @@ class _Unit(NamedTuple):
         return np.cumsum([0, *(len(kind.used) for kind in self.covariances)])
 
 
-def _single_pass(loss: str, like: Imu, parameters: Parameters, unit: _Unit) -> _Pass:
-    problem = unit.problem(loss, like, parameters)
+class _Solving(NamedTuple):
+    """How the problem of a pass is solved: `solver`, where it is not ours, and what tells it apart from every other."""
+
+    loss: str
+    solver: Any = None
+    name: str = ""
+
+    @classmethod
+    def by(cls, loss: str, solver: Any) -> _Solving:
+        """Return the way of solving by a loss and an optimistix solver, or None."""
+        try:
+            name = "" if solver is None else hashlib.sha256(pickle.dumps(solver)).hexdigest()
+        except (pickle.PicklingError, AttributeError, TypeError):  # a function without a name inside
+            name = secrets.token_hex()
+        return cls(loss, solver, f"{loss} {name}")
+
+
+def _single_pass(how: _Solving, like: Imu, parameters: Parameters, unit: _Unit) -> _Pass:
+    problem = unit.problem(how.loss, like, parameters)
     zero = jnp.zeros(len(unit.mean))
     before = problem.objective(zero)
-    solution = solve(problem, zero, MAX_STEPS, _CLOSE)
+    solution = solve(problem, zero, MAX_STEPS, _CLOSE, how.solver)
     there = unit.evaluated(problem, solution.z, solution.residual, solution.jacobian)
     z = solution.z
-    if loss == "linear":  # what the solver's tolerance leaves, taken off by a last Newton step
+    if how.loss == "linear":  # what the solver's tolerance leaves, taken off by a last Newton step
         z = jnp.where(unit.damping == 0, z - there.covariance @ there.gradient, z)
     return _Pass(
         z,
@@ -401,9 +421,9 @@ def _single_pass(loss: str, like: Imu, parameters: Parameters, unit: _Unit) -> _
     )
 
 
-def _no_step(loss: str, like: Imu, parameters: Parameters, unit: _Unit) -> _Evaluated:
+def _no_step(how: _Solving, like: Imu, parameters: Parameters, unit: _Unit) -> _Evaluated:
     """Return the problem where the passes are."""
-    problem = unit.problem(loss, like, parameters)
+    problem = unit.problem(how.loss, like, parameters)
 
     def twice(z):
         value = problem.objective(z)[0]
@@ -415,7 +435,7 @@ def _no_step(loss: str, like: Imu, parameters: Parameters, unit: _Unit) -> _Eval
 
 
 def _run(
-    one: Callable, loss: str, like: Imu, parameters: Parameters, references: Array, sizes: Array, units: _Unit
+    one: Callable, how: _Solving, like: Imu, parameters: Parameters, references: Array, sizes: Array, units: _Unit
 ) -> Any:
     """Run `_single_pass` or `_no_step` for a batch of units; a compiled function for each loss and shape.
 
@@ -429,12 +449,14 @@ def _run(
         def lane(item):
             reference, size, unit = item
             own = eqx.tree_at(lambda p: (p.reference, p.size), parameters, (reference, size))
-            return one(loss, like, own, unit)
+            return one(how, like, own, unit)
 
         lanes = None if jax.default_backend() == "cpu" else count
         return jax.lax.map(lane, (references, sizes, units), batch_size=lanes)
 
-    return stored.call(batch, f"{one.__name__} {loss}", like, parameters, references, sizes, units, quick=count == 1)
+    return stored.call(
+        batch, f"{one.__name__} {how.name}", like, parameters, references, sizes, units, quick=count == 1
+    )
 
 
 # --- passes -----------------------------------------------------------------------------------------------------------
@@ -452,6 +474,7 @@ def fit(
     most: Sequence[float] | FloatArray | None = None,
     follow: bool = False,
     max_passes: int = 32,
+    solver: Any = None,
 ) -> Fit:
     """Fit the free numbers of a unit with its effects; with a leading axis on every array, of many units.
 
@@ -468,6 +491,7 @@ def fit(
     - `estimate_excess`: whether it is estimated (restricted likelihood; for robust losses by medians).
     - `most`: of each component (k,), the most that it can be: a likelihood of few conditions may have no maximum.
     - `follow`: what is known beforehand moves with the estimate, so that what data determine owes the start nothing.
+    - `solver`: an optimistix least-squares solver for the problem of each pass, in place of ours.
 
     **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that
     one bad unit does not stop a batch.
@@ -483,19 +507,8 @@ def fit(
     farthest = np.inf if most is None else numerics.asarray(most, float)
     begin = [size for kind in measured for size in kind.coarse] if excess is None else excess
     blunted = estimate_excess and (is_traced(begin) or bool(np.any(begin)))
-    passes = _Passes(
-        imu,
-        measured,
-        free or measured[0].free,
-        prior,
-        loss,
-        estimate_excess,
-        follow,
-        farthest,
-        max_passes,
-        blunted,
-        numerics,
-    )
+    how = _Solving.by(loss, solver)
+    passes = _Passes(imu, measured, free, prior, how, estimate_excess, follow, farthest, max_passes, blunted, numerics)
     begin = numerics.asarray(begin, float)
     begin = numerics.broadcast_to(begin, (len(imu.accelerometer.bias), begin.shape[-1]))
     fitted = passes.traced(begin) if numerics is jnp else passes.run(begin)
@@ -531,12 +544,12 @@ class _Passes:
     """
 
     def __init__(
-        self, imu: Imu, data: tuple[Data, ...], free: Callable[[Name], bool], prior: Prior | None, loss: str,
+        self, imu: Imu, data: tuple[Data, ...], free: Callable[[Name], bool] | None, prior: Prior | None, how: _Solving,
         estimated: bool, follow: bool, most: FloatArray | float, max_passes: int, blunted: bool, numerics: Any,
     ):  # fmt: skip
-        self.data, self.loss, self.estimated, self.follow = data, loss, estimated, follow
+        self.data, self.estimated, self.follow = data, estimated, follow
         self.prior, self.most, self.max_passes, self.blunted = prior, most, max_passes, blunted
-        self.numerics = numerics
+        self.numerics, self.how, free = numerics, how, free or data[0].free
         inside = data[0].effects_inside
         self.full = imu
         bare = imu if inside else imu.with_effects()
@@ -621,7 +634,7 @@ class _Passes:
             *self.known(state, lanes, first), state.damping, state.excess,
         )  # fmt: skip
         sizes = self.sizes[lanes][:, : self.base]
-        return _run(one, self.loss, self.like, self.parameters, state.reference, sizes, unit)
+        return _run(one, self.how, self.like, self.parameters, state.reference, sizes, unit)
 
     def start(self, excess: Array) -> _State:
         """Return where the passes begin."""
