@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
     from jaximu.ground.gravity import LocalGravity, parse_gravity, wgs84_gravity
     from jaximu.ground.stored import cache
-    from jaximu.model.effects import CATALOGUE, Effect
+    from jaximu.model.effects import CATALOGUE, Effect, register
     from jaximu.model.sensor import Imu, Triad
     from jaximu.model.stimulus import Stimulus
     from jaximu.recordings import write_recording
@@ -68,6 +68,7 @@ __all__ = [
     "observe",
     "parse_gravity",
     "read_recording",
+    "register",
     "segment",
     "simulate",
     "solve",

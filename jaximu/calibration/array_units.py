@@ -75,7 +75,7 @@ class Averaged:
                 for name, values in (("rate", self.rate), ("force", self.force))}  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Array(Document):
     """Several units on one rigid body; the first is the one that the others are told against."""
 

@@ -52,7 +52,7 @@ _ERRORS = {
 _BEYOND = 3.0  # excess variance, in multiples of the noise's, from which an unmodelled effect is suspected
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Calibration(Described, Document):
     """A calibrated unit: y = gain·u + bias + Σ effects, u in SI, with uncertainty and provenance.
 
@@ -294,7 +294,9 @@ def effect_named(given: str | Effect) -> Effect:
     from jaximu.model.effects.catalogue import CATALOGUE  # a tenth of a second, which a plain calibration does not need
 
     if given not in CATALOGUE:
-        raise InputError(f"unknown effect {given!r}: run `jaximu effects` for the list.")
+        raise InputError(
+            f"unknown effect {given!r}: run `jaximu effects` for the list; jaximu.register adds one of your own."
+        )
     return CATALOGUE[given].dormant()
 
 
@@ -307,11 +309,41 @@ def require_calibration(given: object) -> None:
         )
 
 
-def load_calibration(path: str | os.PathLike[str]) -> Calibration:
-    """Read a `calibration.json`. Raises `InputError` naming the file and the key that is missing or wrong."""
+def load_calibration(path: str | os.PathLike[str], effects: Sequence[type[Effect]] = ()) -> Calibration:
+    """Read a `calibration.json`.
+
+    **Arguments:** `effects`: of your own, that the calibration holds; they are registered.
+
+    Raises `InputError` naming the file and the key that is missing or wrong, or the effect that is not known.
+    """
     document = read_document(path, SCHEMA, "a calibration that this version reads")
+    if effects:
+        from jaximu.model.effects.catalogue import register
+
+        for effect in effects:
+            register(effect)
     with damage(path):
+        _require_known_effects(document, os.fspath(path))
         return _from_document(document)
+
+
+def _require_known_effects(document: dict[str, Any], path: str) -> None:
+    """Raise `InputError` for an effect that the catalogue lacks; the file is not to blame for it."""
+    from jaximu.model.effects.catalogue import CATALOGUE
+
+    holders = [document.get(name) for name in ("accelerometer", "gyroscope", "magnetometer", "setup")]
+    for name, entry in (item for holder in holders if holder for item in holder.get("effects", {}).items()):
+        if name not in CATALOGUE:
+            kind = entry.get("class")
+            raise InputError(
+                f"{path} holds an effect {name!r}, which the catalogue of this version lacks. "
+                + (
+                    f"It was defined by {kind}: import that class, and give it to jaximu.load_calibration(path, "
+                    "effects=[…]), or to jaximu.register before."
+                    if kind
+                    else "A later version may know it; an effect of your own is made known by jaximu.register."
+                )
+            )
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> FloatArray:
@@ -327,8 +359,6 @@ def _from_document(document: dict[str, Any]) -> Calibration:
     def effects_of(entries: dict[str, Any]) -> tuple:
         found = []
         for name, entry in entries.items():
-            if name not in CATALOGUE:
-                raise ValueError(f"effect {name!r} is not in the catalogue of this version")
             kind = CATALOGUE[name]
             inner = {key: float(each["value"]) for key, each in entry["inner"].items()}
             found.append(kind.make(_numbers(entry["coefficients"], (kind.size,)), **inner))

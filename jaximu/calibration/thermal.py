@@ -55,7 +55,7 @@ _MISFIT = 1.5
 """χ² per degree of freedom from which on a model is said not to explain the recordings to their noise."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ThermalCalibration(Document):
     """A unit whose bias depends on temperature: the calibration, and the working behind it.
 

@@ -28,13 +28,13 @@ from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.estimation.fitting import fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
-from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.quantities import Z95, change, listed, probability, size, with_interval, with_intervals
 from jaximu.ground.summary import Block, Described, Summary, sentence
 from jaximu.mistakes import prepare, prepared
 from jaximu.mistakes.titles import effect_title
-from jaximu.model.effects import CATALOGUE, Effect
+from jaximu.model.effects import CATALOGUE, Effect, register
 from jaximu.model.noise_model import NoiseModel
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.finding import Finding
@@ -186,7 +186,7 @@ class Option:
         return [name for name, power in self.powers.items() if power >= LIMIT_POWER]
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Diagnosis(Described, Document):
     """What a recording says of its model.
 
@@ -370,6 +370,7 @@ def diagnose(
     segmentation: SegmentationOptions | None = None,
     level: float = 0.05,
     repair: bool = False,
+    candidates: Sequence[str | type[Effect]] | None = None,
 ) -> Diagnosis:
     """Calibrate a unit, ask its recording for everything the model lacks, extend the model and measure the gain.
 
@@ -385,12 +386,15 @@ def diagnose(
     - `level`: rate of false alarms over all tests together.
     - `repair`: change what [`jaximu.mistakes.prepare`][] can put right; rows that are no measurement are left out
       in any case.
+    - `candidates`: the only effects to ask for, by name or class; a class that the catalogue lacks is registered. None
+      asks for all of the catalogue. Noise, mistakes and shapes without a cause are asked for in any case.
 
     No effect is named while a mistake in the recording stands that could imitate it. Raises `NotPossibleError` where
     the recording cannot be calibrated, has no gyroscope, or has too few poses to ask anything; `InputError` where a
     sensor holds nothing to calibrate.
     """
     gravity = as_gravity(gravity)
+    names = None if candidates is None else tuple(map(_candidate, candidates))
     recordings = recordings_of(recordings)
     if any(recording.gyroscope is None for recording in recordings):
         raise NotPossibleError(
@@ -404,14 +408,15 @@ def diagnose(
         calibration, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
         spoiling += [finding for finding in unusual if finding.spoils]
         notes, held = list(calibration.notes), None
+        notes += [] if names is None else [f"of all effects only these were asked for: {', '.join(names) or 'none'}."]
         if heldout is not None:
             other, _ = calibrate_ready([prepare(heldout, repair).recording], choices, repair)
             notes += same_device(calibration, other)
-            held = partial(_experiment, other, start=calibration)
+            held = partial(_experiment, other, start=calibration, candidates=names)
         found = examine(Examination(
-            calibration, own_noise(calibration) if noise is None else noise, partial(_experiment, calibration), held,
-            (*findings, *unusual), tuple(notes), level, drifting=noise is None,
-            naming=not spoiling,
+            calibration, own_noise(calibration) if noise is None else noise,
+            partial(_experiment, calibration, candidates=names), held, (*findings, *unusual), tuple(notes), level,
+            drifting=noise is None, naming=not spoiling,
         ))  # fmt: skip
     if found.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
         spoiling = [finding for finding in findings if finding.partial]
@@ -660,13 +665,28 @@ def _without_effects(found: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis
     )
 
 
-def _experiment(calibration: Calibration, noise: NoiseModel, start: Calibration | None = None) -> HandHeldExperiment:
+def _candidate(effect: str | type[Effect]) -> str:
+    """Return the name of an effect to ask for; a class is registered."""
+    name = effect if isinstance(effect, str) else register(effect).name
+    if name not in CATALOGUE:
+        raise InputError(f"candidates: there is no effect {name!r}; {nearest(name, CATALOGUE)}")
+    return name
+
+
+def _experiment(
+    calibration: Calibration,
+    noise: NoiseModel,
+    start: Calibration | None = None,
+    candidates: tuple[str, ...] | None = None,
+) -> HandHeldExperiment:
     observations = observed_poses(calibration.segmentations, calibration.gravity.value, noise=noise)
     known = tuple(calibration.imu.all_effects().values())
     if known:  # the Earth's rotation, where the latitude is known
         whole = RecordedByHand(calibration.segmentations, observations)
         observations = whole.along(calibration.imu, known).observations
-    return HandHeldExperiment(calibration.segmentations, observations, (start or calibration).imu.with_effects())
+    return HandHeldExperiment(
+        calibration.segmentations, observations, (start or calibration).imu.with_effects(), candidates=candidates
+    )
 
 
 def same_device(first: Calibration, other: Calibration) -> list[str]:

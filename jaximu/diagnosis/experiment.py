@@ -85,6 +85,7 @@ class Experiment(Data):
 
     start: Imu
     drift: DriftComponents | None = None  # that was estimated from this very recording
+    candidates: tuple[str, ...] | None = None  # names of the effects that are asked; None: all of the catalogue
     reference: dict[str, Any] | None = None  # what is known of a measured attitude, as `calibration.json` has it
     advice: ClassVar[Callable[..., str]] = staticmethod(pose_advice)
     owners: ClassVar[tuple[str, ...]] = ("accelerometer", "gyroscope", "setup")  # whose effects are asked
@@ -208,6 +209,8 @@ class Experiment(Data):
             lacking = {"magnetic_field": "no magnetometer was recorded with it"} | dict(lacking)
         for name, kind in CATALOGUE.items():
             if not kind.cause or kind.owner not in self.owners:
+                continue
+            if self.candidates is not None and name not in self.candidates:
                 continue
             missing = [need for need in kind.needs if need in lacking]
             if missing:

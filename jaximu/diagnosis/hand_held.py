@@ -38,6 +38,7 @@ class HandHeldExperiment(RecordedByHand, Experiment):
 
     start: Imu  # a calibration without effects
     drift: DriftComponents | None = None
+    candidates: tuple[str, ...] | None = None
 
     by_hand = True
     no_fixture = "a hand-held recording has no set-up to compare with"

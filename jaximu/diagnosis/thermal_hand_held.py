@@ -50,7 +50,7 @@ class _Thermal(HandHeldExperiment):
         return keep(asked), keep(refused)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HandHeldThermal(Document):
     """A unit calibrated by hand over temperature.
 

@@ -145,7 +145,7 @@ class OutputError:
     unit: str
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Validity(Described, Document):
     """Whether a calibration still holds for a recording.
 

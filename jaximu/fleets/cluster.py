@@ -12,7 +12,7 @@ import numpy as np
 import ray  # pyright: ignore[reportMissingImports]
 import ray.data  # pyright: ignore[reportMissingImports]
 
-from jaximu.fleets.jobs import ONE_THREAD, Job, Rows, Settings, batches
+from jaximu.fleets.jobs import ONE_THREAD, Job, Rows, Settings, batches, own_effects, register_all
 from jaximu.fleets.rows import finish, read_job
 from jaximu.ground import stored
 
@@ -27,7 +27,7 @@ def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, work
     """
     away = "RAY_ADDRESS" in os.environ
     folder = None if away else stored.folder()  # on other machines there is no such folder
-    own = not ray.is_initialized()
+    own, effects = not ray.is_initialized(), own_effects()
     if own:
         where: dict[str, Any] = {} if away else {
             "num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}  # fmt: skip
@@ -37,6 +37,7 @@ def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, work
 
     def read(item: dict[str, Any]) -> dict[str, Any]:
         stored.prepare_process(folder)
+        register_all(effects)
         return {"place": item["place"], "prepared": pickle.dumps(read_job(pickle.loads(item["job"]), settings))}
 
     class FittingActor:
@@ -44,6 +45,7 @@ def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, work
 
         def __init__(self) -> None:
             stored.prepare_process(folder)
+            register_all(effects)
 
         def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, Any]:
             rows = finish([pickle.loads(each) for each in batch["prepared"]], settings)

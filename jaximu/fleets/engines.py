@@ -15,7 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 
-from jaximu.fleets.jobs import ONE_THREAD, Job, Rows, Settings, batches
+from jaximu.fleets.jobs import ONE_THREAD, Job, Rows, Settings, batches, own_effects, register_all
 from jaximu.fleets.rows import row_begun, rows_of
 from jaximu.ground.errors import InputError
 
@@ -84,7 +84,7 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     from jaximu.ground import stored
 
     context = multiprocessing.get_context("spawn")  # a forked JAX may hang
-    pool = ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(stored.folder(),))
+    pool = ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(stored.folder(), own_effects()))
     try:
         yield pool
     finally:
@@ -94,7 +94,7 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _begin(folder) -> None:
+def _begin(folder, effects: Sequence[str]) -> None:
     import signal
 
     from jaximu.ground import stored
@@ -109,6 +109,7 @@ def _begin(folder) -> None:
 
     threading.Thread(target=end_with_parent, daemon=True).start()
     stored.prepare_process(folder)
+    register_all(effects)
 
 
 @contextmanager

@@ -8,8 +8,10 @@ import glob
 import hashlib
 import os
 import shlex
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ from jaximu.ground.magnetic_field import FieldStrength
 from jaximu.recordings.readers import ReadOptions
 from jaximu.recordings.segmentation import SegmentationOptions
 
-__all__ = ["ONE_THREAD", "Job", "Rows", "Settings", "batches", "find_jobs"]
+__all__ = ["ONE_THREAD", "Job", "Rows", "Settings", "batches", "find_jobs", "own_effects", "register_all"]
 
 Rows = tuple[Sequence[int], list[dict[str, Any]]]
 # XLA's pool reads NPROC; a flag of XLA's would make it compile everything anew
@@ -72,7 +74,7 @@ class Settings:
         """Return what tells the row of a job apart from any other: job, settings, version, and the files' states."""
         stated = dict(self.options) | dict(job.options)
         stamps = [_stamp(path) for path in (job.file, stated.get("gyro_log"), job.static) if path]
-        text = repr((asdict(job), asdict(self), stamps, __version__))
+        text = repr((asdict(job), asdict(self), stamps, __version__, *_added_effects()))
         return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:32]
 
     def reading(self, job: Job) -> tuple[ReadOptions, str | None]:
@@ -81,6 +83,36 @@ class Settings:
         gyro_log = stated.pop("gyro_log", None)
         numbers = {name: kind(stated.pop(name)) for name, kind in _NUMBERS.items() if name in stated}
         return ReadOptions(**stated, **numbers, gravity=self.gravity), gyro_log  # pyright: ignore[reportArgumentType]
+
+
+def own_effects() -> tuple[str, ...]:
+    """Return the import paths of the effects that were added to the catalogue, for the processes that do the work.
+
+    Raises `InputError` for one that another process cannot import.
+    """
+    paths = _added_effects()
+    for path in paths:
+        if path.startswith("__main__:") or "<" in path:
+            raise InputError(
+                f"the effect {path} is defined where other processes cannot find it: move its class to another "
+                "module, or use one worker."
+            )
+    return paths
+
+
+def _added_effects() -> tuple[str, ...]:
+    """Return the import paths of the effects that were added to this process's catalogue."""
+    catalogue = sys.modules.get("jaximu.model.effects.catalogue")  # not loaded: nothing was added
+    return () if catalogue is None else tuple(effect.import_path() for effect in catalogue.registered())
+
+
+def register_all(paths: Sequence[str]) -> None:
+    """Add the effects of these import paths to this process's catalogue."""
+    if paths:
+        from jaximu.model.effects import register
+
+        for module, name in (path.split(":") for path in paths):
+            register(getattr(import_module(module), name))
 
 
 def _stamp(path: str) -> tuple[int, int]:

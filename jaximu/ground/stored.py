@@ -14,7 +14,7 @@ import os
 import pickle
 import sys
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import wraps
 from importlib.metadata import version
@@ -24,11 +24,12 @@ from typing import Any, TypeVar, cast
 from jaximu.ground.errors import InputError
 from jaximu.ground.tracing import is_traced
 
-__all__ = ["cache", "call", "compiled", "folder", "forget", "prepare_process"]
+__all__ = ["cache", "call", "compiled", "folder", "forget", "prepare_process", "tell_apart"]
 
 _folder: Path | None = None
 _at_first: Callable[[], None] | None = None
 _loaded: dict[str, Callable] = {}
+_elsewhere: dict[str, str] = {}  # names of what is defined outside the library, with a digest of its source
 _DIGEST = 16  # characters
 F = TypeVar("F", bound=Callable)
 Result = TypeVar("Result")
@@ -58,6 +59,11 @@ def prepare_process(folder: Path | None, at_first: Callable[[], None] | None = N
 def folder() -> Path | None:
     """Return where traced functions are kept, for processes that are to share them; None if nowhere."""
     return _folder
+
+
+def tell_apart(names: Iterable[str], source: str) -> None:
+    """Compile anew what is called by one of these names, in a description or a structure, once its source changes."""
+    _elsewhere.update(dict.fromkeys(names, hashlib.sha256(source.encode("utf-8", "backslashreplace")).hexdigest()))
 
 
 def forget() -> None:
@@ -146,7 +152,9 @@ def _called(function: Callable, description: str, *arguments, quick: bool = True
     leaves, structure = jax.tree.flatten(arguments)
     leaves = [np.asarray(leaf) for leaf in leaves]
     shapes = ";".join(f"{leaf.shape}{leaf.dtype.str}" for leaf in leaves)
-    parts = _code(), description, str(structure), shapes, str(quick)
+    named = description, str(structure)
+    outside = [digest for name, digest in sorted(_elsewhere.items()) if any(name in words for words in named)]
+    parts = _code(), *named, shapes, str(quick), *outside
     key = hashlib.sha256("|".join(parts).encode()).hexdigest()[:40]
     if key in _loaded:
         return _loaded[key](*leaves)

@@ -6,13 +6,15 @@ from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.model.effects.base import Effect, Inner, SetupEffect
-    from jaximu.model.effects.catalogue import CATALOGUE
+    from jaximu.model.effects.catalogue import CATALOGUE, register, registered
 
 __all__ = [
     "CATALOGUE",
     "Effect",
     "Inner",
     "SetupEffect",
+    "register",
+    "registered",
 ]
 
 __getattr__ = lazily(__name__)

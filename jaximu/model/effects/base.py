@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+import secrets
+import sys
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -11,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSORS
@@ -92,6 +96,18 @@ class Effect(eqx.Module):
             common = cls.common_name or cls.plain.replace("_", " ")
             cls.english = common if prefix == "setup" else f"{cls.owner} {common}"
             cls.title = f"{cls.english} ({cls.name})"
+            if not cls.built_in():
+                stored.tell_apart((cls.name, cls.__name__), _source(cls))
+
+    @classmethod
+    def built_in(cls) -> bool:
+        """Return whether the effect is jaximu's own."""
+        return cls.__module__.startswith("jaximu.")
+
+    @classmethod
+    def import_path(cls) -> str:
+        """Return where the class is found, as "module:Class"."""
+        return f"{cls.__module__}:{cls.__qualname__}"
 
     @classmethod
     def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner) -> Effect:
@@ -149,6 +165,7 @@ class Effect(eqx.Module):
             },
             "unit": self.coefficient_unit(output_unit),
             "scope": self.scope,
+            **({} if self.built_in() else {"class": self.import_path()}),
         }
 
     def typical_sizes(self, scale: float | Array) -> Effect:
@@ -182,6 +199,14 @@ class SetupEffect(Effect):
     def reach(self, duration: float) -> float:
         """Return how many seconds of the path before and after an instant the effect looks at."""
         return 0.0
+
+
+def _source(effect: type[Effect]) -> str:
+    """Return the text of the module that defines an effect; where it has none, what is like no other definition."""
+    try:
+        return inspect.getsource(sys.modules[effect.__module__])
+    except (KeyError, TypeError, OSError):
+        return secrets.token_hex()
 
 
 Shape = TypeVar("Shape", bound=Effect)
