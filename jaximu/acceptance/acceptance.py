@@ -29,7 +29,7 @@ _OUTPUTS = ("output", "raw_output")
 _BY_HAND = ("joint", "two-step", "two-step-rk4", "accelerometer")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Acceptance(Document):
     """The verdict on one unit. trace: what is known of the unit and of how it was calibrated."""
 

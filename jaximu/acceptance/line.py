@@ -108,7 +108,7 @@ class FollowedQuantity:
     drift: Drift | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Line(Document):
     """A table's verdicts and statistics. verdicts: (rows,) of the table, undecided for what was not calibrated."""
 

@@ -125,7 +125,7 @@ class Shifts:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fleet(Document):
     """A table's units as a population, and what stands out.
 

@@ -76,6 +76,16 @@ class Document(ABC):
     def document(self) -> dict[str, Any]:
         """Return what is kept, as JSON has it."""
 
+    def __eq__(self, other: object) -> bool:
+        """Return whether another result of this kind is kept as the same document."""
+        return type(other) is type(self) and self._sorted() == other._sorted()
+
+    def __hash__(self) -> int:
+        return hash(self._sorted())
+
+    def _sorted(self) -> str:
+        return json.dumps(self.document(), sort_keys=True)
+
     def text(self) -> str:
         """Return the document as text, with its hash as `digest`.
 

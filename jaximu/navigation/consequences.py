@@ -136,7 +136,7 @@ class MonteCarlo:
         return np.sqrt(np.mean(self.errors**2, axis=0))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Consequences(Document):
     """The errors (1σ) of navigation along a path.
 

@@ -344,7 +344,7 @@ class TriadNoise:
         return np.maximum(self.multiplier, 1.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EstimatorNoise(Document):
     """Multipliers of white noise by triad, and the NEES of increments with them.
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf
 from jaximu.ground.document import SOFTWARE, read_document
+from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import number, size, unit_text
 from jaximu.ground.summary import Block, Described, Summary
@@ -38,8 +39,8 @@ def read_analysis(path: str | os.PathLike[str]) -> dict[str, Any]:
     return read_document(path, SCHEMA, "an allan.json of `jaximu allan LOG -o DIR`: a noise file must state its units")
 
 
-@dataclass(frozen=True, repr=False)
-class NoiseAnalysis(Described):
+@dataclass(frozen=True, repr=False, eq=False)
+class NoiseAnalysis(Described, Comparable):
     """Identified noise by triad (three axes each), its sample rate, and the spread of the bias over several logs.
 
     repeatability: by triad, standard deviation of the recordings' means with its 95 % interval, (3, 3) value, low, high

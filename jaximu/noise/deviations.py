@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf
+from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.precision import require_float64
 
@@ -62,8 +63,8 @@ KINDS = {
 """Deviations by name: `overlapping` is the overlapping Allan deviation."""
 
 
-@dataclass(frozen=True)
-class Deviation:
+@dataclass(frozen=True, eq=False)
+class Deviation(Comparable):
     """Deviations at averaging times: values (..., T) with an interval of `confidence`, in the signal's unit.
 
     tau (T,) s; factor (T,) samples averaged; count (..., T) differences used; exponent (..., T) of the power law

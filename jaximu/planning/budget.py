@@ -126,7 +126,7 @@ class Trials:
     failed: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Budget(Document):
     """How each of s sources reaches each of p parameters.
 

@@ -196,7 +196,7 @@ class Turn:
     words: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Proposal(Document):
     """The next poses and turns, and what they are expected to do to the uncertainty.
 

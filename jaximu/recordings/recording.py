@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.quantities import unit_text
@@ -34,8 +35,8 @@ def _unset() -> FloatArray:
     return np.empty(0)
 
 
-@dataclass(frozen=True)
-class Signal:
+@dataclass(frozen=True, eq=False)
+class Signal(Comparable):
     """The samples of one sensor on their own time stamps.
 
     time: (n,) seconds since `Recording.start`, strictly increasing.
@@ -239,8 +240,8 @@ def _axes_words(axes: str | None) -> str:
     return "axes as they are (FLU)" if axes is None else f"axes {axes}"
 
 
-@dataclass(frozen=True, repr=False)
-class Recording(Described):
+@dataclass(frozen=True, repr=False, eq=False)
+class Recording(Described, Comparable):
     """One recording of one unit. Sensors carry their own stamps, which may differ; absent ones are None.
 
     Of a gyroscope alone (`ReadOptions.alone`) the accelerometer has no samples.
@@ -380,8 +381,8 @@ def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[
     )
 
 
-@dataclass(frozen=True)
-class PoseMeans:
+@dataclass(frozen=True, eq=False)
+class PoseMeans(Comparable):
     """A table of poses at rest, a sample of `recording` a pose: its stamps count the rows and mean nothing.
 
     accelerometer_sigma, gyroscope_sigma: (P, 3) standard deviations of the means, in the signal's unit, or None.

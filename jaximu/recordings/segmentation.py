@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -57,8 +58,8 @@ class SegmentationOptions:
     temperature_reference: float = 25.0
 
 
-@dataclass(frozen=True)
-class Segmentation:
+@dataclass(frozen=True, eq=False)
+class Segmentation(Comparable):
     """Poses found in one recording, and how.
 
     intervals: (P, 2) start and stop (s, on the recording's clock). threshold: the factor used. tried: for each factor

@@ -87,7 +87,7 @@ class Case:
         return self.plan.motion.samples(self.rate)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Truth(Document):
     """What a simulated recording was made from, and what its artefacts did (`notes`)."""
 
