@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaximu import calibrate, diagnose
 from jaximu.calibration.arrangement import arrangement
+from jaximu.estimation.uncertainty import WeakDirection
 from jaximu.mistakes import prepare
 from jaximu.recordings.alignment import Clocks, angle_of, clocks, rotation_of, signed_permutation, turning
 from jaximu.recordings.readers import read_recording
@@ -55,12 +56,12 @@ def test_any_signed_permutation_is_named_and_repaired(recording, matrix):
     assert np.asarray(found.imu.gyroscope.gain) == pytest.approx(
         matrix @ np.asarray(truth.imu.gyroscope.gain), abs=1e-4
     )
-    (finding,) = arrangement(wrong, found.imu)
+    (finding,) = arrangement(wrong, found)
     assert finding.name == "data.swapped_axes"
     assert finding.text in found.notes
     assert ("setup.mounting" in finding.rivals) == (np.linalg.det(matrix) > 0)
     repaired = calibrate(wrong, repair=True)
-    assert arrangement(finding.apply(wrong), repaired.imu) == []
+    assert arrangement(finding.apply(wrong), repaired) == []
     assert any("This was repaired" in note for note in repaired.notes)
 
 
@@ -76,7 +77,7 @@ def test_any_signed_permutation_is_named_and_repaired(recording, matrix):
 )
 def test_the_simplest_of_what_looks_the_same_is_offered(recording, accelerometer, gyroscope, option):
     wrong = mapped(recording, accelerometer, gyroscope)
-    (finding,) = arrangement(wrong, calibrate(wrong).imu)
+    (finding,) = arrangement(wrong, calibrate(wrong))
     assert finding.repair == f'--axes "{option}"'
 
 
@@ -84,8 +85,12 @@ def test_the_simplest_of_what_looks_the_same_is_offered(recording, accelerometer
 def test_a_mounting_is_told_by_its_angle(recording, vector):
     wrong = mapped(recording, gyroscope=Rotation.from_rotvec(vector).as_matrix())
     found = calibrate(wrong)
-    (finding,) = arrangement(wrong, found.imu)
+    (finding,) = arrangement(wrong, found)
     assert finding.name == "setup.mounting"
+    part = "gyroscope.gain[1,0]"
+    unknown = WeakDirection(2.0, False, ((part, 1.0),), "")
+    assert arrangement(wrong, replace(found, weak=(unknown,))) == []  # a gain that is open says nothing
+    assert arrangement(wrong, replace(found, weak=(replace(unknown, determined=True),))) == [finding]
     angle = float(finding.text.partition("turned by ")[2].partition("°")[0])
     assert angle == pytest.approx(np.degrees(np.linalg.norm(vector)), abs=1.5)
     assert found.rms["gravity_direction"][1] < 0.1
@@ -103,7 +108,7 @@ def test_a_mounting_is_told_by_its_angle(recording, vector):
 )
 def test_a_range_is_named(recording, name, factors, said):
     wrong = mapped(recording, **{name: np.diag(factors)})
-    findings = arrangement(wrong, calibrate(wrong).imu)
+    findings = arrangement(wrong, calibrate(wrong))
     assert {each.name for each in findings} == {"data.range"}
     assert said in findings[0].text
 
@@ -113,14 +118,14 @@ def test_all_rates_alike_leave_the_clock_in_doubt():
     imu = draw_imu(1)
     imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=1.02 * ONE))
     recording, _ = simulate(imu, HandHeld(20, 3.0), consumer_noise(), seed=1)
-    findings = arrangement(recording, imu)
+    findings = arrangement(recording, replace(calibrate(recording), imu=imu))
     assert [each.name for each in findings] == ["data.time_scale"]
 
 
 def test_nothing_is_said_of_what_is_right(unit_logs):
     for unit in range(8):
         recording = read_recording(unit_logs / f"unit{unit:03d}.parquet")
-        assert arrangement(recording, calibrate(recording).imu) == []
+        assert arrangement(recording, calibrate(recording)) == []
 
 
 @pytest.mark.parametrize(("late", "drift"), [(0.05, 0.0), (-0.4, 0.0), (1.0, 0.0), (0.0, 5e-3), (0.2, -1e-2)])

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from tracker import ARM, LATE, SPEED_NOISE, TILT, TURNED, tracked
 from tracker import NOISE as NOISE_OF_TRACKER
 
-from jaximu.calibration import FilterInUse, calibrate_by_filter, followed_in_use, load_calibration
+from jaximu.calibration import FilterInUse, calibrate, calibrate_by_filter, followed_in_use, load_calibration
 from jaximu.calibration.attitude import mounted_on
 from jaximu.calibration.systematic import field_of, places_of
 from jaximu.cli.app import main
@@ -32,6 +32,7 @@ from jaximu.model.mounting import Mounting
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings import write_recording
+from jaximu.recordings.readers import read_recording
 from jaximu.recordings.recording import Signal
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import Environment, HandHeld, Positions, Rotations, SingleAxisTable
@@ -509,7 +510,7 @@ def test_in_use_a_reference_of_another_body_diverges(recorded, calibrated, moved
     recording, _, said = moved_about
     stuck = said.quaternion.copy()
     stuck[len(stuck) // 2 :] = stuck[len(stuck) // 2]
-    mounted = mounted_on(recording, replace(said, velocity=None), GRAVITY, NOISE, calibrated[0].imu)
+    mounted = mounted_on(recording, replace(said, velocity=None), GRAVITY, NOISE, calibrated[0])
     rate, force = recording.gyroscope, recording.accelerometer
     follower = FilterInUse(calibrated[0], NOISE, rate.rate, GRAVITY, mounted)
     told = replace(mounted.attitude, quaternion=stuck)
@@ -522,7 +523,7 @@ def test_in_use_a_reference_of_another_body_diverges(recorded, calibrated, moved
 
 def test_a_stream_with_a_reference_gives_the_same_however_it_is_cut(calibrated, moved_about):
     recording, _, said = moved_about
-    mounted = mounted_on(recording, said, GRAVITY, NOISE, calibrated[0].imu)
+    mounted = mounted_on(recording, said, GRAVITY, NOISE, calibrated[0])
     rate, force, told, found = recording.gyroscope, recording.accelerometer, mounted.attitude, []
     for size in (50, 600):
         follower, steps = FilterInUse(calibrated[0], NOISE, rate.rate, GRAVITY, mounted), []
@@ -546,6 +547,23 @@ def test_a_measured_attitude_carries_through_long_motion(recorded):
     assert notes == [] and np.sum(seen.restart) == 0
     lost = replace(tracker, time=tracker.time[:100], quaternion=tracker.quaternion[:100])
     assert np.sum(cut(recording, apart, attitude=lost, mounting=Mounting(delay=LATE))[0].restart) == 1
+
+
+def test_gains_that_poses_leave_open_do_not_tell_how_a_reference_is_mounted(tmp_path):
+    """Turns about two axes leave one gain open; taken for known, it put the reference late and turned by degrees."""
+    spec = ['seed = 24', 'rate = 25', '[protocol]', 'kind = "rotations"', 'duration = 4', 'turn_duration = 3',
+            '[gyroscope]', 'scale = [-0.002, 0.001, 0.002]', 'noise = { white = "0.1 deg/sqrt(h)" }']  # fmt: skip
+    (tmp_path / "unit.toml").write_text("\n".join(spec))
+    log, out = str(tmp_path / "unit.parquet"), tmp_path / "out"
+    assert main(["simulate", str(tmp_path / "unit.toml"), "-o", log]) == 0
+    assert not calibrate(read_recording(log), GRAVITY).gains_determined()
+    assert main(["filter", log, "--reference", log, "--gravity", "9.80665+-0.0005", "-o", str(out)]) == 0
+    found = load_calibration(out / "calibration.json")
+    off = np.diag(found.imu.gyroscope.gain) - [0.998, 1.001, 1.002]
+    assert np.all(np.abs(off) < 5 * np.diag(found.sigma("gyroscope")[0]))
+    assert np.all(np.abs(off) < 3e-4)
+    assert np.degrees(Rotation.from_quat(found.reference["rotation"], scalar_first=True).magnitude()) < 0.05
+    assert abs(found.reference["time_offset"]["value"]) < 1e-3
 
 
 def test_the_attitude_of_another_body_is_refused(recorded):

@@ -10,9 +10,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from jaximu.calibration.calibration import Calibration
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
-from jaximu.model.sensor import Imu, Triad
+from jaximu.model.sensor import Triad
 from jaximu.recordings.alignment import angle_of, rotation_of, signed_permutation
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, apply_axes, spelled_axes
@@ -33,8 +34,14 @@ _SLOW = 0.012
 """Difference of all rates alike from which on the sample rate is in doubt."""
 
 
-def arrangement(recording: Recording, imu: Imu) -> list[Finding]:
-    """Return what is unusual in how a calibrated unit's gains differ from the recording's nominal scales."""
+def arrangement(recording: Recording, calibration: Calibration) -> list[Finding]:
+    """Return what is unusual in how a calibrated unit's gains differ from the recording's nominal scales.
+
+    Gains that the recording leaves open say nothing.
+    """
+    if not calibration.gains_determined():
+        return []
+    imu = calibration.imu
     found = _factors("accelerometer", recording.accelerometer.nominal_scale, imu.accelerometer)
     if imu.gyroscope is None or recording.gyroscope is None:
         return found

@@ -151,10 +151,10 @@ def calibrate_against_attitude(
     # of the set-up's own numbers nobody asks how well they are known
     fixed = {name for name in found.names if of_setup(name)}
     weak = tuple(each for each in calibration.weak if not fixed.issuperset(name for name, _ in each.parameters))
-    unusual = () if weak else arrangement(recording, calibration.imu)  # gains that are open say nothing of axes
-    notes = (*(each.text for each in unusual), *calibration.notes)
     covariance = calibration.covariance + _of_shape(calibration, measurement)
-    calibration = replace(calibration, weak=weak, covariance=covariance, notes=tuple(dict.fromkeys(notes)))
+    calibration = replace(calibration, weak=weak, covariance=covariance)
+    notes = (*(each.text for each in arrangement(recording, calibration)), *calibration.notes)
+    calibration = replace(calibration, notes=tuple(dict.fromkeys(notes)))
     return replace(calibration, reference=reference_summary(calibration)), measurement
 
 
@@ -175,12 +175,13 @@ class Mounted:
 
 
 def mounted_on(
-    recording: Recording, attitude: Attitude, gravity: Gravity, noise: NoiseModel | None, unit: Imu
+    recording: Recording, attitude: Attitude, gravity: Gravity, noise: NoiseModel | None, known: Calibration
 ) -> Mounted:  # fmt: skip
-    """Return how a reference stands to a unit whose gains are known, as `calibrate_against_attitude` finds it.
+    """Return how a reference stands to a unit, as `calibrate_against_attitude` finds it, with its gains where known.
 
     Raises as that does.
     """
+    unit = known.imu if known.gains_determined() else None
     found, how = calibrate_against_attitude(recording, attitude, gravity, static=noise, unit=unit)
     sharp_unit = found.imu.without(SetupReferenceFilter)
     effects = tuple(effect for effect in sharp_unit.all_effects().values() if isinstance(effect, MOUNTING_EFFECTS))

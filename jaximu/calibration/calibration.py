@@ -134,6 +134,11 @@ class Calibration(Described, Document):
             self.reading.require_alike(recording.reading, recording.name, (name,))
         return triad
 
+    def gains_determined(self) -> bool:
+        """Return whether the recording determined all gains that were estimated."""
+        unknown = (name for weak in self.weak if not weak.determined for name, _ in weak.parameters)
+        return not any(".gain[" in name for name in unknown)
+
     def inertial(self) -> Calibration:
         """Return the same without its magnetometer. Raises `InputError` where it has no accelerometer."""
         known = self.triads()

@@ -472,7 +472,7 @@ def _through(
     noise = noise_at_rest(segment(recording)) if noise is None else noise
     mounted, said_by = None, None
     if attitude is not None:
-        mounted = mounted_on(recording, attitude, gravity or calibration.gravity, noise, calibration.inertial().imu)
+        mounted = mounted_on(recording, attitude, gravity or calibration.gravity, noise, calibration.inertial())
         said_by = replace(mounted.attitude, velocity=mounted.attitude.velocities())
     magnetic = field is not None
     follower = FilterInUse(calibration, noise, recording.gyroscope.rate, gravity, mounted, magnetic=magnetic)

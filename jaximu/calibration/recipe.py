@@ -166,7 +166,7 @@ def calibrate_ready(
     reason would be taken for it.
     """
     found = _calibrated(recordings, choices)
-    findings = arrangement(recordings[0], found.imu)
+    findings = arrangement(recordings[0], found)
     wrong = [each for each in findings if each.apply is not None]
     if wrong and not repair:  # turns about wrong axes tell nothing of what was lost in them
         return found, findings

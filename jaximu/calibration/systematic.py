@@ -210,7 +210,7 @@ def calibrate_by_filter(
                 start, findings = calibrate_ready([ready.recording], turning, repair)
         errors = disturbances(noise, None if chosen else known_scale(start))
         still, beyond = longest_rest(errors), NEIGHBOURS if chosen else 0
-        mounted = None if attitude is None else mounted_on(rests.recording, attitude, gravity, noise, start.imu)
+        mounted = None if attitude is None else mounted_on(rests.recording, attitude, gravity, noise, start)
         errors = seen_from_outside(errors, mounted)
         seen: dict[str, Any] = {} if mounted is None else {"attitude": mounted.attitude, "mounting": mounted.mounting}
         outside = () if mounted is None else mounted.effects
