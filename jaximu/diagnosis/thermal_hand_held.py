@@ -15,6 +15,7 @@ import numpy as np
 
 from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
+from jaximu.calibration.refusals import require_solved
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.rest_blocks import LEAST_RANGE
 from jaximu.diagnosis.diagnosis import extended
@@ -109,8 +110,8 @@ def calibrate_thermal_by_hand(
     **Arguments:** as for [`jaximu.calibrate`]. Bias, scale and misalignment of both triads over temperature are asked
     for; what the recording does not determine is said.
 
-    Raises `NotPossibleError` where the recordings cannot be calibrated, have no gyroscope or temperature, or the
-    temperature does not change.
+    Raises `NotPossibleError` where the recordings cannot be calibrated, have no gyroscope or temperature, the
+    temperature does not change, or the fit does not converge.
     """
     gravity = as_gravity(gravity)
     given = recordings_of(recordings)
@@ -151,6 +152,8 @@ def calibrate_thermal_by_hand(
         else:
             refused.add(name)
     found = extended(calibration, experiment, state)
+    assert found.fit is not None
+    require_solved(found.fit, given[0].name)
     notes = tuple(dict.fromkeys((*calibration.notes, *noise.notes)))
     data = found.data | {"temperature_range": [low, high]}
     return HandHeldThermal(
