@@ -495,13 +495,12 @@ def _fitted(
     """Fit the magnetometer, all of its gain where its axes can be told, else a lower triangle as by hand; and the
     gyroscope's bias.
     """
-    beginnings = {effect.beginning() for effect in start.all_effects().values()}
 
     def free(name: Name) -> bool:
         if name.owner == "gyroscope":  # a bias that was another on that day would turn the carried field
             return name.part == "bias" and bool(windows.turn.any())
         whole = full or name.part == "bias" or name.effect is not None or name.axes not in _UPPER
-        return name.owner == "magnetometer" and name.part not in beginnings and whole
+        return name.owner == "magnetometer" and whole
 
     return fit(start, _measured(windows, field), free, follow=True, excess=excess, loss=loss,
                estimate_excess=excess is None)  # fmt: skip

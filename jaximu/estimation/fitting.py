@@ -483,7 +483,7 @@ def fit(
     - `imu`: where the fit starts: gain and bias as the data sheet or an old calibration has them, and the effects to be
       fitted, or to be held, with their numbers.
     - `data`: what was measured; several of one unit are one problem.
-    - `free`: which numbers are free, by name.
+    - `free`: which numbers are free, by name. When an effect begins is held: no derivative tells it.
     - `prior`: what is known beforehand. A number of which it says nothing is known to five typical sizes about its
       start, so a problem is never singular; where data speak, that counts for less than a millionth.
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
@@ -558,7 +558,9 @@ class _Passes:
         self.parameters = Parameters.select(self.like, free)
         nothing = (), self.numerics.zeros((self.count, 0)), self.numerics.zeros((self.count, 0))
         names, self.numbers, sizes = nothing if inside else effect_numbers(imu)
-        self.kept = np.array([free(name) for name in names], bool)
+        effects = imu.all_effects()
+        placed = [name.part == effects[name.owner, name.effect].beginning() for name in names]
+        self.kept = np.array([free(name) for name in names], bool) & ~np.array(placed, bool)
         chosen = tuple(name for name, kept in zip(names, self.kept, strict=True) if kept)
         self.names = (*self.parameters.names, *chosen)
         self.base = len(self.parameters.names)
