@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.optimize
 import scipy.signal
 import scipy.stats
 from synthetic import GRAVITY, POSES, recording, simulated, unit
@@ -202,6 +203,37 @@ def test_independent_conditions_are_scored_as_any_others():
         np.testing.assert_allclose(*map(turned, weights), rtol=1e-12)
     found = [scored(kind, each, residual, jacobian, jnp.ones(2)) for kind, each in zip(both, weights, strict=True)]
     np.testing.assert_allclose(*found, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_component_at_zero_does_not_hold_the_others_off_their_maximum(seed):
+    """Against the bounded maximum of the restricted likelihood, by SciPy, of two components that share rows."""
+    random = np.random.default_rng(seed)
+    rows = 40
+    jacobian = random.standard_normal((rows, 3))
+    roots = random.uniform(0.2, 1.5, (2, rows))
+    covariance = Covariance(jnp.ones(rows), tuple(jnp.asarray(roots)), jnp.ones(rows), jnp.zeros(rows, int))
+    # the first component has less than no scatter, the second some
+    conditions = random.standard_normal(rows) * np.sqrt(1 + 0.8 * roots[1] ** 2) * np.where(roots[0] > 0.9, 0.5, 1.0)
+
+    def white(excess):
+        weights = covariance.weights(excess)
+        return weights, weights.whiten(jnp.asarray(conditions)), weights.whiten(jnp.asarray(jacobian))
+
+    def lost(excess):
+        _, residual, slope = (np.asarray(each.root if hasattr(each, "root") else each) for each in white(excess))
+        square = slope.T @ slope
+        left = residual - slope @ np.linalg.solve(square, slope.T @ residual)
+        return left @ left + np.sum(np.log(1 + roots.T**2 @ excess)) + np.linalg.slogdet(square)[1]
+
+    best = scipy.optimize.minimize(lost, [1.0, 1.0], bounds=[(0, None)] * 2, tol=1e-12).x
+    excess = jnp.ones(2)
+    for _ in range(60):
+        weights, residual, slope = white(excess)
+        residual = residual - slope @ jnp.linalg.solve(slope.T @ slope, slope.T @ residual)
+        excess = scored(covariance, weights, residual, slope, excess)
+    assert best[0] == 0.0
+    np.testing.assert_allclose(excess, best, atol=1e-4)
 
 
 # --- slow bias -------------------------------------------------------------------------------------------------------

@@ -436,8 +436,13 @@ def update_excess(
 
 
 def _scored(excess: Float[Array, " k"], gradient: Float[Array, " k"], scoring: Float[Array, "k k"]):
-    """Take a step of scoring; a component without rows (no turns, say) has no information, and stays."""
+    """Take a step of scoring; a component without rows (no turns, say) has no information, and stays.
+
+    One at zero that would go below it has no part in the step: it would hold the others off their maximum.
+    """
+    free = (excess > 0) | (gradient > 0)
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(scoring), 1e-30))
-    normal = scoring / scale / scale[:, None] + 1e-9 * jnp.eye(len(excess))
-    step = jnp.linalg.solve(normal, gradient / scale) / scale
+    normal = jnp.where(free & free[:, None], scoring / scale / scale[:, None], jnp.diag(1.0 - free))
+    normal = normal + 1e-9 * jnp.eye(len(excess))
+    step = jnp.linalg.solve(normal, jnp.where(free, gradient / scale, 0.0)) / scale
     return jnp.where(jnp.diagonal(scoring) > 1e-20, jnp.maximum(excess + step, 0.0), excess)
