@@ -551,8 +551,10 @@ def test_a_measured_attitude_carries_through_long_motion(recorded):
 
 def test_gains_that_poses_leave_open_do_not_tell_how_a_reference_is_mounted(tmp_path):
     """Turns about two axes leave one gain open; taken for known, it put the reference late and turned by degrees."""
+    low = 'noise = { white = "20 ug/sqrt(Hz)", density = "one-sided" }'
     spec = ['seed = 24', 'rate = 50', '[protocol]', 'kind = "rotations"', 'duration = 4', 'turn_duration = 3',
-            '[accelerometer]', 'noise = { white = "20 ug/sqrt(Hz)", density = "one-sided" }', '[gyroscope]', 'scale = [-0.002, 0.001, 0.002]', 'noise = { white = "0.1 deg/sqrt(h)" }']  # fmt: skip
+            '[accelerometer]', low, '[gyroscope]', 'scale = [-0.002, 0.001, 0.002]',
+            'noise = { white = "0.1 deg/sqrt(h)" }']  # fmt: skip
     (tmp_path / "unit.toml").write_text("\n".join(spec))
     log, out = str(tmp_path / "unit.parquet"), tmp_path / "out"
     assert main(["simulate", str(tmp_path / "unit.toml"), "-o", log]) == 0
