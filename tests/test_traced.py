@@ -11,9 +11,13 @@ import pytest
 from synthetic import GRAVITY, POSES, SAMPLES, recording, simulated
 
 import jaximu
-from jaximu.data.poses import PosesAndTurns
+from jaximu.data.gravity_direction import gravity_direction
+from jaximu.data.gravity_norm import gravity_norm
+from jaximu.data.poses import PosesAndTurns, condense
+from jaximu.data.poses_covariance import integrate_turns
 from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.problem import Name, without_equipment
+from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.segmentation import segment
 
 NOMINAL = jax.tree.map(np.asarray, jaximu.Imu.nominal())
@@ -201,3 +205,80 @@ def test_a_solver_that_does_not_converge_says_so(data):
     """Steps a millionth as long as they should be: it is this solver that is used."""
     fit = jaximu.fit(NOMINAL, data[0], solver=optx.GradientDescent(learning_rate=1e-6, rtol=1e-9, atol=1e-9))
     assert not fit.converged
+
+
+# --- what a unit's numbers go through, function by function -----------------------------------------------------------
+
+_RANDOM = np.random.default_rng(40)
+_STIMULUS = jaximu.Stimulus(
+    specific_force=jnp.asarray(_RANDOM.normal(0, 6, (20, 3))), angular_rate=jnp.asarray(_RANDOM.normal(0, 2, (20, 3))),
+    time=jnp.arange(20) / 50.0, temperature=jnp.linspace(20.0, 30.0, 20),
+)  # fmt: skip
+_OUTPUTS = _STIMULUS.specific_force, _STIMULUS.angular_rate
+_EFFECTS = [
+    CATALOGUE[name].make(10 * CATALOGUE[name].typical)
+    for name in ("accel.quadratic", "accel.temperature", "gyro.g_sensitivity", "gyro.lag", "gyro.warm_up")
+]
+
+
+def _norm(imu, data):
+    return gravity_norm(imu, data, jnp.ones(len(data.poses.mask)))
+
+
+def _direction(imu, data):
+    return gravity_direction(imu, data, None, jnp.ones((len(data.turns.mask), 2, 2)))
+
+
+def _whitened(imu, data):
+    conditions, covariance, *_ = condense(imu, data)
+    return covariance.weights(jnp.asarray(EXCESS)).whiten(conditions(imu))
+
+
+TRACEABLE = {
+    "Imu.respond": lambda imu, data: imu.respond(_STIMULUS),
+    "Imu.respond with effects": lambda imu, data: imu.with_effects(*_EFFECTS).respond(_STIMULUS),
+    "Imu.recover": lambda imu, data: imu.recover(data.poses.accelerometer_mean, data.poses.gyroscope_mean),
+    "Imu.recover with effects": lambda imu, data: imu.with_effects(*_EFFECTS).recover(*_OUTPUTS, _STIMULUS),
+    "gravity_norm": _norm,
+    "gravity_direction": _direction,
+    "static_gyroscope": lambda imu, data: static_gyroscope(imu, data, jnp.ones((len(data.poses.mask), 3, 3))),
+    "integrate_turns": lambda imu, data: integrate_turns(imu, data.turns),
+    "conditions": lambda imu, data: condense(imu, data)[0](imu),
+    "covariance": lambda imu, data: condense(imu, data)[1],
+    "whitening": _whitened,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TRACEABLE)
+def test_every_piece_of_the_way_is_compiled_batched_and_differentiated(name, data):
+    def numbers(imu):
+        leaves = jax.tree.leaves(
+            eqx.filter(TRACEABLE[name](imu, jax.tree.map(jnp.asarray, data[2])), eqx.is_inexact_array)
+        )
+        return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves])
+
+    units = [jax.tree.map(jnp.asarray, simulated(seed).imu) for seed in (30, 31)]
+    random = np.random.default_rng(41)
+    direction = jax.tree.map(lambda leaf: jnp.asarray(random.normal(size=leaf.shape)), units[0])
+    units += [jax.tree.map(lambda a, b, step=step: a + step * b, units[0], direction) for step in (1e-5, -1e-5)]
+    expected = [np.asarray(numbers(unit)) for unit in units[:2]]
+    scale = np.abs(expected[0]).max()
+    assert np.all(np.isfinite(expected))
+    assert np.abs(expected[0] - expected[1]).max() > 1e-9 * scale
+    many = jax.jit(jax.vmap(numbers))(jax.tree.map(lambda *leaves: jnp.stack(leaves), *units))
+    np.testing.assert_allclose(many[:2], expected, atol=1e-11 * scale)
+    share = jnp.asarray(random.normal(size=len(expected[0]))) / scale
+
+    @jax.jit
+    def both_ways(unit):
+        """All numbers, and how a sum of them changes along a direction: forward, and by the gradient."""
+        changed = jax.jvp(numbers, (unit,), (direction,))
+        gradient = jax.grad(lambda moved: share @ numbers(moved))(unit)
+        parts = jax.tree.map(lambda a, b: jnp.sum(a * b), gradient, direction)
+        return changed[0], share @ changed[1], sum(jax.tree.leaves(parts))
+
+    found, forward, reverse = both_ways(units[0])
+    np.testing.assert_allclose(found, expected[0], atol=1e-11 * scale)
+    assert float(reverse) == pytest.approx(float(forward), rel=1e-10, abs=1e-12)
+    difference = float(share @ (many[2] - many[3])) / 2e-5
+    assert float(forward) == pytest.approx(difference, rel=1e-5, abs=1e-7)
