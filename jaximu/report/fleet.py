@@ -198,9 +198,9 @@ def population_figure(fleet: Fleet) -> Figure:
                       if name == population.names[k]]  # fmt: skip
             for value, device in marked[:5]:
                 axes.plot(column, value, "D", color=_STRANGER, markersize=5)
-                side = "right" if column == len(own) - 1 else "left"  # towards the middle of the panel
-                axes.annotate(device, (column, value), (-5 if side == "right" else 5, 0), textcoords="offset points",
-                              fontsize=7, color=_STRANGER, va="center", ha=side)  # fmt: skip
+                last = column == len(own) - 1  # its name goes towards the middle of the panel
+                axes.annotate(device, (column, value), (5 - 10 * last, 0), textcoords="offset points", fontsize=7,
+                              color=_STRANGER, va="center", ha="right" if last else "left")  # fmt: skip
         axes.set_xticks(
             range(len(own)), ["".join("xyz"[axis] for axis in dict.fromkeys(population.names[k].axes)) for k in own]
         )
