@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.recordings.alignment import BlockMeans, gravity_turning
+from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turning
 from jaximu.recordings.finding import Rows
 from jaximu.recordings.recording import Recording, Signal
 
@@ -105,6 +105,11 @@ class Sensor:
         scale = self.local[::16]
         lowest = np.quantile(scale, 0.2, axis=0)
         return np.maximum(lowest / _CURVATURE_NOISE, self.step / np.sqrt(12))
+
+    @cached_property
+    def coarse(self) -> tuple[float | None, ...]:
+        """The step of each axis whose noise is finer than it, else None."""
+        return tuple(coarse_step(self, axis) for axis in range(3))
 
     @cached_property
     def step(self) -> FloatArray:
@@ -203,6 +208,14 @@ class Samples:
         if force is None or rate is None:
             return None
         return gravity_turning(force.time, force.values, rate.time, rate.values)
+
+    @cached_property
+    def clocks(self) -> Clocks | None:
+        """By how much the gyroscope's stamps are late, None where nothing turns or there is no gyroscope."""
+        force, rate = self.accelerometer, self.gyroscope
+        if force is None or rate is None:
+            return None
+        return clocks(force.time, force.values, rate.time, rate.values)
 
     @cached_property
     def rests(self) -> FloatArray:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
-from jaximu.mistakes.base import Samples, Sensor, coarse_step, runs_of
+from jaximu.mistakes.base import Samples, Sensor, runs_of
 from jaximu.recordings.finding import Finding, Rows
 
 __all__ = ["TITLES", "at_limits", "find", "stops"]
@@ -47,7 +47,7 @@ def _clipped(sensor: Sensor) -> list[Finding]:
     limits, rows, all_out = [], np.zeros(len(sensor.values), bool), at_limits(sensor)
     for axis, extreme in zip(np.repeat(range(3), 2), extremes.T.ravel(), strict=True):
         values = sensor.values[:, axis]
-        if np.ptp(values) <= 0 or coarse_step(sensor, axis) is not None:
+        if np.ptp(values) <= 0 or sensor.coarse[axis] is not None:
             continue
         # rates of two axes, or of both ends of one, that stop at the same value to the last digit stop at the range
         alike = np.argwhere(np.isclose(np.abs(extremes), abs(extreme), rtol=1e-9, atol=0.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.mistakes.base import Samples, with_signal
-from jaximu.recordings.alignment import Clocks, clocks
+from jaximu.recordings.alignment import Clocks
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
@@ -26,7 +26,7 @@ def find(samples: Samples) -> list[Finding]:
     accelerometer, gyroscope = samples.accelerometer, samples.gyroscope
     if accelerometer is None or gyroscope is None:
         return []
-    found = clocks(accelerometer.time, accelerometer.values, gyroscope.time, gyroscope.values)
+    found = samples.clocks
     if found is None or found.explained < _EXPLAINED:
         return []
     ends = found.late(gyroscope.time[[0, -1]])

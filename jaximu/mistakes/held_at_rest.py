@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Samples, Sensor, coarse_step, with_signal
+from jaximu.mistakes.base import Samples, Sensor, with_signal
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
@@ -64,7 +64,7 @@ def find(samples: Samples) -> list[Finding]:
 
 def _held(samples: Samples, sensor: Sensor, rest: np.ndarray) -> float | None:
     """Return the noise at rest as a share of that in motion, where it is hardly any."""
-    if rest.sum() < 100 or (~rest).sum() < 100 or any(coarse_step(sensor, axis) for axis in range(3)):
+    if rest.sum() < 100 or (~rest).sum() < 100 or any(sensor.coarse):
         return None
     still = samples.accelerometer
     if still is None or np.min(still.noise) < 1e-6 or sensor.even.mean() < 0.9:  # a simulation without noise, or bursts

@@ -7,7 +7,6 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.mistakes.base import Samples, runs_of
 from jaximu.mistakes.lost_samples import steps
-from jaximu.recordings.alignment import clocks
 from jaximu.recordings.finding import Finding
 
 __all__ = ["TITLES", "find"]
@@ -43,9 +42,7 @@ def _unrelated(samples: Samples) -> list[Finding]:
     usable = (np.abs(norm / np.median(norm) - 1) < 0.08) & between
     if (moving & usable).sum() < 20:
         return []
-    accelerometer, gyroscope = samples.accelerometer, samples.gyroscope
-    assert accelerometer is not None and gyroscope is not None
-    found = clocks(accelerometer.time, accelerometer.values, gyroscope.time, gyroscope.values)
+    found = samples.clocks
     if found is None or found.explained > _RELATED:
         return []
     best = found.explained

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import gamma_mean_sf
 from jaximu.ground.quantities import size
-from jaximu.mistakes.base import Samples, Sensor, coarse_step, runs_of
+from jaximu.mistakes.base import Samples, Sensor, runs_of
 from jaximu.mistakes.resampled import held_at, interpolated_at
 from jaximu.recordings.finding import Finding
 
@@ -37,7 +37,7 @@ def _lines(samples: Samples, sensor: Sensor) -> list[Finding]:
     found = []
     for axis in range(3):
         flat = np.median(power[:, axis]) > 1e-20 * np.mean(values[:, axis] ** 2)
-        if coarse_step(sensor, axis) is not None or not flat:
+        if sensor.coarse[axis] is not None or not flat:
             continue  # rounding makes lines, too
         around = _beside(power[:, axis])
         peak = int(np.argmax(power[:, axis] / around))
@@ -65,12 +65,20 @@ def _beside(power: FloatArray) -> FloatArray:
 
     A line stands out from both sides, at the upper end from one. Infinite at the lower end, which the trend took.
     """
-    found = np.full(len(power), np.inf)
+    beside, whole = np.full(len(power), np.inf), np.zeros(0)
+    if len(power) >= _SIDE:
+        whole = np.median(np.lib.stride_tricks.sliding_window_view(power, _SIDE), axis=1)
+
+    def usual(start: int, stop: int) -> float:
+        if stop - start == _SIDE:
+            return float(whole[start])
+        return float(np.median(power[start:stop])) if stop > start else 0.0
+
     for place in range(2 * _LOBE + 2, len(power) - _LOBE):
-        low = power[max(_LOBE, place - _LOBE - _SIDE) : place - _LOBE]
-        high = power[place + _LOBE + 1 : place + _LOBE + 1 + _SIDE]
-        found[place] = max(*(float(np.median(side)) for side in (low, high) if len(side)), 1e-300)
-    return found
+        low = max(_LOBE, place - _LOBE - _SIDE), place - _LOBE
+        high = place + _LOBE + 1, min(place + _LOBE + 1 + _SIDE, len(power))
+        beside[place] = max(usual(*low), usual(*high), 1e-300)
+    return beside
 
 
 _FALL = 0.12
@@ -84,7 +92,7 @@ _SLOPE = -1.2
 def _bandwidth(samples: Samples, sensor: Sensor) -> list[Finding]:
     if held_at(sensor) is not None or interpolated_at(sensor) is not None:
         return []
-    if np.any(sensor.noise < 3 * sensor.step) and any(coarse_step(sensor, axis) for axis in range(3)):
+    if np.any(sensor.noise < 3 * sensor.step) and any(sensor.coarse):
         return []
     if not samples.posed:  # what looks quiet on a vehicle is vibration, and vibration is no white noise
         return []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Samples, Sensor, coarse_step
+from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding, Rows
 
 __all__ = ["TITLES", "find", "held_at", "interpolated_at"]
@@ -56,7 +56,7 @@ def held_at(sensor: Sensor) -> Rows | None:
 
 def interpolated_at(sensor: Sensor) -> Rows | None:
     """Return the rows at the ends of straight lines, where nearly all of the log consists of such lines."""
-    if any(coarse_step(sensor, axis) is not None for axis in range(3)):
+    if any(step is not None for step in sensor.coarse):
         return None
     bend = np.abs(np.diff(sensor.values, n=2, axis=0))
     scale = np.sqrt(np.mean(bend**2, axis=0))

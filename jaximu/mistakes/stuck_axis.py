@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.mistakes.base import Samples, Sensor, coarse_step, runs_of
+from jaximu.mistakes.base import Samples, Sensor, runs_of
 from jaximu.mistakes.clipping import at_limits, stops
 from jaximu.mistakes.resampled import held_at
 from jaximu.recordings.finding import Finding
@@ -38,7 +38,7 @@ def _stuck(sensor: Sensor) -> list[Finding]:
     found = []
     for axis in range(3):
         values = sensor.values[:, axis]
-        if coarse_step(sensor, axis) is not None:
+        if sensor.coarse[axis] is not None:
             continue
         others = change[:, [k for k in range(3) if k != axis]].any(axis=1)
         candidates = [run for run in runs_of(~change[:, axis]) if run[1] - run[0] >= length]
@@ -69,7 +69,7 @@ def _stuck(sensor: Sensor) -> list[Finding]:
     if held_at(sensor) is not None:
         return found
     same = ~change.any(axis=1) & ~at_limits(sensor)[1:]
-    coarse = [coarse_step(sensor, axis) is not None for axis in range(3)]
+    coarse = [step is not None for step in sensor.coarse]
     hung = [] if all(coarse) else _hung(sensor, same)
     if hung:
         rows = np.concatenate([np.arange(start + 1, stop + 1) for start, stop in hung])
