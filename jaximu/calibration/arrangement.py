@@ -6,19 +6,20 @@ columns are called. They are mistakes where somebody relies on the file's axes a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration
+from jaximu.estimation.uncertainty import WeakDirection, gains_open
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
-from jaximu.model.sensor import Triad
+from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.alignment import angle_of, rotation_of, signed_permutation
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, apply_axes, spelled_axes
 
-__all__ = ["arrangement"]
+__all__ = ["arrangement", "unusual_gains"]
 
 _MOUNTED = np.radians(5.0)
 """Rotation of the gyroscope against the accelerometer beyond which it is a mounting and no misalignment."""
@@ -39,13 +40,18 @@ def arrangement(recording: Recording, calibration: Calibration) -> list[Finding]
 
     Gains that the recording leaves open say nothing.
     """
-    if not calibration.gains_determined():
+    scales = {name: signal.nominal_scale for name, signal in recording.signals.items()}
+    return unusual_gains(calibration.imu, calibration.weak, scales)
+
+
+def unusual_gains(imu: Imu, weak: Sequence[WeakDirection], scales: Mapping[str, FloatArray]) -> list[Finding]:
+    """Return the same of a fitted unit; `scales` (3,) by sensor: the nominal ones, `weak`: what the data leave open."""
+    if gains_open(weak):
         return []
-    imu = calibration.imu
-    found = _factors("accelerometer", recording.accelerometer.nominal_scale, imu.accelerometer)
-    if imu.gyroscope is None or recording.gyroscope is None:
+    found = _factors("accelerometer", scales["accelerometer"], imu.accelerometer)
+    if imu.gyroscope is None or "gyroscope" not in scales:
         return found
-    scale = recording.gyroscope.nominal_scale
+    scale = scales["gyroscope"]
     read = np.asarray(imu.gyroscope.gain) / scale[:, None]  # rates as read = read @ true rates
     arranged = signed_permutation(read.T).T
     rest = rotation_of((arranged.T @ read).T).T

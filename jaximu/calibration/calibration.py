@@ -13,7 +13,7 @@ import numpy as np
 
 from jaximu.estimation.fitting import Fit
 from jaximu.estimation.problem import Name, names_of, without_equipment
-from jaximu.estimation.uncertainty import WeakDirection, describe, pose_advice, weak_directions
+from jaximu.estimation.uncertainty import WeakDirection, describe, gains_open, pose_advice, weak_directions
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage, read_document
 from jaximu.ground.errors import InputError
@@ -136,8 +136,7 @@ class Calibration(Described, Document):
 
     def gains_determined(self) -> bool:
         """Return whether the recording determined all gains that were estimated."""
-        unknown = (name for weak in self.weak if not weak.determined for name, _ in weak.parameters)
-        return not any(".gain[" in name for name in unknown)
+        return not gains_open(self.weak)
 
     def inertial(self) -> Calibration:
         """Return the same without its magnetometer. Raises `InputError` where it has no accelerometer."""

@@ -17,6 +17,7 @@ __all__ = [
     "WeakDirection",
     "allowing_for_neighbours",
     "describe",
+    "gains_open",
     "label",
     "pose_advice",
     "spoken_amount",
@@ -46,6 +47,12 @@ class WeakDirection:
     determined: bool
     parameters: tuple[tuple[str, float], ...]
     text: str
+
+
+def gains_open(weak: Sequence[WeakDirection]) -> bool:
+    """Return whether a gain is part of a combination that the data do not determine."""
+    unknown = (direction.parameters for direction in weak if not direction.determined)
+    return any(".gain[" in name for parameters in unknown for name, _ in parameters)
 
 
 def pose_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from jaximu.calibration import nominal_imu, require_spanning
+from jaximu.calibration.arrangement import unusual_gains
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.fitting import Fit
 from jaximu.estimation.problem import names_of, without_equipment
@@ -24,6 +25,7 @@ from jaximu.fleets.fit import FleetUnit, fit_units
 from jaximu.fleets.jobs import Job, Settings
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
+from jaximu.mistakes import prepared
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import fit_noise
@@ -37,6 +39,8 @@ __all__ = ["PARAMETERS", "SCHEMA", "ReadJob", "covariances", "finish", "free_pla
 PARAMETERS = names_of(Imu.nominal())
 """Names of the 24 numbers of a row, in the order of its column `covariance`."""
 _TRIANGLE = np.tril_indices(len(PARAMETERS))
+_TRIADS = {"accel": "accelerometer", "gyro": "gyroscope"}
+"""By what the table's columns call them."""
 _EPOCH = 946684800.0  # s; the year 2000: a logger's start before it is no date
 
 
@@ -128,11 +132,12 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
         options, gyro_log = settings.reading(job)
         recording = read_recording(job.file, gyro_log, options)
         noise = _noise(job.static, replace(options, check=False)) if job.static else None
-        found = segment(recording, settings.segmentation)
-        unit, notes = _unit(recording, found, settings, noise)
+        with prepared([recording]) as (ready,):
+            found = segment(ready.recording, settings.segmentation)
+            unit, notes = _unit(ready.recording, found, settings, noise)
     except Exception as error:
         return ReadJob(row | _failure(error), None)
-    row |= _facts(recording, unit, (*recording.notes, *notes, *found.notes))
+    row |= _facts(ready.recording, unit, (*recording.notes, *ready.notes, *notes, *found.notes))
     if job.date:
         row["date"] = job.date
     if settings.diagnose:
@@ -225,6 +230,12 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
     except NotPossibleError as error:
         return row | _failure(error)
     rank, weak = weak_directions(fit.jacobian, fit.names, fit.sizes, unit.nominal)
+    scales = {triad: np.array(row[f"{name}_nominal"][:3]) for name, triad in _TRIADS.items() if row[f"{name}_nominal"]}
+    unusual = unusual_gains(fit.imu, weak, scales)
+    for finding in unusual:
+        if finding.apply is not None:  # in wrong axes the unit is none of the population
+            wrong = NotPossibleError(f"{row['file']}: {finding.text.partition(';')[0]}.")
+            return row | _failure(wrong)
     kinds = len(EXCESS_NAMES) if unit.gyroscope else 1
     whole = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     places = [PARAMETERS.index(name) for name in fit.names]
@@ -239,10 +250,11 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
         "excess": [*np.asarray(fit.excess[:kinds]).tolist(), *[None] * (3 - kinds)],
         "rank": rank,
         "weak": [each.text for each in weak],
+        "notes": list(dict.fromkeys([*row["notes"], *(finding.text for finding in unusual)])),
     }
     if unit.gyroscope and row["turns"]:
         row["gyro_rms"] = float(rms[1])
-    for name, triad, start in (("accel", "accelerometer", 0), ("gyro", "gyroscope", 12))[: 1 + unit.gyroscope]:
+    for (name, triad), start in zip(list(_TRIADS.items())[: 1 + unit.gyroscope], (0, 12), strict=False):
         gain, bias, known = slice(start, start + 9), slice(start + 9, start + 12), fit.imu.triads()[triad]
         row[f"{name}_gain"], row[f"{name}_bias"] = np.ravel(known.gain), known.bias
         row[f"{name}_gain_sigma"], row[f"{name}_bias_sigma"] = sigma[gain], sigma[bias]
