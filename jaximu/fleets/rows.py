@@ -231,7 +231,7 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
         return row | _failure(error)
     rank, weak = weak_directions(fit.jacobian, fit.names, fit.sizes, unit.nominal)
     scales = {triad: np.array(row[f"{name}_nominal"][:3]) for name, triad in _TRIADS.items() if row[f"{name}_nominal"]}
-    unusual = unusual_gains(fit.imu, weak, scales)
+    unusual = unusual_gains(fit.imu, weak, scales) if scales else []
     for finding in unusual:
         if finding.apply is not None:  # in wrong axes the unit is none of the population
             wrong = NotPossibleError(f"{row['file']}: {finding.text.partition(';')[0]}.")
@@ -250,7 +250,7 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
         "excess": [*np.asarray(fit.excess[:kinds]).tolist(), *[None] * (3 - kinds)],
         "rank": rank,
         "weak": [each.text for each in weak],
-        "notes": list(dict.fromkeys([*row["notes"], *(finding.text for finding in unusual)])),
+        "notes": list(dict.fromkeys([*(row["notes"] or ()), *(finding.text for finding in unusual)])),
     }
     if unit.gyroscope and row["turns"]:
         row["gyro_rms"] = float(rms[1])
