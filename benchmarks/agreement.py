@@ -565,7 +565,8 @@ def table_of(ours: dict[str, Any], theirs: dict[str, Any], note: str = "") -> tu
         words = "; ".join(changed[: len(difference.changed)] if len(difference.changed) <= SHOWN else changed)
         words += f" ({', '.join(difference.new[:SHOWN])})" if difference.new else ""
         seconds = ours[name].get("taken", {}).get("cpu", "")
-        table.add(name, f"{difference.size:.1e}", difference.where, words.replace("|", "/"), str(seconds))
+        where = difference.where.replace("[", "(").replace("]", ")")  # brackets would be links
+        table.add(name, f"{difference.size:.1e}", where, words.replace("|", "/"), str(seconds))
         failed += [name] * difference.fails
     return table, failed
 
