@@ -21,7 +21,7 @@ VERBS = ("calibrate", "reference", "magnetometer", "turntable", "array")
 
 
 def watched(arguments: list[str]) -> None:
-    """Run a command; print the number of free parameters, the excess and the likelihood where its last fit ended."""
+    """Run a command; print the excess where its last fit that estimates one ended, and the likelihood there."""
     import jax
 
     from jaximu.estimation import fitting

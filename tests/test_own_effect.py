@@ -138,9 +138,8 @@ def test_what_another_process_cannot_import_is_refused_before_it_starts(ripple, 
         own_effects()
 
 
-def test_a_changed_formula_is_computed_anew(log, folder, monkeypatch):
+def test_a_changed_formula_is_computed_anew(log, folder):
     """Kept programs are of the source that they were made of, though class and name are the same."""
-    (folder / "changing.py").write_text(MODULE)
     sizes = []
     for factor in (1, 2):
         (folder / "changing.py").write_text(MODULE.replace("FACTOR = 1", f"FACTOR = {factor}  # {'=' * factor}"))
