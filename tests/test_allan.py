@@ -234,16 +234,18 @@ def test_the_grid_of_uneven_stamps():
             "did not rest: .* seconds scatter",
         ),
         (lambda: analyse_noise(at_rest(60.0, artefacts=[Jitter(0.004)])), InputError, "sampled unevenly"),
-        (
-            lambda: analyse_noise(replace(at_rest(60.0), gyroscope=CONSTANT)),
-            NotPossibleError,
-            "no noise to identify",
-        ),
+        (lambda: analyse_noise(replace(at_rest(60.0), accelerometer=CONSTANT)), InputError, "Nothing was measured"),
     ],
 )
 def test_what_tells_no_noise_is_refused(make, error, words):
     with pytest.raises(error, match=words):
         make()
+
+
+def test_a_gyroscope_that_measured_nothing_is_left_out_of_the_analysis():
+    found = analyse_noise(replace(at_rest(60.0), gyroscope=CONSTANT))
+    assert set(found.axes) == {"accelerometer"}
+    assert any("Nothing was measured" in note for note in found.notes)
 
 
 def test_statuses_of_the_command(tmp_path, capsys):

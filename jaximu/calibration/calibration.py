@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from jaximu.estimation.problem import Name, names_of, without_equipment
 from jaximu.estimation.uncertainty import WeakDirection, describe, gains_open, pose_advice, weak_directions
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage, read_document
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.quantities import Z95, change, number, unit_text
 from jaximu.ground.reexport import later
@@ -289,6 +289,17 @@ def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:
     known = {"accelerometer": "rate", "gyroscope": "gyroscope_rate"}
     rates = {known[name]: signal.rate for name, signal in recordings[0].signals.items() if name in known}
     return {**(files[0] if files else {}), **rates, "files": files}
+
+
+def require_another(calibration: Calibration, sources: Iterable[str]) -> None:
+    """Raise `NotPossibleError` where a calibration was fitted to one of the files of these SHA-256."""
+    fitted = {each.get("sha256"): each["file"] for each in calibration.data.get("files", ())}
+    same = [fitted[source] for source in sources if source and source in fitted]
+    if same:
+        raise NotPossibleError(
+            f"{same[0]} is the recording that this calibration was fitted to: it agrees with it whatever has moved "
+            "since. Record the unit again, and check by that."
+        )
 
 
 def effect_named(given: str | Effect) -> Effect:

@@ -21,16 +21,17 @@ from jaximu.estimation.problem import TOLERANCE, Loss, Name, Parameters
 from jaximu.estimation.uncertainty import UNDETERMINED, station_advice
 from jaximu.ground import stored
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import counted
+from jaximu.mistakes import Prepared, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.observations import Stations
-from jaximu.recordings.recording import Recording, recordings_of, same_outputs
+from jaximu.recordings.recording import Defect, Recording, recordings_of, same_outputs
 from jaximu.recordings.reference import Entry, entries_of_columns
 from jaximu.simulation.protocols import earth_rate
 
@@ -39,7 +40,14 @@ _RECORD = (
     "rests."
 )
 
-__all__ = ["calibrate_turntable", "fit_turntable", "free_on_table", "station_errors", "station_rms"]
+__all__ = [
+    "calibrate_table_ready",
+    "calibrate_turntable",
+    "fit_turntable",
+    "free_on_table",
+    "station_errors",
+    "station_rms",
+]
 
 
 def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss: Loss = "linear") -> Fit:
@@ -130,6 +138,7 @@ def calibrate_turntable(
     effects: Sequence[str | Effect] = (),
     latitude: float | None = None,
     loss: Loss = "linear",
+    repair: bool = False,
 ) -> Calibration:
     """Calibrate a unit from recordings of known poses and turns: rate table, dividing head, six positions.
 
@@ -142,6 +151,8 @@ def calibrate_turntable(
     - `static`: a recording of the unit at rest, or the `NoiseModel` fitted to one.
     - `effects`: effects to fit beside gain and bias, by name or with a start: errors of the set-up
       (`"setup.table_tilt"`), nonlinearities (`"accel.quadratic"`), `"gyro.earth_rotation"`.
+    - `repair`: change what is wrong with the samples where that can be put right. Poses and turns of which samples are
+      no measurement are left out.
     - `latitude`: degrees; the Earth's rotation is then known and held. Headings must be stated and count from where
       `attitude_of(up, 0)` stands with x east and y north.
 
@@ -161,13 +172,24 @@ def calibrate_turntable(
     if len(given) != len(recordings):
         raise InputError(f"{len(recordings)} recordings need as many references, found {len(given)}.")
     noise = noise_of(static)
-    stations, said = observe_stations(recordings, given, gravity.value, noise)  # pyright: ignore[reportArgumentType]
+    with prepared(recordings, repair) as ready:
+        found = calibrate_table_ready(ready, given, gravity, noise, effects, latitude, loss)  # pyright: ignore[reportArgumentType]
+    return replace(found, notes=(*mixed, *found.notes))
+
+
+def calibrate_table_ready(
+    ready: Sequence[Prepared], given: Sequence[Sequence[Entry]], gravity: LocalGravity, noise: NoiseModel | None = None,
+    effects: Sequence[str | Effect] = (), latitude: float | None = None, loss: Loss = "linear",
+) -> Calibration:  # fmt: skip
+    """Calibrate as `calibrate_turntable` does, from recordings that [`jaximu.mistakes.prepare`][] has been over."""
+    recordings = [one.recording for one in ready]
+    stations, said = observe_stations(recordings, given, gravity.value, noise)
     nominal = as_stated(recordings[0])
     if recordings[0].gyroscope is None:
         nominal = Imu(nominal.accelerometer, None)
     chosen = [effect_named(each) for each in effects]
     if latitude is not None:
-        _require_headings(recordings, given)  # pyright: ignore[reportArgumentType]
+        _require_headings(recordings, given)
         known = GyroEarthRotation.make(earth_rate(np.radians(latitude)))
         chosen = [*(each for each in chosen if each.name != known.name), known]
     free = tuple(each.name for each in chosen if latitude is None or not isinstance(each, GyroEarthRotation))
@@ -190,10 +212,10 @@ def calibrate_turntable(
     found = _at_rest_where_open(found, start)
     before, after = station_rms(start, stations), station_rms(found.imu, stations)
     notes = (
-        *(note for recording in recordings for note in recording.notes), *(() if noise is None else noise.notes), *said,
-        *mixed,
+        *(note for recording in recordings for note in recording.notes if not isinstance(note, Defect)),
+        *(note for one in ready for note in one.notes), *(() if noise is None else noise.notes), *said,
     )  # fmt: skip
-    calibration = concluded(
+    return concluded(
         found, gravity=gravity, method="turntable", loss=loss, advice=station_advice, notes=notes,
         excess_names=EXCESS_NAMES if nominal.gyroscope is not None else EXCESS_NAMES[:1],
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
@@ -201,7 +223,6 @@ def calibrate_turntable(
         stations=stations, nominal=nominal, reading=recordings[0].reading,
         absent=() if "accelerometer" in recordings[0].signals else ("accelerometer",),
     )  # fmt: skip
-    return calibration
 
 
 def _at_rest_where_open(found: Fit, start: Imu) -> Fit:

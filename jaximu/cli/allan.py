@@ -38,7 +38,7 @@ def run(
 
     """
     with progress("reading"):
-        recordings = [log.read(path, STANDARD, check=False) for path in logs]
+        recordings = [log.read(path, STANDARD, alone=True) for path in logs]
     with progress("identifying the noise"):
         from jaximu.noise.analysis import analyse_noise
 

@@ -105,7 +105,7 @@ def run(
             (said,) = references_of(others, [heldout_reference])
             held = others[0], said
         with progress("diagnosing"):
-            diagnosis = diagnose_turntable(recordings[0], entries, gravity, static=noise, heldout=held)
+            diagnosis = diagnose_turntable(recordings[0], entries, gravity, static=noise, heldout=held, repair=repair)
     if not thermal and any(each.rivals or each.weak for each in diagnosis.named):
         from jaximu.planning.separation import advised
 

@@ -100,15 +100,17 @@ def _shown(advice: Advice) -> str:
 def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -> dict[str, Any]:
     import numpy as np
 
-    from jaximu.mistakes import inspect
+    from jaximu.mistakes import prepare
     from jaximu.recordings.recording import Defect, plausibility
     from jaximu.recordings.segmentation import segment
 
-    signals = {name: _signal(signal) for name, signal in recording.signals.items()}
+    ready = prepare(recording)
+    used = ready.recording.signals
+    signals = {name: _signal(signal, used[name]) for name, signal in recording.signals.items()}
     own = guessed or advice is not None
     notes = [each for each in recording.notes if not own or "--" not in each]  # options that only this verb gave
     notes = [each for each in notes if not isinstance(each, Defect)]  # which are findings
-    findings = [*guessed, *notes, *(each.text for each in inspect(recording))]
+    findings = [*guessed, *notes, *ready.notes]
     uses: list[dict[str, str]] = []
     if "accelerometer" not in signals:
         findings.append("no accelerometer: poses cannot be found")
@@ -120,13 +122,13 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     physical = not (guessed and recording.accelerometer.unit == "count")
     try:
         findings += plausibility(recording, STANDARD) if physical else ()
-        found = segment(recording)
+        found = segment(ready.recording)
         poses = len(found.intervals)
         still = float(np.sum(found.intervals[:, 1] - found.intervals[:, 0]))
         findings.append(f"{poses} static poses, {still:.0f} s in all")
     except JaximuError as error:
         findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
-    rest, longest, begin = _rest(recording) if physical else (0.0, 0.0, 0.0)
+    rest, longest, begin = _rest(ready.recording) if physical else (0.0, 0.0, 0.0)
     length = signals["accelerometer"]["duration"]
     if rest:
         findings.append(
@@ -171,18 +173,20 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     return document
 
 
-def _signal(signal: Signal) -> dict[str, Any]:
+def _signal(signal: Signal, used: Signal) -> dict[str, Any]:
+    """What a signal holds; where its stamps were put right, as every other verb does, those."""
     import numpy as np
 
-    interval = np.diff(signal.time)
+    used = used if len(used) == len(signal) else signal  # rows that are left out are no gap of the log
+    interval = np.diff(used.time)
     several = len(interval) > 0
     return {
         "unit": signal.unit,
         "samples": len(signal),
-        "rate": float(signal.rate) if several else 0.0,
+        "rate": float(used.rate) if several else 0.0,
         "jitter": float(np.std(interval)) if several else 0.0,
         "longest_gap": float(interval.max()) if several else 0.0,
-        "duration": float(signal.time[-1] - signal.time[0]),
+        "duration": float(used.time[-1] - used.time[0]),
         "minimum": signal.values.min(axis=0).tolist(),
         "maximum": signal.values.max(axis=0).tolist(),
     }

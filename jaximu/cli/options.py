@@ -204,7 +204,7 @@ class LogOptions:
             require_files(*paths, static)
             recordings = [self.read(path, gravity, alone=alone) for path in paths]
             own = replace(self, gyro_log=None)  # --gyro-log is LOG's
-            return recordings, None if static is None else own.read(static, gravity, check=False)
+            return recordings, None if static is None else own.read(static, gravity)
 
 
 @dataclass(frozen=True)

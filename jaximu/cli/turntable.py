@@ -52,6 +52,7 @@ def run(
         ),
     ] = None,
     loss: options.LossChoice = "linear",
+    repair: options.RepairFlag = False,
     traced: options.Traced = options.TRACED,
     results: options.Output = options.RESULTS,
 ) -> None:
@@ -80,7 +81,7 @@ def run(
         wanted = (*fit, GyroEarthRotation.name) if earth_rotation == "fit" else fit
         calibration = calibrate_turntable(
             recordings, references, gravity, static=noise, effects=list(dict.fromkeys(wanted)),
-            latitude=local.latitude if earth_rotation == "known" else None, loss=loss,
+            latitude=local.latitude if earth_rotation == "known" else None, loss=loss, repair=repair,
         )  # fmt: skip
     calibration = replace(calibration, trace=trace)
     write = options.drawn("stations", "write_station_report", calibration)

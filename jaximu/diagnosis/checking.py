@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.calibration.calibration import provenance, require_calibration
+from jaximu.calibration.calibration import provenance, require_another, require_calibration
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.systematic import History, noise_at_rest
 from jaximu.data.drift import with_usual_drift
@@ -82,14 +82,15 @@ def check(
     first rest: its innovations say whether the calibration holds, and which parameters moved, as far as they tell.
 
     Raises `InputError` where output units differ, one of the two has no gyroscope, or the outputs are so far off that
-    it is hardly the same unit; `NotPossibleError` where the unit never rests or never moves, or a mistake in the
-    recording stands that may be all that differs.
+    it is hardly the same unit; `NotPossibleError` where the unit never rests or never moves, a mistake in the
+    recording stands that may be all that differs, or the calibration was fitted to this very recording.
     """
     require_float64()
     require_calibration(calibration)
     gravity = as_gravity(gravity)
     recordings = recordings_of(recordings)
     _same_sensors(calibration, recordings)
+    require_another(calibration, [source.sha256 for recording in recordings for source in recording.sources])
     with prepared(recordings) as ready:
         found = _checked(calibration, [each.recording for each in ready], gravity, static, segmentation, level)
         if found.verdict != "valid" and any(each.spoiling for each in ready):

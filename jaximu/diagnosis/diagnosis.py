@@ -41,7 +41,7 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import SegmentationOptions, observed_poses
 
-__all__ = ["Diagnosis", "Examination", "Named", "diagnose", "examine", "same_device"]
+__all__ = ["Diagnosis", "Examination", "Named", "diagnose", "examine", "same_device", "without_effects"]
 
 _DOUBT = 0.01
 """Probability below which chance is no longer offered as an explanation."""
@@ -420,7 +420,7 @@ def diagnose(
         ))  # fmt: skip
     if found.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
         spoiling = [finding for finding in findings if finding.partial]
-    return _without_effects(found, spoiling) if spoiling else found
+    return without_effects(found, spoiling) if spoiling else found
 
 
 @dataclass(frozen=True)
@@ -650,7 +650,7 @@ def _require_freedom(base: State, calibration: Calibration) -> None:
         )
 
 
-def _without_effects(found: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis:
+def without_effects(found: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis:
     """Return the diagnosis of a recording with mistakes that stand: what they imitate is not named."""
     options = list(dict.fromkeys(each.repair for each in spoiling if each.repair and each.spoils))
     names = ", ".join(dict.fromkeys(effect_title(each.name) for each in spoiling))

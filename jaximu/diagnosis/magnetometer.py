@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.calibration.calibration import require_another
 from jaximu.data.field import FieldWindows, MagneticField
 from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.selection import select
@@ -195,8 +196,10 @@ def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
     """Ask whether an old calibration of a magnetometer still holds, given a new one of another recording.
 
     Gains are compared up to one common factor, the strength of the field, which is another at another place. Raises
-    `InputError` where one of them has no magnetometer, or outputs are in different units.
+    `InputError` where one of them has no magnetometer, or outputs are in different units, `NotPossibleError` where both
+    are of one recording.
     """
+    require_another(old, [each.get("sha256", "") for each in new.data.get("files", ())])
     triads = [each.imu.magnetometer for each in (old, new) if each.magnetic is not None and each.imu.magnetometer]
     if len(triads) < 2:
         raise InputError("there is no magnetometer in one of the two calibrations that are to be compared.")

@@ -10,13 +10,13 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.calibration.turntable import calibrate_turntable, station_rms
+from jaximu.calibration.turntable import calibrate_table_ready, station_rms
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.observe_stations import observe_stations
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.stations import KnownStations, StationConditions, station_covariances, station_rows
 from jaximu.data.track import Track, added, mean_outputs, stimuli
-from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device
+from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device, without_effects
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.noise import own_noise
@@ -29,8 +29,8 @@ from jaximu.estimation.rows import Rows
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
-from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
-from jaximu.mistakes import inspect
+from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
+from jaximu.mistakes import Prepared, prepare, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
@@ -212,33 +212,46 @@ def diagnose_turntable(
     static: Recording | NoiseModel | None = None,
     heldout: tuple[Recording, Sequence[Entry] | None] | None = None,
     level: float = 0.05,
+    repair: bool = False,
 ) -> Diagnosis:
     """Calibrate a unit at known poses and turns, ask for everything that model and set-up lack, measure the gain.
 
-    **Arguments:** as for [`jaximu.calibration.calibrate_turntable`] and [`jaximu.diagnosis.diagnose`]; `heldout`:
+    **Arguments:** as for [`jaximu.calibration.calibrate_turntable`][] and [`jaximu.diagnosis.diagnose`]; `heldout`:
     another recording of the unit with its reference.
 
-    Raises what these two raise.
+    No effect is named while a mistake in the recording stands that could imitate it. Raises what these two raise.
     """
-    gravity = as_gravity(gravity)
+    with prepared([recording], repair) as (ready,):
+        found = _of_ready(ready, reference, as_gravity(gravity), noise_of(static), heldout, level, repair)
+    return without_effects(found, ready.spoiling) if ready.spoiling else found
+
+
+def _of_ready(
+    ready: Prepared, reference: Sequence[Entry] | None, gravity: LocalGravity, noise: NoiseModel | None,
+    heldout: tuple[Recording, Sequence[Entry] | None] | None, level: float, repair: bool,
+) -> Diagnosis:  # fmt: skip
+    """Diagnose a recording that was looked over."""
+    recording = ready.recording
     if recording.gyroscope is None or (heldout is not None and heldout[0].gyroscope is None):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
-    noise = noise_of(static)
 
-    def made(part: Recording, said: Sequence[Entry] | None, imu: Imu, known: NoiseModel) -> Turntable:
-        entries = entries_of_columns(part) if said is None else said
+    def made(part: Recording, entries: Sequence[Entry], imu: Imu, known: NoiseModel) -> Turntable:
         return Turntable(part, observe_stations(part, entries, gravity.value, known)[0], jax.tree.map(np.asarray, imu))
 
-    calibration = calibrate_turntable(recording, reference, gravity)
+    entries = entries_of_columns(recording) if reference is None else reference
+    calibration = calibrate_table_ready([ready], [entries], gravity)
     notes = list(calibration.notes)
     held = None
     if heldout is not None:
-        notes += same_device(calibration, calibrate_turntable(*heldout, gravity))
-        held = partial(made, *heldout, calibration.imu)
-    remade = partial(made, recording, reference, calibration.imu)
-    findings = inspect(recording)
+        other = prepare(heldout[0], repair)
+        stated = entries_of_columns(other.recording) if heldout[1] is None else heldout[1]
+        notes += same_device(calibration, calibrate_table_ready([other], [stated], gravity))
+        held = partial(made, other.recording, stated, calibration.imu)
+    remade = partial(made, recording, entries, calibration.imu)
     if noise is not None:
-        return examine(Examination(calibration, noise, remade, held, tuple(findings), tuple(notes), level))
+        return examine(Examination(
+            calibration, noise, remade, held, ready.findings, tuple(notes), level, naming=not ready.spoiling
+        ))  # fmt: skip
     stations = calibration.stations
     assert stations is not None
     rest = np.asarray(stations.gyroscope_used) & ~np.asarray(stations.turn)
@@ -248,7 +261,7 @@ def diagnose_turntable(
     usual = with_usual_drift(own, plain.shortest(), plain.extent().duration)
     notes += usual.notes
     return examine(Examination(
-        calibration, usual, remade, held, tuple(findings), tuple(notes), level, trusted=True
+        calibration, usual, remade, held, ready.findings, tuple(notes), level, trusted=True, naming=not ready.spoiling
     ))  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import hashlib
 import os
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from importlib import import_module
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from jaximu._version import __version__
+from jaximu.ground.document import file_digest
 from jaximu.ground.errors import InputError, only, readable
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.magnetic_field import FieldStrength
@@ -45,7 +47,7 @@ class Job:
     """One recording of one device. date, lot, station: for the fleet's statistics.
 
     options: how to read it, as (name, value). static: a recording at rest, which tells the noise; ""
-    where there is none.
+    where there is none. copy_of: the file, of another job, that has the same bytes; "" where there is none.
     """
 
     device: str
@@ -55,6 +57,7 @@ class Job:
     options: tuple[tuple[str, str], ...] = ()
     static: str = ""
     station: str = ""
+    copy_of: str = ""
 
 
 @dataclass(frozen=True)
@@ -175,6 +178,7 @@ def find_jobs(
             raise InputError(f"{each}: no such file or folder.")
     jobs = named + [Job(device, str(path)) for device, path in zip(_devices(loose), loose, strict=True)]
     _refuse_repeated(jobs)
+    jobs = _with_copies(jobs)
     if at_rest:
         jobs = [
             replace(job, static=job.static or os.fspath(at_rest.get(job.device, at_rest.get(_ALL, "")))) for job in jobs
@@ -245,6 +249,18 @@ def _refuse_repeated(jobs: Sequence[Job]) -> None:
             owners = job.device if job.device == other.device else f"{other.device} and {job.device}"
             raise InputError(f"{job.file} is named twice ({owners}): every recording must be named once.")
         seen[real] = job
+
+
+def _with_copies(jobs: Sequence[Job]) -> list[Job]:
+    """Return the jobs, those whose file has the bytes of an earlier one's marked; only files of one size are read."""
+    sizes = Counter(_stamp(job.file)[0] for job in jobs)
+    first: dict[str, str] = {}
+    found = []
+    for job in jobs:
+        size = _stamp(job.file)[0]
+        other = first.setdefault(file_digest(job.file), job.file) if size > 0 and sizes[size] > 1 else job.file
+        found.append(job if other == job.file else replace(job, copy_of=other))
+    return found
 
 
 def _read_manifest(path: Path) -> list[Job] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -129,9 +129,11 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
     """Read, segment and, where it is asked for, diagnose one recording. Never raises: a failure is the job's row."""
     row = row_begun(job)
     try:
+        if job.copy_of:
+            raise InputError(f"{job.file}: the same bytes as {job.copy_of}: one recording under two names, used once.")
         options, gyro_log = settings.reading(job)
         recording = read_recording(job.file, gyro_log, options)
-        noise = _noise(job.static, replace(options, check=False)) if job.static else None
+        noise = _noise(job.static, options) if job.static else None
         with prepared([recording]) as (ready,):
             found = segment(ready.recording, settings.segmentation)
             unit, notes = _unit(ready.recording, found, settings, noise)

@@ -31,9 +31,15 @@ TITLES = {
 BRIDGED = 3
 """Samples in a row that may be missing in a turn: interpolation across them costs less than the noise does."""
 _SHOWN = 5
+_ZEROS, _BESIDE, _FINER = 0.2, 20, 8
+"""Share of zeros from which on a dead band is sought; samples within twice its size that must be there, and how many
+times finer than the band their steps must be, or coarse steps would do it."""
+_FEW_STEPS = 3.5
+"""Steps that the smallest tenth of the changes of a coarse output stay below."""
 _BLOCK = 0.25  # s, over which scatter is taken to tell rest from motion
 _QUIET = 6.0  # times the floor of the variance up to which a block counts as rest
 _SHORTEST_REST = 0.75  # s
+_RESTED = 0.9  # share of a recording that is quiet where it was made of a unit at rest
 _UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 _CURVATURE_NOISE = float(np.sqrt(1 + 34 / 36))  # of a sample's difference from the cubic through its neighbours
 
@@ -110,6 +116,23 @@ class Sensor:
     def coarse(self) -> tuple[float | None, ...]:
         """The step of each axis whose noise is finer than it, else None."""
         return tuple(coarse_step(self, axis) for axis in range(3))
+
+    @cached_property
+    def dead_band(self) -> tuple[float, float] | None:
+        """The share of an axis's samples that are exactly zero, and the least size (SI) of the others, where all that
+        are smaller are missing although larger ones come in finer steps: of the axis with most zeros.
+        """
+        found: list[tuple[float, float]] = []
+        for values, scale in zip(self.signal.values.T, self.signal.nominal_scale, strict=True):
+            zero = values == 0.0
+            if not _ZEROS <= zero.mean() < 1.0:
+                continue
+            sizes = np.abs(values[~zero])
+            least = float(sizes.min())
+            near = sizes[sizes < 2 * least]
+            if len(near) >= _BESIDE and len(np.unique(np.round(near / least * _FINER))) >= _FINER // 2:
+                found.append((float(zero.mean()), least / float(np.abs(scale))))
+        return max(found) if found else None
 
     @cached_property
     def step(self) -> FloatArray:
@@ -229,6 +252,12 @@ class Samples:
         return spans[spans[:, 1] - spans[:, 0] >= _SHORTEST_REST]
 
     @cached_property
+    def rested(self) -> bool:
+        """Whether the unit lay still all along, but for moments: what varies then is noise, or a disturbance."""
+        still = [sensor.dead_band[0] if sensor.dead_band else sensor.quiet.mean() for sensor in self.sensors.values()]
+        return bool(still) and min(still) > _RESTED and not self.posed
+
+    @cached_property
     def posed(self) -> bool:
         """Whether the unit was turned from rest to rest: four times by 20° or more."""
         sensor, rests = self.accelerometer, self.rests
@@ -265,7 +294,8 @@ def coarse_step(sensor: Sensor, axis: int, quiet: NDArray[np.bool_] | None = Non
         equal = max(equal, float(np.mean(difference[quiet[1:]] == 0)))
     if equal < 0.4 or np.mean(np.abs(moved / step - np.round(moved / step)) < 0.01) < 0.99:
         return None
-    return step
+    # an axis that is held, at a limit say, repeats itself as well: elsewhere its differences are many steps of its text
+    return step if np.quantile(moved, 0.1) < _FEW_STEPS * step else None
 
 
 def with_signal(recording: Recording, name: str, **changes: Any) -> Recording:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Samples, Sensor, with_signal
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
@@ -21,7 +22,11 @@ _FEWEST = 5
 def zeroed_at_rest(samples: Samples) -> float | None:
     """Return the share of the gyroscope's samples at rest that are exactly zero, where its driver sets them so."""
     sensor = samples.gyroscope
-    if sensor is None or samples.accelerometer is None:
+    if sensor is None:
+        return None
+    if sensor.dead_band is not None:
+        return sensor.dead_band[0]
+    if samples.accelerometer is None:
         return None
     rest = samples.quiet_at(sensor)
     zero = (sensor.signal.values == 0.0).all(axis=1)
@@ -40,7 +45,19 @@ def zeroed_at_rest(samples: Samples) -> float | None:
 def find(samples: Samples) -> list[Finding]:
     """Return a gyroscope that is set to zero, held, or drawn to zero at rest."""
     sensor = samples.gyroscope
-    if sensor is None or samples.accelerometer is None:
+    if sensor is None:
+        return []
+    if sensor.dead_band is not None:
+        share, least = sensor.dead_band
+        first = int(np.argmax((sensor.signal.values == 0.0).any(axis=1)))
+        return [Finding(
+            "data.auto_zero", sensor.rows([first]),
+            f"gyroscope: {100 * share:.0f} % of an axis's samples are exactly zero, and none of the others is smaller "
+            f"than {size(least, 'rad/s', 2)}: its driver zeroes it at rest (a dead band), so neither its bias nor its "
+            "noise is known. Switch the dead band off and record again.", spoils=True,
+            refuses="gyroscope" if samples.rested else "",
+        )]  # fmt: skip
+    if samples.accelerometer is None:
         return []
     share = zeroed_at_rest(samples)
     rest = samples.quiet_at(sensor)

@@ -94,7 +94,7 @@ def _bandwidth(samples: Samples, sensor: Sensor) -> list[Finding]:
         return []
     if np.any(sensor.noise < 3 * sensor.step) and any(sensor.coarse):
         return []
-    if not samples.posed:  # what looks quiet on a vehicle is vibration, and vibration is no white noise
+    if not samples.posed and not samples.rested:  # what looks quiet on a vehicle is vibration, which is no white noise
         return []
     parts = _still_parts(samples, sensor)
     if parts is None or len(parts) < 6:
@@ -124,13 +124,17 @@ def _bandwidth(samples: Samples, sensor: Sensor) -> list[Finding]:
     if len(corners) < 3 or max(corners) > 2 * min(corners):  # a filter acts on all axes alike
         return []
     corner = float(np.median(corners))
-    spoils = corner < 4.0
+    spoils = corner < 4.0 and not samples.rested
+    cure = "Turn slowly, or choose a wider filter."
+    if samples.rested:
+        cure = "What it took away is not known; a wider filter shows it."
+    elif spoils:
+        cure = "Turns are quicker than that: choose a filter of 20 Hz or more, and record again."
     return [Finding(
         "data.bandwidth", (),
         f"{sensor.name}: its noise at rest falls off above some {corner:.2g} Hz, far below the {half:.4g} Hz that "
-        f"{sensor.rate:.4g} samples a second could show: a low-pass filter is on. "
-        + ("Turns are quicker than that: choose a filter of 20 Hz or more, and record again." if spoils else
-           "Turn slowly, or choose a wider filter."), spoils=spoils,
+        f"{sensor.rate:.4g} samples a second could show: a low-pass filter is on. {cure}", spoils=spoils,
+        numbers={sensor.name: corner},
     )]  # fmt: skip
 
 

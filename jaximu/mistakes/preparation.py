@@ -17,6 +17,7 @@ from jaximu.mistakes import (
     clocks,
     duplicate,
     held_at_rest,
+    knocks,
     lost_axis,
     lost_samples,
     mixed_devices,
@@ -37,11 +38,13 @@ from jaximu.recordings.recording import Defect, Recording, Signal
 __all__ = ["MISTAKES", "Prepared", "inspect", "prepare", "prepared", "without_rows"]
 
 _ROUNDS = 4
+_MUCH = 0.01  # share of a sensor's rows left out that may be why a calibration is not possible
 _REPAIRED = "This was repaired."
 _STAGES = (
     (timing,),
     (duplicate, resampled),
-    (zeros, wrap),
+    (zeros, knocks),
+    (wrap,),
     (spikes,),
     (stuck_axis, clipping, quantisation, held_at_rest, no_force, lost_axis),
     (clocks,),
@@ -157,10 +160,20 @@ def prepared(
         if not isinstance(error, JaximuError):  # numbers that no recording gives whose rests scatter
             standing = standing or [finding for each in ready for finding in each.findings]
         if not standing:
-            raise
+            emptied = [finding for each in ready for finding in each.findings if _leaves_out_much(each, finding)]
+            if not isinstance(error, NotPossibleError) or not emptied:
+                raise
+            raise NotPossibleError(
+                f"{error} Found in the recording: {' '.join(each.text for each in emptied[:3])}"
+            ) from error
         said = {finding.name: f"{finding.text} ({finding.name})" for finding in reversed(standing)}
         reason = str(error) if isinstance(error, JaximuError) else "nothing can be estimated from it."
         raise NotPossibleError(f"{' '.join(list(said.values())[::-1][:3])} Hence: {reason}") from error
+
+
+def _leaves_out_much(ready: Prepared, finding: Finding) -> bool:
+    """Whether a finding left out enough of a recording for what is left to be too little."""
+    return any(len(rows) > _MUCH * len(getattr(ready.recording, name)) for name, rows in finding.without.items())
 
 
 def _named(ready: Prepared, number: int) -> Prepared:

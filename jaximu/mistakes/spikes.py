@@ -33,6 +33,8 @@ def find(samples: Samples) -> list[Finding]:
     """Return the samples that stand out from both sides."""
     found = []
     for name, sensor in samples.sensors.items():
+        if name == "gyroscope" and sensor.dead_band is not None:  # what leaves the band is no outlier
+            continue
         rows = _outliers(sensor)
         if sensor is samples.gyroscope and samples.accelerometer is not None and len(rows):
             runs = np.split(rows, 1 + np.flatnonzero(np.diff(rows) > 1))

@@ -66,7 +66,7 @@ def _stuck(sensor: Sensor) -> list[Finding]:
                 text += " These rows are left out."
             found.append(Finding("data.stuck_axis", sensor.rows(first), text, spoils=most and noisy,
                                  without={sensor.name: rows} if noisy and not most else {}))  # fmt: skip
-    if held_at(sensor) is not None:
+    if held_at(sensor) is not None or sensor.dead_band is not None:
         return found
     same = ~change.any(axis=1) & ~at_limits(sensor)[1:]
     coarse = [step is not None for step in sensor.coarse]

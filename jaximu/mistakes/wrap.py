@@ -80,7 +80,17 @@ def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None
     rows = np.flatnonzero(turns)
     if turns[-1] != 0 or turns[0] != 0 or np.max(np.abs(turns)) > 1 or len(rows) > 0.4 * len(values):
         return None
+    # what overflowed lay beyond all that did not, put back: the sensor leaves its range there and nowhere else
+    inside = values[turns == 0]
+    if not _beyond(values + turns * full, turns, float(inside.min()), float(inside.max()), sensor.noise[axis]):
+        return None
     return turns, full, rows
+
+
+def _beyond(restored: FloatArray, turns: FloatArray, low: float, high: float, noise: float) -> bool:
+    """Whether values put back lie beyond the ends, low and high, of those that did not overflow."""
+    over = np.concatenate([restored[turns > 0] - high, low - restored[turns < 0]])
+    return bool(np.min(over) > -0.01 * (high - low) - 3 * noise and np.max(over) > 3 * noise)
 
 
 def _of_an_integer(sensor: Sensor, axis: int, full: float) -> float:

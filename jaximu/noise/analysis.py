@@ -18,6 +18,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import number, size, unit_text
 from jaximu.ground.summary import Block, Described, Summary
 from jaximu.ground.units import SENSOR_QUANTITIES
+from jaximu.mistakes import Prepared, prepared
 from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
 from jaximu.noise.cleaning import PeriodicLine, without_outliers
 from jaximu.noise.identification import Identified, identify
@@ -112,20 +113,41 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
     """Identify the noise of a unit at rest; several recordings are power-ons of the same unit.
 
     The terms are those of the longest recording; the spread of all recordings' means is the bias's repeatability.
-    Raises `NotPossibleError` for a recording that is too short or moves, `InputError` for uneven stamps.
+    What is wrong with the samples is found as for a calibration, and said. Raises `NotPossibleError` for a recording
+    that is too short or moves, `InputError` for uneven stamps and for a sensor that holds no measurement; a gyroscope
+    that holds none is left out beside an accelerometer, with a note.
     """
     recordings = recordings_of(recordings)
     if not recordings:
         raise InputError("no recording was given.")
-    longest = max(recordings, key=lambda recording: len(recording.accelerometer))
+    alone = not any(len(recording.accelerometer) for recording in recordings)
+    with prepared(recordings, gyroscope=alone) as ready:
+        return _of_ready(ready)
+
+
+_OF_ITS_OWN = {"data.periodic", "data.gap", "data.quantisation"}
+"""Findings that the analysis makes itself, with numbers: lines, missing samples, quantisation."""
+_BELOW = 0.1
+"""Times a filter's corner up to which it leaves the spectrum as it was: one per cent of the power of one pole."""
+
+
+def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
+    """Return the analysis of recordings that were looked over."""
+    findings = [each for one in ready for each in one.findings]
+    notes = list(dict.fromkeys(each.text for each in findings if each.name not in _OF_ITS_OWN))
+    unusable = {each.refuses for each in findings if each.refuses}
+    recordings = [one.recording for one in ready]
+    chosen = max(ready, key=lambda one: max(len(signal) for signal in one.recording.signals.values()))
+    longest = chosen.recording
     axes: dict[str, list[Identified]] = {}
     rates: dict[str, float] = {}
-    notes: list[str] = []
+    corners = [each.numbers for each in chosen.findings if each.name == "data.bandwidth"]
     for name in SENSOR_QUANTITIES:
-        if getattr(longest, name) is None:
+        if getattr(longest, name) is None or not len(getattr(longest, name)) or name in unusable:
             continue
+        corner = min((each[name] for each in corners if name in each), default=None)
         try:
-            found, rate, said = _analysed(recordings, longest, name)
+            found, rate, said = _analysed(recordings, longest, name, corner and _BELOW * corner)
         except (InputError, NotPossibleError) as error:
             if name != "magnetometer":  # which may lie in a field that changes, or be logged in another way
                 raise
@@ -164,9 +186,9 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
 
 
 def _analysed(
-    recordings: Sequence[Recording], longest: Recording, name: str
+    recordings: Sequence[Recording], longest: Recording, name: str, highest: float | None
 ) -> tuple[list[Identified], float, list[str]]:
-    """Return the noise of a triad's three axes in the longest recording, its rate (Hz), and notes."""
+    """Return the noise of a triad's axes in the longest recording, up to a frequency (Hz), its rate (Hz), and notes."""
     what, notes = f"{longest.name}: the {name}", []
     values, rate = evenly_sampled(getattr(longest, name), what)
     for recording in recordings:
@@ -179,10 +201,14 @@ def _analysed(
             "before them, mirrored, and no difference of the deviation reaches over more than five in a row."
         )
     try:
-        found = identify(values, rate)
+        found = identify(values, rate, highest=highest)
     except NotPossibleError as error:
         raise NotPossibleError(f"{what}: {error}") from error
     assert isinstance(found, list)
+    if highest is not None:
+        notes.append(
+            f"{name}: its terms are those of the spectrum below {highest:.2g} Hz, where the filter does nothing."
+        )
     return found, rate, notes
 
 

@@ -4,6 +4,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
+from jaximu.mistakes import Prepared, prepared
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
 from jaximu.noise.analysis import at_rest
 from jaximu.noise.cleaning import BRIDGED, filled, periodic_lines
@@ -11,6 +12,8 @@ from jaximu.recordings.recording import Recording, Signal, recordings_of
 
 __all__ = ["fit_noise", "noise_of"]
 
+_OF_ITS_OWN = {"data.periodic", "data.gap"}
+"""Findings that the fit makes itself, with numbers."""
 _FEWEST = 1000
 """Samples below which a spectrum cannot tell white noise from slow bias."""
 
@@ -28,8 +31,14 @@ def fit_noise(recording: Recording) -> NoiseModel:
     A few samples missing in a row are bridged; of a recording with longer gaps the longest whole part is used.
     Raises `NotPossibleError` where it is too short, moves or has no noise, `InputError` for uneven stamps.
     """
-    found: dict[str, AxisNoise] = {}
-    notes: list[str] = []
+    with prepared([recording]) as (ready,):
+        return _of_ready(ready)
+
+
+def _of_ready(ready: Prepared) -> NoiseModel:
+    """Return the noise of a recording that was looked over."""
+    recording, found = ready.recording, dict[str, AxisNoise]()
+    notes = [each.text for each in ready.findings if each.name not in _OF_ITS_OWN]
     for name in ("accelerometer", "gyroscope"):
         signal: Signal | None = getattr(recording, name)
         if signal is None:

@@ -93,9 +93,9 @@ def filled(values: FloatArray, longest: int | None = None) -> FloatArray:
 
 
 def periodic_lines(
-    values: FloatArray, rate: float
+    values: FloatArray, rate: float, highest: float | None = None
 ) -> tuple[tuple[PeriodicLine, ...], list[tuple[float, float]], FloatArray | None]:
-    """Return the periodic lines, the bands of frequency (Hz) around them, and their sum over time (n,).
+    """Return the periodic lines up to a frequency, the bands (Hz) around them, and their sum over time (n,).
 
     Ordinates of the Hann-tapered periodogram of noise are exponential about its spectrum, and the median of those
     around is ln 2 of that. A line stands above what the largest of all reaches by chance. Each is subtracted at the
@@ -110,7 +110,7 @@ def periodic_lines(
     slope = 12 * np.dot(place - (samples - 1) / 2, values - values.mean()) / (samples * (samples**2 - 1.0))
     rest = values - values.mean() - slope * (place - (samples - 1) / 2)
     for _ in range(4):
-        peaks, news = _peaks(rest), False
+        peaks, news = _peaks(rest, None if highest is None else round(highest / rate * samples)), False
         for low, peak, high in peaks:
             touching = [i for i, (a, b) in enumerate(spans) if low <= b + 6 and high >= a - 6]
             if touching:  # what subtraction left of a line that is not quite steady
@@ -132,9 +132,12 @@ def periodic_lines(
     return tuple(lines[i] for i in order), bands, periodic
 
 
-def _peaks(values: FloatArray) -> list[tuple[int, int, int]]:
-    """Return first, highest and last ordinate of every peak of the tapered periodogram, the highest peak first."""
-    raw = np.asarray(scipy.fft.rfft(values))
+def _peaks(values: FloatArray, last: int | None) -> list[tuple[int, int, int]]:
+    """Return first, highest and last of the ordinates of every peak of the tapered periodogram, the highest peak first.
+
+    The ordinate `last` is the highest that is looked at.
+    """
+    raw = np.asarray(scipy.fft.rfft(values))[: None if last is None else last + 2]
     tapered = raw[1:-1] / 2 - (raw[:-2] + raw[2:]) / 4  # Hann's taper; ordinates 1 …
     power = tapered.real**2 + tapered.imag**2
     edges = _median_edges(len(power))

@@ -111,8 +111,9 @@ class Identified:
 
 
 def identify(
-    values: ArrayLike, rate: float, terms: str = TERMS, confidence: float = 0.95, gauss_markov: int = 0
-) -> Identified | list[Identified]:
+    values: ArrayLike, rate: float, terms: str = TERMS, confidence: float = 0.95, gauss_markov: int = 0,
+    highest: float | None = None,
+) -> Identified | list[Identified]:  # fmt: skip
     """Identify the noise of samples at rest: one `Identified` for (n,), a list of them for (axes, n).
 
     **Arguments:**
@@ -121,6 +122,7 @@ def identify(
     - `terms`: those to look for, of Q (quantisation), N (white), B (bias instability), K (rate random walk), R (ramp).
     - `confidence`: of the intervals.
     - `gauss_markov`: number of first-order Gauss–Markov processes to fit beside the terms.
+    - `highest`: frequency (Hz) above which the spectrum is not used, where a filter acted on it.
 
     Outliers, periodic lines and an exponential warm-up are found first, taken out and reported; the last only where the
     likelihood says overwhelmingly that it is not a random walk. Which terms the data supports is decided by an
@@ -141,13 +143,15 @@ def identify(
     if np.isinf(data).any():
         raise InputError("the signal holds infinite values.")
     if data.ndim == 2:
-        return [_identify(axis, rate, terms, confidence, gauss_markov) for axis in data]
+        return [_identify(axis, rate, terms, confidence, gauss_markov, highest) for axis in data]
     if data.ndim != 1:
         raise InputError(f"values must be (n,) or (axes, n), found shape {data.shape}.")
-    return _identify(data, rate, terms, confidence, gauss_markov)
+    return _identify(data, rate, terms, confidence, gauss_markov, highest)
 
 
-def _identify(values: FloatArray, rate: float, terms: str, confidence: float, markov: int) -> Identified:
+def _identify(
+    values: FloatArray, rate: float, terms: str, confidence: float, markov: int, highest: float | None
+) -> Identified:
     samples = len(values)
     if samples < _SHORTEST:
         raise NotPossibleError(f"{samples} samples are too few to identify noise; record at least {_SHORTEST}.")
@@ -159,7 +163,9 @@ def _identify(values: FloatArray, rate: float, terms: str, confidence: float, ma
         raise NotPossibleError("the signal is constant, or quantised to whole steps: there is no noise to identify.")
     values, outliers = without_outliers(values)
     whole = filled(values)  # for the spectrum; the deviation leaves long gaps out
-    lines, bands, periodic = periodic_lines(whole, rate)
+    lines, bands, periodic = periodic_lines(whole, rate, highest)
+    if highest is not None:
+        bands = [*bands, (highest, rate / 2)]
     if periodic is not None:
         whole, values = whole - periodic, values - periodic
     spectrum = _spectrum(whole, rate, bands)

@@ -23,7 +23,8 @@ class Finding:
     cannot be trusted while it stands. refuses: nothing can be calibrated from this sensor ("accelerometer" …) at all.
     partial: a repair cannot find all of it, so that what is left may still look like an effect.
     apply: changes the recording as the repair does; done without being asked where `repair` is empty. without: rows of
-    each sensor, counted from 0, that are no measurement and are left out.
+    each sensor, counted from 0, that are no measurement and are left out. numbers: what the text states of each sensor:
+    the corner (Hz) of a filter.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Finding:
     partial: bool = False
     apply: Callable[[Recording], Recording] | None = field(default=None, compare=False, repr=False)
     without: Mapping[str, Rows] = field(default_factory=dict, compare=False, repr=False)
+    numbers: Mapping[str, float] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
         """Return the finding as `diagnosis.json` has it."""

@@ -109,14 +109,16 @@ def _label(each: Entry) -> str:
 
 def _inside(recording: Recording, each: Entry, notes: list[str]) -> bool:
     """Whether the log holds an entry without a gap."""
+    there = [signal for signal in recording.signals.values() if len(signal) > 1]
+    first, last = min(signal.time[0] for signal in there), max(signal.time[-1] for signal in there)
     for signal in (recording.accelerometer, recording.gyroscope):
         if signal is None or not len(signal):
             continue
         slack = 1.5 / signal.rate
-        if each.start < signal.time[0] - slack or each.stop > signal.time[-1] + slack:
+        if each.start < first - slack or each.stop > last + slack:
             raise InputError(
-                f"{_label(each)} lies outside of the log ({signal.time[0]:.6g} to {signal.time[-1]:.6g} s): the "
-                "reference is not on the log's clock, or belongs to another log."
+                f"{_label(each)} lies outside of the log ({first:.6g} to {last:.6g} s): the reference is not on the "
+                "log's clock, or belongs to another log."
             )
         inside = signal.time[(signal.time > each.start) & (signal.time < each.stop)]
         stamps = np.concatenate([[each.start], inside, [each.stop]])

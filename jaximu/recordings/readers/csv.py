@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate, pairwise
+from os import SEEK_END
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,8 @@ def read(path: Path, source: Source) -> Table:
     if wide:
         with suppress(UnicodeDecodeError):
             head = path.read_bytes().decode("utf-16").encode()
+    whole = None if wide else _without_zeros(path)  # where the file ends in them
+    head = head if whole is None else whole[:_SAMPLE]
     if len(head) != len(head.translate(None, _CONTROL)):
         raise InputError(
             f"{source.path}: holds binary data of no known format; expected CSV, TSV, blank-separated text, "
@@ -53,9 +56,10 @@ def read(path: Path, source: Source) -> Table:
         )
     layout = _layout(_lines(head), source.path)
     rows: np.ndarray | int = layout.first + 1
-    found = None if layout.delimiter == " " or wide else _read_straight(path, layout)
+    found = None if layout.delimiter == " " or wide or whole is not None else _read_straight(path, layout)
     if found is None:
-        table, rows = _read_cleaned(_lines(head if wide else path.read_bytes()), layout, source.path)
+        data = head if wide else path.read_bytes() if whole is None else whole
+        table, rows = _read_cleaned(_lines(data), layout, source.path)
         found = [from_arrow(column) for column in table.columns], table.schema
     (columns, schema), names = found, layout.names or None
     if names:  # a column of dates states its own unit
@@ -70,7 +74,18 @@ def read(path: Path, source: Source) -> Table:
             columns[at] = stamps
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [ns]", *names[at + 1 :])
-    return Table(source, names, tuple(columns), rows, layout.rate)
+    notes = () if whole is None else ("the file ends in zero bytes, as after a power loss: its last row is left out.",)
+    return Table(source, names, tuple(columns), rows, layout.rate, notes=notes)
+
+
+def _without_zeros(path: Path) -> bytes | None:
+    """The whole rows of a file that ends in zero bytes, which an interrupted write leaves; None for any other."""
+    with path.open("rb") as file:
+        file.seek(max(0, file.seek(0, SEEK_END) - 1))
+        if file.read(1) != b"\0":
+            return None
+    data = path.read_bytes().rstrip(b"\0")
+    return data[: data.rfind(b"\n") + 1]
 
 
 def _lines(data: bytes) -> bytes:
