@@ -1,4 +1,4 @@
-"""What is wrong with a recording is known to every verb that it matters to: at rest, on a table, in a fleet, to `info`."""
+"""What is wrong with a recording is known to every verb: at rest, on a table, in a fleet, to `info`."""
 
 import json
 import shutil
@@ -169,7 +169,7 @@ def test_an_accelerometer_that_clips_on_a_table_is_not_the_gyroscopes_fault():
     force = np.clip(log.accelerometer.values, -9.0, 9.0)
     clipped = replace(log, accelerometer=replace(log.accelerometer, values=force))
     found = diagnose_turntable(clipped, truth.schedule)
-    assert "data.clipping" in [finding.name for finding in found.findings]
+    assert "data.clipping" in [finding.name for finding in found.preflight]
     assert not [each for each in found.named if each.effect.name.startswith("gyro.")]
 
 

@@ -133,6 +133,9 @@ class LogOptions:
         ),
     ] = None
     gyro_offset: Annotated[str | None, arg(metavar="COUNTS", help="Counts at zero rate, one number or three.")] = None
+    device: Annotated[
+        str | None, arg(metavar="ID", help="Whose rows to take of a table in which several units write in turn.")
+    ] = None
     topic: Annotated[
         str | None,
         arg(

@@ -209,6 +209,7 @@ class ReadOptions:
     gravity: local gravity, from which the scale of a raw accelerometer is found.
     check: refuse what is not plausible, see `jaximu.recordings.recording.plausibility`.
     alone: take a file of a gyroscope alone; its accelerometer then has no samples.
+    device: whose rows to take of a table in which several units write in turn.
     topic, instance, stamp: what to take from bags and flight logs, see `jaximu.recordings.columns.table.Selection`.
     like: how the log of a calibration was read, which is used where options and file leave something open: columns
         where the header is the same, axes where the file's writer has not applied them, rate and scales where needed.
@@ -226,6 +227,7 @@ class ReadOptions:
     gravity: LocalGravity = STANDARD
     check: bool = True
     alone: bool = False
+    device: str | None = None
     topic: str | None = None
     instance: int | None = None
     stamp: str = "header"

@@ -48,6 +48,8 @@ _REFUSED = {
 }  # fmt: skip
 """Words beside a sensor's by which a column is not its measurement, and what it is."""
 _TIME = set("t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec".split())
+_TIME_ALONE = set("ms us ns sec secs seconds milliseconds microseconds nanoseconds epoch uptime".split())
+"""Words that name a column of time where they are its whole name, and no other names one."""
 _TIME_BESIDE = _NEUTRAL | set(
     "s since start reboot boot seconds second unix epoch utc system sys local host device sample fine elapsed offset "
     "recording phone node chip epoc "
@@ -107,6 +109,11 @@ class Field:
             return f"{self.sensor}_{self.axis}" if self.axis and self.axis in "xyz" else None
         return self.sensor
 
+    @property
+    def bare_time(self) -> bool:
+        """Whether the name is a unit of time and no more."""
+        return self.sensor == "time" and len(self.stem) == 1 and self.stem[0] in _TIME_ALONE
+
     @classmethod
     def of(cls, name: str) -> Field:
         """Read a column's name."""
@@ -134,6 +141,8 @@ class Field:
             if stated is None:
                 return cls(tuple(words), None, "time", unit or _UNIT_WORDS["time"].get(tail or ""))
             return cls(tuple(words), None, "temperature", unit)  # T (°)
+        if axis is None and len(words) == 1 and words[0] in _TIME_ALONE:
+            return cls(tuple(words), None, "time", unit or _UNIT_WORDS["time"].get(words[0]))
         measured = find_unit(unit) if unit and axis and unit != "G" else None
         if measured and not stem and axis in tuple("xyz"):  # X (m/s^2)
             sensor = QUANTITIES.get(measured.quantity)

@@ -86,6 +86,10 @@ def header_columns(table: Table) -> tuple[Column, ...] | None:
     fields = fields_of(table.names)
     columns = [Column(field.canonical, field.unit) for field in fields]
     times = [at for at, column in enumerate(columns) if column.name == TIME]
+    bare = [at for at in times if fields[at].bare_time]
+    if bare and len(times) > 1:  # parts of a time of day, most likely
+        columns = [Column(None) if at in bare else column for at, column in enumerate(columns)]
+        times = [at for at in times if at not in bare]
     if len(times) > 1:
         best = max(times, key=lambda at: (rises(table.columns[at]), columns[at].unit is not None, -at))
         columns = [Column(None) if at in times and at != best else column for at, column in enumerate(columns)]

@@ -23,7 +23,7 @@ from jaximu.recordings.columns.guess import Advice, advise
 from jaximu.recordings.columns.known import known_names, whole_stamps
 from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, parse_columns
 from jaximu.recordings.columns.table import MessageSelection, Table, from_arrow, mapped_axes, named_with_units
-from jaximu.recordings.readers.records import apart
+from jaximu.recordings.readers.records import apart, of_device
 from jaximu.recordings.recording import (
     Defect,
     PoseMeans,
@@ -45,6 +45,9 @@ _TABLE = 200  # rows, up to which a file without time may be a table of pose mea
 _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
 _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their rows to be in order
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
+_ENDS = sorted({2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-9, 1e-6, 1e-3)} | {86400.0, 604800.0})
+"""Seconds after which clocks begin anew: counters of 16, 24 and 32 bits, a day, a week of GPS."""
+_CARRIED = 10.0  # sample intervals between the last stamp before a clock began anew and the first after
 _SHARED = 0.1  # of the messages may share a stamp
 
 
@@ -60,8 +63,7 @@ def read_recording(
     is in raw counts whose scale is not given and cannot be found.
     """
     options = _sound(options)
-    selection = MessageSelection(options.topic, options.instance, options.stamp)
-    tables = read_tables(path, selection)
+    tables = _read(path, options)
     if tables[0].messages and options.columns is not None:
         raise InputError(f"{tables[0].path}: names its columns and units itself; --columns is for tables.")
     open_columns = options.columns is None and options.gyro_columns is None
@@ -74,7 +76,7 @@ def read_recording(
             )
         parts = _parts(tables, options)
     else:
-        table, second = _stamped(tables[0], options.columns), read_tables(gyro_log, selection)[0]
+        table, second = _stamped(tables[0], options.columns), _read(gyro_log, options)[0]
         second = _stamped(second, options.columns or options.gyro_columns)
         first_columns, second_columns = choose_pair(table, second, options.columns, options.gyro_columns)
         parts = [
@@ -90,6 +92,12 @@ def read_recording(
             "(if it is in another file: --gyro-log)."
         )
     return recording
+
+
+def _read(path: str | os.PathLike[str], options: ReadOptions) -> list[Table]:
+    """The tables of a file, with the rows of one unit where several write into it in turn."""
+    tables = read_tables(path, MessageSelection(options.topic, options.instance, options.stamp))
+    return [table if table.messages else of_device(table, options.device) for table in tables]
 
 
 def read_frame(frame: Any, options: ReadOptions | None = None) -> Recording:
@@ -213,7 +221,7 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     """
     options = _sound(options)
     parts = []
-    for place, table in enumerate(read_tables(path, MessageSelection(options.topic, options.instance, options.stamp))):
+    for place, table in enumerate(_read(path, options)):
         options = options if place else _alike(options, table)
         table = _stamped(table, options.columns)
         columns = choose_columns(table, options.columns, "mag") if not table.messages else header_columns(table) or ()
@@ -443,7 +451,11 @@ def extract(
     sensor = "gyro" if option == "--gyro-columns" else None
     found = column_units(table, wanted, option, sensor)
     put_right = _ordered if table.messages else _rising
-    table, disorder = put_right(table, found) if TIME in found else (table, [])
+    disorder: list[str] = []
+    if TIME in found:
+        table, wraps = _carried_on(table, found)
+        table, disorder = put_right(table, found)
+        disorder = [*wraps, *disorder]
     stamps, origin, notes = _stamps(table, found, options)
     notes = [*table.notes, *disorder, *notes]
     signals: dict[str, Signal] = {}
@@ -473,6 +485,30 @@ def _per_second(unit: Unit, sensor: str, stamps: FloatArray) -> Unit:
     """The unit of a rate for increments over the sampling interval, any other unit as it is."""
     quantity = _INCREMENTS.get((sensor, unit.quantity))
     return Unit(unit.name, quantity, unit.factor / float(np.median(np.diff(stamps)))) if quantity else unit
+
+
+def _carried_on(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
+    """The rows with a time that goes on where a counter passed its end, or a day or a week of GPS began, and a note."""
+    index, unit = found[TIME]
+    stamps = table.numbers(index)
+    steps = np.diff(stamps)
+    if not (steps < 0).any() or not (steps > 0).any():  # NaN is neither
+        return table, []
+    usual = float(np.median(steps[steps > 0]))
+    for seconds in _ENDS:
+        full = stamps.dtype.type(round(seconds / unit.factor) if stamps.dtype.kind == "i" else seconds / unit.factor)
+        back = np.flatnonzero(steps < -full / 2)
+        if not len(back) or not np.all((steps[back] + full > 0) & (steps[back] + full < _CARRIED * usual)):
+            continue
+        columns = list(table.columns)
+        turns = np.zeros(len(stamps), stamps.dtype)
+        turns[back + 1] = full
+        columns[index] = stamps + np.cumsum(turns)
+        places = f"{len(back)} place{'s' * (len(back) != 1)} (row {table.row(int(back[0]) + 1)})"
+        return replace(table, columns=tuple(columns)), [
+            f"the clock begins anew after {seconds:.10g} s in {places}: its time goes on from there."
+        ]
+    return table, []
 
 
 def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
-from jaximu.recordings.columns.habits import fields_of, sensor_of
+from jaximu.recordings.columns.habits import fields_of, sensor_of, words_of
 from jaximu.recordings.columns.names import rises
 from jaximu.recordings.columns.table import Table
 from jaximu.recordings.readers.arrays import table_of
@@ -145,6 +145,52 @@ def apart(table: Table) -> Table:
         found = _joined(parts)
         return replace(found, notes=(*found.notes, f"each row is one sensor's, by {table.label(at)}."))
     return table
+
+
+_DEVICE = set("id ids device devices dev sensor unit imu node serial sn mac address addr source".split())
+"""Words of the names of columns that say which unit a row is of."""
+_FEWEST, _MOST_DEVICES, _IN_TURN = 0.02, 64, 0.02
+"""Share of the rows that a unit has at the least, number of units, and share of rows after which another one writes."""
+
+
+def of_device(table: Table, device: str | None) -> Table:
+    """A table with the rows of one unit where a column names several that write in turn; any other as it is.
+
+    Raises `InputError` where none of them, or one that is not there, was chosen.
+    """
+    for at, field in enumerate(fields_of(table.names or ())):
+        words = set(words_of(table.names[at])) if table.names else set()
+        if field.canonical or not words & _DEVICE or (field.axis and field.sensor):
+            continue
+        names = np.array([str(each) for each in table.columns[at].tolist()])
+        units, counts = np.unique(names, return_counts=True)
+        in_turn = np.mean(names[1:] != names[:-1])
+        if not 1 < len(units) <= _MOST_DEVICES or counts.min() < _FEWEST * len(names) or in_turn < _IN_TURN:
+            continue
+        if not _alike(table, [names == unit for unit in units]):  # rows of several sensors of one unit
+            continue
+        if device is None:
+            raise InputError(
+                f"{table.path}: its rows are of {len(units)} units, which write in turn, by column {table.label(at)}: "
+                f"choose one with --device {' or --device '.join(units[:8])}."
+            )
+        if device not in units:
+            raise InputError(f"{table.path}: --device {device}: column {table.label(at)} holds {', '.join(units[:8])}.")
+        taken = table.take(np.flatnonzero(names == device))
+        return replace(taken, notes=(*taken.notes, f"the rows are those of {device}, by column {table.label(at)}."))
+    if device is not None:
+        raise InputError(f"{table.path}: --device {device}: no column says which of several units a row is of.")
+    return table
+
+
+def _alike(table: Table, groups: Sequence[np.ndarray]) -> bool:
+    """Whether the same columns are filled in the rows of each group."""
+    for column in table.columns:
+        filled = ~np.isnan(column) if column.dtype.kind == "f" else np.ones(len(column), bool)
+        shares = [filled[group].mean() for group in groups]
+        if max(shares) > 2 * min(shares) + 0.1:
+            return False
+    return True
 
 
 def _sensor(tag: Any) -> str | None:
