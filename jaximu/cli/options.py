@@ -219,8 +219,8 @@ class GravityOptions:
         str | None,
         arg(
             metavar="G[+-S]",
-            help="Local gravity in m/s², with its standard deviation if known: 9.81744+-0.0005. "
-            "Default: standard gravity, known to 0.015 m/s².",
+            help="Local gravity in m/s², with its standard deviation if known: 9.81744+-0.0005; a bare 9.81 is "
+            "known to half a unit of its last digit. Default: standard gravity, known to 0.015 m/s².",
         ),
     ] = None
     latitude: Annotated[

@@ -66,11 +66,13 @@ def as_gravity(value: Gravity) -> LocalGravity:
 def parse_gravity(text: str) -> LocalGravity:
     """Gravity from "G" or "G+-SIGMA" (also "G±SIGMA"), in m/s²: "9.81744", "9.81+-0.001".
 
-    A bare G has sigma 0: the user states it and is believed. Raises InputError for anything else.
+    A bare G is known to half a unit of its last digit, anything within as likely: 9.81 has sigma 0.005/√3; G+-0 is
+    exact. Raises InputError for anything else.
     """
     parts = re.split(r"\+/?-|±", text)
+    decimals = len(parts[0].strip().partition(".")[2])
     try:
-        value, sigma = float(parts[0]), float(parts[1]) if len(parts) > 1 else 0.0
+        value, sigma = float(parts[0]), float(parts[1]) if len(parts) > 1 else 0.5 * 10.0**-decimals / math.sqrt(3)
     except ValueError:
         value, sigma = math.nan, math.nan
     if len(parts) > 2 or math.isnan(value) or math.isnan(sigma):

@@ -35,6 +35,10 @@ def _unset() -> FloatArray:
     return np.empty(0)
 
 
+_GAP = 1.6
+"""Times the usual interval from which on a longer one is a gap."""
+
+
 @dataclass(frozen=True, eq=False)
 class Signal(Comparable):
     """The samples of one sensor on their own time stamps.
@@ -85,8 +89,14 @@ class Signal(Comparable):
 
     @cached_property
     def rate(self) -> float:
-        """Sample rate in Hz: one over the median interval between stamps."""
-        return float(1.0 / np.median(np.diff(self.time)))
+        """Sample rate in Hz: samples over time, gaps left out.
+
+        One over the median interval would be the rate at which stamps are rounded, or a logger polls.
+        """
+        interval = np.diff(self.time)
+        usual = float(np.median(interval))
+        longest = _GAP * max(usual, float(np.mean(np.minimum(interval, 3 * usual))))
+        return float(1.0 / np.mean(interval[interval <= longest]))
 
     @cached_property
     def rounding_variance(self) -> float:

@@ -15,6 +15,8 @@ UNPACKED, RATIO = 128 << 20, 200
 """A compressed file may unpack to so many bytes, or to so many times its own size: no recording compresses better."""
 AXES = b"jaximu.axes"
 """Key of Arrow's metadata: the map by which a writer has put a log in body axes."""
+FEW = 0.01
+"""Share of the rows up to which one that holds no whole sample costs itself, and not the recording."""
 _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
 
 
@@ -86,11 +88,17 @@ class Table:
         return repr(name) if name else f"number {index + 1}"
 
     def numbers(self, index: int) -> np.ndarray:
-        """The column as int64 or float64 (NaN where empty). Raises InputError for a cell that is no finite number."""
+        """The column as int64 or float64 (NaN where empty).
+
+        Of readings that are infinite, or larger than any is, a few count as empty. Raises InputError for more of them,
+        and for a cell that is no number.
+        """
         column = self.columns[index]
         if column.dtype == object:
             column = self._parse(index)
         if column.dtype.kind == "f" and (absurd := np.abs(column) > _LARGEST).any():
+            if absurd.mean() <= FEW:
+                return np.where(absurd, np.nan, column)
             row = self.row(int(np.argmax(absurd)))
             raise InputError(
                 f"{self.path}, row {row}: column {self.label(index)} is infinite, or too large for a reading."

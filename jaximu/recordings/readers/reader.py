@@ -22,7 +22,7 @@ from jaximu.recordings.columns.choose import choose_columns, choose_pair, column
 from jaximu.recordings.columns.guess import Advice, advise
 from jaximu.recordings.columns.known import known_names, whole_stamps
 from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, parse_columns
-from jaximu.recordings.columns.table import MessageSelection, Table, from_arrow, mapped_axes, named_with_units
+from jaximu.recordings.columns.table import FEW, MessageSelection, Table, from_arrow, mapped_axes, named_with_units
 from jaximu.recordings.readers.records import apart, of_device
 from jaximu.recordings.recording import (
     Defect,
@@ -48,6 +48,7 @@ _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
 _ENDS = sorted({2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-9, 1e-6, 1e-3)} | {86400.0, 604800.0})
 """Seconds after which clocks begin anew: counters of 16, 24 and 32 bits, a day, a week of GPS."""
 _CARRIED = 10.0  # sample intervals between the last stamp before a clock began anew and the first after
+_FEW_SHARED, _FEW_SHARES = 10, 0.02  # rows, and share of them, from which on repeated stamps are a habit
 _SHARED = 0.1  # of the messages may share a stamp
 
 
@@ -469,7 +470,7 @@ def extract(
             notes.append(f"{GROUPS[key].field}: the columns are empty.")
             continue
         if dropped:
-            notes.append(f"{GROUPS[key].field}: {dropped} of {len(stamps)} rows hold no sample of it.")
+            notes.append(f"{GROUPS[key].field}: {dropped} of {len(stamps)} rows hold no whole sample of it.")
         signals[key] = signal
     unused = [table.label(index) for index, each in enumerate(columns) if each.name is None]
     if unused and table.names and options.columns is None and not table.messages:
@@ -614,6 +615,16 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
     if len(late) and (shared.any() or close > before):
         return table, []  # sorting does not help: stamps are wrong, and which, the refusal says
     columns = [np.asarray(column)[kept] for column in table.columns]
+    if not len(late) and shared.sum() >= _FEW_SHARED and _FEW_SHARES < shared.mean() <= 0.25:
+        even = _even_clock(stamps[kept])
+        if even is not None:
+            columns[index] = even
+            rate = (len(even) - 1) / (float(even[-1] - even[0]) * unit.factor)
+            return table.take(kept, columns), [*notes, Defect(
+                "data.jitter",
+                f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of {rate:.5g} "
+                "Hz fitted to the stamps replaces them.",
+            )]  # fmt: skip
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
         number = np.arange(len(kept))
         place = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
@@ -677,7 +688,10 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
         values[:, place] = each if plain else each * unit.factor + unit.offset
     if (missing := np.isnan(values)).any():
         absent = missing.all(1)
-        if (broken := missing.any(1) & ~absent).any():
+        broken = missing.any(1) & ~absent
+        if 0 < broken.mean() <= FEW:
+            absent |= broken
+        elif broken.any():
             row = int(np.argmax(broken))
             label = table.label(columns[int(np.argmax(missing[row]))][1])
             raise InputError(
