@@ -180,15 +180,18 @@ def _run(given: Sequence[str]) -> int:
         work = _parse(name, _common(rest))
         _settings()
         work()
-    elif name in ("--help", "-h"):
+    elif name == "help" and rest and rest[0] in VERBS:
+        print(help_text(rest[0], _verb(rest[0])))
+    elif name in ("--help", "-h") or (name == "help" and not rest):
         print(listed(_groups(), _verb))
-    elif name in ("--version", "-V"):
+    elif name in ("--version", "-V", "version"):
         print(f"jaximu {__version__}")
     elif name == "--completion":
         print(completion(rest[0] if rest else "", VERBS, _verb))
     elif name:
         import difflib
 
+        name = rest[0] if name == "help" else name
         near = difflib.get_close_matches(name, VERBS, 1)
         raise InputError(
             f"there is no command {name!r}{f' (did you mean {near[0]}?)' if near else ''}; `jaximu --help` lists them."

@@ -14,6 +14,8 @@ TITLES = {"data.duplicate": "repeated rows"}
 
 _CHANCE = 1e-6
 """Expected number of blocks that repeat by chance, below which a repeat is none."""
+_AROUND = 200
+"""Rows on either side that say how alike rows are there: a sensor at rest in coarse steps shows few different ones."""
 _DISTINCT = 5, 0.5
 """Different rows that a block must have, and what share of its rows, less those that usually repeat, must differ: a
 sensor that stands still repeats itself."""
@@ -70,4 +72,14 @@ def _repeated(values: np.ndarray) -> Rows:
             continue
         if len(np.unique(code[start : start + length])) >= distinct:
             marked[stop : stop + length] = True
+    for first, last in runs_of(marked):
+        if _by_chance(code[max(0, first - _AROUND) : last + _AROUND], last - first, count):
+            marked[first:last] = False
     return np.flatnonzero(marked)
+
+
+def _by_chance(codes: np.ndarray, length: int, count: int) -> bool:
+    """Whether a run of rows as alike as those around it would repeat by chance somewhere among so many rows."""
+    _, often = np.unique(codes, return_counts=True)
+    alike = float(np.sum(often * (often - 1.0))) / max(len(codes) * (len(codes) - 1.0), 1.0)  # of two rows
+    return length * -np.log(max(alike, 1e-12)) < np.log(count**2 / _CHANCE)

@@ -17,6 +17,8 @@ _SLOW = 0.15
 """Radians of a block from which on samples at a low rate need not tell how far it turned."""
 _LEAK = 2e-3
 """Share of the others' motion that misalignment gives to any axis that lives."""
+_NO_BIAS = 0.2
+"""rad/s that an axis reads which turns steadily, and no bias is."""
 _ROUND, _OFF = 0.15, 3.0
 """Share of gravity by which its norm at rest may change, and m/s² that biases of a live sensor may be."""
 _OF_REST = 0.6
@@ -98,7 +100,7 @@ def _dead_rate(samples: Samples) -> list[Finding]:
     moved = np.sqrt(np.mean((sensor.values - np.median(sensor.values, axis=0)) ** 2, axis=0))
     axis = int(np.argmin(moved))
     others = float(np.min(np.delete(moved, axis)))
-    if others < 0.05 or moved[axis] > 0.02 * others:
+    if others < 0.05 or moved[axis] > 0.02 * others or abs(np.median(sensor.values[:, axis])) > _NO_BIAS:
         return []
     seen = blocks.change
     left = seen + np.cross(blocks.turned(), blocks.force)

@@ -340,7 +340,12 @@ def _recognise(path: Path) -> _Format:
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             return _ROS2
-        raise InputError(f"{path}: is a folder, not a file, and no ROS 2 bag (it has no metadata.yaml).")
+        files = sorted(each.name for each in path.iterdir() if each.is_file())
+        held = f"it holds {', '.join(files[:3])}{' …' if len(files) > 3 else ''}" if files else "no file lies in it"
+        raise InputError(
+            f"{path}: is a folder, not a file, and no ROS 2 bag (it has no metadata.yaml); {held}. Name one log, or "
+            f"calibrate all: jaximu fleet {path} -o fleet.parquet."
+        )
     with path.open("rb") as file:
         head = file.read(_HEAD)
     if not head or head.isspace():
@@ -713,8 +718,8 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
         for axis, (_, index, _) in zip(values.T, columns, strict=True):
             if axis[0] == axis[-1] and (axis == axis[0]).all():
                 raise InputError(
-                    f"{table.path}: column {table.label(index)} never changes; the sensor's axis is dead or not "
-                    "recorded."
+                    f"{table.path}: column {table.label(index)} never changes from {axis[0]:.6g}: nothing was measured, "
+                    "or its steps are coarser than all that the sensor saw. Log more digits."
                 )
     return Signal(stamps, values, columns[0][2].base), rows - len(kept)
 
