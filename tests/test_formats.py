@@ -145,7 +145,7 @@ def test_types_that_change_late_in_a_long_file(tmp_path):
     assert recording.accelerometer.values[-2].tolist() == [0.5, 0.25, 9.75]
     assert recording.temperature is not None
     assert len(recording.temperature) == 5
-    assert recording.notes == (f"temperature: {rows - 5} of {rows} rows hold no sample of it.",)
+    assert recording.notes == (f"temperature: {rows - 5} of {rows} rows hold no whole sample of it.",)
 
 
 def test_dates_state_their_own_unit(tmp_path):

@@ -344,7 +344,7 @@ def test_attitude_of_broad(files):
     recording = read(files["broad"])
     assert recording.attitude is not None and recording.magnetometer is not None
     assert len(recording.attitude) == ROWS - 10
-    assert said(recording, "the BROAD data set") and said(recording, "10 of 400 rows hold no sample")
+    assert said(recording, "the BROAD data set") and said(recording, "10 of 400 rows hold no whole sample")
 
 
 @pytest.mark.parametrize(("name", "program"), [("euroc", "EuRoC"), ("kalibr", "Kalibr's bag extractor")])

@@ -47,6 +47,7 @@ _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their 
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
 _ENDS = sorted({2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-9, 1e-6, 1e-3)} | {86400.0, 604800.0})
 """Seconds after which clocks begin anew: counters of 16, 24 and 32 bits, a day, a week of GPS."""
+_COUNTED = 64.0  # samples that a counter tells apart at the least
 _CARRIED = 10.0  # sample intervals between the last stamp before a clock began anew and the first after
 _FEW_SHARED, _FEW_SHARES = 10, 0.02  # rows, and share of them, from which on repeated stamps are a habit
 _SHARED = 0.1  # of the messages may share a stamp
@@ -502,6 +503,8 @@ def _carried_on(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table
         return table, []
     usual = float(np.median(steps[steps > 0]))
     for seconds in _ENDS:
+        if seconds / unit.factor < _COUNTED * usual:
+            continue
         full = stamps.dtype.type(round(seconds / unit.factor) if stamps.dtype.kind == "i" else seconds / unit.factor)
         back = np.flatnonzero(steps < -full / 2)
         if not len(back) or not np.all((steps[back] + full > 0) & (steps[back] + full < _CARRIED * usual)):
@@ -718,8 +721,8 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
         for axis, (_, index, _) in zip(values.T, columns, strict=True):
             if axis[0] == axis[-1] and (axis == axis[0]).all():
                 raise InputError(
-                    f"{table.path}: column {table.label(index)} never changes from {axis[0]:.6g}: nothing was measured, "
-                    "or its steps are coarser than all that the sensor saw. Log more digits."
+                    f"{table.path}: column {table.label(index)} never changes from {axis[0]:.6g}: nothing was "
+                    "measured, or its steps are coarser than all that the sensor saw. Log more digits."
                 )
     return Signal(stamps, values, columns[0][2].base), rows - len(kept)
 

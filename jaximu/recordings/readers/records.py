@@ -172,7 +172,7 @@ def of_device(table: Table, device: str | None) -> Table:
         if device is None:
             raise InputError(
                 f"{table.path}: its rows are of {len(units)} units, which write in turn, by column {table.label(at)}: "
-                f"choose one with --device {' or --device '.join(units[:8])}."
+                f"choose one of them, {', '.join(units[:8])}, with --device."
             )
         if device not in units:
             raise InputError(f"{table.path}: --device {device}: column {table.label(at)} holds {', '.join(units[:8])}.")

@@ -1,0 +1,168 @@
+"""What a log's stamps and rows say: counters that pass their end, units that write in turn, single bad values."""
+
+import re
+
+import numpy as np
+import pytest
+
+from jaximu.calibration import calibrate
+from jaximu.cli import main
+from jaximu.ground.errors import InputError
+from jaximu.mistakes import inspect
+from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld
+
+NAMES = [f"{sensor}_{axis} [{unit}]" for sensor, unit in (("accel", "m/s^2"), ("gyro", "rad/s")) for axis in "xyz"]
+AS_IS = ReadOptions(check=False)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return simulate(draw_imu(6), HandHeld(12, 1.5), consumer_noise(), rate=100.0, seed=6)[0]
+
+
+def values_of(recording) -> np.ndarray:
+    return np.hstack([recording.accelerometer.values, recording.gyroscope.values])
+
+
+def write(path, time, values, name="time [s]", extra=None):
+    columns = {name: time} | (extra or {}) | dict(zip(NAMES, values.T, strict=True))
+    rows = [",".join(map(str, row)) for row in zip(*(np.asarray(column).tolist() for column in columns.values()))]
+    path.write_text("\n".join([",".join(columns), *rows]) + "\n")
+    return path
+
+
+CLOCKS = {
+    "milliseconds in 16 bits": ("ms", 2**16, 1e3, 65_000),
+    "microseconds in 32 bits": ("time [us]", 2**32, 1e6, 2**32 - 5_000_000),
+    "microseconds in 24 bits": ("time [us]", 2**24, 1e6, 0),
+    "a time of day past midnight": ("time [s]", 86400.0, 1.0, 86395.0),
+    "a week of GPS that ends": ("time [s]", 604800.0, 1.0, 604790.0),
+}
+
+
+@pytest.mark.parametrize("kind", CLOCKS)
+def test_a_clock_that_begins_anew_goes_on(recording, tmp_path, kind):
+    name, full, per_second, start = CLOCKS[kind]
+    time = recording.accelerometer.time
+    stamps = np.round((start + time * per_second) % full, 6)
+    stamps = stamps.astype(np.int64) if per_second > 1 else stamps
+    found = read_recording(write(tmp_path / "log.csv", stamps, values_of(recording), name))
+    np.testing.assert_allclose(
+        found.accelerometer.time, time - time[0], atol=1.1 / per_second if per_second > 1 else 1e-5
+    )
+    assert any("its time goes on from there" in note for note in found.notes)
+    assert not {"data.order", "data.gap"} & {finding.name for finding in inspect(found)}
+
+
+def test_a_clock_that_was_set_back_does_not_go_on(recording, tmp_path):
+    """No counter ends after 31.4 s: rows from there on are of another recording, or out of order."""
+    time = recording.accelerometer.time.copy()
+    time[3000:] -= 31.4
+    with pytest.raises(InputError, match="two recordings in one file"):
+        read_recording(write(tmp_path / "log.csv", time, values_of(recording)))
+
+
+@pytest.mark.parametrize("ids", [("0", "1"), ("left", "right")])
+@pytest.mark.parametrize("late", [0.0, 0.001, 0.005])
+def test_units_that_write_in_turn_are_not_mixed(recording, tmp_path, ids, late):
+    time = recording.accelerometer.time
+    values, other = values_of(recording), values_of(recording) * 1.02 + 0.01
+    both = np.stack([values, other], axis=1).reshape(-1, 6)
+    stamps = np.stack([time, time + late], axis=1).ravel()
+    path = write(tmp_path / "log.csv", stamps, both, extra={"id": np.tile(ids, len(time))})
+    with pytest.raises(InputError, match=f"of 2 units.*--device {ids[0]} or --device {ids[1]}"):
+        read_recording(path)
+    for device, its in zip(ids, (values, other), strict=True):
+        found = read_recording(path, options=ReadOptions(device=device, check=False))
+        np.testing.assert_allclose(values_of(found), its)
+        assert found.gyroscope.rate == pytest.approx(100.0, rel=1e-3)
+    with pytest.raises(InputError, match="--device 7: column 'id' holds"):
+        read_recording(path, options=ReadOptions(device="7"))
+
+
+def test_a_column_that_says_something_else_makes_no_units(recording, tmp_path, capsys):
+    """A counter, a label for parts of the recording, one unit's number in every row."""
+    time, values = recording.accelerometer.time, values_of(recording)
+    count = len(time)
+    for extra in ({"id": np.arange(count)}, {"device": np.full(count, 7)}, {"source": np.arange(count) // (count // 3)},
+                  {"flag": np.arange(count) % 2}):  # fmt: skip
+        path = write(tmp_path / "log.csv", time, values, extra=extra)
+        assert len(read_recording(path).accelerometer) == count
+    assert main(["calibrate", str(path), "--device", "1"]) == 2
+    assert "no column says which of several units" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("bad", ["inf", "-Infinity", "1e300", "nan", ""])
+def test_a_bad_value_costs_its_row(recording, tmp_path, bad):
+    path = write(tmp_path / "log.csv", recording.accelerometer.time, values_of(recording))
+    lines = path.read_text().splitlines()
+    cells = lines[2000].split(",")
+    cells[5] = bad
+    path.write_text("\n".join([*lines[:2000], ",".join(cells), *lines[2001:]]) + "\n")
+    found = read_recording(path)
+    assert len(found.gyroscope) == len(recording.gyroscope) - 1
+    assert len(found.accelerometer) == len(recording.accelerometer)
+    assert any(re.search("gyroscope: 1 of .* rows hold no whole sample", note) for note in found.notes)
+    whole, less = calibrate(recording), calibrate(found)
+    off = (np.asarray(less.imu.gyroscope.gain) - np.asarray(whole.imu.gyroscope.gain)) / less.sigma("gyroscope")[0]
+    assert np.abs(off).max() < 0.5
+
+
+def test_many_bad_values_are_refused_with_the_row(recording, tmp_path):
+    values = values_of(recording)
+    values[100:300, 4] = np.inf
+    with pytest.raises(InputError, match="row 102: column 'gyro_y' is infinite"):
+        read_recording(write(tmp_path / "log.csv", recording.accelerometer.time, values))
+
+
+@pytest.mark.parametrize("tick", [0.005125, 0.007, 0.001])
+def test_a_rate_is_samples_over_time(recording, tmp_path, tick):
+    """A logger that polls writes the stamps of its own loop, whose usual interval is not the sensor's."""
+    time = np.ceil(recording.accelerometer.time / tick) * tick
+    found = read_recording(write(tmp_path / "log.csv", time, values_of(recording)))
+    assert found.gyroscope.rate == pytest.approx(100.0, rel=2e-3)
+    gone = np.delete(np.arange(len(time)), np.arange(500, 3000, 50))
+    found = read_recording(write(tmp_path / "log.csv", time[gone], values_of(recording)[gone]))
+    assert found.gyroscope.rate == pytest.approx(100.0, rel=4e-3)
+
+
+def test_stamps_that_repeat_are_a_steady_clocks(recording, tmp_path):
+    time = recording.accelerometer.time.copy()
+    time[3:-2:4] = time[2:-3:4]
+    found = read_recording(write(tmp_path / "log.csv", time, values_of(recording)))
+    np.testing.assert_allclose(found.gyroscope.time, recording.gyroscope.time, atol=2e-3)
+    assert any("stamps repeat the one before" in note for note in found.notes)
+
+
+def test_parts_of_a_time_of_day_are_no_clock(recording, tmp_path):
+    """Columns `sec` and `ms` say the time together, and neither alone; one of them alone is the time."""
+    time = recording.accelerometer.time
+    parts = {"sec": np.floor(time).astype(int)}
+    path = write(tmp_path / "log.csv", np.round(time % 1 * 1e3).astype(int), values_of(recording), "ms", parts)
+    with pytest.raises(InputError, match="no time column"):
+        read_recording(path)
+    found = read_recording(write(tmp_path / "log.csv", np.round(time * 1e3).astype(int), values_of(recording), "ms"))
+    np.testing.assert_allclose(found.gyroscope.time, time - time[0], atol=1e-3)
+
+
+def test_gravity_stated_in_three_digits_counts_by_them(recording, tmp_path, capsys):
+    path = write(tmp_path / "log.csv", recording.accelerometer.time, values_of(recording))
+    assert main(["calibrate", str(path), "--gravity", "9.81"]) == 0
+    assert "9.81000 ± 0.0057 m/s²" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(("line", "words"), [("help", "calibrate"), ("help allan", "--json"), ("version", "0.1")])
+def test_help_and_version_are_commands(capsys, line, words):
+    assert main(line.split()) == 0
+    assert words in capsys.readouterr().out
+
+
+def test_a_folder_is_answered_with_what_lies_in_it(recording, tmp_path, capsys):
+    write(tmp_path / "log.csv", recording.accelerometer.time, values_of(recording))
+    assert main(["info", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "it holds log.csv" in said and f"jaximu fleet {tmp_path}" in said
+    assert main(["help", "calibrat"]) == 2
+    assert "did you mean calibrate" in capsys.readouterr().err
