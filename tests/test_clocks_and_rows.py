@@ -28,7 +28,8 @@ def values_of(recording) -> np.ndarray:
 
 def write(path, time, values, name="time [s]", extra=None):
     columns = {name: time} | (extra or {}) | dict(zip(NAMES, values.T, strict=True))
-    rows = [",".join(map(str, row)) for row in zip(*(np.asarray(column).tolist() for column in columns.values()))]
+    cells = [map(str, np.asarray(column).tolist()) for column in columns.values()]
+    rows = [",".join(row) for row in zip(*cells, strict=True)]
     path.write_text("\n".join([",".join(columns), *rows]) + "\n")
     return path
 
@@ -72,13 +73,13 @@ def test_units_that_write_in_turn_are_not_mixed(recording, tmp_path, ids, late):
     both = np.stack([values, other], axis=1).reshape(-1, 6)
     stamps = np.stack([time, time + late], axis=1).ravel()
     path = write(tmp_path / "log.csv", stamps, both, extra={"id": np.tile(ids, len(time))})
-    with pytest.raises(InputError, match=f"of 2 units.*--device {ids[0]} or --device {ids[1]}"):
+    with pytest.raises(InputError, match=f"of 2 units.* choose one of them, {ids[0]}, {ids[1]}"):
         read_recording(path)
     for device, its in zip(ids, (values, other), strict=True):
         found = read_recording(path, options=ReadOptions(device=device, check=False))
         np.testing.assert_allclose(values_of(found), its)
         assert found.gyroscope.rate == pytest.approx(100.0, rel=1e-3)
-    with pytest.raises(InputError, match="--device 7: column 'id' holds"):
+    with pytest.raises(InputError, match="column 'id' holds"):
         read_recording(path, options=ReadOptions(device="7"))
 
 
@@ -113,7 +114,7 @@ def test_a_bad_value_costs_its_row(recording, tmp_path, bad):
 def test_many_bad_values_are_refused_with_the_row(recording, tmp_path):
     values = values_of(recording)
     values[100:300, 4] = np.inf
-    with pytest.raises(InputError, match="row 102: column 'gyro_y' is infinite"):
+    with pytest.raises(InputError, match="row 102: column 'gyro_y .* is infinite"):
         read_recording(write(tmp_path / "log.csv", recording.accelerometer.time, values))
 
 
