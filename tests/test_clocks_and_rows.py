@@ -114,7 +114,7 @@ def test_a_bad_value_costs_its_row(recording, tmp_path, bad):
 def test_many_bad_values_are_refused_with_the_row(recording, tmp_path):
     values = values_of(recording)
     values[100:300, 4] = np.inf
-    with pytest.raises(InputError, match="row 102: column 'gyro_y .* is infinite"):
+    with pytest.raises(InputError, match=r"row 102: column 'gyro_y .* is infinite"):
         read_recording(write(tmp_path / "log.csv", recording.accelerometer.time, values))
 
 

@@ -15,7 +15,7 @@ from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turn
 from jaximu.recordings.finding import Rows
 from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["BRIDGED", "TITLES", "Samples", "Sensor", "coarse_step", "runs_of"]
+__all__ = ["BRIDGED", "TITLES", "Samples", "Sensor", "block_medians", "coarse_step", "runs_of"]
 
 TITLES = {
     "data.bumped_pose": "bumped pose",
@@ -98,8 +98,7 @@ class Sensor:
         """(n, 3) robust standard deviation of `curvature` around each sample: of a block of 16 and its neighbours."""
         size = 16
         blocks = max(1, len(self) // size)
-        kept = np.abs(self.curvature[: blocks * size]).reshape(blocks, -1, 3)
-        scale = 1.4826 * np.median(kept, axis=1)
+        scale = 1.4826 * block_medians(np.abs(self.curvature[: blocks * size]), blocks)
         wide = scale.copy()
         wide[1:] = np.maximum(wide[1:], scale[:-1])
         wide[:-1] = np.maximum(wide[:-1], scale[1:])
@@ -278,21 +277,27 @@ def runs_of(flags: NDArray[np.bool_]) -> Rows:
     return edges.reshape(-1, 2)
 
 
+def block_medians(values: FloatArray, blocks: int) -> FloatArray:
+    """Return the median (blocks, 3) of the values (n, 3) of each of so many blocks in a row, all of one length."""
+    return np.stack([np.median(axis.reshape(blocks, -1), axis=1) for axis in np.ascontiguousarray(values.T)], axis=1)
+
+
 def coarse_step(sensor: Sensor, axis: int, quiet: NDArray[np.bool_] | None = None) -> float | None:
     """Return the step of an axis whose noise is finer than it, else None."""
-    values = sensor.values[:, axis]
+    values, change = sensor.values[:, axis], sensor.difference[:, axis]
+    # at rest most neighbours are equal, and those that are not differ by whole steps
+    same = change == 0
+    equal = float(np.mean(same))
+    if quiet is not None and quiet[1:].sum() > 100:
+        equal = max(equal, float(np.mean(same[quiet[1:]])))
+    if equal < 0.4:
+        return None
     steps = np.diff(np.unique(values))
     steps = steps[steps > 1e-9 * max(float(np.ptp(values)), 1e-300)]
     if len(steps) < 2:
         return None
-    difference = np.abs(sensor.difference[:, axis])
-    step = float(steps.min())
-    moved = difference[difference > 0]
-    # at rest most neighbours are equal, and those that are not differ by whole steps
-    equal = float(np.mean(difference == 0))
-    if quiet is not None and quiet[1:].sum() > 100:
-        equal = max(equal, float(np.mean(difference[quiet[1:]] == 0)))
-    if equal < 0.4 or np.mean(np.abs(moved / step - np.round(moved / step)) < 0.01) < 0.99:
+    step, moved = float(steps.min()), np.abs(change[~same])
+    if np.mean(np.abs(moved / step - np.round(moved / step)) < 0.01) < 0.99:
         return None
     # an axis that is held, at a limit say, repeats itself as well: elsewhere its differences are many steps of its text
     return step if np.quantile(moved, 0.1) < _FEW_STEPS * step else None

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.mistakes.base import Samples, Sensor
+from jaximu.mistakes.base import Samples, Sensor, block_medians
 from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import Recording
 
@@ -96,8 +96,12 @@ def _evidence(samples: Samples, lost: FloatArray, wanted: Rows, reach: int) -> t
     return np.array(power), np.array(product)
 
 
-def _quickly(samples: Samples, reach: int) -> tuple[FloatArray, FloatArray]:
-    """The same for all intervals (n − 1,) of evenly sampled sensors, by filters: nothing is known to be lost yet."""
+def _quickly(samples: Samples, wanted: Rows, reach: int) -> tuple[FloatArray, FloatArray]:
+    """The same for evenly sampled sensors, by filters over what is near the intervals: nothing is known lost yet."""
+    near = np.zeros(len(next(iter(samples.sensors.values()))), bool)
+    for shift in range(1 - reach, 1 + reach):
+        near[wanted + shift] = True
+    place_of = np.cumsum(near)[wanted] - 1
     place = np.arange(2 * reach) - reach + 0.5
     after = (place > 0) - 0.5
     design = np.stack([place**0, place / reach, (place / reach) ** 2, (place / reach) ** 3, after], axis=1)
@@ -105,10 +109,9 @@ def _quickly(samples: Samples, reach: int) -> tuple[FloatArray, FloatArray]:
     basis, _ = np.linalg.qr(design)
     power, product = [], []
     for sensor in samples.sensors.values():
-        count = len(sensor) - 1
-        totals = np.zeros((2, count))
+        totals = np.zeros((2, len(wanted)))
         for axis in range(3):
-            values = sensor.values[:, axis] - sensor.values[:, axis].mean()
+            values = sensor.values[near, axis] - sensor.values[:, axis].mean()
             step, slope = (np.correlate(values, weights[k], "valid") for k in (4, 1))
             left = np.correlate(values**2, np.ones(2 * reach), "valid")
             for column in basis.T:
@@ -116,7 +119,8 @@ def _quickly(samples: Samples, reach: int) -> tuple[FloatArray, FloatArray]:
             noise = np.maximum(sensor.noise[axis] ** 2, np.maximum(left, 0.0) / (2 * reach - 5))
             variance = np.maximum(noise * float(weights[4] @ weights[4]), 1e-300)
             slope = slope / reach
-            totals[:, reach - 1 : reach - 1 + len(step)] += slope**2 / variance, slope * step / variance
+            both = np.stack([slope**2 / variance, slope * step / variance])
+            totals += both[:, place_of - (reach - 1)]
         power.append(totals[0])
         product.append(totals[1])
     return np.array(power), np.array(product)
@@ -178,7 +182,7 @@ def _singles(samples: Samples) -> list[Finding]:
     sure, least = _SURE, _CLEAR
     for turn in range(_ROUNDS):  # a place that is known shows its neighbours
         if turn == 0:
-            powers, products = (each[:, wanted] for each in _quickly(samples, reach))
+            powers, products = _quickly(samples, wanted, reach)
         else:
             powers, products = _evidence(samples, known, wanted, reach)
         power, product = powers.sum(axis=0), products.sum(axis=0)
@@ -275,7 +279,7 @@ def steps(sensor: Sensor) -> FloatArray:
         miss[np.clip(broken + shift, 0, count - 2)] = 0.0
     size = 16
     blocks = max(1, len(miss) // size)
-    usual = 1.4826 * np.median(np.abs(miss[: blocks * size]).reshape(blocks, -1, 3), axis=1)
+    usual = 1.4826 * block_medians(np.abs(miss[: blocks * size]), blocks)
     wide = usual.copy()
     wide[1:], wide[:-1] = np.maximum(wide[1:], usual[:-1]), np.maximum(wide[:-1], usual[1:])
     scale = np.maximum(wide[np.minimum(np.arange(len(miss)) // size, blocks - 1)], 1.8 * sensor.noise)

@@ -21,20 +21,21 @@ def find(samples: Samples) -> list[Finding]:
     """Return lines in the spectrum at rest, and a spectrum that falls off far below half the rate."""
     found = []
     for sensor in samples.sensors.values():
-        found += _lines(samples, sensor)
-        found += _bandwidth(samples, sensor)
+        parts = _still_parts(samples, sensor)
+        if parts is None or len(parts) < 6:
+            continue
+        spectrum = np.fft.rfft(parts.swapaxes(1, 2) * np.hanning(parts.shape[1]), axis=2)
+        power = np.mean(spectrum.real**2 + spectrum.imag**2, axis=0).T
+        found += _lines(sensor, parts, power)
+        found += _bandwidth(samples, sensor, power, parts.shape[1])
     return found
 
 
-def _lines(samples: Samples, sensor: Sensor) -> list[Finding]:
-    """Sharp lines in the spectrum of the quieter half of the recording."""
-    values = sensor.values
-    parts = _still_parts(samples, sensor)
-    if parts is None or len(parts) < 12:
+def _lines(sensor: Sensor, parts: FloatArray, power: FloatArray) -> list[Finding]:
+    """Sharp lines in the spectrum (f, 3) of the quieter half of the recording."""
+    if len(parts) < 12:
         return []
-    quiet, width = parts, parts.shape[1]
-    power = np.mean(np.abs(np.fft.rfft(quiet * np.hanning(width)[:, None], axis=1)) ** 2, axis=0)
-    found = []
+    values, quiet, width, found = sensor.values, parts, parts.shape[1], []
     for axis in range(3):
         flat = np.median(power[:, axis]) > 1e-20 * np.mean(values[:, axis] ** 2)
         if sensor.coarse[axis] is not None or not flat:
@@ -89,18 +90,14 @@ _SLOPE = -1.2
 """Slope of the logarithm of the density over that of frequency in the upper part: white noise has 0, one pole −2."""
 
 
-def _bandwidth(samples: Samples, sensor: Sensor) -> list[Finding]:
+def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) -> list[Finding]:
+    """A spectrum (f, 3), of parts of so many samples, that falls off far below half the rate."""
     if held_at(sensor) is not None or interpolated_at(sensor) is not None:
         return []
     if np.any(sensor.noise < 3 * sensor.step) and any(sensor.coarse):
         return []
     if not samples.posed and not samples.rested:  # what looks quiet on a vehicle is vibration, which is no white noise
         return []
-    parts = _still_parts(samples, sensor)
-    if parts is None or len(parts) < 6:
-        return []
-    width = parts.shape[1]
-    power = np.mean(np.abs(np.fft.rfft(parts * np.hanning(width)[:, None], axis=1)) ** 2, axis=0)
     floor = sensor.step**2 / 12 * np.sum(np.hanning(width) ** 2)
     frequency = np.arange(len(power)) * sensor.rate / width
     half = sensor.rate / 2
@@ -159,9 +156,15 @@ def _rest(samples: Samples, still: NDArray[np.bool_]) -> bool:
     """Whether the quiet stretches of a recording are rest, and not merely quieter than the others."""
     for name, sensor in samples.sensors.items():
         if len(sensor) == len(still):
-            runs = [run for run in runs_of(still) if run[1] - run[0] > 7]
-            squares = [np.var(sensor.values[a:b], axis=0).sum() for a, b in runs]
-            if squares and np.sqrt(np.median(squares)) > _SHAKEN[name]:
+            runs = runs_of(still)
+            runs = runs[runs[:, 1] - runs[:, 0] > 7]
+            if not len(runs):
+                continue
+            values = sensor.values - sensor.values.mean(axis=0)
+            sums, squares = (np.cumsum(np.pad(part, ((1, 0), (0, 0))), axis=0) for part in (values, values**2))
+            length = np.diff(runs)
+            mean, square = ((total[runs[:, 1]] - total[runs[:, 0]]) / length for total in (sums, squares))
+            if np.sqrt(np.median(np.sum(square - mean**2, axis=1))) > _SHAKEN[name]:
                 return False
     return True
 

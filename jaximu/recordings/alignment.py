@@ -101,11 +101,9 @@ class BlockMeans(NamedTuple):
     time: FloatArray
     angle: FloatArray
 
-    def turned(self, late: FloatArray | float = 0.0, part: slice = slice(None)) -> FloatArray:
+    def turned(self, late: FloatArray | float = 0.0) -> FloatArray:
         """Return the gyroscope's angle (n, 3) from each block to the next, its stamps (n + 1,) `late` s late."""
-        first = part.start or 0
-        stop = len(self.change) if part.stop is None else part.stop
-        at = (self.centre + late)[first : stop + 1]
+        at = self.centre + late
         angle = np.stack([np.interp(at, self.time, each) for each in self.angle.T], axis=1)
         return np.asarray(np.diff(angle, axis=0), np.float64)
 
@@ -257,8 +255,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         return None
     middle = float(blocks.centre.mean())
     edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)
-    parts = [slice(a, b) for a, b in pairwise(edges)]
-    places = np.array([float(blocks.centre[part].mean()) for part in parts]) - middle
+    places = np.array([float(blocks.centre[a:b].mean()) for a, b in pairwise(edges)]) - middle
     seen, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
 
     def sums(lag: float) -> tuple[FloatArray, FloatArray]:
@@ -273,8 +270,10 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
         return power - np.einsum("...i,...ij,...j->...", product, inverse, product)
 
-    def missed(lag: FloatArray, part: slice, matrix: FloatArray) -> float:
-        return float(np.sum((seen[part].ravel() - _columns(levers[part], blocks.turned(lag, part)) @ matrix) ** 2))
+    def missed(lag: FloatArray, matrix: FloatArray) -> FloatArray:
+        """Return the sum of squares (P,) of each part that a matrix (9,) leaves at a lag (n + 1,)."""
+        explained = (_columns(levers, blocks.turned(lag)) @ matrix).reshape(-1, 3)
+        return np.add.reduceat(np.sum((seen - explained) ** 2, axis=1), edges[:-1])
 
     line = np.zeros(2)  # of the lag: at the middle, and by time
     power = np.add.reduceat(np.sum(seen**2, axis=1), edges[:-1])
@@ -290,16 +289,13 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
             trusted = found.min(axis=0) < (1 - _WELL) * power
             if trusted.sum() >= 3:
                 line = _robust_line(places[trusted], _LAGS[best[trusted]])
-    shifts, bends = np.zeros(len(parts)), np.zeros(len(parts))
     for step in (0.06, 0.03, 0.01, 0.01, 0.005):
         lag = line[0] + line[1] * (blocks.centre - middle)
         columns = _columns(levers, blocks.turned(lag))
         matrix = np.asarray(np.linalg.lstsq(columns, seen.ravel(), rcond=1e-6)[0], np.float64)
-        for k, part in enumerate(parts):
-            values = [missed(lag + step * each, part, matrix) for each in (-1, 0, 1)]
-            bends[k] = max(values[0] - 2 * values[1] + values[2], 0.0) / step**2
-            shift = (values[0] - values[2]) / (2 * max(bends[k] * step, 1e-300))
-            shifts[k] = float(np.clip(shift, -2 * step, 2 * step))
+        early, there, late = (missed(lag + shift, matrix) for shift in (-step, 0.0, step))
+        bends = np.maximum(early - 2 * there + late, 0.0) / step**2
+        shifts = np.clip((early - late) / (2 * np.maximum(bends * step, 1e-300)), -2 * step, 2 * step)
         good = bends > 1e-3 * bends.max()
         if good.sum() < 3:
             return None
