@@ -24,6 +24,8 @@ __all__ = ["EffectBlock", "Evidence", "Scores", "detection_limit", "limit_noncen
 
 _BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
+_LARGE = 20.0
+"""Usual sizes that an effect's coefficients may have."""
 _NOTHING = 1e-9
 """Share of the longest column of a block below which another is none."""
 _DRAWN = 2000
@@ -264,6 +266,16 @@ class Evidence:
         inside = self.span(blocks)
         root, _ = _roots(self._gram[np.ix_(inside, inside)][None], self._reach[inside][None])
         return root[0] @ (root[0].T @ self._product[inside])
+
+    def start(self, blocks: Sequence[int]) -> FloatArray:
+        """Return coefficients, in units of their sizes, to begin a fit of the blocks' effects with.
+
+        They are known beforehand to be no larger than effects are, or a direction that the data hardly show would
+        begin anywhere: a lag that all axes have in common moves nothing to first order.
+        """
+        inside = self.span(blocks)
+        known = self._gram[np.ix_(inside, inside)] + np.eye(len(inside)) / _LARGE**2
+        return np.linalg.solve(known, self._product[inside])
 
 
 def _guard(outside: FloatArray, freedom: int) -> FloatArray:

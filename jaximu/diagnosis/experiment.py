@@ -23,6 +23,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -235,7 +236,7 @@ class Experiment(Data):
         """Fit gain, bias and the effects, each starting where it is given, and ask what else may be there.
 
         With a prior the effects' inner parameters are held. `asking`: of the effects of these names alone, without
-        their triads.
+        their triads. Raises `NotPossibleError` where the fit comes to nothing that a unit can be.
         """
         start = (self.start if imu is None else imu).with_effects(*effects)
 
@@ -245,6 +246,9 @@ class Experiment(Data):
 
         found = fit(start, self, free, prior=prior, excess=np.zeros(len(self.coarse)), estimate_excess=False,
                     max_passes=16)  # fmt: skip
+        if not bool(found.finite):
+            names = " and ".join(effect.name for effect in effects) or "gain and bias"
+            raise NotPossibleError(f"a fit of {names} to this recording comes to nothing that a unit can be.")
         linear, used = self.linearise(found.imu), self.used
         covariance = np.zeros((len(linear.names),) * 2)
         places = [linear.names.index(name) for name in found.names]

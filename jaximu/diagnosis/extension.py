@@ -12,6 +12,7 @@ from jaximu.diagnosis.evidence import EffectBlock, Evidence, strength
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import on_held_out
 from jaximu.diagnosis.selection import BESIDE, SelectedCause, Selection, causes_of, one_curve, select
+from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.recordings.finding import Finding
@@ -85,9 +86,9 @@ def extend(
         if len(found) - chosen + len(poses) + len(selection.causes) > _MOST:
             break
         effects, blocks = list(state.effects), state.evidence.blocks
-        coefficients = state.evidence.coefficients([cause.block for cause in selection.causes])
+        coefficients = state.evidence.start([cause.block for cause in selection.causes])
         edges = np.cumsum([0, *(len(blocks[cause.block].sizes) for cause in selection.causes)])
-        bumped = []
+        bumped, before = [], len(found)
         for cause, a, b in zip(selection.causes, edges[:-1], edges[1:], strict=True):
             block = blocks[cause.block]
             if block.kind == "data":
@@ -100,7 +101,11 @@ def extend(
             experiment = experiment.without(pose)
         if bumped:
             base = experiment.fit()
-        state = experiment.fit(effects, state.imu) if effects else base
+        try:
+            state = experiment.fit(effects, state.imu) if effects else base
+        except NotPossibleError:  # what looks like these effects to first order is none of them
+            found = found[:before]
+            break
         # what is found once all was explained is mostly chance, or a shape that the refit did not quite meet
         selection = select(state.evidence, level if guessed else level / 100)
     complete = selection.complete and not selection.causes
@@ -139,7 +144,11 @@ def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str
         if not causes or not any(device.values()):
             continue
         states = {entry.name: state}
-        states |= {name: _fitted(extension, state, entry.name, cause) for name, cause in causes.items()}
+        for name, cause in list(causes.items()):
+            try:
+                states[name] = _fitted(extension, state, entry.name, cause)
+            except NotPossibleError:  # it is no rival whose fit comes to nothing
+                del causes[name]
         gains = {
             name: on_held_out(held, extension.base, states[name]).log_likelihood for name in states if device[name]
         }
@@ -170,7 +179,7 @@ def _fitted(extension: Extension, state: State, name: str, cause: SelectedCause)
     """Return a fit with a cause in the place of the effect of this name."""
     evidence = extension.base.evidence
     block = evidence.blocks[cause.block]
-    coefficients = evidence.coefficients([cause.block]) * block.sizes
+    coefficients = evidence.start([cause.block]) * block.sizes
     others = [effect for effect in state.effects if effect.name != name]
     return extension.experiment.fit([*others, CATALOGUE[block.name].make(coefficients, **block.inner)], state.imu)
 

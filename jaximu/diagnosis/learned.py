@@ -22,6 +22,7 @@ from jaximu.estimation.fitting import Prior
 from jaximu.estimation.leave_out import leave_out
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import Learned as Curve
 
@@ -116,7 +117,10 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
     if best is None or best[0] < _PAYS:
         return None
     _, effect, strength, (found, root) = best
-    fitted = _fitted(experiment, state, effect, root * np.sqrt(strength))
+    try:
+        fitted = _fitted(experiment, state, effect, root * np.sqrt(strength))
+    except NotPossibleError:  # a curve that leads a fit to nothing explains nothing
+        return None
     told = [_prediction(experiment, each) for each in (base, found)]
     gain = Gain(told[0], told[1], f"{len(folds)} parts left out in turn")
     if held is not None and effect.scope == "device":

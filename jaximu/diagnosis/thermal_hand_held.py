@@ -144,7 +144,11 @@ def calibrate_thermal_by_hand(
         evidence = state.evidence
         place = next(k for k, block in enumerate(evidence.blocks) if block.name == name)
         statistic = float(evidence.scores().statistic[place])
-        tried = experiment.fit((*state.effects, CATALOGUE[name].dormant()), state.imu)
+        try:
+            tried = experiment.fit((*state.effects, CATALOGUE[name].dormant()), state.imu)
+        except NotPossibleError:  # beside the others it comes to nothing
+            refused.add(name)
+            continue
         gain = left_out_likelihood(experiment, tried) - left_out_likelihood(experiment, state)
         if gain > 0:
             state = tried
