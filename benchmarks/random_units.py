@@ -24,7 +24,6 @@ os.environ.update(environment())
 
 from common import Table, finish, machine, share
 
-
 MET = (
     (
         "1935",

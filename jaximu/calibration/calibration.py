@@ -293,7 +293,7 @@ def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:
 
 def require_another(calibration: Calibration, sources: Iterable[str]) -> None:
     """Raise `NotPossibleError` where a calibration was fitted to one of the files of these SHA-256."""
-    fitted = {each.get("sha256"): each["file"] for each in calibration.data.get("files", ())}
+    fitted = {file.get("sha256"): file["file"] for file in calibration.data.get("files", ())}
     same = [fitted[source] for source in sources if source and source in fitted]
     if same:
         raise NotPossibleError(

@@ -31,7 +31,7 @@ from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.observations import Stations
-from jaximu.recordings.recording import Defect, Recording, recordings_of, same_outputs
+from jaximu.recordings.recording import Recording, recordings_of, same_outputs
 from jaximu.recordings.reference import Entry, entries_of_columns
 from jaximu.simulation.protocols import earth_rate
 
@@ -173,14 +173,19 @@ def calibrate_turntable(
         raise InputError(f"{len(recordings)} recordings need as many references, found {len(given)}.")
     noise = noise_of(static)
     with prepared(recordings, repair) as ready:
-        found = calibrate_table_ready(ready, given, gravity, noise, effects, latitude, loss)  # pyright: ignore[reportArgumentType]
-    return replace(found, notes=(*mixed, *found.notes))
+        calibration = calibrate_table_ready(ready, given, gravity, noise, effects, latitude, loss)  # pyright: ignore[reportArgumentType]
+    return replace(calibration, notes=(*mixed, *calibration.notes))
 
 
 def calibrate_table_ready(
-    ready: Sequence[Prepared], given: Sequence[Sequence[Entry]], gravity: LocalGravity, noise: NoiseModel | None = None,
-    effects: Sequence[str | Effect] = (), latitude: float | None = None, loss: Loss = "linear",
-) -> Calibration:  # fmt: skip
+    ready: Sequence[Prepared],
+    given: Sequence[Sequence[Entry]],
+    gravity: LocalGravity,
+    noise: NoiseModel | None = None,
+    effects: Sequence[str | Effect] = (),
+    latitude: float | None = None,
+    loss: Loss = "linear",
+) -> Calibration:
     """Calibrate as `calibrate_turntable` does, from recordings that [`jaximu.mistakes.prepare`][] has been over."""
     recordings = [one.recording for one in ready]
     stations, said = observe_stations(recordings, given, gravity.value, noise)
@@ -212,7 +217,7 @@ def calibrate_table_ready(
     found = _at_rest_where_open(found, start)
     before, after = station_rms(start, stations), station_rms(found.imu, stations)
     notes = (
-        *(note for recording in recordings for note in recording.notes if not isinstance(note, Defect)),
+        *(note for recording in recordings for note in recording.remarks),
         *(note for one in ready for note in one.notes), *(() if noise is None else noise.notes), *said,
     )  # fmt: skip
     return concluded(

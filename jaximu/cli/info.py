@@ -101,15 +101,14 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     import numpy as np
 
     from jaximu.mistakes import prepare
-    from jaximu.recordings.recording import Defect, plausibility
+    from jaximu.recordings.recording import plausibility
     from jaximu.recordings.segmentation import segment
 
     ready = prepare(recording)
     used = ready.recording.signals
     signals = {name: _signal(signal, used[name]) for name, signal in recording.signals.items()}
     own = guessed or advice is not None
-    notes = [each for each in recording.notes if not own or "--" not in each]  # options that only this verb gave
-    notes = [each for each in notes if not isinstance(each, Defect)]  # which are findings
+    notes = [each for each in recording.remarks if not own or "--" not in each]  # options that only this verb gave
     findings = [*guessed, *notes, *ready.notes]
     uses: list[dict[str, str]] = []
     if "accelerometer" not in signals:

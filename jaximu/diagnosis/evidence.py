@@ -275,7 +275,7 @@ class Evidence:
         """
         inside = self.span(blocks)
         known = self._gram[np.ix_(inside, inside)] + np.eye(len(inside)) / _LARGE**2
-        return np.linalg.solve(known, self._product[inside])
+        return np.asarray(np.linalg.solve(known, self._product[inside]), np.float64)
 
 
 def _guard(outside: FloatArray, freedom: int) -> FloatArray:

@@ -76,8 +76,7 @@ def extend(
     if causes and not selection.explained:
         blocks = base.evidence.blocks
         found = [_named(blocks, cause) for cause in causes]
-        kept = {entry.name for entry in found}
-        state = experiment.fit([effect for effect in taken if effect.name in kept], base.imu)
+        state = experiment.fit([e for e in taken if e.name in {entry.name for entry in found}], base.imu)
         selection = select(state.evidence, level / 100)
     chosen = len(found)
     guessed = False  # a cause was taken in that did not explain the misfit
@@ -110,10 +109,8 @@ def extend(
         selection = select(state.evidence, level if guessed else level / 100)
     complete = selection.complete and not selection.causes
     p_value, beside = experiment.beside(state) if complete and found else (1.0, "")
-    if p_value < level * BESIDE:
-        complete = False  # something that the causes look like, and that no catalogue has
-    else:
-        beside = ""
+    imitated = p_value < level * BESIDE  # by something that the causes look like, and that no catalogue has
+    complete, beside = complete and not imitated, beside if imitated else ""
     own = causes_of(base.evidence, [entry.name for entry in found[chosen:]])
     if any(one_curve(base.evidence, a.block, b.block) for a, b in combinations(own, 2)):
         complete = False  # a curve of one input that is in no catalogue, imitated by two that are

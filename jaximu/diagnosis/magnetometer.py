@@ -199,7 +199,7 @@ def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
     `InputError` where one of them has no magnetometer, or outputs are in different units, `NotPossibleError` where both
     are of one recording.
     """
-    require_another(old, [each.get("sha256", "") for each in new.data.get("files", ())])
+    require_another(old, [file.get("sha256", "") for file in new.data.get("files", ())])
     triads = [each.imu.magnetometer for each in (old, new) if each.magnetic is not None and each.imu.magnetometer]
     if len(triads) < 2:
         raise InputError("there is no magnetometer in one of the two calibrations that are to be compared.")

@@ -222,14 +222,19 @@ def diagnose_turntable(
     No effect is named while a mistake in the recording stands that could imitate it. Raises what these two raise.
     """
     with prepared([recording], repair) as (ready,):
-        found = _of_ready(ready, reference, as_gravity(gravity), noise_of(static), heldout, level, repair)
-    return without_effects(found, ready.spoiling) if ready.spoiling else found
+        diagnosis = _of_ready(ready, reference, as_gravity(gravity), noise_of(static), heldout, level, repair)
+    return without_effects(diagnosis, ready.spoiling) if ready.spoiling else diagnosis
 
 
 def _of_ready(
-    ready: Prepared, reference: Sequence[Entry] | None, gravity: LocalGravity, noise: NoiseModel | None,
-    heldout: tuple[Recording, Sequence[Entry] | None] | None, level: float, repair: bool,
-) -> Diagnosis:  # fmt: skip
+    ready: Prepared,
+    reference: Sequence[Entry] | None,
+    gravity: LocalGravity,
+    noise: NoiseModel | None,
+    heldout: tuple[Recording, Sequence[Entry] | None] | None,
+    level: float,
+    repair: bool,
+) -> Diagnosis:
     """Diagnose a recording that was looked over."""
     recording = ready.recording
     if recording.gyroscope is None or (heldout is not None and heldout[0].gyroscope is None):
@@ -249,9 +254,11 @@ def _of_ready(
         held = partial(made, other.recording, stated, calibration.imu)
     remade = partial(made, recording, entries, calibration.imu)
     if noise is not None:
-        return examine(Examination(
-            calibration, noise, remade, held, ready.findings, tuple(notes), level, naming=not ready.spoiling
-        ))  # fmt: skip
+        return examine(
+            Examination(
+                calibration, noise, remade, held, ready.findings, tuple(notes), level, naming=not ready.spoiling
+            )
+        )
     stations = calibration.stations
     assert stations is not None
     rest = np.asarray(stations.gyroscope_used) & ~np.asarray(stations.turn)

@@ -255,12 +255,12 @@ def _with_copies(jobs: Sequence[Job]) -> list[Job]:
     """Return the jobs, those whose file has the bytes of an earlier one's marked; only files of one size are read."""
     sizes = Counter(_stamp(job.file)[0] for job in jobs)
     first: dict[str, str] = {}
-    found = []
+    marked = []
     for job in jobs:
         size = _stamp(job.file)[0]
         other = first.setdefault(file_digest(job.file), job.file) if size > 0 and sizes[size] > 1 else job.file
-        found.append(job if other == job.file else replace(job, copy_of=other))
-    return found
+        marked.append(job if other == job.file else replace(job, copy_of=other))
+    return marked
 
 
 def _read_manifest(path: Path) -> list[Job] | None:

@@ -121,7 +121,7 @@ class Sensor:
         """The share of an axis's samples that are exactly zero, and the least size (SI) of the others, where all that
         are smaller are missing although larger ones come in finer steps: of the axis with most zeros.
         """
-        found: list[tuple[float, float]] = []
+        axes: list[tuple[float, float]] = []
         for values, scale in zip(self.signal.values.T, self.signal.nominal_scale, strict=True):
             zero = values == 0.0
             if not _ZEROS <= zero.mean() < 1.0:
@@ -130,8 +130,8 @@ class Sensor:
             least = float(sizes.min())
             near = sizes[sizes < 2 * least]
             if len(near) >= _BESIDE and len(np.unique(np.round(near / least * _FINER))) >= _FINER // 2:
-                found.append((float(zero.mean()), least / float(np.abs(scale))))
-        return max(found) if found else None
+                axes.append((float(zero.mean()), least / float(np.abs(scale))))
+        return max(axes) if axes else None
 
     @cached_property
     def step(self) -> FloatArray:
@@ -254,7 +254,7 @@ class Samples:
     def rested(self) -> bool:
         """Whether the unit lay still all along, but for moments: what varies then is noise, or a disturbance."""
         still = [sensor.dead_band[0] if sensor.dead_band else sensor.quiet.mean() for sensor in self.sensors.values()]
-        return bool(still) and min(still) > _RESTED and not self.posed
+        return bool(still) and bool(min(still) > _RESTED) and not self.posed
 
     @cached_property
     def posed(self) -> bool:

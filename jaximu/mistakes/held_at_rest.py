@@ -50,13 +50,17 @@ def find(samples: Samples) -> list[Finding]:
     if sensor.dead_band is not None:
         share, least = sensor.dead_band
         first = int(np.argmax((sensor.signal.values == 0.0).any(axis=1)))
-        return [Finding(
-            "data.auto_zero", sensor.rows([first]),
-            f"gyroscope: {100 * share:.0f} % of an axis's samples are exactly zero, and none of the others is smaller "
-            f"than {size(least, 'rad/s', 2)}: its driver zeroes it at rest (a dead band), so neither its bias nor its "
-            "noise is known. Switch the dead band off and record again.", spoils=True,
-            refuses="gyroscope" if samples.rested else "",
-        )]  # fmt: skip
+        return [
+            Finding(
+                "data.auto_zero",
+                sensor.rows([first]),
+                f"gyroscope: {100 * share:.0f} % of an axis's samples are exactly zero, and none of the others is "
+                f"smaller than {size(least, 'rad/s', 2)}: its driver zeroes it at rest (a dead band), so neither its "
+                "bias nor its noise is known. Switch the dead band off and record again.",
+                spoils=True,
+                refuses="gyroscope" if samples.rested else "",
+            )
+        ]
     if samples.accelerometer is None:
         return []
     share = zeroed_at_rest(samples)

@@ -40,11 +40,15 @@ def find(samples: Samples) -> list[Finding]:
     first = next(iter(samples.sensors.values()))
     rows = without[first.name]
     starts = rows[np.concatenate([[True], np.diff(rows) > 1])]
-    return [Finding(
-        "data.knock", first.rows(starts),
-        f"The unit rests, but {'was knocked' if len(starts) == 1 else f'was knocked {len(starts)} times'}, first about "
-        f"{spans[:, 0].min():.1f} s in: {len(rows) / first.rate:.3g} s are left out.", without=without,
-    )]  # fmt: skip
+    return [
+        Finding(
+            "data.knock",
+            first.rows(starts),
+            f"The unit rests, but was knocked{'' if len(starts) == 1 else f' {len(starts)} times'}, first about "
+            f"{spans[:, 0].min():.1f} s in: {len(rows) / first.rate:.3g} s are left out.",
+            without=without,
+        )
+    ]
 
 
 def _knocks(sensor: Sensor) -> np.ndarray:

@@ -160,12 +160,11 @@ def prepared(
         if not isinstance(error, JaximuError):  # numbers that no recording gives whose rests scatter
             standing = standing or [finding for each in ready for finding in each.findings]
         if not standing:
-            emptied = [finding for each in ready for finding in each.findings if _leaves_out_much(each, finding)]
-            if not isinstance(error, NotPossibleError) or not emptied:
+            emptied = [finding for one in ready for finding in one.findings if _leaves_out_much(one, finding)]
+            if not emptied:
                 raise
-            raise NotPossibleError(
-                f"{error} Found in the recording: {' '.join(each.text for each in emptied[:3])}"
-            ) from error
+            texts = " ".join(finding.text for finding in emptied[:3])
+            raise type(error)(f"{error} Found in the recording: {texts}") from error
         said = {finding.name: f"{finding.text} ({finding.name})" for finding in reversed(standing)}
         reason = str(error) if isinstance(error, JaximuError) else "nothing can be estimated from it."
         raise NotPossibleError(f"{' '.join(list(said.values())[::-1][:3])} Hence: {reason}") from error

@@ -133,19 +133,19 @@ _BELOW = 0.1
 
 def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
     """Return the analysis of recordings that were looked over."""
-    findings = [each for one in ready for each in one.findings]
-    notes = list(dict.fromkeys(each.text for each in findings if each.name not in _OF_ITS_OWN))
-    unusable = {each.refuses for each in findings if each.refuses}
+    findings = [finding for one in ready for finding in one.findings]
+    notes = list(dict.fromkeys(finding.text for finding in findings if finding.name not in _OF_ITS_OWN))
+    unusable = {finding.refuses for finding in findings if finding.refuses}
     recordings = [one.recording for one in ready]
     chosen = max(ready, key=lambda one: max(len(signal) for signal in one.recording.signals.values()))
     longest = chosen.recording
     axes: dict[str, list[Identified]] = {}
     rates: dict[str, float] = {}
-    corners = [each.numbers for each in chosen.findings if each.name == "data.bandwidth"]
+    corners = [finding.numbers for finding in chosen.findings if finding.name == "data.bandwidth"]
     for name in SENSOR_QUANTITIES:
         if getattr(longest, name) is None or not len(getattr(longest, name)) or name in unusable:
             continue
-        corner = min((each[name] for each in corners if name in each), default=None)
+        corner = min((corner[name] for corner in corners if name in corner), default=None)
         try:
             found, rate, said = _analysed(recordings, longest, name, corner and _BELOW * corner)
         except (InputError, NotPossibleError) as error:

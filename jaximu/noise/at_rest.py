@@ -38,7 +38,7 @@ def fit_noise(recording: Recording) -> NoiseModel:
 def _of_ready(ready: Prepared) -> NoiseModel:
     """Return the noise of a recording that was looked over."""
     recording, found = ready.recording, dict[str, AxisNoise]()
-    notes = [each.text for each in ready.findings if each.name not in _OF_ITS_OWN]
+    notes = [finding.text for finding in ready.findings if finding.name not in _OF_ITS_OWN]
     for name in ("accelerometer", "gyroscope"):
         signal: Signal | None = getattr(recording, name)
         if signal is None:

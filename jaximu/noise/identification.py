@@ -111,9 +111,13 @@ class Identified:
 
 
 def identify(
-    values: ArrayLike, rate: float, terms: str = TERMS, confidence: float = 0.95, gauss_markov: int = 0,
+    values: ArrayLike,
+    rate: float,
+    terms: str = TERMS,
+    confidence: float = 0.95,
+    gauss_markov: int = 0,
     highest: float | None = None,
-) -> Identified | list[Identified]:  # fmt: skip
+) -> Identified | list[Identified]:
     """Identify the noise of samples at rest: one `Identified` for (n,), a list of them for (axes, n).
 
     **Arguments:**

@@ -299,6 +299,11 @@ class Recording(Described, Comparable):
         return turning(accelerometer.time, accelerometer.si(), gyroscope.time, gyroscope.si())
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """The notes that tell of no defect: those are findings."""
+        return tuple(note for note in self.notes if not isinstance(note, Defect))
+
+    @property
     def name(self) -> str:
         """The files it came from, for messages."""
         return " and ".join(source.path for source in self.sources) or "recording"

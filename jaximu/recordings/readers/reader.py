@@ -341,7 +341,7 @@ def _recognise(path: Path) -> _Format:
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             return _ROS2
-        files = sorted(each.name for each in path.iterdir() if each.is_file())
+        files = sorted(file.name for file in path.iterdir() if file.is_file())
         held = f"it holds {', '.join(files[:3])}{' …' if len(files) > 3 else ''}" if files else "no file lies in it"
         raise InputError(
             f"{path}: is a folder, not a file, and no ROS 2 bag (it has no metadata.yaml); {held}. Name one log, or "
@@ -628,11 +628,14 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
         if even is not None:
             columns[index] = even
             rate = (len(even) - 1) / (float(even[-1] - even[0]) * unit.factor)
-            return table.take(kept, columns), [*notes, Defect(
-                "data.jitter",
-                f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of {rate:.5g} "
-                "Hz fitted to the stamps replaces them.",
-            )]  # fmt: skip
+            return table.take(kept, columns), [
+                *notes,
+                Defect(
+                    "data.jitter",
+                    f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of "
+                    f"{rate:.5g} Hz fitted to the stamps replaces them.",
+                ),
+            ]
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
         number = np.arange(len(kept))
         place = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))

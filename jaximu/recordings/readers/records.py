@@ -162,7 +162,7 @@ def of_device(table: Table, device: str | None) -> Table:
         words = set(words_of(table.names[at])) if table.names else set()
         if field.canonical or not words & _DEVICE or (field.axis and field.sensor):
             continue
-        names = np.array([str(each) for each in table.columns[at].tolist()])
+        names = np.array(list(map(str, table.columns[at].tolist())))
         units, counts = np.unique(names, return_counts=True)
         in_turn = np.mean(names[1:] != names[:-1])
         if not 1 < len(units) <= _MOST_DEVICES or counts.min() < _FEWEST * len(names) or in_turn < _IN_TURN:
