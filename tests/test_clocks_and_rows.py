@@ -95,6 +95,18 @@ def test_a_column_that_says_something_else_makes_no_units(recording, tmp_path, c
     assert "no column says which of several units" in capsys.readouterr().err
 
 
+def test_rows_of_several_sensors_are_no_units(recording, tmp_path):
+    """Rows that say which sensor they are of, whose columns no header names, ask for the columns and not for a unit."""
+    force, rate = recording.accelerometer, recording.gyroscope
+    rows = [f"{t:.3f},{name},{','.join(f'{x:.5f}' for x in value)}"
+            for t, a, g in zip(force.time, force.values, rate.values, strict=True)
+            for name, value in (("one", a), ("two", g))]  # fmt: skip
+    (tmp_path / "log.csv").write_text("\n".join(["time [s],sensor,v0,v1,v2", *rows]))
+    with pytest.raises(InputError) as refused:
+        read_recording(tmp_path / "log.csv")
+    assert "units" not in str(refused.value)
+
+
 @pytest.mark.parametrize("bad", ["inf", "-Infinity", "1e300", "nan", ""])
 def test_a_bad_value_costs_its_row(recording, tmp_path, bad):
     path = write(tmp_path / "log.csv", recording.accelerometer.time, values_of(recording))

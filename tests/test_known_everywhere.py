@@ -122,6 +122,15 @@ def test_knocks_are_what_noise_and_drift_do_not_do(rest):
     assert "data.knock" not in {finding.name for finding in inspect(replace(rest, **parts))}
 
 
+def test_a_turn_between_long_rests_is_no_knock():
+    recording, _ = simulate(draw_imu(1), HandHeld(3, 60.0), NOISE, rate=RATE, seed=3)
+    assert inspect(recording) == []
+    level = replace(
+        recording, accelerometer=replace(recording.accelerometer, time=np.zeros(0), values=np.zeros((0, 3)))
+    )
+    assert "data.knock" not in {finding.name for finding in inspect(level)}
+
+
 def test_of_a_gyroscope_with_a_dead_band_no_noise_is_stated(rest):
     rate = rest.gyroscope.values - rest.gyroscope.values.mean(axis=0)
     limit = 2.0 * rate.std()

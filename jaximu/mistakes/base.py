@@ -39,6 +39,7 @@ _FEW_STEPS = 3.5
 _BLOCK = 0.25  # s, over which scatter is taken to tell rest from motion
 _QUIET = 6.0  # times the floor of the variance up to which a block counts as rest
 _SHORTEST_REST = 0.75  # s
+_TURN = np.radians(20)  # from one rest to the next, that makes another pose of it
 _RESTED = 0.9  # share of a recording that is quiet where it was made of a unit at rest
 _UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 _CURVATURE_NOISE = float(np.sqrt(1 + 34 / 36))  # of a sample's difference from the cubic through its neighbours
@@ -254,21 +255,40 @@ class Samples:
     def rested(self) -> bool:
         """Whether the unit lay still all along, but for moments: what varies then is noise, or a disturbance."""
         still = [sensor.dead_band[0] if sensor.dead_band else sensor.quiet.mean() for sensor in self.sensors.values()]
-        return bool(still) and bool(min(still) > _RESTED) and not self.posed
+        return bool(still) and bool(min(still) > _RESTED) and not self.turned
+
+    @cached_property
+    def turned(self) -> bool:
+        """Whether the unit was turned by 20° or more anywhere between rests."""
+        rate = self.gyroscope
+        if rate is not None:
+            angle = np.cumsum((rate.values - np.median(rate.values, axis=0)) * rate.period, axis=0)
+            runs = runs_of(~rate.quiet)
+            far = np.linalg.norm(angle[runs[:, 1] - 1] - angle[runs[:, 0]], axis=1)
+            if np.max(far, initial=0.0) > _TURN:
+                return True
+        return self._reversals is None or self._reversals > 0
 
     @cached_property
     def posed(self) -> bool:
         """Whether the unit was turned from rest to rest: four times by 20° or more."""
+        if self._reversals is None:  # an axis or a unit is wrong, and directions tell nothing
+            return len(self.rests) > 8
+        return len(self.rests) >= 5 and self._reversals >= 4
+
+    @cached_property
+    def _reversals(self) -> int | None:
+        """How often gravity lies 20° or more off where it lay in the rest before; None where its size changes."""
         sensor, rests = self.accelerometer, self.rests
-        if sensor is None or len(rests) < 5:
-            return False
+        if sensor is None or not len(rests):
+            return 0
         edges = np.searchsorted(sensor.time, rests)
         means = np.stack([np.median(sensor.values[a : max(b, a + 1)], axis=0) for a, b in edges])
         size = np.linalg.norm(means, axis=1)
         if np.ptp(size) > 0.5 * np.median(size):
-            return len(rests) > 8  # an axis or a unit is wrong, and directions tell nothing
+            return None
         cosine = np.sum(means[1:] * means[:-1], axis=1) / np.maximum(size[1:] * size[:-1], 1e-300)
-        return int(np.sum(cosine < np.cos(np.radians(20)))) >= 4
+        return int(np.sum(cosine < np.cos(_TURN)))
 
 
 def runs_of(flags: NDArray[np.bool_]) -> Rows:

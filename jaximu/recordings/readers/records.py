@@ -158,7 +158,9 @@ def of_device(table: Table, device: str | None) -> Table:
 
     Raises `InputError` where none of them, or one that is not there, was chosen.
     """
-    for at, field in enumerate(fields_of(table.names or ())):
+    fields = fields_of(table.names or ())
+    triads = {field.sensor for field in fields if field.axis} & _TRIADS
+    for at, field in enumerate(fields if triads else ()):
         words = set(words_of(table.names[at])) if table.names else set()
         if field.canonical or not words & _DEVICE or (field.axis and field.sensor):
             continue
