@@ -103,6 +103,15 @@ def test_an_unknown_candidate_is_named(log):
         jaximu.diagnose(log, candidates=["accel.rippel"])
 
 
+def other(folder) -> str:
+    """Another recording of the unit."""
+    log = folder / "other.parquet"
+    if not log.exists():
+        (folder / "other.toml").write_text(SPEC.replace("seed = 7", "seed = 8"))
+        assert main(["simulate", str(folder / "other.toml"), "-o", str(log)]) == 0
+    return str(log)
+
+
 def test_a_file_names_what_it_lacks_and_takes_it(found, folder, ripple):
     path = folder / "calibration.json"
     found.extended_calibration().save(path)
@@ -113,7 +122,7 @@ def test_a_file_names_what_it_lacks_and_takes_it(found, folder, ripple):
     assert "holds an effect 'accel.ripple'" in last
     assert "ripples:Ripple" in last
     assert "damaged" not in last
-    assert main(["check", str(path), str(folder / "unit.parquet")]) == 0
+    assert main(["check", str(path), other(folder)]) == 0
     given = f"import sys; sys.path.insert(0, {str(folder)!r}); from ripples import Ripple; import jaximu\n"
     code = f"{given}print(jaximu.load_calibration({str(path)!r}, effects=[Ripple]).imu.accelerometer.effects[0].name)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
@@ -121,10 +130,7 @@ def test_a_file_names_what_it_lacks_and_takes_it(found, folder, ripple):
 
 
 def test_processes_of_a_fleet_know_it(log, folder, tmp_path):
-    again = SPEC.replace("seed = 7", "seed = 8")
-    (folder / "other.toml").write_text(again)
-    assert main(["simulate", str(folder / "other.toml"), "-o", str(folder / "other.parquet")]) == 0
-    logs = [folder / "unit.parquet", folder / "other.parquet"]
+    logs = [folder / "unit.parquet", other(folder)]
     assert run_fleet(find_jobs(logs), tmp_path / "fleet.parquet", Settings(diagnose=True), workers=2) == {"ok": 2}
     import pyarrow.parquet
 

@@ -47,7 +47,7 @@ def test_finds_all_rests(seed):
     ("rates", "jitter"), [((100.0, 100.0), 0.0), ((50.0, 200.0), 0.0), ((104.0, 417.0), 0.4), ((25.0, 20.0), 0.2)]
 )
 def test_rates_and_stamps_may_differ(rates, jitter):
-    log, rests = recording(5, rates=rates, jitter=jitter, rest=3.0, turn=2.0)
+    log, rests = recording(4, rates=rates, jitter=jitter, rest=3.0, turn=2.0)
     check_found(log, rests, 0.3 if min(rates) > 40 else 0.6)
     data = observed_poses(segment(log), GRAVITY)
     assert int(data.poses.mask.sum()) == POSES

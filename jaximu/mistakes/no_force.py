@@ -32,7 +32,7 @@ def find(samples: Samples) -> list[Finding]:
         return [Finding(
             "data.gravity_free", (),
             f"accelerometer: the median of its norm is {middle:.2g} m/s², far from gravity: gravity was taken out "
-            "(a linear acceleration). Log the raw accelerometer.", spoils=True, refuses="accelerometer",
+            "(a linear acceleration). Log the raw accelerometer.", spoils=True, refuses="gravity",
         )]  # fmt: skip
     noise = float(np.min(sensor.noise))
     scatter = float(np.quantile(np.abs(norm - middle), 0.995)) / 2.8

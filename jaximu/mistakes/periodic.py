@@ -164,7 +164,7 @@ def _rest(samples: Samples, still: NDArray[np.bool_]) -> bool:
             sums, squares = (np.cumsum(np.pad(part, ((1, 0), (0, 0))), axis=0) for part in (values, values**2))
             length = np.diff(runs)
             mean, square = ((total[runs[:, 1]] - total[runs[:, 0]]) / length for total in (sums, squares))
-            if np.sqrt(np.median(np.sum(square - mean**2, axis=1))) > _SHAKEN[name]:
+            if np.median(np.sum(square - mean**2, axis=1)) > _SHAKEN[name] ** 2:
                 return False
     return True
 

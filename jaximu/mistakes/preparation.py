@@ -140,16 +140,22 @@ def prepare(recording: Recording, repair: bool = False, magnetometer: bool = Fal
 
 @contextmanager
 def prepared(
-    recordings: Sequence[Recording], repair: bool = False, gyroscope: bool = True, magnetometer: bool = False
+    recordings: Sequence[Recording],
+    repair: bool = False,
+    gyroscope: bool = True,
+    magnetometer: bool = False,
+    gravity: bool = True,
 ) -> Iterator[tuple[Prepared, ...]]:
     """Make recordings ready; an error on the way begins with the mistake found in them, which is the likelier cause.
 
-    Raises InputError where a sensor that is needed holds nothing to calibrate, with the finding's own sentence.
+    `gyroscope`, `gravity`: whether they are needed. Raises InputError where what is needed is not there, with the
+    finding's own sentence.
     """
+    unneeded = {name for name, needed in (("gyroscope", gyroscope), ("gravity", gravity)) if not needed}
     ready = tuple(prepare(recording, repair, magnetometer) for recording in recordings)
     for each in ready:
         for finding in each.findings:
-            if finding.refuses and (gyroscope or finding.refuses != "gyroscope"):
+            if finding.refuses and finding.refuses not in unneeded:
                 raise InputError(f"{each.recording.name}: {finding.text} ({finding.name})")
     if len(ready) > 1:
         ready = tuple(_named(each, number) for number, each in enumerate(ready, 1))

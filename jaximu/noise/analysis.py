@@ -121,7 +121,7 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
     if not recordings:
         raise InputError("no recording was given.")
     alone = not any(len(recording.accelerometer) for recording in recordings)
-    with prepared(recordings, gyroscope=alone) as ready:
+    with prepared(recordings, gyroscope=alone, gravity=False) as ready:
         return _of_ready(ready)
 
 

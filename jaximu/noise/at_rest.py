@@ -31,7 +31,7 @@ def fit_noise(recording: Recording) -> NoiseModel:
     A few samples missing in a row are bridged; of a recording with longer gaps the longest whole part is used.
     Raises `NotPossibleError` where it is too short, moves or has no noise, `InputError` for uneven stamps.
     """
-    with prepared([recording]) as (ready,):
+    with prepared([recording], gravity=False) as (ready,):
         return _of_ready(ready)
 
 

@@ -295,7 +295,8 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         matrix = np.asarray(np.linalg.lstsq(columns, seen.ravel(), rcond=1e-6)[0], np.float64)
         early, there, late = (missed(lag + shift, matrix) for shift in (-step, 0.0, step))
         bends = np.maximum(early - 2 * there + late, 0.0) / step**2
-        shifts = np.clip((early - late) / (2 * np.maximum(bends * step, 1e-300)), -2 * step, 2 * step)
+        slope = early - late  # of a part: its shift by its curvature, no further than two steps
+        shifts = slope / np.maximum(np.maximum(2 * bends * step, np.abs(slope) / (2 * step)), 1e-300)
         good = bends > 1e-3 * bends.max()
         if good.sum() < 3:
             return None

@@ -20,7 +20,8 @@ class Finding:
 
     name: "data.zeros" and so on. rows: the first rows concerned, counted from 1. text: what is wrong and what to do.
     repair: the option to paste. rivals: mistakes that would look exactly the same. spoils: parameters and effects
-    cannot be trusted while it stands. refuses: nothing can be calibrated from this sensor ("accelerometer" …) at all.
+    cannot be trusted while it stands. refuses: nothing can be calibrated from this sensor ("accelerometer" …) at all,
+    or by "gravity".
     partial: a repair cannot find all of it, so that what is left may still look like an effect.
     apply: changes the recording as the repair does; done without being asked where `repair` is empty. without: rows of
     each sensor, counted from 0, that are no measurement and are left out. numbers: what the text states of each sensor:

@@ -515,7 +515,7 @@ def _carried_on(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table
         columns[index] = stamps + np.cumsum(turns)
         places = f"{len(back)} place{'s' * (len(back) != 1)} (row {table.row(int(back[0]) + 1)})"
         return replace(table, columns=tuple(columns)), [
-            f"the clock begins anew after {seconds:.10g} s in {places}: its time goes on from there."
+            f"the clock starts again after {seconds:.10g} s in {places}: its time goes on from there."
         ]
     return table, []
 

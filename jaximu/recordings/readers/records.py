@@ -162,7 +162,7 @@ def of_device(table: Table, device: str | None) -> Table:
     triads = {field.sensor for field in fields if field.axis} & _TRIADS
     for at, field in enumerate(fields if triads else ()):
         words = set(words_of(table.names[at])) if table.names else set()
-        if field.canonical or not words & _DEVICE or (field.axis and field.sensor):
+        if field.canonical or not words or not words <= _DEVICE or (field.axis and field.sensor):
             continue
         names = np.array(list(map(str, table.columns[at].tolist())))
         units, counts = np.unique(names, return_counts=True)
