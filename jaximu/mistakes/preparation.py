@@ -162,7 +162,7 @@ def prepared(
     try:
         yield ready
     except (JaximuError, ArithmeticError, ValueError) as error:
-        standing = [finding for each in ready for finding in each.spoiling]
+        standing = [finding for each in ready for finding in each.spoiling if finding.refuses not in unneeded]
         if not isinstance(error, JaximuError):  # numbers that no recording gives whose rests scatter
             standing = standing or [finding for each in ready for finding in each.findings]
         if not standing:
