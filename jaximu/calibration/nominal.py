@@ -66,7 +66,7 @@ def _forces(recording: Recording) -> FloatArray:
     In many attitudes Σ (f_i / s_i)² = g² is linear in 1/s_i²; a unit in few attitudes keeps its data sheet's scales.
     """
     force = recording.accelerometer.si()
-    size = max(1, round(_BLOCK * recording.accelerometer.rate))
+    size = max(1, recording.accelerometer.samples(_BLOCK))
     count = len(force) // size
     if count < 2 * _FEWEST:
         return np.ones(3)

@@ -256,7 +256,7 @@ def windows_of(
     time, values = time[inside], values[inside]
     edges = _edges(time, values, signal.rate, _MOST if gyroscope is not None else _MOST_ALONE)
     longest = _MEAN if gyroscope is not None else _MEAN_ALONE
-    size = max(1, round(longest * signal.rate))
+    size = max(1, signal.samples(longest))
     stops = np.minimum(edges[1:], edges[:-1] + size)
     count = stops - edges[:-1]
     place = np.minimum(edges[:-1, None] + np.arange(count.max()), stops[:, None] - 1)

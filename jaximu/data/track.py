@@ -141,7 +141,7 @@ def _at(time: FloatArray, values: FloatArray, wanted: FloatArray) -> FloatArray:
 
 def _vibration(accelerometer: Signal, force: FloatArray, time: FloatArray) -> FloatArray | None:
     """Mean square of the vibration (n,), (m/s²)², beyond the quietest tenth; None where nothing stands out."""
-    width = max(4, round(_VIBRATION_WINDOW * accelerometer.rate))
+    width = max(4, accelerometer.samples(_VIBRATION_WINDOW))
     if len(force) < 4 * width:
         return None
     kernel = np.ones(width) / width

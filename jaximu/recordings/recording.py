@@ -98,6 +98,10 @@ class Signal(Comparable):
         longest = _GAP * max(usual, float(np.mean(np.minimum(interval, 3 * usual))))
         return float(1.0 / np.mean(interval[interval <= longest]))
 
+    def samples(self, seconds: float) -> int:
+        """Return how many samples so many seconds are; of a half, rounding of the rate does not decide."""
+        return int(seconds * self.rate + 0.5 + 1e-9)
+
     @cached_property
     def rounding_variance(self) -> float:
         """Variance, summed over the axes (SI units squared), of rounding to the steps that the output comes in."""

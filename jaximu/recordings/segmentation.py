@@ -309,7 +309,7 @@ def _density(signal: Signal, columns: Sequence[FloatArray]) -> FloatArray:
     What a hand trembles averages out within a second or so: blocks of a quarter would take it for white noise, tens of
     times too much of it for the mean of a pose. `columns`: the samples (3, n) of each interval at rest.
     """
-    size = max(1, round(_SHORTEST * signal.rate))
+    size = max(1, signal.samples(_SHORTEST))
     found, _ = _of_blocks(signal, columns, size)
     for longer in (2, 4):
         density, freedom = _of_blocks(signal, columns, longer * size)

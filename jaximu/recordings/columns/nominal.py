@@ -123,7 +123,7 @@ def _said(sensor: str, scale: FloatArray, per: str, option: str) -> str:
 
 def _windows(signal: Signal, seconds: float) -> FloatArray:
     """(windows, samples, 3) the values cut into windows of about `seconds`; the whole, if it is shorter."""
-    span = min(len(signal), max(5, round(seconds * signal.rate)))
+    span = min(len(signal), max(5, signal.samples(seconds)))
     count = len(signal) // span
     return signal.values[: count * span].reshape(count, span, -1)
 
