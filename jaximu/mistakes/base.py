@@ -34,6 +34,8 @@ _SHOWN = 5
 _ZEROS, _BESIDE, _FINER = 0.2, 20, 8
 """Share of zeros from which on a dead band is sought; samples within twice its size that must be there, and how many
 times finer than the band their steps must be, or coarse steps would do it."""
+_EITHER = 0.02
+"""Share of the samples beside a dead band that lie on either side of it: rows of zeros beside a bias have one side."""
 _FEW_STEPS = 3.5
 """Steps that the smallest tenth of the changes of a coarse output stay below."""
 _BLOCK = 0.25  # s, over which scatter is taken to tell rest from motion
@@ -129,8 +131,9 @@ class Sensor:
                 continue
             sizes = np.abs(values[~zero])
             least = float(sizes.min())
-            near = sizes[sizes < 2 * least]
-            if len(near) >= _BESIDE and len(np.unique(np.round(near / least * _FINER))) >= _FINER // 2:
+            near = values[~zero][sizes < 2 * least] / least
+            both = min(np.mean(near > 0), np.mean(near < 0)) > _EITHER
+            if len(near) >= _BESIDE and both and len(np.unique(np.round(np.abs(near) * _FINER))) >= _FINER // 2:
                 axes.append((float(zero.mean()), least / float(np.abs(scale))))
         return max(axes) if axes else None
 
