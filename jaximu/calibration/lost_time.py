@@ -357,7 +357,7 @@ def without_lost_stretches(found: Calibration) -> tuple[list[Recording], list[Fi
             (_TAIL + 2) / 2 * np.log1p(squared[turn] / _TAIL) - np.log(2 * _SLACK * squared[turn])
             - (left / _SLACK) ** 2 / 2 - np.log(len(time) * rare)
         )  # fmt: skip
-        # next to no rate turns so far in no time that a logger is held up
+        # where the rate is nearly zero, the time could be anything: nothing is lost for longer than the recording
         sure[(time <= 0) | (time > np.ptp(recorded.stamps(recorded.samples[turn][0])))] = -np.inf
         place = int(np.argmax(sure))
         if sure[place] < _SURE:
