@@ -34,7 +34,7 @@ MET = (
     (
         "1265",
         "diagnose --reference: a gyroscope's gain off by 44 sigma",
-        "the same of a step of the scale near one end of the recording",
+        "most likely a fit with a step of the scale that did not converge; it begins elsewhere now",
     ),
     ("507", "calibrate: division by zero", "turns that fit exactly leave no variance to compare"),
     ("several", "check: an empty picture", "no parameter was told by itself"),

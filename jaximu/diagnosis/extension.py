@@ -103,7 +103,7 @@ def extend(
         try:
             state = experiment.fit(effects, state.imu) if effects else base
         except NotPossibleError:  # what looks like these effects to first order is none of them
-            found = found[:before]
+            state, found = experiment.fit(state.effects, base.imu) if bumped else state, found[:before]
             break
         # what is found once all was explained is mostly chance, or a shape that the refit did not quite meet
         selection = select(state.evidence, level if guessed else level / 100)
