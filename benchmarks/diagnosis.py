@@ -34,9 +34,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import hidden_effects as hidden
 
 from jaximu import LocalGravity, calibrate, read_recording
+from jaximu.data.by_hand import RecordedByHand
 from jaximu.diagnosis import diagnose
 from jaximu.diagnosis.evidence import limit_noncentrality
-from jaximu.diagnosis.hand_held import HandHeldExperiment
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE
 from jaximu.noise.at_rest import fit_noise
@@ -59,14 +60,14 @@ def sized(case, folder, noise, multiples):
     plain = read_recording(bare.write(folder / "bare", ("fit",))["fit"])
     calibration = calibrate(plain, GRAVITY)
     (part,) = calibration.segmentations
-    experiment = HandHeldExperiment((part,), observed_poses(part, GRAVITY.value, noise=noise), calibration.imu)
+    experiment = Experiment(RecordedByHand((part,), observed_poses(part, GRAVITY.value, noise=noise)), calibration.imu)
     state = experiment.fit()
     scales = {}
     for effect, multiple in zip(case.hidden, multiples, strict=True):
         loud = {each.name: 5.0 if each.name == effect.name else 0.0 for each in case.hidden}
         other = read_recording(case.with_size(loud).write(folder / "loud", ("fit",))["fit"])
         observations = observed_poses(replace(part, recording=other), GRAVITY.value, noise=noise)
-        conditions = replace(experiment, observations=observations).predict(state.imu)[0]
+        conditions = replace(experiment, data=RecordedByHand((part,), observations)).predict(state.imu)[0]
         change = state.weights @ (conditions - state.conditions) / 5.0
         basis = np.linalg.svd(state.evidence.jacobian, full_matrices=False)[0]
         length = np.linalg.norm(change - basis @ (basis.T @ change))

@@ -32,7 +32,8 @@ from scipy.stats import binomtest
 from jaximu import LocalGravity, calibrate, read_recording
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms
+from jaximu.calibration.recipe import Choices, calibrate_ready
+from jaximu.data import residual_rms
 from jaximu.ground.errors import JaximuError
 from jaximu.mistakes import inspect, prepare
 from jaximu.recordings.finding import Finding

@@ -15,7 +15,7 @@ from jaximu.calibration import calibrate_against_attitude, load_calibration
 from jaximu.cli.app import main
 from jaximu.data.attitude import EXCESS_NAMES
 from jaximu.diagnosis import diagnose_against_attitude
-from jaximu.diagnosis.attitude import MeasuredAttitude
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.reference_filter import SetupReferenceFilter
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
@@ -52,7 +52,7 @@ def calibrated():
     setup = tuple(each for each in calibration.imu.all_effects().values() if each.scope == "fixture")
     excess = np.array([calibration.excess[name] for name in EXCESS_NAMES])
     start = jax.tree.map(np.asarray, calibration.imu.with_effects())
-    return calibration, MeasuredAttitude(measurement, setup, excess, start)
+    return calibration, Experiment(measurement, start, setup=setup, excess=excess)
 
 
 def test_what_is_not_known_of_the_reference_is_part_of_the_noise(calibrated):
@@ -82,7 +82,7 @@ def test_near_the_level_the_twin_is_as_wrong_as_the_recording():
     setup = tuple(each for each in calibration.imu.all_effects().values() if each.scope == "fixture")
     excess = np.array([calibration.excess[name] for name in EXCESS_NAMES])
     start = jax.tree.map(np.asarray, calibration.imu.with_effects())
-    experiment = MeasuredAttitude(measurement, setup, excess, start)
+    experiment = Experiment(measurement, start, setup=setup, excess=excess)
     state = experiment.fit(asking=())
     for seed in (1, 2, 3):
         copied = experiment.twin(state, None, seed)
@@ -97,7 +97,7 @@ def test_reactions_are_the_changes_of_the_conditions(calibrated):
     # filter and lever arm make something of the rates themselves, which is of second order and none of an effect's
     lifted = calibration.imu.without(SetupReferenceFilter).without(AccelLeverArm)
     lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], lifted)
-    measurement = experiment.measurement
+    measurement = experiment.data
     about = measurement.about(lifted)
     random = np.random.default_rng(4)
     bare = calibration.imu.with_effects()
@@ -123,7 +123,7 @@ def test_reactions_are_the_changes_of_the_conditions(calibrated):
 def test_noise_of_the_attitude_reaches_rotations_and_forces_alike(calibrated):
     """The second factor of the covariance, against the conditions with a reference that stands wrong by known turns."""
     calibration, experiment = calibrated
-    measurement, imu = experiment.measurement, calibration.imu.without(SetupReferenceFilter)
+    measurement, imu = experiment.data, calibration.imu.without(SetupReferenceFilter)
     lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu)
     mounting = Rotation.from_rotvec(np.asarray(imu.coefficients(SetupReferenceRotation)))
 

@@ -8,9 +8,10 @@ import scipy.stats
 import synthetic
 
 from jaximu import LocalGravity, calibrate
+from jaximu.data.by_hand import RecordedByHand
 from jaximu.diagnosis.checks import checks_of
 from jaximu.diagnosis.evidence import Evidence
-from jaximu.diagnosis.hand_held import HandHeldExperiment
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observed_poses
@@ -22,7 +23,7 @@ GRAVITY = LocalGravity(synthetic.GRAVITY, 0.0)
 def fitted(recording: Recording):
     calibration = calibrate(recording, GRAVITY, static=NOISE)
     observations = observed_poses(calibration.segmentations, GRAVITY.value, noise=NOISE)
-    experiment = HandHeldExperiment(calibration.segmentations, observations, calibration.imu)
+    experiment = Experiment(RecordedByHand(calibration.segmentations, observations), calibration.imu)
     return experiment.fit(), experiment
 
 
@@ -61,7 +62,7 @@ def test_law_where_nothing_depends(problem):
 def test_statistic_is_the_difference_of_two_fits(problem):
     """Least squares with and without the norms' polynomials of time, written out."""
     _, _, state, experiment = problem
-    poses = experiment.observations.poses
+    poses = experiment.data.observations.poses
     real = np.asarray(poses.mask)
     time = (np.asarray(poses.start) + np.asarray(poses.stop))[real] / 2
     rows = experiment.real.kind == 0

@@ -7,6 +7,7 @@ import pytest
 from synthetic import recording
 
 import jaximu
+from jaximu.mistakes import prepare
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,7 @@ def test_calibrations_and_their_files(log, tmp_path):
 def test_fits_and_data(log):
     data = jaximu.observe(log)
     assert data == jaximu.observe(log)
+    assert data == jaximu.observe(prepare(log)) == jaximu.observe([prepare(log)])
     fit = jaximu.fit(jaximu.Imu.nominal(), data)
     assert fit == jaximu.fit(jaximu.Imu.nominal(), data)
     assert fit.imu == jaximu.fit(jaximu.Imu.nominal(), data).imu

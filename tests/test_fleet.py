@@ -16,9 +16,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from jaximu.calibration import fit_hand_held, nominal_imu, residual_rms
+from jaximu.calibration import fit_hand_held, nominal_imu
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.cli import main
+from jaximu.data import residual_rms
 from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.fitting import fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment

@@ -17,8 +17,9 @@ from magnetic_motion import turned
 from jaximu.calibration import calibrate, load_calibration
 from jaximu.cli.app import main
 from jaximu.cli.streams import _letter
+from jaximu.data.by_hand import RecordedByHand
 from jaximu.diagnosis import diagnose
-from jaximu.diagnosis.hand_held import HandHeldExperiment as Experiment
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.estimation.problem import flatten, names_of, typical_sizes
 from jaximu.estimation.uncertainty import weak_directions
 from jaximu.ground.gravity import LocalGravity
@@ -336,7 +337,7 @@ def test_a_twin_with_another_number_of_poses_is_drawn(tmp_path, monkeypatch):
     found = diagnose(hand_held(12, 5), LocalGravity(9.80665, 0.0))
     for poses in (11, 13):
         other = calibrate(hand_held(poses, 5))
-        twin = Experiment(other.segmentations, other.observations, found.experiment.start)
+        twin = Experiment(RecordedByHand(other.segmentations, other.observations), found.experiment.start)
         monkeypatch.setattr(diagnosis_page, "twin_of", lambda _, twin=twin: twin)
         assert diagnosis_page.write_diagnosis(found, tmp_path).stat().st_size > 10_000
 

@@ -10,10 +10,9 @@ from commands import result_of
 from jaximu import calibration
 from jaximu.calibration import calibrate_thermal, compensate, load_calibration
 from jaximu.calibration.thermal_regression import multifactor
-from jaximu.calibration.thermal_selection import folds_of
 from jaximu.cli.app import main
 from jaximu.data import without_startup
-from jaximu.data.rest_blocks import rest_blocks
+from jaximu.data.rest_blocks import folds_of, rest_blocks
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
@@ -149,7 +148,7 @@ def test_legs_and_folds(found):
     legs = found.identifiability.legs
     assert [leg.up for leg in legs] == [True, False] * 3
     assert np.allclose([abs(leg.rate) * 60 for leg in legs], [1, 1, 2, 2, 4, 4], rtol=0.02)
-    folds = folds_of(found.blocks, legs)
+    folds = folds_of(legs)
     assert len(folds) == 6 and sorted(np.concatenate(folds)) == list(range(len(found.blocks)))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaximu.calibration import load_calibration
-from jaximu.diagnosis.thermal import Resting, diagnose_thermal
+from jaximu.diagnosis.thermal import diagnose_thermal
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE
 from jaximu.simulation import simulate
@@ -77,7 +77,6 @@ def test_a_warm_up_ties_temperature_with_what_goes_with_it_and_asks_for_a_cycle(
 def test_the_conditions_are_linear_in_the_effects(clean):
     """Columns are the derivatives of the conditions: an effect of known size moves them by as much."""
     experiment = clean.experiment
-    assert isinstance(experiment, Resting)
     imu = clean.base.imu
     plain = experiment.linearise(imu)
     kind = CATALOGUE["gyro.thermal_lag"]
@@ -85,7 +84,8 @@ def test_the_conditions_are_linear_in_the_effects(clean):
     columns = experiment.dormant_columns(imu, plain.details, {kind: [{"time_constant": 300.0}]})[kind][0]
     moved = plain.conditions - experiment.linearise(imu.with_effects(effect)).conditions
     assert np.allclose(moved, columns @ np.asarray(effect.coefficients), atol=1e-12)
-    assert experiment.largest(clean.base, effect)["gyroscope"] == pytest.approx(np.abs(moved).max(), rel=1e-9)
+    # along the way, of which blocks are means
+    assert np.abs(moved).max() < experiment.largest(clean.base, effect)["gyroscope"] < 1.1 * np.abs(moved).max()
 
 
 def test_in_one_pose_scale_is_bias_over_temperature():

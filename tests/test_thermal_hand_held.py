@@ -69,7 +69,7 @@ def test_what_was_put_in_comes_out_with_its_spread(found):
 
 def test_the_report_s_numbers(found):
     """Errors at rest with one bias by hand: the gyroscope's slope over temperature times the poses' warmth."""
-    poses = found.experiment.observations.poses
+    poses = found.experiment.data.observations.poses
     kelvin = np.asarray(poses.temperature)[np.asarray(poses.mask)]
     expected = np.degrees(np.linalg.norm(EFFECTS["gyro.temperature"]) * np.std(kelvin))
     (said,) = (each for each in headline(found) if each.startswith("Rate at rest"))

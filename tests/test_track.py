@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaximu.data.field import FieldSamples
-from jaximu.data.track import Track, added, mean_outputs
+from jaximu.estimation.track import Track, added, mean_outputs
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus

@@ -20,9 +20,10 @@ from jaximu.calibration.closed_form import (
     turn_pairs,
 )
 from jaximu.calibration.scheme import describe_scheme
-from jaximu.calibration.turntable import calibrate_turntable, fit_turntable, station_rms
+from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
 from jaximu.cli.app import main
 from jaximu.data.observe_stations import attitudes, observe_stations, scheme_stations
+from jaximu.data.stations import station_rms
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.units import STANDARD_GRAVITY

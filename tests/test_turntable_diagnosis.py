@@ -11,8 +11,10 @@ import scipy.stats
 from jaximu.calibration import load_calibration
 from jaximu.cli.app import main
 from jaximu.data.observe_stations import observe_stations
+from jaximu.data.recorded_stations import RecordedStations, station_of
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.improvement import cross_validated
-from jaximu.diagnosis.turntable import Turntable, diagnose_turntable, station_of
+from jaximu.diagnosis.turntable import diagnose_turntable
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
@@ -112,7 +114,6 @@ def test_the_rotation_of_the_earth_is_found(noise):
 
 def test_its_twin_has_no_misfit(clean):
     twin = clean.experiment.twin(clean.base, clean.noise, 1)
-    assert isinstance(twin, Turntable)
     scores = twin.fit().evidence.scores()
     assert scores.outside[2] > 1e-4
     # the errors of the twin are noise: as large as those of the recording
@@ -140,7 +141,8 @@ def test_five_poses_predict_what_they_determine(noise):
         [np.linalg.norm(force - w, axis=1) < 0.1 for w in wanted], 0
     )
     assert pose.sum() == 5
-    experiment = Turntable(recording, replace(stations, accelerometer_used=pose), truth.imu)
+    data = RecordedStations(recording, replace(stations, accelerometer_used=pose))
+    experiment = Experiment(data, truth.imu)
     gain = cross_validated(experiment, experiment.fit())
     assert gain.after.count < experiment.used.sum()
     assert 1e-3 < scipy.stats.chi2.sf(gain.after.chi_squared, gain.after.count) < 0.999

@@ -15,7 +15,7 @@ from jaximu import InputError, LocalGravity, NotPossibleError, Recording, calibr
 from jaximu.cli.app import main
 from jaximu.diagnosis import check
 from jaximu.diagnosis.comparison import Fresh, Old, Question, Widened
-from jaximu.diagnosis.hand_held import HandHeldExperiment
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.estimation.data import About, Conditions
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Parameters, without_equipment
@@ -78,7 +78,7 @@ class LinearConditions(Conditions):
         return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
 
 
-class Drawn(HandHeldExperiment):
+class Drawn(Experiment):
     """A recording whose conditions are linear and drawn; their covariance is one for all units."""
 
     beside: About
@@ -86,9 +86,9 @@ class Drawn(HandHeldExperiment):
     drawn: np.ndarray
 
     @classmethod
-    def of(cls, real: HandHeldExperiment, imu: Imu) -> "Drawn":
+    def of(cls, real: Experiment, imu: Imu) -> "Drawn":
         """Linearise a recording at a unit."""
-        found = cls(real.segmentations, real.observations, real.start)
+        found = cls(real.data, real.start)
         found.beside = real.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu))
         columns = np.zeros((len(real.used), len(real.predict(imu)[3])))
         columns[real.used] = real.predict(imu)[1]
@@ -99,7 +99,7 @@ class Drawn(HandHeldExperiment):
         """Return the drawn conditions, whatever the unit."""
         drawn = np.zeros(len(self.used))
         drawn[self.used] = self.drawn
-        conditions = LinearConditions(drawn, *self.linear, self.observations.gravity)
+        conditions = LinearConditions(drawn, *self.linear, self.data.observations.gravity)
         return replace(self.beside, conditions=jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions))
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from jaximu.calibration.magnetometer import FieldStrength, Heading, MagneticLog, calibrate_magnetometer
     from jaximu.calibration.means import calibrate_means
     from jaximu.calibration.nominal import nominal_imu
-    from jaximu.calibration.recipe import calibrate, forces_and_angles, residual_rms
+    from jaximu.calibration.recipe import calibrate
     from jaximu.calibration.refusals import require_spanning
     from jaximu.calibration.scheme import Scheme, describe_scheme
     from jaximu.calibration.systematic import History, calibrate_by_filter
@@ -58,13 +58,11 @@ __all__ = [
     "fit_together",
     "fit_turntable",
     "followed_in_use",
-    "forces_and_angles",
     "leave_out_turns",
     "linear_least_squares",
     "load_calibration",
     "nominal_imu",
     "require_spanning",
-    "residual_rms",
     "six_position",
     "turn_pairs",
 ]

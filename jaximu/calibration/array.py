@@ -20,9 +20,8 @@ from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import calibrate
 from jaximu.calibration.refusals import require_solved
-from jaximu.calibration.turntable import station_errors
 from jaximu.data.shared_motion import shared_stations
-from jaximu.data.stations import KnownStations
+from jaximu.data.stations import KnownStations, station_errors
 from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.problem import Loss, flatten, names_of, typical_sizes
 from jaximu.ground.array_types import FloatArray

@@ -19,7 +19,8 @@ from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.refusals import require_solved
 from jaximu.data.array import UnitsOnOneBody
-from jaximu.data.poses import EXCESS_NAMES, RecordedByHand, condensed
+from jaximu.data.by_hand import RecordedByHand
+from jaximu.data.poses import EXCESS_NAMES, condensed
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.ground.array_types import FloatArray

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration, require_calibration
-from jaximu.data.track import TEMPERATURE_WINDOW
+from jaximu.estimation.track import TEMPERATURE_WINDOW
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64

@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
-from jaximu.data.poses import Condensed, RecordedByHand, condensed, extent_of, missed_by_sampling
+from jaximu.data.by_hand import RecordedByHand
+from jaximu.data.handling import missed_by_sampling
+from jaximu.data.poses import Condensed, condensed
 from jaximu.estimation.fitting import effect_numbers, linearise, unwhitened
 from jaximu.estimation.problem import without_equipment
 from jaximu.ground.array_types import FloatArray
@@ -473,7 +475,7 @@ def _effects(recorded: _Recorded) -> float:
     bare = found.imu.with_effects()
     measurement = RecordedByHand(found.segmentations, recorded.observations)
     linear = linearise(bare, measurement, without_equipment)
-    extent = extent_of(found.segmentations)
+    extent = measurement.extent()
     reactions = measurement.dormant_columns(bare, linear.details, {kind: kind.grid(extent) for kind in kinds})
     candidates = [
         (columns[recorded.used] * _PLAUSIBLE * effect_numbers(bare.with_effects(kind.dormant()))[2][: kind.size],

@@ -7,9 +7,8 @@ from dataclasses import replace
 from jaximu.calibration.calibration import Calibration, concluded, provenance
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.calibration.recipe import residual_rms
 from jaximu.calibration.refusals import relative_covariance, require_solved, require_spanning
-from jaximu.data.poses import EXCESS_NAMES
+from jaximu.data.poses import EXCESS_NAMES, residual_rms
 from jaximu.estimation.problem import Loss
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity

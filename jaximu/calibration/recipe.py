@@ -15,11 +15,11 @@ from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved, require_spanning
 from jaximu.calibration.saturation import saturation
+from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import with_drift
-from jaximu.data.poses import EXCESS_NAMES, RecordedByHand, condensed
+from jaximu.data.poses import EXCESS_NAMES, residual_rms
 from jaximu.estimation.fitting import Prior, fit
 from jaximu.estimation.problem import Loss
-from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
@@ -38,8 +38,6 @@ __all__ = [
     "Choices",
     "calibrate",
     "calibrate_ready",
-    "forces_and_angles",
-    "residual_rms",
 ]
 
 _ROUNDS = 4
@@ -47,45 +45,6 @@ _ROUNDS = 4
 _NO_DRIFT = (
     "The intervals of the biases leave out slow drift: use the joint method with the linear loss, or add --static LOG."
 )
-
-
-def residual_rms(
-    imu: Imu,
-    observations: Observations,
-    gyroscope: bool = True,
-    seen: tuple[FloatArray, FloatArray] | None = None,
-) -> dict[str, tuple[float, str]]:
-    """Return the rms of each kind of residual in units a person knows: m/s², degrees, rad/s (all unweighted).
-
-    `seen`: forces and angles of the unit, where at hand.
-    """
-    poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
-    force, angle = forces_and_angles(imu, observations) if seen is None else seen
-    norm = np.linalg.norm(force[poses], axis=1) - float(observations.gravity)
-    found = {"gravity_norm": (_rms(norm), "m/s^2")}
-    if imu.gyroscope is None or not gyroscope:
-        return found
-    if turns.any():
-        found["gravity_direction"] = (_rms(np.degrees(angle)[turns]), "deg")
-    rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
-    scale = np.linalg.norm(np.asarray(imu.gyroscope.gain), axis=1)
-    found["static_gyroscope"] = (_rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
-    return found
-
-
-def forces_and_angles(imu: Imu, observations: Observations) -> tuple[FloatArray, FloatArray]:
-    """Return each pose's specific force (P, 3), m/s², and each turn's angle (T,), rad, from carried to measured.
-
-    Padding included; the angles mean nothing where `imu` has no gyroscope. Effects are not looked at.
-    """
-    full = imu if imu.gyroscope is not None else Imu(imu.accelerometer, Imu.nominal().gyroscope)
-    lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))
-    found = condensed(*lifted)
-    return found.force[0], found.angle[0]
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @dataclass(frozen=True)

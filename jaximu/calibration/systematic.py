@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from jaximu.calibration.attitude import Mounted, mounted_on, reference_summary
 from jaximu.calibration.calibration import Calibration, concluded, effect_named
 from jaximu.calibration.compensation import compensate
-from jaximu.calibration.recipe import Choices, calibrate_ready, residual_rms
+from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import refuse_undetermined, require_solved
+from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.motion import (
     Disturbances,
@@ -27,7 +28,7 @@ from jaximu.data.motion import (
     merged_drift,
     sees_earth,
 )
-from jaximu.data.poses import RecordedByHand
+from jaximu.data.poses import residual_rms
 from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.information_filter import Knowledge
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, typical_sizes, without_equipment_or_effects

@@ -22,10 +22,10 @@ from jaximu.calibration.thermal_terms import HISTORY, LEARNED, NETWORK, POWERS, 
 from jaximu.calibration.thermal_triad import TriadFit, fit_triad
 from jaximu.data.rest import mean_terms
 from jaximu.data.rest_blocks import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
-from jaximu.data.track import TEMPERATURE_WINDOW, Track
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
+from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Document
 from jaximu.ground.errors import InputError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import product
 from math import comb, log
 from typing import TypeVar
 
@@ -25,11 +25,10 @@ from jaximu.calibration.thermal_terms import (
     ThermalTerm,
     history,
 )
-from jaximu.data.rest_blocks import Leg, RestBlocks
 from jaximu.ground.array_types import FloatArray
 
 __all__ = ["CUBIC", "PAYS", "VAGUE", "Candidate", "best_by_axis", "beyond_bias", "candidate_of", "completed",
-           "exchanged", "families_of", "folds_of", "parameters_of", "richest", "stepwise", "terms_of",
+           "exchanged", "families_of", "parameters_of", "richest", "stepwise", "terms_of",
            "tuned"]  # fmt: skip
 
 T = TypeVar("T")
@@ -41,7 +40,6 @@ _AT_ONCE = (POWERS[0], LEARNED)
 _PICKED = 0.3  # numbers by nat of choice: two over the logarithm of some hundred blocks
 _ALIKE = 1.1  # times the least error on what was left out, up to which a simpler model may have more
 VAGUE = 0.5  # of a time constant or a half-width: with a larger standard deviation slow noise is taken for it
-_FOLDS = 8
 
 
 @dataclass(frozen=True)
@@ -78,19 +76,6 @@ class Candidate:
     def names(self) -> tuple[str, ...]:
         """The effects in it, without prefix."""
         return tuple(dict.fromkeys(term.name for term in self.terms))
-
-
-def folds_of(blocks: RestBlocks, legs: Sequence[Leg]) -> list[NDArray[np.int64]]:
-    """Return what is left out in turn: whole legs where there are four or more, else stretches of them."""
-    parts = [leg.blocks for leg in legs]
-    if len(parts) < 4:
-        pieces = -(-4 // len(parts)) if len(parts) > 1 else 5
-        parts = [piece for part in parts for piece in np.array_split(part, pieces) if len(piece)]
-        return parts[1:-1] if len(legs) == 1 else parts  # the ends of one leg could only be extrapolated to
-    while len(parts) > _FOLDS:
-        shortest = int(np.argmin([len(a) + len(b) for a, b in pairwise(parts)]))
-        parts[shortest : shortest + 2] = [np.concatenate(parts[shortest : shortest + 2])]
-    return parts
 
 
 def parameters_of(terms: Sequence[ThermalTerm]) -> float:

@@ -23,7 +23,7 @@ from jaximu.calibration.thermal_terms import (
 )
 from jaximu.data.rest import mean_terms, padded_count
 from jaximu.data.rest_blocks import RestBlocks
-from jaximu.data.track import Track
+from jaximu.estimation.track import Track
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects import CATALOGUE

@@ -26,7 +26,6 @@ from jaximu.calibration.thermal_selection import (
     candidate_of,
     completed,
     families_of,
-    folds_of,
     richest,
     stepwise,
     terms_of,
@@ -34,6 +33,7 @@ from jaximu.calibration.thermal_selection import (
 )
 from jaximu.calibration.thermal_terms import HISTORY, RATES, Model
 from jaximu.data.rest import RestOverTemperature, mean_terms
+from jaximu.data.rest_blocks import folds_of
 from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
@@ -89,7 +89,7 @@ def fit_triad(data: Whitened, found: Identifiability, families: Sequence[str] | 
     Inner parameters are those of the model that is best for all axes together: each axis then chooses its terms at
     them. An axis is left as it is where no model predicts what was left out better than a constant does.
     """
-    folds, beyond = folds_of(data.blocks, found.legs), beyond_bias(data, found)
+    folds, beyond = folds_of(found.legs), beyond_bias(data, found)
     scale = richest(data, found)[1]
     offered = {family: each for family, each in families_of(found.told, beyond).items()
                if family == "constant" or families is None or family in families}  # fmt: skip

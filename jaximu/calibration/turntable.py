@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +14,10 @@ from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
 from jaximu.data.observe_stations import observe_stations
 from jaximu.data.poses import EXCESS_NAMES
-from jaximu.data.station_error import turntable_error
-from jaximu.data.stations import KnownStations, station_covariance
+from jaximu.data.stations import KnownStations, station_rms
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import TOLERANCE, Loss, Name, Parameters
 from jaximu.estimation.uncertainty import UNDETERMINED, station_advice
-from jaximu.ground import stored
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
@@ -45,8 +43,6 @@ __all__ = [
     "calibrate_turntable",
     "fit_turntable",
     "free_on_table",
-    "station_errors",
-    "station_rms",
 ]
 
 
@@ -84,49 +80,6 @@ def free_on_table(imu: Imu, free: Sequence[str] = ()) -> Callable[[Name], bool]:
     """Return which numbers of a unit are free: gains, biases, and those of the effects named in `free`."""
     effects = imu.all_effects()
     return lambda name: name.effect is None or effects[name.owner, name.effect].name in free
-
-
-@dataclass(frozen=True)
-class StationErrors:
-    """Errors of one kind, by station: `name`, `unit`, `place` (n,) of the stations, `error` and `sigma` (3, n)."""
-
-    name: str
-    unit: str
-    place: np.ndarray
-    error: np.ndarray
-    sigma: np.ndarray
-
-
-def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[StationErrors]:
-    """Return the errors of each kind in SI: force and rate in poses, and the angle of turns (degrees)."""
-
-    def compute(imu, stations, excess):
-        variance = jnp.diagonal(station_covariance(stations).total(excess)).reshape(-1, 6).T
-        return turntable_error(imu, stations), jnp.sqrt(variance)
-
-    error, sigma = map(np.asarray, stored.call(compute, "station errors", imu, stations, excess))
-    scale = [np.linalg.norm(np.asarray(triad.gain), axis=1)[:, None] for triad in imu.triads().values()]
-    gyroscope, turn = np.asarray(stations.gyroscope_used), np.asarray(stations.turn)
-    degrees = np.degrees(np.asarray(stations.stop) - np.asarray(stations.start))
-    kinds = [("specific_force", "m/s^2", np.asarray(stations.accelerometer_used), slice(3), 1.0)]
-    if len(scale) > 1:
-        kinds += [("rate_at_rest", "rad/s", gyroscope & ~turn, slice(3, 6), 1.0),
-                  ("turn_angle", "deg", gyroscope & turn, slice(3, 6), degrees)]  # fmt: skip
-    found = []
-    for name, unit, used, rows, factor in kinds:
-        per = factor / scale[rows.start is not None]
-        place = np.flatnonzero(used)
-        found.append(StationErrors(name, unit, place, (error[rows] * per)[:, place], (sigma[rows] * per)[:, place]))
-    return found
-
-
-def station_rms(imu: Imu, stations: Stations) -> dict[str, tuple[float, str]]:
-    """Return the rms of each kind of error, as vectors, with its unit."""
-    return {
-        each.name: (float(np.sqrt(np.mean(np.sum(each.error**2, axis=0)))), each.unit)
-        for each in station_errors(imu, stations, np.zeros(len(KnownStations.coarse)))
-        if len(each.place)
-    }
 
 
 def calibrate_turntable(

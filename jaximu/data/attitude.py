@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from jaximu.data.poses_covariance import integrate_turns
 from jaximu.data.preintegration import swing
-from jaximu.data.track import Track, added, stimuli
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.data import About, Conditions, Data, Observed
 from jaximu.estimation.problem import Parameters
 from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
+from jaximu.estimation.track import Track, added, stimuli
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotate, rotation_matrix
@@ -81,7 +81,7 @@ class AttitudeConditions(Conditions):
     rotation, target: the unit's and the reference's, from the frame at an interval's end to that at its start; the
     former at (A | c) = `linear`, A = K⁻¹ and c = −K⁻¹ b, by which its last frame turns with `slope`. force: slope of a
     window's mean force (m/s², upright frame) by the accelerometer's (A | c); swung: by the gyroscope's, which turns the
-    frames in between; gain: the velocity gained, over the time. shift: added to all conditions.
+    frames in between; gain: the velocity gained, over the time.
     """
 
     rotation: Float[Array, "T 4"]
@@ -94,7 +94,6 @@ class AttitudeConditions(Conditions):
     turn: Bool[Array, " T"]
     window: Bool[Array, " W"]
     magnitude: Float[Array, ""]
-    shift: Float[Array, " n"]
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of the rotations (rad) and of the mean forces (m/s²)."""
@@ -106,7 +105,7 @@ class AttitudeConditions(Conditions):
         force = force + jnp.einsum("wijk,jk->wi", self.swung, change)
         force = force - self.magnitude * jnp.array([0.0, 0.0, 1.0])
         error, force = error * self.turn[:, None], force * self.window[:, None]
-        return jnp.concatenate([error.reshape(-1), force.reshape(-1)]) + self.shift
+        return jnp.concatenate([error.reshape(-1), force.reshape(-1)])
 
 
 class Reactions(eqx.Module):
@@ -144,10 +143,10 @@ class AttitudeDetails:
     imu: Imu
 
     @cached_property
-    def tracks(self) -> dict[str, Track]:
+    def tracks(self) -> list[dict[str, Track]]:
         """What the unit went through at the gyroscope's samples, the accelerometer's included: one observation."""
         stimulus = self.measurement.around(self.imu)
-        return dict.fromkeys(_TRIADS, Track.padded(stimulus, np.zeros(len(np.asarray(stimulus.time)), np.int64), 1))
+        return [dict.fromkeys(_TRIADS, Track.padded(stimulus, np.zeros(len(np.asarray(stimulus.time)), np.int64), 1))]
 
 
 class Intervals(eqx.Module):
@@ -268,7 +267,6 @@ def evaluated(
     conditions = AttitudeConditions(
         whole.rotation, target, whole.slope(turns.output), bare.gyroscope.inverse(), by_window(summed),
         by_window(swung), gained / safe[:, None], data.used, complete, data.gravity,
-        jnp.zeros(3 * (len(place) + windows)),
     )  # fmt: skip
     share = (upright * (jnp.repeat(complete / safe, group) * data.used)[:, None, None])[:, None]
     leaning = share[:, 0] @ jnp.cross(jnp.eye(3), lever[:, None]).swapaxes(1, 2)
@@ -306,6 +304,7 @@ class AgainstAttitude(Data):
 
     excess_names = EXCESS_NAMES
     coarse = (1.0, 1.0, 1.0, 1.0, 1e2)
+    no_fixture = "how the reference is mounted, late and smoothed is estimated in any case"
 
     @cached_property
     def intervals(self) -> Intervals:
@@ -474,7 +473,50 @@ class AgainstAttitude(Data):
             force, rate = ((outputs[name] @ inverse_matrix(triads[name].gain).T)[..., None] for name in _TRIADS)
             return reactions.react(force, rate, windows)[:, 0]
 
-        return f"against attitude {windows}", of, [(details.tracks, details.reactions)]
+        return f"against attitude {windows}", of, [(tracks, details.reactions) for tracks in details.tracks]
+
+    # --- what a diagnosis needs to know ---------------------------------------------------------------------------
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was recorded."""
+        return (self.recording,)
+
+    def spans(self) -> list[FloatArray]:
+        """Return start and stop (k, 2), s, of the windows of the specific force."""
+        ends = np.asarray(self.intervals.stamp)[:: self.group]
+        return [np.stack([ends[:-1], ends[1:]], axis=1)]
+
+    def rests(self) -> list[FloatArray]:
+        """Return none: the unit is in motion, and its noise is the fit's."""
+        return [np.zeros((0, 2))]
+
+    def observed(self, imu: Imu, details: AttitudeDetails) -> Observed:
+        """Return the samples, along which shapes act: slow changes, and what depends on orientation."""
+        (tracks,), stamps = details.tracks, np.asarray(self.intervals.stamp)
+        stimulus, windows = tracks["gyroscope"].stimulus, len(details.duration) // self.group
+        force = np.asarray(stimulus.specific_force)
+
+        def react(triad: str, shape: FloatArray) -> FloatArray:
+            columns = []
+            for axis in np.eye(3):
+                along = axis[:, None] * shape[:, None, :]
+                none = np.zeros_like(along)
+                both = (along, none) if triad == "accelerometer" else (none, along)
+                columns.append(np.asarray(details.reactions.react(*both, windows)))
+            return np.concatenate(columns, axis=1)
+
+        share = (np.asarray(stimulus.time) - stamps[0]) / np.ptp(stamps)
+        return Observed(react, share, up=force / np.linalg.norm(force, axis=1, keepdims=True))
+
+    def without(self, observation: int) -> AgainstAttitude:
+        """Return the recording with a window of the force left out, and the rotations in it."""
+        return replace(self, left_out=(*self.left_out, observation))
+
+    def rms(self, imu: Imu, details: AttitudeDetails, conditions: FloatArray) -> dict[str, tuple[float, str]]:
+        """Return the rms of each kind of residual, with its unit, as a calibration has it."""
+        sizes = super().rms(imu, details, conditions)
+        return sizes | {"rotation": (float(np.degrees(sizes["rotation"][0])), "deg/s")}
 
     def _covariance(
         self, conditions, spread: FloatArray, duration: FloatArray, leaning: FloatArray, white: float

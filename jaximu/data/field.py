@@ -21,10 +21,10 @@ import scipy
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu.data.track import Track, added
 from jaximu.estimation.covariance import BlockFactor, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
+from jaximu.estimation.track import Track, added
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import exponential, inverse_matrix, rotate, running_rotations

@@ -8,9 +8,9 @@ bias alone). A turn about a fixed axis is linear in (A, c) however far it goes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple, Self
 
 import equinox as eqx
@@ -29,8 +29,6 @@ from jaximu.data.poses_covariance import (
     integrate_turns,
     sensitivities,
 )
-from jaximu.data.track import Track, added, mean_outputs
-from jaximu.data.tracks_by_hand import tracks_by_hand, turn_samples
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import Name
@@ -49,32 +47,28 @@ from jaximu.ground.rotation import (
     rotate,
 )
 from jaximu.ground.tracing import array_module
-from jaximu.mistakes import prepared
-from jaximu.model.effects.base import Effect, Extent
+from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.noise_model import NoiseModel
-from jaximu.model.sensor import Imu, Triad
-from jaximu.recordings.observations import Observations, Turns
-from jaximu.recordings.recording import Recording, recordings_of
-from jaximu.recordings.segmentation import Segmentation, observed_poses, segment
+from jaximu.model.sensor import Imu
+from jaximu.recordings.observations import Observations
+from jaximu.recordings.recording import Recording
+from jaximu.recordings.segmentation import observed_poses, segment
 
 __all__ = [
     "COARSE_EXCESS",
     "EXCESS_NAMES",
     "RESIDUALS",
-    "Along",
     "Condensed",
     "HandHeldConditions",
     "PosesAndTurns",
-    "RecordedByHand",
     "condense",
     "condensed",
-    "extent_of",
-    "missed_by_sampling",
+    "forces_and_angles",
     "observe",
     "only",
     "pose_rows",
+    "residual_rms",
     "resized",
-    "rest_shifts",
     "stack",
 ]
 
@@ -87,8 +81,6 @@ RESIDUALS = (
     ResidualKind("gravity_direction", "gravity carried over a turn", "deg", 2, float(np.degrees(1.0))),
     ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
 )
-_ROUNDS, _CHANGED = 6, 1e-3
-"""Times that tracks are taken anew with what effects add taken off, and the relative change of it that ends them."""
 
 
 class HandHeldConditions(Conditions):
@@ -254,21 +246,25 @@ class PosesAndTurns(Observations, Data):
 
 
 def observe(
-    recordings: Recording | Sequence[Recording], gravity: Gravity = STANDARD, noise: NoiseModel | None = None
+    recordings: Recording | Prepared | Sequence[Recording | Prepared],
+    gravity: Gravity = STANDARD,
+    noise: NoiseModel | None = None,
 ) -> PosesAndTurns:
     """Return poses and turns of recordings of one unit as data of a fit; chosen on the host, a PyTree of arrays.
 
-    **Arguments:** `gravity`: local gravity, m/s². `noise`: fitted to the unit at rest; without it the scatter within
-    the poses tells the noise. A fit starts at the data sheet's values, [`jaximu.calibration.nominal_imu`][].
+    **Arguments:** `recordings`: one or several; each may have been looked over by [`jaximu.mistakes.prepare`][], which
+    says what was found in it. `gravity`: local gravity, m/s². `noise`: fitted to the unit at rest; without it the
+    scatter within the poses tells the noise. A fit starts at the data sheet's values,
+    [`jaximu.calibration.nominal_imu`][].
 
     Rows that are no measurement are left out. Raises `InputError` where gyroscopes are missing from some recordings,
     and `NotPossibleError` where there are no poses.
     """
-    parts = recordings_of(recordings)
-    without = [recording.name for recording in parts if "gyroscope" not in recording.signals]
-    if 0 < len(without) < len(parts):
+    given = one_or_several(recordings)
+    without = [each.name for each in given if "gyroscope" not in each.signals]
+    if 0 < len(without) < len(given):
         raise InputError(f"{without[0]} has no gyroscope and others have: observe them apart.")
-    with prepared(parts, gyroscope=not without) as ready:
+    with prepared(given, gyroscope=not without) as ready:
         segmentations = [segment(one.recording) for one in ready]
         observations = observed_poses(segmentations, as_gravity(gravity).value, noise=noise)
     return PosesAndTurns.of(observations, "norm" if without else "all")
@@ -335,164 +331,6 @@ def pose_rows(imu: Imu, observations: Observations) -> Rows:
     )
 
 
-class Along:
-    """A hand-held recording about a unit: what was condensed, and the tracks of each part, made when asked for.
-
-    observations: with what the effects add taken off.
-    """
-
-    def __init__(self, condensed: Condensed, observations: Observations, made: Callable[[], list[dict[str, Track]]]):
-        self.condensed, self.observations, self._made = condensed, observations, made
-
-    @cached_property
-    def tracks(self) -> list[dict[str, Track]]:
-        """What the unit went through, part by part."""
-        return self._made()
-
-    @property
-    def reaction(self) -> Sensitivities:
-        """How the conditions react to the outputs."""
-        assert self.condensed.reaction is not None
-        return self.condensed.reaction
-
-
-@dataclass
-class RecordedByHand(Data):
-    """Poses and turns of one unit, and the recordings that they were cut from, along which effects act."""
-
-    segmentations: tuple[Segmentation, ...]
-    observations: Observations
-
-    excess_names = EXCESS_NAMES
-    coarse = COARSE_EXCESS
-
-    @cached_property
-    def shifts(self) -> FloatArray:
-        """What the observations took off each recording's gyroscope output (k, 3): its bias against the first's."""
-        return rest_shifts(self.segmentations)
-
-    def rows(self, imu: Imu) -> Rows:
-        """Return what each condition is: norms of poses, two components of turns, three of means at rest."""
-        return pose_rows(imu, self.observations)
-
-    @cached_property
-    def turn_samples(self) -> list[NDArray[np.int64]]:
-        """Where the samples (T, S) of each turn are among those of each recording's gyroscope; 0 for none."""
-        return turn_samples(self.segmentations, self.observations)
-
-    def about(self, imu: Imu) -> About:
-        """Return the conditions about one unit, the leading axis of length one, and its effects' columns."""
-        unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        along = self.along(unit, tuple(unit.all_effects().values()))
-        covariance = along.condensed.covariance
-        columns = self.own_columns(unit, along, covariance.used.shape[1])[None]
-        return About(along.condensed.conditions, covariance, columns, along)
-
-    def along(self, imu: Imu, effects: tuple[Effect, ...]) -> Along:
-        """Return the recordings about a unit with effects: the tracks, and the observations without what they add."""
-        bare = jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu.with_effects())
-        recorded = [
-            {"accelerometer": signals["accelerometer"].values, "gyroscope": signals["gyroscope"].values - shift}
-            for signals, shift in zip((part.recording.signals for part in self.segmentations), self.shifts, strict=True)
-        ]
-        offsets: list[Any] = [None] * len(recorded)
-        outputs, observations, change = recorded, self.observations, np.inf
-        for number in range(_ROUNDS):  # the tracks tell what effects add, and what they add changes the tracks
-            found = condensed(bare, jax.tree.map(lambda leaf: np.asarray(leaf)[None], observations))
-            assert found.running is not None
-            made = partial(tracks_by_hand, self.segmentations, self.turn_samples, imu, outputs, found.running)
-            if not effects or change < _CHANGED or number == _ROUNDS - 1:
-                break
-            before, tracks = offsets, made()
-            offsets = [jax.tree.map(np.asarray, added(imu.with_effects(*effects), each)) for each in tracks]
-            change = max(_change(old, new) for old, new in zip(before, offsets, strict=True))
-            outputs = [
-                {name: values - offset[name][: len(values)] for name, values in whole.items()}
-                for whole, offset in zip(recorded, offsets, strict=True)
-            ]
-            observations = self._without(tracks, offsets)
-        return Along(found, observations, made)
-
-    def reactions(self, details: Along):
-        """Return how norms, directions and means at rest react to effects, recording by recording."""
-
-        def of(effect, imu, part):
-            tracks, samples, reaction = part
-            outputs = added(imu.with_effects(effect), tracks)
-            means = mean_outputs(tracks, outputs, reaction.norm.shape[0])
-            force = means[:, :3]
-            norm = jnp.sum(reaction.norm * force, axis=-1)
-            turn = jnp.einsum("tai,ti->ta", reaction.after, force[1:])
-            turn = turn + jnp.einsum("tai,ti->ta", reaction.before, force[:-1])
-            turn = turn + jnp.einsum("tasi,tsi->ta", reaction.turn, outputs["gyroscope"][samples])
-            return jnp.concatenate([norm, turn.reshape(-1), means[:, 3:].reshape(-1)])
-
-        parts = zip(details.tracks, self.turn_samples, strict=True)
-        return "by hand", of, [(tracks, samples, details.reaction) for tracks, samples in parts]
-
-    def _without(self, tracks: Sequence[dict[str, Track]], offsets: Sequence[dict[str, FloatArray]]) -> Observations:
-        """Return the observations with what is added to the samples of each recording taken off."""
-        poses, turns = self.observations.poses, self.observations.turns
-        means, output = np.zeros((len(poses.mask), 6)), np.array(turns.output)
-        for track, offset, samples in zip(tracks, offsets, self.turn_samples, strict=True):
-            means += np.asarray(mean_outputs(track, offset, len(means)))
-            output[samples > 0] -= offset["gyroscope"][samples[samples > 0]]
-        return replace(
-            self.observations,
-            poses=replace(
-                poses,
-                accelerometer_mean=np.asarray(poses.accelerometer_mean) - means[:, :3],
-                gyroscope_mean=np.asarray(poses.gyroscope_mean) - means[:, 3:],
-            ),
-            turns=replace(turns, output=output),
-        )
-
-
-def rest_shifts(segmentations: Sequence[Segmentation]) -> FloatArray:
-    """Return the difference (k, 3) of each recording's gyroscope output at rest to the first recording's."""
-    middles = []
-    for part in segmentations:
-        signal = part.recording.gyroscope
-        assert signal is not None
-        means = [signal.values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in part.intervals]
-        middles.append(np.median(means, axis=0))
-    return np.array(middles) - middles[0]
-
-
-def extent_of(segmentations: Sequence[Segmentation]) -> Extent:
-    """Return what recordings made by hand span."""
-    stops = [part.intervals for part in segmentations]
-    boundaries = [float(t) for each in stops for t in (each[:-1, 1] + each[1:, 0]) / 2]
-    kelvin = [part.recording.temperature.values for part in segmentations if part.recording.temperature]
-    return Extent(
-        max(float(each[-1, 1] - each[0, 0]) for each in stops), tuple(boundaries),
-        max((float(np.ptp(each)) for each in kelvin), default=0.0),
-    )  # fmt: skip
-
-
-def missed_by_sampling(turns: Turns, gyroscope: Triad, running: FloatArray) -> FloatArray:
-    """Return half of what rotations (T, 3), rad, from even and from odd samples differ by: Σ (−1)^i R_i ω_i Δt.
-
-    Where sampling is dense enough it is noise. running: the turns' rotations (T, S, 4) after each sample.
-    """
-    rates = gyroscope.recover_on_host(turns.output)
-    interval = np.asarray(turns.interval)
-    sign = np.where(np.arange(interval.shape[1]) % 2 == 0, 1.0, -1.0)
-    axis = running[..., 1:]
-    across = 2 * np.cross(axis, rates)
-    turned = rates + running[..., :1] * across + np.cross(axis, across)
-    return np.sum(turned * (interval * sign)[..., None], axis=1)
-
-
-def _change(before: dict[str, FloatArray] | None, after: dict[str, FloatArray]) -> float:
-    """Return the largest change of what effects add, as a share of the most that they add to a triad."""
-    shares = [0.0]
-    for name, new in after.items():
-        old, most = 0.0 if before is None else before[name], np.max(np.abs(new), initial=0.0)
-        shares.append(float(np.max(np.abs(new - old), initial=0.0) / most) if most > 0 else 0.0)
-    return max(shares)
-
-
 def only(covariance: Covariance | Chain, rows: str, excess: Array) -> Covariance | Chain:
     """Return the covariance with rows left out; with "turning" of each turn by itself, the poses' excess given.
 
@@ -512,3 +350,42 @@ def _errors(conditions: HandHeldConditions, imu: Imu) -> tuple[Array, Array]:
     predicted = rotate(conjugate(conditions.rotation), directions[:-1])
     chord = jnp.sqrt(jnp.sum((predicted - directions[1:]) ** 2, axis=-1))
     return force, jnp.where(conditions.turn, 2 * jnp.arcsin(jnp.clip(chord / 2, 0, 1)), 0.0)
+
+
+def residual_rms(
+    imu: Imu,
+    observations: Observations,
+    gyroscope: bool = True,
+    known: tuple[FloatArray, FloatArray] | None = None,
+) -> dict[str, tuple[float, str]]:
+    """Return the rms of each kind of residual in units a person knows: m/s², degrees, rad/s (all unweighted).
+
+    `known`: forces and angles of the unit, where at hand.
+    """
+    poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
+    force, angle = forces_and_angles(imu, observations) if known is None else known
+    norm = np.linalg.norm(force[poses], axis=1) - float(observations.gravity)
+    sizes = {"gravity_norm": (_rms(norm), "m/s^2")}
+    if imu.gyroscope is None or not gyroscope:
+        return sizes
+    if turns.any():
+        sizes["gravity_direction"] = (_rms(np.degrees(angle)[turns]), "deg")
+    rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
+    scale = np.linalg.norm(np.asarray(imu.gyroscope.gain), axis=1)
+    sizes["static_gyroscope"] = (_rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
+    return sizes
+
+
+def forces_and_angles(imu: Imu, observations: Observations) -> tuple[FloatArray, FloatArray]:
+    """Return each pose's specific force (P, 3), m/s², and each turn's angle (T,), rad, from carried to measured.
+
+    Padding included; the angles mean nothing where `imu` has no gyroscope. Effects are not looked at.
+    """
+    full = imu if imu.gyroscope is not None else Imu(imu.accelerometer, Imu.nominal().gyroscope)
+    lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))
+    found = condensed(*lifted)
+    return found.force[0], found.angle[0]
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from jaximu.data.track import Track
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, Data, derivatives_by_numbers
+from jaximu.estimation.track import Track
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import CATALOGUE, Effect
@@ -60,7 +60,7 @@ class RestOverTemperature(Data):
     def __init__(
         self, triad: str, output: FloatArray, weights: FloatArray, level: NDArray[np.int64], tracks: Sequence[Track]
     ):
-        self.triad, self.output, self.tracks = triad, output, tracks
+        self.triad, self.output, self.paths = triad, output, tracks
         member = np.eye(int(level.max()) + 1)[level]
         apart = member[:, 1:] - member[:, :1]  # levels that add up to nothing: their mean is the bias
         self.weights = weights
@@ -79,7 +79,7 @@ class RestOverTemperature(Data):
     def about(self, imu: Imu) -> About:
         """Return the outputs without what the effects of one unit, the leading axis, add to them."""
         unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        added, slopes = mean_terms(tuple(unit.all_effects().values()), self.tracks, len(self.output))
+        added, slopes = mean_terms(tuple(unit.all_effects().values()), self.paths, len(self.output))
         conditions = _WhiteOutputs(
             self._white((self.output - added)[:, :, None])[:, :, 0], self.bias, np.zeros(1),
             np.full(1, int(self.triad == "gyroscope")),

@@ -9,20 +9,33 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.data.track import TEMPERATURE_WINDOW, Track
+from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal, recordings_of, same_outputs, smoothed_slope
 
-__all__ = ["LEAST_RANGE", "RATE_BANDWIDTH", "Leg", "RestBlocks", "joined", "rest_blocks", "without_startup"]
+__all__ = [
+    "LEAST_RANGE",
+    "RATE_BANDWIDTH",
+    "WAYS",
+    "Leg",
+    "RestBlocks",
+    "folds_of",
+    "joined",
+    "rest_blocks",
+    "without_startup",
+]
 
 LEAST_RANGE = 3.0
 """K of change below which nothing is said about temperature."""
 RATE_BANDWIDTH = 0.578 / TEMPERATURE_WINDOW
 """Hz at which the slope of a line through the window shows 0.71 of a rate of temperature that swings:
 3 (sin x − x cos x) / x³ with x = π f window."""
+WAYS = 4
+"""Ways of the temperature from which on they are left out whole."""
+_FOLDS = 8  # parts that are left out in turn, at most
 _MOST_BLOCKS = 600
 _FEWEST_BLOCKS = 30
 _NODES = 8  # of the temperature's path in each block
@@ -203,6 +216,19 @@ class RestBlocks:
             same = (self.level == self.level[edge]) & (np.arange(len(self)) >= edge) & (self.log == self.log[edge])
             level[same] = level.max() + 1
         return replace(self, level=np.unique(level, return_inverse=True)[1])
+
+
+def folds_of(legs: Sequence[Leg]) -> list[NDArray[np.int64]]:
+    """Return the blocks that are left out in turn: whole legs where there are enough, else stretches of them."""
+    parts = [leg.blocks for leg in legs]
+    if len(parts) < WAYS:
+        pieces = -(-WAYS // len(parts)) if len(parts) > 1 else WAYS + 1
+        parts = [piece for part in parts for piece in np.array_split(part, pieces) if len(piece)]
+        return parts[1:-1] if len(legs) == 1 else parts  # the ends of one leg could only be extrapolated to
+    while len(parts) > _FOLDS:
+        shortest = int(np.argmin([len(a) + len(b) for a, b in pairwise(parts)]))
+        parts[shortest : shortest + 2] = [np.concatenate(parts[shortest : shortest + 2])]
+    return parts
 
 
 def _turning_points(kelvin: FloatArray, least: float) -> list[int]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,9 +24,12 @@ __all__ = [
     "RESIDUALS",
     "KnownStations",
     "StationConditions",
+    "StationErrors",
     "station_covariance",
     "station_covariances",
+    "station_errors",
     "station_excess",
+    "station_rms",
     "station_rows",
     "station_weights",
     "turntable",
@@ -161,3 +166,46 @@ def station_covariances(stations: Stations) -> Covariance:
         return jax.lax.map(station_covariance, stations)
 
     return stored.call(batch, "station covariance", stations, quick=np.shape(stations.gravity)[0] == 1)
+
+
+@dataclass(frozen=True)
+class StationErrors:
+    """Errors of one kind, by station: `name`, `unit`, `place` (n,) of the stations, `error` and `sigma` (3, n)."""
+
+    name: str
+    unit: str
+    place: np.ndarray
+    error: np.ndarray
+    sigma: np.ndarray
+
+
+def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[StationErrors]:
+    """Return the errors of each kind in SI: force and rate in poses, and the angle of turns (degrees)."""
+
+    def compute(imu, stations, excess):
+        variance = jnp.diagonal(station_covariance(stations).total(excess)).reshape(-1, 6).T
+        return turntable_error(imu, stations), jnp.sqrt(variance)
+
+    error, sigma = map(np.asarray, stored.call(compute, "station errors", imu, stations, excess))
+    scale = [np.linalg.norm(np.asarray(triad.gain), axis=1)[:, None] for triad in imu.triads().values()]
+    gyroscope, turn = np.asarray(stations.gyroscope_used), np.asarray(stations.turn)
+    degrees = np.degrees(np.asarray(stations.stop) - np.asarray(stations.start))
+    kinds = [("specific_force", "m/s^2", np.asarray(stations.accelerometer_used), slice(3), 1.0)]
+    if len(scale) > 1:
+        kinds += [("rate_at_rest", "rad/s", gyroscope & ~turn, slice(3, 6), 1.0),
+                  ("turn_angle", "deg", gyroscope & turn, slice(3, 6), degrees)]  # fmt: skip
+    errors = []
+    for name, unit, used, rows, factor in kinds:
+        per = factor / scale[rows.start is not None]
+        place = np.flatnonzero(used)
+        errors.append(StationErrors(name, unit, place, (error[rows] * per)[:, place], (sigma[rows] * per)[:, place]))
+    return errors
+
+
+def station_rms(imu: Imu, stations: Stations) -> dict[str, tuple[float, str]]:
+    """Return the rms of each kind of error, as vectors, with its unit."""
+    return {
+        kind.name: (float(np.sqrt(np.mean(np.sum(kind.error**2, axis=0)))), kind.unit)
+        for kind in station_errors(imu, stations, np.zeros(len(KnownStations.coarse)))
+        if len(kind.place)
+    }

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu.data.track import Track, measured
+from jaximu.estimation.track import Track, measured
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations

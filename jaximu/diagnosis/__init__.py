@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from jaximu.diagnosis.attitude import diagnose_against_attitude
     from jaximu.diagnosis.checking import check
     from jaximu.diagnosis.checks import Check
-    from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
+    from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose, twin_of
     from jaximu.diagnosis.magnetometer import (
         MagneticDiagnosis,
         MagneticShift,
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     )
     from jaximu.diagnosis.thermal import diagnose_thermal
     from jaximu.diagnosis.turntable import diagnose_turntable
-    from jaximu.diagnosis.twin import twin_of
     from jaximu.diagnosis.validity import Validity
 
 __all__ = [

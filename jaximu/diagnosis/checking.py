@@ -12,9 +12,10 @@ from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import provenance, require_another, require_calibration
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.systematic import History, noise_at_rest
+from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import with_usual_drift
 from jaximu.diagnosis.comparison import FollowedUnit, Fresh, Old, Question, Widened, candidates, scatter_about_a_fit
-from jaximu.diagnosis.hand_held import HandHeldExperiment
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.noise import own_noise
 from jaximu.diagnosis.selection import Selection, select
 from jaximu.diagnosis.validity import Cause, OutputError, Shift, Validity
@@ -118,17 +119,18 @@ def _checked(
         return _followed(calibration, old, recordings, gravity, noise, level, why)
     notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]
 
-    def made(known: NoiseModel) -> HandHeldExperiment:
-        return HandHeldExperiment(parts, observed_poses(parts, gravity.value, noise=known), old.imu.with_effects())
+    def made(known: NoiseModel) -> RecordedByHand:
+        return RecordedByHand(parts, observed_poses(parts, gravity.value, noise=known))
 
     if noise is None:
         own = own_noise(replace(calibration, segmentations=parts))
-        plain = made(own)
+        plain = Experiment(made(own), old.imu.with_effects())
         noise = with_usual_drift(own, plain.shortest(), plain.extent().duration)
         notes += noise.notes
-    experiment = made(noise)
-    old = old.rested(experiment)
-    notes += _temperatures(calibration, old, experiment)
+    data = made(noise)
+    experiment = Experiment(data, old.imu.with_effects())
+    old = old.rested(data.observations)
+    notes += _temperatures(calibration, old, data)
     conditions = experiment.predict(old.imu)[0]
     _same_unit(experiment, conditions, recordings[0].name)
 
@@ -181,12 +183,12 @@ def _checked(
             "by it. `jaximu diagnose` seeks the reason."
         )
     before, after = (experiment.real.rms(each) for each in (conditions, fresh.conditions))
-    observed = experiment.observations
+    observed = data.observations
     return Validity(
         verdict, selection.p_value, float(question.evidence.residual @ question.evidence.residual),
         question.evidence.freedom,
         difference=(square, len(compared), float(chi2_sf(square, len(compared))) if compared else 1.0),
-        shifts=shifts, causes=causes, output_errors={} if unknown else _output_errors(old, fresh, experiment),
+        shifts=shifts, causes=causes, output_errors={} if unknown else _output_errors(old, fresh, data),
         errors={name: (value, after[name][0], unit) for name, (value, unit) in before.items()},
         scatter=wide, notes=tuple(dict.fromkeys(notes)), experiment=experiment,
         conditions=(conditions, fresh.conditions),
@@ -348,7 +350,7 @@ def _same_sensors(calibration: Calibration, recordings: Sequence[Recording]) -> 
         )
 
 
-def _same_unit(experiment: HandHeldExperiment, conditions: FloatArray, name: str) -> None:
+def _same_unit(experiment: Experiment, conditions: FloatArray, name: str) -> None:
     real = experiment.real
     for index, (kind, limit) in enumerate(zip(real.kinds, _FAR_OFF, strict=False)):
         vectors = (conditions * real.to_si)[real.kind == index].reshape(-1, kind.components)
@@ -372,14 +374,14 @@ def _same_gains(old: Old, fresh: Fresh, name: str) -> None:
             )
 
 
-def _temperatures(calibration: Calibration, old: Old, experiment: HandHeldExperiment) -> list[str]:
+def _temperatures(calibration: Calibration, old: Old, data: RecordedByHand) -> list[str]:
     """Say where temperatures differ and the calibration has nothing that depends on them."""
     before = calibration.data.get("temperature")
     if before is None or any("temperature" in " ".join(effect.needs) for effect in old.imu.all_effects().values()):
         return []
-    poses = experiment.observations.poses
+    poses = data.observations.poses
     after = float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))
-    known = all(part.recording.temperature is not None for part in experiment.segmentations)
+    known = all(part.recording.temperature is not None for part in data.segmentations)
     if not known or abs(after - before) < _WARMTH:
         return []
     return [
@@ -444,7 +446,7 @@ def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
     return tuple(found)
 
 
-def _output_errors(old: Old, fresh: Fresh, experiment: HandHeldExperiment) -> dict[str, OutputError]:
+def _output_errors(old: Old, fresh: Fresh, data: RecordedByHand) -> dict[str, OutputError]:
     """The largest difference of the outputs in the recording, gyroscope bias apart, and of the turns' rotations."""
     found = {}
 
@@ -455,7 +457,7 @@ def _output_errors(old: Old, fresh: Fresh, experiment: HandHeldExperiment) -> di
     for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
         before, after = old.imu.triads()[name], fresh.imu.triads()[name]
         inverse, places = np.linalg.inv(before.gain), old.places(name, "gain", "bias")
-        values = np.concatenate([getattr(part.recording, name).values for part in experiment.segmentations])
+        values = np.concatenate([getattr(part.recording, name).values for part in data.segmentations])
         true = (values - after.bias) @ np.linalg.inv(after.gain).T
         told = (values - (after if name == "gyroscope" else before).bias) @ inverse.T
         size = np.linalg.norm(told - true, axis=1)
@@ -463,11 +465,11 @@ def _output_errors(old: Old, fresh: Fresh, experiment: HandHeldExperiment) -> di
         axes = [old.names[k].axes for k in places]  # (output, input) of a gain, (output,) of a bias
         columns = [inverse[:, each[0]] * np.prod([true[worst, k] for k in each[1:]]) for each in axes]
         found[name] = error(float(size[worst]), np.stack(columns, axis=1), places, unit)
-    real = np.asarray(experiment.observations.turns.mask)
+    real = np.asarray(data.observations.turns.mask)
     if real.any():
         before, after = old.imu.triads()["gyroscope"], fresh.imu.triads()["gyroscope"]
         rested = eqx.tree_at(lambda imu: imu.gyroscope.bias, old.imu.with_effects(), after.bias)
-        by = np.asarray(experiment.along(rested, ()).condensed.conditions.slope)[0, real]
+        by = np.asarray(data.along(rested, ()).condensed.conditions.slope)[0, real]
         # how each turn's rotation vector reacts to A = K⁻¹, the bias held: c = −A b
         by = np.degrees(by[..., :3] - by[..., 3:] * np.asarray(after.bias))
         inverse = np.linalg.inv(before.gain)

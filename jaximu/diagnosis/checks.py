@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.diagnosis.evidence import EffectBlock, Evidence
-from jaximu.diagnosis.experiment import Experiment, State
-from jaximu.diagnosis.hand_held import HandHeldExperiment
+from jaximu.diagnosis.experiment import LEAST_WARMING, Experiment, State
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, kolmogorov_sf
@@ -23,7 +22,6 @@ _KINDS = {
 }
 _STILL = 1e-3
 """Share of a covariate's size that it must vary by for anything to be seen to depend on it."""
-_LEAST_WARMING = 0.2  # K
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ def checks_of(state: State, experiment: Experiment) -> tuple[Check, ...]:
     if freedom:
         text = f"what no candidate can explain: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom"
         found.append(Check("outside the catalogue", statistic / freedom, p_value, text))
-    if isinstance(experiment, HandHeldExperiment):
+    if experiment.data.by_hand:
         found += _dependences(state, experiment)
     found += [_distribution(state), _odd_even(state, experiment)]
     order = sorted(range(len(found)), key=lambda k: found[k].p_value)
@@ -99,7 +97,7 @@ def _by_kind(state: State, experiment: Experiment) -> list[Check]:
     return found
 
 
-def _dependences(state: State, experiment: HandHeldExperiment) -> list[Check]:
+def _dependences(state: State, experiment: Experiment) -> list[Check]:
     """Whether a kind of residual depends on time, temperature, specific force, or on a turn's angle, rate, duration.
 
     A score test of a few polynomials of the covariate: of the norms and of each axis of the means at rest by
@@ -110,7 +108,7 @@ def _dependences(state: State, experiment: HandHeldExperiment) -> list[Check]:
     root = np.linalg.inv(state.weights)
     jacobian = root @ state.evidence.jacobian
     real = experiment.rows(state.imu).real()
-    kinds, steady = real.kind, experiment.extent().temperature_range <= _LEAST_WARMING
+    kinds, steady = real.kind, experiment.extent().temperature_range <= LEAST_WARMING
     names = ("gravity norm at rest", "gravity direction over turns", "rate at rest")
     scales = [state.names.index(Name("gyroscope", "gain", (axis, axis))) for axis in range(3)]
     blocks = []

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import EffectBlock, Evidence
-from jaximu.diagnosis.hand_held import HandHeldExperiment
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.estimation.data import About, Data
 from jaximu.estimation.fitting import Prior, effect_numbers, fit
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
@@ -21,6 +21,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
+from jaximu.recordings.observations import Observations
 
 __all__ = ["Explanation", "FollowedUnit", "Fresh", "Old", "Question", "Widened", "candidates", "scatter_about_a_fit"]
 
@@ -103,12 +104,12 @@ class Old:
         """Return the places of a triad's gain, bias or both, without what is allowed to change."""
         return [k for k in self.tested if self.names[k].owner == owner and self.names[k].part in parts]
 
-    def rested(self, experiment: HandHeldExperiment) -> Old:
-        """Return the calibration with the gyroscope's bias of the start taken anew at rest.
+    def rested(self, observations: Observations) -> Old:
+        """Return the calibration with the gyroscope's bias of the start as it is at rest in new observations.
 
         Turns under a bias that is off by degrees a second are not linear in it.
         """
-        poses = experiment.observations.poses
+        poses = observations.poses
         bias = np.mean(np.asarray(poses.gyroscope_mean)[np.asarray(poses.mask)], axis=0)
         start = np.array(self.values)
         start[self.allowed] = bias
@@ -144,11 +145,9 @@ class Widened(Data):
     numbers that are solved for at once with all others; as nobody asks for them, they stand in the covariance.
     """
 
-    excess_names = HandHeldExperiment.excess_names
-    coarse = HandHeldExperiment.coarse
-
-    def __init__(self, experiment: HandHeldExperiment, scatter: FloatArray, causes: Sequence[FloatArray] = ()):
+    def __init__(self, experiment: Experiment, scatter: FloatArray, causes: Sequence[FloatArray] = ()):
         self.experiment, self.used = experiment, experiment.used
+        self.excess_names, self.coarse = experiment.excess_names, experiment.coarse
         self.wide = scatter[experiment.real.kind]
         self.causes = np.concatenate([np.zeros((len(self.wide), 0)), *causes], axis=1)
 
@@ -190,7 +189,7 @@ class Fresh:
 
     @classmethod
     def fit(
-        cls, old: Old, experiment: HandHeldExperiment, scatter: FloatArray, causes: Sequence[FloatArray] = (),
+        cls, old: Old, experiment: Experiment, scatter: FloatArray, causes: Sequence[FloatArray] = (),
         begin: Imu | None = None,
     ) -> Fresh:  # fmt: skip
         """Fit all parameters, known beforehand about the old ones, in a recording with `causes`; begin at a unit."""
@@ -226,7 +225,7 @@ class Fresh:
         return np.sqrt(np.diag(self.covariance)) < _COMPARABLE * old.sizes
 
 
-def scatter_about_a_fit(old: Old, experiment: HandHeldExperiment, fresh: Fresh) -> FloatArray:
+def scatter_about_a_fit(old: Old, experiment: Experiment, fresh: Fresh) -> FloatArray:
     """Return factors (kinds,), one at least, by which each kind of condition scatters about a fresh calibration.
 
     `fresh`: the calibration with factors of one.
@@ -260,7 +259,7 @@ class Explanation:
         return self.block.columns * (1.0 if self.scope == "fixture" else _FREE)
 
 
-def candidates(old: Old, experiment: HandHeldExperiment) -> list[Explanation]:
+def candidates(old: Old, experiment: Experiment) -> list[Explanation]:
     """Return what else a diagnosis asks the recording for: effects, shapes without a cause, poses that were bumped."""
     state = experiment.fit(tuple(old.imu.all_effects().values()), old.imu.with_effects())
     root = np.linalg.inv(state.weights)

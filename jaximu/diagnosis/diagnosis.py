@@ -13,14 +13,13 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import concluded
 from jaximu.calibration.recipe import Choices, calibrate_ready
+from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import with_usual_drift
-from jaximu.data.poses import RecordedByHand
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.drift import DriftComponents, drifted, estimate_drift, hands_of
 from jaximu.diagnosis.evidence import LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
-from jaximu.diagnosis.hand_held import HandHeldExperiment
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import LearnedTerm, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
@@ -41,7 +40,7 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import SegmentationOptions, observed_poses
 
-__all__ = ["Diagnosis", "Examination", "Named", "diagnose", "examine", "same_device", "without_effects"]
+__all__ = ["Diagnosis", "Examination", "Named", "diagnose", "examine", "same_device", "twin_of", "without_effects"]
 
 _DOUBT = 0.01
 """Probability below which chance is no longer offered as an explanation."""
@@ -336,7 +335,7 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
     Without effects it is, by hand, one whose weights and intervals know the slow noise, and what hands added where
     that was estimated.
     """
-    if not state.effects and not experiment.by_hand:
+    if not state.effects and not experiment.data.by_hand:
         return calibration
     held = (
         {}
@@ -352,7 +351,7 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
         known if len(known) == len(after) else experiment.rms(experiment.start, experiment.linearise(experiment.start))
     )
     calibrated = concluded(
-        found, gravity=calibration.gravity, method=calibration.method, loss="linear", advice=experiment.advice,
+        found, gravity=calibration.gravity, method=calibration.method, loss="linear", advice=experiment.data.advice,
         excess_names=experiment.excess_names,
         rms={name: (before[name][0], size, unit) for name, (size, unit) in after.items()},
         data=calibration.data, notes=calibration.notes, segmentations=calibration.segmentations,
@@ -421,6 +420,11 @@ def diagnose(
     if found.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
         spoiling = [finding for finding in findings if finding.partial]
     return without_effects(found, spoiling) if spoiling else found
+
+
+def twin_of(diagnosis: Diagnosis, seed: int = 0) -> Experiment:
+    """Return the twin of a diagnosed recording's base fit, ready to be asked what the recording was asked."""
+    return diagnosis.experiment.twin(diagnosis.base, diagnosis.noise, seed)
 
 
 @dataclass(frozen=True)
@@ -503,13 +507,13 @@ def _examined(examination: Examination) -> Diagnosis:
         experiment = remade(noise)
         if asked:  # a wrong noise model makes false effects: it is put right first
             noises, right = quick_noise(experiment, noise, level)
-            swaying = experiment.sway(noise) if noises else []
+            swaying = experiment.data.sway(experiment.start, noise) if noises else []
             if noises:
                 examination, noise = replace(examination, noise=right), right
             noises = [] if swaying else noises  # it is the hand's, and not the unit's
         experiment, base = examination.first
         first = select(base.evidence, level)
-    if experiment.by_hand and asked and not first.explained:  # hands are asked first: what they do is in the samples
+    if experiment.data.by_hand and asked and not first.explained:  # what hands do is in the samples
         experiment, noise, base, first = _with_hands(examination, noise, (base, first))
         notes += experiment.drift.notes if experiment.drift is not None else []
         again = partial(_moved, remade, experiment.drift)
@@ -521,11 +525,13 @@ def _examined(examination: Examination) -> Diagnosis:
             experiment = again(noise)
             base = experiment.fit()
             first = select(base.evidence, level)
-    findings += experiment.found_by_hand() or swaying
+    findings += experiment.moved_by_hand() or swaying
     strange = [] if experiment.drift is None else experiment.drift.implausible
     other = None if held is None else held(noise)
     if held is not None and other is not None and experiment.drift is not None:
-        other = _moved(held, hands_of(other, calibration.imu, noise, experiment.drift), noise)
+        details = other.linearise(calibration.imu).details
+        hands = hands_of(other.data, details, other.used, calibration.imu, noise, experiment.drift)
+        other = _moved(held, hands, noise)
     extension = Extension([], base, experiment, base, True, [])
     if naming:
         extension = extend(experiment, base, first, level, taken)
@@ -626,7 +632,9 @@ def _with_hands(
         none = np.zeros((len(base.weights), 0))
         columns = np.concatenate([none, *(block.columns for block in (*steady, *causes))], axis=1)
         columns = np.asarray(np.linalg.solve(base.weights, columns), np.float64)
-        drift = estimate_drift(remade(noise), calibration.imu, noise, columns, drifting=known is None)
+        experiment = remade(noise)
+        linear = experiment.linearise(calibration.imu)
+        drift = estimate_drift(experiment.data, linear, experiment.used, calibration.imu, noise, columns, known is None)
         experiment = _moved(remade, drift, drifted(noise, drift))
         base = experiment.fit()
         selection = select(base.evidence, level)
@@ -638,7 +646,7 @@ def _with_hands(
 
 def _moved(remade: Callable[[NoiseModel], Experiment], drift: DriftComponents | None, noise: NoiseModel) -> Experiment:
     """Return the experiment with a noise model, and what drift and hands add."""
-    return replace(remade(noise), drift=drift)  # pyright: ignore[reportArgumentType]
+    return replace(remade(noise), drift=drift)
 
 
 def _require_freedom(base: State, calibration: Calibration) -> None:
@@ -678,15 +686,14 @@ def _experiment(
     noise: NoiseModel,
     start: Calibration | None = None,
     candidates: tuple[str, ...] | None = None,
-) -> HandHeldExperiment:
+) -> Experiment:
     observations = observed_poses(calibration.segmentations, calibration.gravity.value, noise=noise)
     known = tuple(calibration.imu.all_effects().values())
     if known:  # the Earth's rotation, where the latitude is known
         whole = RecordedByHand(calibration.segmentations, observations)
         observations = whole.along(calibration.imu, known).observations
-    return HandHeldExperiment(
-        calibration.segmentations, observations, (start or calibration).imu.with_effects(), candidates=candidates
-    )
+    data = RecordedByHand(calibration.segmentations, observations)
+    return Experiment(data, (start or calibration).imu.with_effects(), candidates=candidates)
 
 
 def same_device(first: Calibration, other: Calibration) -> list[str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,11 @@ from jaximu.data.drift import (
     restricted_likelihood,
     with_noise,
 )
-from jaximu.diagnosis.handling import Handling
+from jaximu.estimation.data import Data, Handling
+from jaximu.estimation.fitting import Linear
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise_model import AxisNoise, NoiseModel
-
-if TYPE_CHECKING:
-    from jaximu.diagnosis.experiment import Experiment
-    from jaximu.model.sensor import Imu
+from jaximu.model.sensor import Imu
 
 __all__ = ["DRAWS", "DriftComponents", "drifted", "estimate_drift", "hands_of"]
 
@@ -108,8 +106,12 @@ class DriftComponents:
         basis = orthonormal_basis(np.concatenate([jacobian, weights @ self.beside[used]], axis=1))
         pulled = drawn - basis @ (basis.T @ drawn)
         inside = [np.trace(part) - np.trace(basis.T @ part @ basis) for part in parts]
-        gradient = np.stack([np.sum(pulled * (part @ pulled), axis=0) - mean
-                             for part, mean in zip(parts, inside, strict=True)]) / 2  # fmt: skip
+        gradient = (
+            np.stack(
+                [np.sum(pulled * (part @ pulled), axis=0) - mean for part, mean in zip(parts, inside, strict=True)]
+            )
+            / 2
+        )
         return changed(drawn, -self.uncertainty @ gradient)
 
     @cached_property
@@ -128,44 +130,60 @@ def drifted(noise: NoiseModel, drift: DriftComponents) -> NoiseModel:
 
 
 def estimate_drift(
-    experiment: Experiment, imu: Imu, noise: NoiseModel, columns: FloatArray, drifting: bool = True
+    data: Data,
+    linear: Linear,
+    used: NDArray[np.bool_],
+    imu: Imu,
+    noise: NoiseModel,
+    columns: FloatArray,
+    drifting: bool = True,
 ) -> DriftComponents:
     """Estimate what a recording shows beyond `noise`: drift, of which that knows nothing, and what hands add.
 
-    **Arguments:** `experiment`: made with `noise`; `imu`: a unit close to the recording's; `columns` (n, q):
-    derivatives of the real conditions by effects that may be present and must not pass for drift; `drifting`: false
-    where the noise comes from elsewhere and knows the drift within a recording.
+    **Arguments:** `data`, `linear`: made with `noise`, about `imu`, a unit close to the recording's; `used` (n,): which
+    conditions are real; `columns` (n, q): derivatives of the real conditions by effects that may be present and must
+    not pass for drift; `drifting`: false where the noise comes from elsewhere and knows the drift within a recording.
     """
-    linear, used = experiment.linearise(imu), experiment.used
-    units, components = experiment.drifts(noise, linear, drifting)
+    units, components = data.drifts(noise, linear.details, drifting)
+    if components is None:
+        components = np.zeros((0, *linear.covariance.shape))
     names = list(units)
-    hands = experiment.handling(imu, noise)
+    hands = data.handling(imu, linear.details, noise)
     if hands is not None:
         names += ["poses that move", "turns undersampled"]
-        components = np.concatenate([components, np.stack(_by_hand(hands))])
-    usual = [next(each for kind, each in _USUAL.items() if name.endswith(kind)) for name in names]
+        components = np.concatenate([components, _by_hand(hands)])
+    usual = [next(size for kind, size in _USUAL.items() if name.endswith(kind)) for name in names]
     mean, spread = np.array([(2 * np.log(median), 2 * wide) for median, wide in usual]).T
     log_size, uncertainty = restricted_likelihood(
-        linear.conditions[used], np.concatenate([linear.slope[used], columns], axis=1),
-        linear.covariance[np.ix_(used, used)],        components[:, used][:, :, used], mean, spread,
-    )  # fmt: skip
+        linear.conditions[used],
+        np.concatenate([linear.slope[used], columns], axis=1),
+        linear.covariance[np.ix_(used, used)],
+        components[:, used][:, :, used],
+        mean,
+        spread,
+    )
     beside = np.zeros((len(used), columns.shape[1]))
     beside[used] = columns
     return DriftComponents(tuple(names), tuple(units.values()), components, hands, log_size, uncertainty, beside)
 
 
-def _by_hand(hands: Handling) -> tuple[FloatArray, FloatArray]:
-    return np.asarray(np.diag(hands.moving), np.float64), np.asarray(np.diag(hands.sampling), np.float64)
+def _by_hand(hands: Handling) -> FloatArray:
+    return np.stack([np.diag(variance) for variance in (hands.moving, hands.sampling)])
 
 
-def hands_of(experiment: Experiment, imu: Imu, noise: NoiseModel, drift: DriftComponents) -> DriftComponents:
+def hands_of(
+    data: Data, details: Any, used: NDArray[np.bool_], imu: Imu, noise: NoiseModel, drift: DriftComponents
+) -> DriftComponents:
     """Return what hands added to another recording, at the sizes that were estimated; its drift is in the noise."""
-    hands = experiment.handling(imu, noise)
+    hands = data.handling(imu, details, noise)
     first = len(drift.units)
-    components = np.zeros((0, *drift.components.shape[1:]))
-    if hands is not None:
-        components = np.stack(_by_hand(hands))
+    components = np.zeros((0, *drift.components.shape[1:])) if hands is None else _by_hand(hands)
     return DriftComponents(
-        drift.names[first:], (), components, hands, drift.log_size[first:], drift.uncertainty[first:, first:],
-        np.zeros((len(experiment.used), 0)),
-    )  # fmt: skip
+        drift.names[first:],
+        (),
+        components,
+        hands,
+        drift.log_size[first:],
+        drift.uncertainty[first:, first:],
+        np.zeros((len(used), 0)),
+    )

@@ -2,42 +2,49 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any
 
 import jax
 import numpy as np
 import scipy
+from jaxtyping import Float
 from numpy.typing import NDArray
 
-from jaximu.data.track import Track, added
 from jaximu.diagnosis.drift import DriftComponents
 from jaximu.diagnosis.evidence import EffectBlock, Evidence
-from jaximu.diagnosis.handling import Handling
-from jaximu.estimation.data import Data
-from jaximu.estimation.fitting import Linear, Prior, fit, linearise
+from jaximu.diagnosis.shapes import imitated_shapes, shapes_without_cause
+from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.fitting import Linear, Prior, effect_numbers, fit, linearise
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
-from jaximu.estimation.uncertainty import pose_advice
-from jaximu.ground.array_types import FloatArray
+from jaximu.estimation.track import added
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent
-from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
-__all__ = ["Experiment", "State"]
+__all__ = ["LEAST_WARMING", "Experiment", "State"]
 
+LEAST_WARMING = 0.2
+"""K of change below which a recording shows nothing of temperature."""
 _PLAUSIBLE = 20.0
 """Typical sizes beyond which a detection limit means that a recording does not show the effect."""
-_LEAST_WARMING = 0.2  # K
+_SURE = 5.0
+"""Standard deviations that samples of instants must change the conditions by to be told from means."""
 _SEED = 20260101
 _PARTS = 8  # left out in turn
+_LACKING = {
+    "vibration_power": "the recording has no vibration that stands out",
+    "magnetic_field": "no magnetometer was recorded with it",
+    "attitude": "the attitude is not known at all times",
+}
 
 
 @dataclass(frozen=True)
@@ -74,27 +81,109 @@ class State:
     def places(self, name: str, part: str = "coefficients") -> list[int]:
         """Return the places of a fitted effect's coefficients, or of an inner parameter, among the numbers."""
         (key,) = (key for key, effect in self.model.all_effects().items() if effect.name == name)
-        return [k for k, each in enumerate(self.names) if (each.owner, each.effect) == key and each.part == part]
+        return [
+            k for k, number in enumerate(self.names) if (number.owner, number.effect) == key and number.part == part
+        ]
 
 
+class _Shifted(Conditions):
+    """Conditions with something added to each."""
+
+    conditions: Conditions
+    shift: Float[Array, " n"]
+
+    @property
+    def magnitude(self) -> Array:
+        """What is known and uncertain."""
+        return self.conditions.magnitude  # pyright: ignore[reportAttributeAccessIssue]
+
+    def __call__(self, imu: Imu) -> Float[Array, " n"]:
+        """Return the conditions."""
+        return self.conditions(imu) + self.shift
+
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> _Shifted:
+        """Return the same with another magnitude."""
+        return replace(self, conditions=self.conditions.at_magnitude(magnitude))
+
+
+@dataclass
 class Experiment(Data):
-    """A recording of one unit as conditions that its parameters and effects should bring to zero.
+    """Data of one unit, to be asked for all that its calibration lacks.
 
-    A subclass says how conditions and the effects' columns are computed; fitting, asking and predicting are the same
-    for all. `start` is a calibration without effects.
+    data: what was recorded. start: a calibration without effects. drift: what was estimated of it from this very
+    recording. candidates: names of the effects that are asked; None: all of the catalogue. setup: effects of a fixture,
+    as calibrated, whose numbers are known to what set-ups usually are, and no more: that is part of the covariance.
+    excess (k,): of the noise, where a calibration estimated it. shift (n,): added to the conditions. reference: what is
+    known of a measured attitude, as `calibration.json` has it.
     """
 
+    data: Data
     start: Imu
-    drift: DriftComponents | None = None  # that was estimated from this very recording
-    candidates: tuple[str, ...] | None = None  # names of the effects that are asked; None: all of the catalogue
-    reference: dict[str, Any] | None = None  # what is known of a measured attitude, as `calibration.json` has it
-    advice: ClassVar[Callable[..., str]] = staticmethod(pose_advice)
-    owners: ClassVar[tuple[str, ...]] = ("accelerometer", "gyroscope", "setup")  # whose effects are asked
-    by_hand: ClassVar[bool] = False  # hands moved the unit
-    no_fixture: ClassVar[str] = ""  # why effects of a set-up cannot be asked; empty where they can
-    no_session: str = ""  # why effects of a single recording cannot be asked; empty where they can
+    drift: DriftComponents | None = None
+    candidates: tuple[str, ...] | None = None
+    setup: tuple[Effect, ...] = ()
+    excess: FloatArray | None = None
+    shift: FloatArray | float = 0.0
+    reference: dict[str, Any] | None = None
 
-    # --- what a kind of recording says of itself ------------------------------------------------------------------
+    def __post_init__(self) -> None:
+        self.excess_names, self.coarse = self.data.excess_names, self.data.coarse
+
+    # --- the data, as a fit takes them ----------------------------------------------------------------------------
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition is."""
+        return self.data.rows(imu)
+
+    def free(self, name: Name) -> bool:
+        """Return whether a number is free."""
+        return self.data.free(name)
+
+    def reactions(self, details: Any):
+        """Return how the conditions react to effects."""
+        return self.data.reactions(details)
+
+    def about(self, imu: Imu) -> About:
+        """Return the conditions about one unit, the leading axis, and in their covariance all that is not known."""
+        about, noise, unknown, mine = self._evaluated(jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu))
+        if noise is None:
+            return about
+        covariance = jax.tree.map(lambda leaf: leaf[0], about.covariance).dense()
+        covariance = replace(covariance, measured=noise + unknown @ unknown.T)
+        lifted = jax.tree.map(lambda leaf: leaf[None], covariance)
+        conditions: Conditions = about.conditions
+        if np.any(self.shift):
+            conditions = _Shifted(conditions, np.asarray(self.shift)[None])  # pyright: ignore[reportCallIssue]
+        return replace(about, conditions=conditions, covariance=lifted, columns=about.columns[..., mine])
+
+    def _evaluated(self, imu: Imu) -> tuple[About, FloatArray | None, FloatArray, NDArray[np.bool_]]:
+        """Return the data about a unit and its fixture, as a batch of one, and what of their covariance is noise.
+
+        With it the covariance (n, n) of noise, None where nothing is beside what was measured; what the fixture may do
+        (n, q) at one standard deviation of each of its numbers; and which of the columns are the unit's own.
+        """
+        unit = imu.all_effects()
+        whole = imu.with_effects(*unit.values(), *self.setup)
+        about = self.data.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], whole))
+        names = effect_numbers(whole)[0]
+        mine = np.array([(name.owner, name.effect) in unit for name in names], bool)
+        unknown = np.zeros((about.covariance.used.shape[1], 0))
+        if self.drift is None and self.excess is None and not self.setup and not np.any(self.shift):
+            return about, None, unknown, mine
+        covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance).dense()
+        noise = np.array(covariance.measured)
+        if self.excess is not None:
+            noise = np.asarray(covariance.total(self.excess)) - np.diag(1 - covariance.used)
+        if self.drift is not None:
+            noise += np.diag(self.drift.by_hand)
+        prior = Prior.of_effects(whole) if self.setup else None
+        if prior is not None:
+            known = dict(zip(prior.names, 1 / np.diag(prior.root), strict=True))
+            sizes = [known[name] for name, kept in zip(names, mine, strict=True) if not kept]
+            unknown = about.columns[0][:, ~mine] * sizes
+        return about, noise, unknown, mine
+
+    # --- what was recorded ----------------------------------------------------------------------------------------
 
     @cached_property
     def used(self) -> NDArray[np.bool_]:
@@ -106,125 +195,125 @@ class Experiment(Data):
         """What each real condition is."""
         return self.rows(self.start).real()
 
-    @abstractmethod
-    def generic(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
-        """Return shapes without a cause and defects of single observations, not whitened, padding included."""
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What is diagnosed, as it was recorded."""
+        return self.data.recordings
 
-    def nearly(self, imu: Imu, linear: Linear) -> list[EffectBlock]:
-        """Return shapes, as `generic` does, that named causes may be taken for: asked of what these leave."""
-        return []
-
-    @abstractmethod
     def extent(self) -> Extent:
         """Return what the recordings span."""
+        return self.data.extent()
 
-    def tracks(self, linear: Linear) -> list[dict[str, Track]]:
-        """Return what the unit went through, part by part, at the samples of each triad."""
-        return linear.details.tracks
+    def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
+        """Return what a triad put out (k, 3) in each part at rest, in SI, and its rate, Hz."""
+        parts, rate = [], 1.0
+        for recording, rests in zip(self.recordings, self.data.rests(), strict=True):
+            signal = recording.signals[triad]
+            rate, values = signal.rate, signal.si()
+            parts += [values[first:last] for first, last in np.searchsorted(signal.time, rests)]
+        return parts, rate
 
-    def lacks(self, linear: Linear) -> Mapping[str, str]:
-        """Return fields of the stimulus that are not known along the path, and why."""
-        found = {}
-        for field in ("temperature", "temperature_rate", "vibration_power"):
-            stimuli = (track.stimulus for tracks in self.tracks(linear) for track in tracks.values())
-            if any(getattr(stimulus, field) is None for stimulus in stimuli):
-                said = "vibration that stands out" if field == "vibration_power" else field.replace("_", " ")
-                found[field] = f"the recording has no {said}"
-        return found
+    def shortest(self) -> float:
+        """Return the usual length (s) of a part at rest: noise that is slower shows between them."""
+        parts, rate = self.still_parts("accelerometer")
+        return float(np.median([len(part) for part in parts])) / rate
+
+    def parts(self, real: Rows | None = None, count: int = _PARTS) -> list[NDArray[np.int64]]:
+        """Return the observations that are left out in turn, in the order of time."""
+        return self.data.parts(self.real if real is None else real, count)
+
+    def without(self, observation: int) -> Experiment:
+        """Return the experiment with an observation, and what touches it, left out."""
+        return replace(self, data=self.data.without(observation))
+
+    def averaged(self) -> Experiment:
+        """Return the experiment with the gyroscope's samples of instants turned into means."""
+        data = self.data.averaged()
+        return self if data is None else replace(self, data=data)
+
+    # --- what can be asked ----------------------------------------------------------------------------------------
+
+    def lacking(self, kind: type[Effect], linear: Linear) -> str:
+        """Return why what an effect depends on is not known along the path; empty where it is."""
+        stimuli = [track.stimulus for tracks in self.data.tracks(linear.details) for track in tracks.values()]
+        for need in kind.needs:
+            if any(getattr(stimulus, need) is None for stimulus in stimuli):
+                return _LACKING.get(need, f"the recording has no {need.replace('_', ' ')}")
+        return ""
+
+    def askable(self, linear: Linear) -> tuple[dict[str, type[Effect]], dict[str, str]]:
+        """Return the effects that can be asked of these recordings, and why others cannot."""
+        asked, refused = {}, {}
+        warming, hidden = self.extent().temperature_range, self.data.hidden()
+        several = len(self.recordings) > 1 and self.data.by_hand  # each has its own time and heading
+        for name, kind in CATALOGUE.items():
+            if not kind.cause or kind.owner not in self.data.owners:
+                continue
+            if self.candidates is not None and name not in self.candidates:
+                continue
+            why = self.lacking(kind, linear)
+            if why:
+                refused[name] = why
+            elif kind.scope == "fixture" and self.data.no_fixture:
+                refused[name] = self.data.no_fixture
+            elif kind.scope == "session" and several:
+                refused[name] = "it belongs to one recording, and these are several"
+            elif "temperature" in " ".join(kind.needs) and warming < LEAST_WARMING:
+                refused[name] = "the temperature stood still"
+            elif name in hidden:
+                refused[name] = hidden[name]
+            else:
+                asked[name] = kind
+        return asked, refused
 
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's output in these recordings."""
         triads = state.imu.triads()
         most = dict.fromkeys(triads, 0.0)
-        for recording, tracks in zip(self.recordings, self.tracks(state.linear), strict=True):
+        for tracks in self.data.tracks(state.linear.details):
             for name, outputs in added(state.imu.with_effects(effect), tracks).items():
-                values = np.asarray(outputs)[: len(recording.signals[name])]
                 scale = np.linalg.norm(np.asarray(triads[name].gain), axis=1)
-                most[name] = max(most[name], float(np.max(np.abs(values / scale))))
+                values = np.abs(np.asarray(outputs)[tracks[name].inside()] / scale)
+                most[name] = max(most[name], float(np.max(values)))
         return most
 
-    @abstractmethod
-    def without(self, place: int) -> Self:
-        """Return the recording with an observation, and what touches it, left out."""
-
-    @abstractmethod
     def rms(self, imu: Imu, linear: Linear) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
-
-    @abstractmethod
-    def twin(self, state: State, noise: NoiseModel, seed: int) -> Self:
-        """Return the recording as a fit without effects would have it, along the same motion, noise included."""
-
-    @abstractmethod
-    def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
-        """Return what a triad put out (k, 3) in each still part, in SI, and its rate, Hz."""
-
-    @property
-    @abstractmethod
-    def recordings(self) -> tuple[Recording, ...]:
-        """What is diagnosed, as it was recorded."""
-
-    def shortest(self) -> float:
-        """Return the usual length (s) of a still part: noise that is slower shows between them."""
-        parts, rate = self.still_parts("accelerometer")
-        return float(np.median([len(part) for part in parts])) / rate
-
-    def parts(self) -> list[NDArray[np.int64]]:
-        """Return the observations that are left out in turn, in the order of time."""
-        return self.real.parts(_PARTS)
-
-    def drifts(self, noise: NoiseModel, linear: Linear, within: bool) -> tuple[dict[str, AxisNoise], FloatArray]:
-        """Return drifts of the biases by name, at a size of one, and the covariance (k, n, n) that each adds.
-
-        `within`: false where `noise` knows the drift in a recording; what changes between several is asked in any case.
-        """
-        return {}, np.zeros((0, *linear.covariance.shape))
-
-    def handling(self, imu: Imu, noise: NoiseModel) -> Handling | None:
-        """Return what hands add to the conditions, where hands moved the unit."""
-        return None
-
-    def sway(self, noise: NoiseModel) -> list[Finding]:
-        """Return whether hands turn the unit while it should be at rest, which looks like noise."""
-        return []
+        return self.data.rms(imu, linear.details, linear.conditions)
 
     def instants(self, state: State) -> bool:
-        """Return whether a fit shows the gyroscope's samples to be rates at instants, and not means."""
-        return False
+        """Return whether a fit shows the gyroscope's samples to be rates at instants, and not means.
 
-    def averaged(self) -> Self:
-        """Return the recording with the gyroscope's samples of instants turned into means."""
-        return self
+        Along what that would change of the conditions, the fit's residual is nothing or all of it.
+        """
+        if self.data.averaged() is None:
+            return False
+        white = state.weights @ self.data.change_by_averaging(state.linear.details)[self.used]
+        basis = np.linalg.svd(state.evidence.jacobian, full_matrices=False)[0]
+        white -= basis @ (basis.T @ white)
+        length = float(white @ white)
+        return length > _SURE**2 and abs(float(white @ state.evidence.residual) / length - 1) < 0.5
 
-    def found_by_hand(self) -> list[Finding]:
-        """Return what is wrong with how hands moved the unit."""
-        return []
+    def moved_by_hand(self) -> list[Finding]:
+        """Return what is wrong with how hands moved the unit, as far as it was estimated."""
+        if self.drift is None or self.drift.handling is None:
+            return []
+        return self.data.moved_by_hand(self.start, self.drift.handling, self.drift.sizes["turns undersampled"][0])
 
-    # --- the same for all ----------------------------------------------------------------------------------------
+    def twin(self, state: State, noise: NoiseModel, seed: int) -> Experiment:
+        """Return the experiment as a fit without effects would have it, along the same motion, noise included.
 
-    def askable(self, linear: Linear) -> tuple[dict[str, type[Effect]], dict[str, str]]:
-        """Return the effects that can be asked of these recordings, and why others cannot."""
-        asked, refused = {}, {}
-        lacking, warming = self.lacks(linear), self.extent().temperature_range
-        if "magnetometer" not in self.owners:
-            lacking = {"magnetic_field": "no magnetometer was recorded with it"} | dict(lacking)
-        for name, kind in CATALOGUE.items():
-            if not kind.cause or kind.owner not in self.owners:
-                continue
-            if self.candidates is not None and name not in self.candidates:
-                continue
-            missing = [need for need in kind.needs if need in lacking]
-            if missing:
-                refused[name] = lacking[missing[0]]
-            elif kind.scope == "fixture" and self.no_fixture:
-                refused[name] = self.no_fixture
-            elif kind.scope == "session" and self.no_session:
-                refused[name] = self.no_session
-            elif "temperature" in " ".join(kind.needs) and warming < _LEAST_WARMING:
-                refused[name] = "the temperature stood still"
-            else:
-                asked[name] = kind
-        return asked, refused
+        Where the noise is known of the conditions alone it is drawn for them; how a reference is mounted and late was
+        found, and is taken off.
+        """
+        made = self.data.twin(state.imu, state.linear.details, state.linear.conditions, noise, seed)
+        if made is not None:
+            return Experiment(made, state.imu)
+        noisy = self._evaluated(jax.tree.map(np.asarray, state.imu))[1]
+        assert noisy is not None
+        root = np.linalg.cholesky(noisy + np.diag((~self.used).astype(float)))
+        drawn = root @ np.random.default_rng(seed).normal(size=len(self.used)) * self.used
+        return replace(self, start=state.imu, shift=self.shift + drawn - state.linear.conditions)
 
     def fit(
         self,
@@ -244,43 +333,50 @@ class Experiment(Data):
             held = prior is not None and name.effect is not None and name.part != "coefficients"
             return self.free(name) and not held
 
-        found = fit(start, self, free, prior=prior, excess=np.zeros(len(self.coarse)), estimate_excess=False,
-                    max_passes=16)  # fmt: skip
-        if not bool(found.finite):
+        fitted = fit(
+            start, self, free, prior=prior, excess=np.zeros(len(self.coarse)), estimate_excess=False, max_passes=16
+        )
+        if not bool(fitted.finite):
             names = " and ".join(effect.name for effect in effects) or "gain and bias"
             raise NotPossibleError(f"a fit of {names} to this recording comes to nothing that a unit can be.")
-        linear, used = self.linearise(found.imu), self.used
+        linear, used = self.linearise(fitted.imu), self.used
         covariance = np.zeros((len(linear.names),) * 2)
-        places = [linear.names.index(name) for name in found.names]
-        covariance[np.ix_(places, places)] = found.covariance
+        places = [linear.names.index(name) for name in fitted.names]
+        covariance[np.ix_(places, places)] = fitted.covariance
         weights = scipy.linalg.solve_triangular(
             np.linalg.cholesky(linear.covariance[np.ix_(used, used)]), np.eye(int(used.sum())), lower=True
         )
         columns = np.concatenate([linear.slope, linear.columns * linear.sizes[linear.slope.shape[1] :]], axis=1)
         jacobian = weights @ columns[np.ix_(used, np.sort(places))]
-        model = jax.tree.map(np.asarray, found.imu)
-        fitted = {effect.name for effect in model.all_effects().values()}
-        blocks, blind = self._blocks(model.with_effects(), linear, weights, fitted, asking)
+        model = jax.tree.map(np.asarray, fitted.imu)
+        inside = {effect.name for effect in model.all_effects().values()}
+        blocks, blind = self._blocks(model.with_effects(), linear, weights, inside, asking)
         noise = None
         if self.drift is not None:
             noise = self.drift.draws(weights, jacobian, used, _SEED)
         whole = Evidence(weights @ linear.conditions[used], jacobian, blocks)
         limits = _limits(whole, model)
-        seen = [b for b in blocks if b.kind != "effect" or limits[b.name][0] < _PLAUSIBLE * np.max(b.sizes)]
-        for name in sorted({block.name for block in blocks} - {block.name for block in seen}):
+        visible = [b for b in blocks if b.kind != "effect" or limits[b.name][0] < _PLAUSIBLE * np.max(b.sizes)]
+        for name in sorted({block.name for block in blocks} - {block.name for block in visible}):
             blind[name] = (
                 "bias, scale and misalignment imitate it here, or nothing excites it; it needs "
                 f"{CATALOGUE[name].excited_by}"
             )
-        limits = {name: each for name, each in limits.items() if name not in blind}
-        evidence = Evidence(whole.residual, jacobian, seen, noise)
+        limits = {name: limit for name, limit in limits.items() if name not in blind}
+        evidence = Evidence(whole.residual, jacobian, visible, noise)
         return State(
             model, linear.names, covariance, evidence, linear.conditions[used], weights, limits, blind, linear, prior
         )
 
     def by_setup(self, state: State) -> FloatArray:
-        """Return what the set-up most likely adds to the real conditions (m,), where their covariance allows for it."""
-        return np.zeros(len(state.conditions))
+        """Return what the set-up most likely adds to the real conditions (m,): its numbers' mean, given these.
+
+        Near the level a tilted reference looks like a bias of the accelerometer; which of both it is, nothing tells.
+        """
+        if not self.setup:
+            return np.zeros(len(state.conditions))
+        unknown = self._evaluated(state.model)[2][self.used]
+        return unknown @ ((state.weights @ unknown).T @ (state.weights @ state.conditions))
 
     def errors(self, state: State) -> list[FloatArray]:
         """Return the errors (v,) of each kind of condition that a fit leaves, in its unit."""
@@ -288,7 +384,7 @@ class Experiment(Data):
 
     def beside(self, state: State) -> tuple[float, str]:
         """Return which shape, that a fit's effects may be taken for, stands out beside them, and its p-value."""
-        blocks = self.nearly(state.imu, state.linear)
+        blocks = imitated_shapes(self.data.observed(state.imu, state.linear.details))
         if not blocks:
             return 1.0, ""
         blocks = [replace(b, columns=state.weights @ b.columns[self.used]) for b in blocks]
@@ -316,23 +412,24 @@ class Experiment(Data):
             asked = {name: kind for name, kind in asked.items() if kind.plain in asking}
         extent, used, blocks = self.extent(), self.used, []
         grids = {kind: kind.grid(extent) for kind in asked.values()}
-        found = self.dormant_columns(imu, linear.details, grids)
+        reactions = self.dormant_columns(imu, linear.details, grids)
         for name, kind in asked.items():
             if name in fitted:
                 continue
             size = _sizes(kind, imu)
-            for given, columns in zip(grids[kind], found[kind], strict=True):
-                placed = kind.beginning() in given
+            for inner, columns in zip(grids[kind], reactions[kind], strict=True):
+                placed = kind.beginning() in inner
                 blocks.append(
-                    EffectBlock(name, weights @ (columns * size)[used], size, "effect", given, placed, kind.curved())
+                    EffectBlock(name, weights @ (columns * size)[used], size, "effect", inner, placed, kind.curved())
                 )
-        generic = [replace(b, columns=weights @ b.columns[used]) for b in self.generic(imu, linear)]
+        shapes = shapes_without_cause(self.data.observed(imu, linear.details))
+        generic = [replace(b, columns=weights @ b.columns[used]) for b in shapes]
         return blocks + generic, refused
 
 
 def _limits(evidence: Evidence, imu: Imu) -> dict[str, tuple[float, str]]:
     """Return each effect's detection limit, wherever on its grid it is, and its unit; infinite if it is blind."""
-    found: dict[str, tuple[float, str]] = {}
+    limits: dict[str, tuple[float, str]] = {}
     triads = imu.triads()
     places: dict[str, list[int]] = {}
     for k, block in enumerate(evidence.blocks):
@@ -340,10 +437,10 @@ def _limits(evidence: Evidence, imu: Imu) -> dict[str, tuple[float, str]]:
             places.setdefault(block.name, []).append(k)
     for name, blocks in places.items():
         triad = triads.get(CATALOGUE[name].owner, imu.accelerometer)
-        seen = [k for k in blocks if evidence.observable(k)]
-        limit = evidence.limit(seen) if seen else np.inf
-        found[name] = limit, CATALOGUE[name].coefficient_unit(triad.output_unit)
-    return found
+        visible = [k for k in blocks if evidence.observable(k)]
+        limit = evidence.limit(visible) if visible else np.inf
+        limits[name] = limit, CATALOGUE[name].coefficient_unit(triad.output_unit)
+    return limits
 
 
 def _sizes(kind: type[Effect], imu: Imu) -> FloatArray:

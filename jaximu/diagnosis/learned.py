@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.diagnosis.experiment import Experiment, State
+from jaximu.diagnosis.experiment import LEAST_WARMING, Experiment, State
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
 from jaximu.estimation.fitting import Prior
 from jaximu.estimation.leave_out import leave_out
@@ -32,7 +32,6 @@ _STRENGTHS = 10.0 ** np.arange(7)
 """Prior variances tried, of what the data tells best, in variances that the data tells it with."""
 _PAYS = 10.0
 """Nats that a curve must gain on parts left out: with nothing hidden, the best of all does so in 0.2 % of draws."""
-_LEAST_WARMING = 0.2  # K
 _POINTS = 101
 
 
@@ -154,12 +153,14 @@ def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatA
     Columns (n, q) are whitened and those of coefficients that are a priori of variance one; the roots (q,) are these
     coefficients' unit.
     """
-    lacking, warming = experiment.lacks(state.linear), experiment.extent().temperature_range
+    warming = experiment.extent().temperature_range
     effects = []
     for kind in CATALOGUE.values():
-        if not issubclass(kind, Curve) or set(kind.needs) & set(lacking) or kind.owner not in state.imu.triads():
+        if not issubclass(kind, Curve) or kind.owner not in state.imu.triads():
             continue
-        still = "temperature" in kind.needs[0] and warming < _LEAST_WARMING
+        if experiment.lacking(kind, state.linear):
+            continue
+        still = "temperature" in kind.needs[0] and warming < LEAST_WARMING
         effect = None if still else _spanned(experiment, kind, state)
         effects += [] if effect is None else [effect]
     grids = {type(effect): [{name: float(getattr(effect, name)) for name in effect.inner}] for effect in effects}
@@ -174,12 +175,11 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
     name = kind.owner
     typical = {name: each.typical for name, each in kind.inner.items()}
     values = []
-    for track in (tracks[name] for tracks in experiment.tracks(state.linear)):
-        observation = np.asarray(track.observation)
-        still = observation < observation.max()
-        if name == "gyroscope":  # its turns count, too, but not the padding at the end
-            still[: np.flatnonzero(still)[-1]] = True
-        true = jax.tree.map(lambda leaf, rows=still: np.asarray(leaf)[rows], track.stimulus)
+    for track in (tracks[name] for tracks in experiment.data.tracks(state.linear.details)):
+        rows = track.inside()
+        if name == "accelerometer":  # which is compared at rest alone
+            rows &= np.asarray(track.observation) < np.max(track.observation)
+        true = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], track.stimulus)
         true = replace(true, time_reference=state.imu.triads()[name].time_reference)
         values.append(np.asarray(kind(np.zeros(kind.size), **typical).covariate(true)))
     low, high = min(float(each.min()) for each in values), max(float(each.max()) for each in values)

@@ -2,72 +2,91 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.diagnosis.evidence import EffectBlock
+from jaximu.estimation.data import Observed
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["SIZES", "Shapes", "harmonics", "placed"]
+__all__ = ["harmonics", "imitated_shapes", "shapes_without_cause"]
 
-SIZES = {"accelerometer": 0.01, "gyroscope": 1e-3}
+_SIZES = {"accelerometer": 0.01, "gyroscope": 1e-3}
 """Size of a shape, m/s² and rad/s."""
+_CYCLES = 2.0, 20.0
+"""Periods in a recording, between which a swing of the bias is asked for; half a period apart, none is missed."""
 
 
-@dataclass(frozen=True)
-class Shapes:
-    """Shapes over the observations or samples (o,) of a recording.
+def shapes_without_cause(observed: Observed) -> list[EffectBlock]:
+    """Return shapes without a cause and defects of single observations, not whitened.
 
-    react: returns how the conditions (n, q) react to a shape of a triad's output, (o, k) alike for each axis.
+    Waves of half a period and more over the recording; harmonics of the direction up, of the gyroscope in observations
+    at rest or in all; swings to and fro; smooth functions of temperature; each observation by itself, its force being
+    off.
     """
-
-    react: Callable[[str, FloatArray], FloatArray]
-
-    def block(self, triad: str, name: str, shape: FloatArray, **inner: float) -> EffectBlock:
-        """Return the question for a shape; one with inner parameters stands at one of many places."""
-        columns, size = self.react(triad, shape), SIZES[triad]
-        return EffectBlock(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner))
-
-    def slow_changes(self, share: FloatArray) -> list[EffectBlock]:
-        """Return waves of half a period and more over the recording, of which `share` (o,) has gone by."""
-        waves = np.cos(np.pi * share[:, None] * np.arange(1, 6))
-        return [self.block(triad, f"slow change of the {triad}", waves) for triad in SIZES]
-
-    def orientations(self, up: FloatArray, at_rest: NDArray[np.bool_] | None = None) -> list[EffectBlock]:
-        """Return harmonics of the direction up (o, 3); of the gyroscope those in observations at rest (o,) or all."""
-        second, third = harmonics(up)
-        words, shape = "the gyroscope depends on orientation", second
-        if at_rest is not None:
-            words = "the gyroscope at rest depends on orientation"
-            shape = np.concatenate([up, second], axis=1) * at_rest[:, None]
-        return [
-            self.block("accelerometer", "the accelerometer depends on orientation (second harmonics)", second),
-            self.block("accelerometer", "the accelerometer depends on orientation (third harmonics)", third),
-            self.block("gyroscope", words, shape),
+    waves = np.cos(np.pi * observed.share[:, None] * np.arange(1, 6))
+    blocks = [_block(observed, triad, f"slow change of the {triad}", waves) for triad in _SIZES]
+    if observed.up is not None:
+        blocks += _orientations(observed, observed.up)
+    if observed.duration is not None:
+        for cycles in np.arange(_CYCLES[0], min(_CYCLES[1], len(observed.share) / 2), 0.5):
+            phase, period = 2 * np.pi * cycles * observed.share, observed.duration / cycles
+            wave = np.stack([np.cos(phase), np.sin(phase)], axis=1)
+            blocks += [
+                _block(observed, triad, f"the {triad}'s bias swings to and fro", wave, period=period)
+                for triad in _SIZES
+            ]
+    if observed.curves is not None:
+        blocks += [
+            _block(observed, triad, f"the {triad} depends smoothly on temperature", observed.curves) for triad in _SIZES
         ]
+    if observed.alone is not None and observed.number is not None:
+        size = _SIZES["accelerometer"]
+        for number in observed.alone:
+            columns = observed.react("accelerometer", np.equal(observed.number, number)[:, None].astype(float))
+            blocks.append(
+                EffectBlock("data.bumped_pose", size * columns, np.full(3, size), "data", {"pose": int(number)}, True)
+            )
+    return blocks
 
-    def bumped(self, poses: NDArray[np.int64], among: NDArray[np.int64]) -> list[EffectBlock]:
-        """Return each pose by itself, its force being off; among (o,): the observations' numbers."""
-        blocks, size = [], SIZES["accelerometer"]
-        for pose in poses:
-            columns = size * self.react("accelerometer", np.equal(among, pose)[:, None].astype(float))
-            blocks.append(EffectBlock("data.bumped_pose", columns, np.full(3, size), "data", {"pose": int(pose)}, True))
-        return blocks
+
+def _block(observed: Observed, triad: str, name: str, shape: FloatArray, **inner: float) -> EffectBlock:
+    """Return the question for a shape; one with inner parameters stands at one of many places."""
+    columns, size = observed.react(triad, shape), _SIZES[triad]
+    return EffectBlock(name, columns * size, np.full(columns.shape[1], size), "generic", inner, bool(inner))
 
 
-def placed(triad: str, shape: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
-    """Return the reaction (6 o, 3 k) of mean outputs, accelerometer and gyroscope of one observation after another.
+def _orientations(observed: Observed, up: FloatArray) -> list[EffectBlock]:
+    second, third = harmonics(up)
+    words, shape = "the gyroscope depends on orientation", second
+    if observed.still is not None:
+        words = "the gyroscope at rest depends on orientation"
+        shape = np.concatenate([up, second], axis=1) * observed.still[:, None]
+    return [
+        _block(observed, "accelerometer", "the accelerometer depends on orientation (second harmonics)", second),
+        _block(observed, "accelerometer", "the accelerometer depends on orientation (third harmonics)", third),
+        _block(observed, "gyroscope", words, shape),
+    ]
 
-    **Arguments:** `used` (o,): observations in which the triad counts.
+
+def imitated_shapes(observed: Observed) -> list[EffectBlock]:
+    """Return shapes that named causes may be taken for, asked of what these leave; of carried attitudes alone.
+
+    Higher harmonics, a heading, curves of an axis's own force.
     """
-    first = 3 * list(SIZES).index(triad)
-    columns = np.zeros((len(shape), 6, shape.shape[1], 3))
-    for axis in range(3):
-        columns[used, first + axis, :, axis] = shape[used]
-    return columns.reshape(6 * len(shape), -1)
+    if observed.attitude is None or observed.up is None:
+        return []
+    curves = np.asarray(np.polynomial.legendre.legvander(observed.up, 7)[..., 4:], np.float64)
+    return [
+        _block(observed, "gyroscope", "the gyroscope at rest depends on its heading", observed.attitude),
+        _block(
+            observed,
+            "gyroscope",
+            "the gyroscope at rest depends on orientation (third harmonics)",
+            harmonics(observed.up)[1],
+        ),
+        _block(observed, "accelerometer", "the accelerometer's axes are curved (even powers)", curves[..., ::2]),
+        _block(observed, "accelerometer", "the accelerometer's axes are curved (odd powers)", curves[..., 1::2]),
+    ]
 
 
 def harmonics(up: FloatArray) -> tuple[FloatArray, FloatArray]:

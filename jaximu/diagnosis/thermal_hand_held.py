@@ -16,11 +16,11 @@ import numpy as np
 from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
 from jaximu.calibration.refusals import require_solved
+from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.rest_blocks import LEAST_RANGE
 from jaximu.diagnosis.diagnosis import extended
-from jaximu.diagnosis.experiment import State
-from jaximu.diagnosis.hand_held import HandHeldExperiment
+from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import left_out_likelihood
 from jaximu.diagnosis.noise import own_noise
 from jaximu.ground.document import Document
@@ -42,15 +42,6 @@ _FIRST = {"temperature_squared": "temperature", "temperature_cubed": "temperatur
 _POSES, _LONG = 9, 300.0  # fewest poses by hand; s, of rests that are longer than a hand is still
 
 
-class _Thermal(HandHeldExperiment):
-    """A hand-held recording that is asked for what temperature does only."""
-
-    def askable(self, linear):
-        asked, refused = super().askable(linear)
-        keep = lambda found: {name: each for name, each in found.items() if name in ASKED}  # noqa: E731
-        return keep(asked), keep(refused)
-
-
 @dataclass(frozen=True, eq=False)
 class HandHeldThermal(Document):
     """A unit calibrated by hand over temperature.
@@ -63,7 +54,7 @@ class HandHeldThermal(Document):
     calibration: Calibration
     base: State
     state: State
-    experiment: HandHeldExperiment
+    experiment: Experiment
     range: tuple[float, float]
     steps: tuple[tuple[str, float, float], ...]
     limits: dict[str, tuple[float, str]]
@@ -128,9 +119,10 @@ def calibrate_thermal_by_hand(
     noise = noise_of(static)
     calibration = calibrate(given, gravity)
 
-    def made(known: NoiseModel) -> _Thermal:
+    def made(known: NoiseModel) -> Experiment:
         observations = observed_poses(calibration.segmentations, gravity.value, noise=known)
-        return _Thermal(calibration.segmentations, observations, calibration.imu)
+        data = RecordedByHand(calibration.segmentations, observations)
+        return Experiment(data, calibration.imu, candidates=ASKED)
 
     if noise is None:
         own = own_noise(calibration)
@@ -162,7 +154,7 @@ def calibrate_thermal_by_hand(
     data = found.data | {"temperature_range": [low, high]}
     return HandHeldThermal(
         replace(found, data=data, notes=notes), base, state, experiment, (low, high), tuple(steps), state.limits,
-        {name: why for name, why in state.blind.items() if name in ASKED}, notes,
+        state.blind, notes,
     )  # fmt: skip
 
 

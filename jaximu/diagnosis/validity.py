@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.calibration import Calibration, History
-from jaximu.diagnosis.hand_held import HandHeldExperiment
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
@@ -171,7 +171,7 @@ class Validity(Described, Document):
     errors: dict[str, tuple[float, float, str]]
     scatter: dict[str, float]
     notes: tuple[str, ...]
-    experiment: HandHeldExperiment | None
+    experiment: Experiment | None
     conditions: tuple[FloatArray, FloatArray]  # (n,) under the old calibration and under the fresh one
     data: dict[str, Any]
     calibration: Calibration

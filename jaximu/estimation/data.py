@@ -1,4 +1,9 @@
-"""What recordings say about a unit: the abstract `Data` that `fit` takes, and what a kind of data makes of itself."""
+"""What recordings say about a unit: the abstract `Data` that `fit` takes, and what a kind of data makes of itself.
+
+A kind of data stands in one class. For a fit it says what its conditions are, their covariance and how they react to
+effects. For a diagnosis it says besides what its recordings span, what the unit went through, and which shapes without
+a cause its conditions would show.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -18,13 +23,18 @@ from numpy.typing import NDArray
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.problem import Name, without_equipment_or_effects
 from jaximu.estimation.rows import Rows
+from jaximu.estimation.track import Track
+from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.tracing import array_module
-from jaximu.model.effects.base import Effect
+from jaximu.model.effects.base import Effect, Extent
+from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.recordings.finding import Finding
+from jaximu.recordings.recording import Recording
 
-__all__ = ["About", "Conditions", "Data", "derivatives_by_numbers"]
+__all__ = ["About", "Conditions", "Data", "Handling", "Observed", "derivatives_by_numbers"]
 
 _GRID = 16
 """Inner parameters of an effect are asked for in multiples of so many."""
@@ -59,16 +69,60 @@ class About:
     details: Any = None
 
 
+@dataclass(frozen=True)
+class Observed:
+    """The observations or samples (o,) along which shapes without a cause are looked for.
+
+    react: returns how the conditions (n, q) react to a shape of a triad's output, (o, k) alike for each axis or
+    (o, 3, k) of each axis by itself. share (o,): of the recording that has gone by. up (o, 3): the specific force's
+    direction, None where orientation is not compared. still (o,): observations at rest, None for samples in motion.
+    number (o,): of each observation, and alone: those that may be off by themselves. duration: s, within which a bias
+    may swing to and fro; None where that is not looked for. attitude (o, 9): the level frame's axes, where they are
+    carried from one observation to the next. curves (o, k): smooth functions of temperature.
+    """
+
+    react: Callable[[str, FloatArray], FloatArray]
+    share: FloatArray
+    up: FloatArray | None = None
+    still: NDArray[np.bool_] | None = None
+    number: NDArray[np.int64] | None = None
+    alone: NDArray[np.int64] | None = None
+    duration: float | None = None
+    attitude: FloatArray | None = None
+    curves: FloatArray | None = None
+
+
+class Handling(NamedTuple):
+    """Variances (n,) of all conditions, padding included, by poses that tilt and by turns that are undersampled.
+
+    tilting: rate (P,), rad/s, by which each pose tilts, noise taken off; noise: its standard deviation (P,). missed:
+    (T,), rad, half of what even and odd samples of a turn differ by, noise taken off; turned (T,): what white noise
+    turns each by.
+    """
+
+    moving: FloatArray
+    sampling: FloatArray
+    tilting: FloatArray
+    noise: FloatArray
+    missed: FloatArray
+    turned: FloatArray
+
+
 class Data(ABC):
     """What recordings say about a unit, or about units along a leading axis.
 
     effects_inside: the conditions evaluate effects themselves; else `about` gives their columns. coarse: the excess to
-    begin with.
+    begin with. owners: whose effects can show. by_hand: hands moved the unit. no_fixture: why effects of a set-up
+    cannot show, empty where they can. advice: says what to record where numbers stay open.
     """
 
     effects_inside: ClassVar[bool] = False
-    excess_names: ClassVar[tuple[str, ...]] = ()
-    coarse: ClassVar[tuple[float, ...]] = ()
+    excess_names: tuple[str, ...] = ()
+    coarse: tuple[float, ...] = ()
+    owners: ClassVar[tuple[str, ...]] = ("accelerometer", "gyroscope", "setup")
+    by_hand: ClassVar[bool] = False
+    no_fixture: ClassVar[str] = ""
+    advice: ClassVar[Callable[..., str]] = staticmethod(station_advice)
 
     @abstractmethod
     def about(self, imu: Imu) -> About:
@@ -147,6 +201,93 @@ class Data(ABC):
         found = [stored.call(derivatives, key, imu, part, *inner, quick=False) for part in parts]
         sums = [np.sum(own, axis=0) for own in zip(*found, strict=True)]
         return {kind: each[: len(asked[kind])] for kind, each in zip(kinds, sums, strict=True)}
+
+    # --- what a diagnosis needs to know ---------------------------------------------------------------------------
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was recorded."""
+        return ()
+
+    def spans(self) -> list[FloatArray]:
+        """Return start and stop (k, 2), s, of the observations of each recording, in the order of time."""
+        raise NotImplementedError
+
+    def rests(self) -> list[FloatArray]:
+        """Return the spans (k, 2), s, of each recording in which the unit lay still."""
+        return self.spans()
+
+    def extent(self) -> Extent:
+        """Return what the recordings span: effects may begin between two observations."""
+        spans = self.spans()
+        temperatures = [each.temperature.values for each in self.recordings if each.temperature is not None]
+        return Extent(
+            max(float(part[-1, 1] - part[0, 0]) for part in spans),
+            tuple(float(time) for part in spans for time in (part[:-1, 1] + part[1:, 0]) / 2),
+            max((float(np.ptp(values)) for values in temperatures), default=0.0),
+        )
+
+    def tracks(self, details: Any) -> list[dict[str, Track]]:
+        """Return what the unit went through, part by part, at the samples of each triad."""
+        return details.tracks
+
+    def hidden(self) -> Mapping[str, str]:
+        """Return effects, by name, that this recording cannot show, and why."""
+        return {}
+
+    def parts(self, real: Rows, count: int) -> list[NDArray[np.int64]]:
+        """Return the observations that are left out in turn; `real`: the rows that are no padding."""
+        return real.parts(count)
+
+    def observed(self, imu: Imu, details: Any) -> Observed:
+        """Return the observations along which shapes without a cause are looked for."""
+        raise NotImplementedError
+
+    def rms(self, imu: Imu, details: Any, conditions: FloatArray) -> dict[str, tuple[float, str]]:
+        """Return the rms of each kind of residual of all conditions (n,), with its unit, as a calibration has it."""
+        rows = self.rows(imu)
+        return rows.real().rms(conditions[rows.used])
+
+    def without(self, observation: int) -> Self:
+        """Return the data with an observation, and what touches it, left out."""
+        raise NotImplementedError
+
+    def twin(self, imu: Imu, details: Any, conditions: FloatArray, noise: NoiseModel, seed: int) -> Self | None:
+        """Return the data that a unit without effects would give along the same motion, noise included.
+
+        `conditions` (n,): of that unit in these data. None where the noise is known of the conditions alone.
+        """
+        return None
+
+    def drifts(self, noise: NoiseModel, details: Any, within: bool) -> tuple[dict[str, AxisNoise], FloatArray | None]:
+        """Return drifts of the biases by name, at a size of one, and the covariance (k, n, n) that each adds.
+
+        `within`: false where `noise` knows the drift in a recording; what changes between several counts in any case.
+        """
+        return {}, None
+
+    def handling(self, imu: Imu, details: Any, noise: NoiseModel) -> Handling | None:
+        """Return what hands add to the conditions, where hands moved the unit."""
+        return None
+
+    def moved_by_hand(self, imu: Imu, handling: Handling, undersampling: float) -> list[Finding]:
+        """Return what is wrong with how hands moved the unit; `undersampling`: share of what samples miss."""
+        return []
+
+    def sway(self, imu: Imu, noise: NoiseModel) -> list[Finding]:
+        """Return whether hands turn the unit while it should be at rest, which looks like noise."""
+        return []
+
+    def averaged(self) -> Self | None:
+        """Return the data with the gyroscope's samples, taken for rates of instants, turned into means.
+
+        None where no means over turns are compared.
+        """
+        return None
+
+    def change_by_averaging(self, details: Any) -> FloatArray:
+        """Return how the conditions (n,) change by that."""
+        raise NotImplementedError
 
 
 def _slope(kind: type[Effect], of: Callable[[Array], Array], numbers: Array) -> Array:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from jaximu.calibration import fit_hand_held, residual_rms
+from jaximu.calibration import fit_hand_held
+from jaximu.data import residual_rms
 from jaximu.data.poses import PosesAndTurns, condensed, stack
 from jaximu.estimation.fitting import Fit
 from jaximu.ground.array_types import FloatArray

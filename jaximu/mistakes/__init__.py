@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
-    from jaximu.mistakes.preparation import MISTAKES, Prepared, inspect, prepare, prepared, without_rows
+    from jaximu.mistakes.preparation import MISTAKES, Prepared, inspect, one_or_several, prepare, prepared, without_rows
 
 __all__ = [
     "MISTAKES",
     "Prepared",
     "inspect",
+    "one_or_several",
     "prepare",
     "prepared",
     "without_rows",

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,9 +34,9 @@ from jaximu.mistakes import (
 )
 from jaximu.mistakes.base import BRIDGED, Samples, runs_of
 from jaximu.recordings.finding import Finding, Rows
-from jaximu.recordings.recording import Defect, Recording, Signal
+from jaximu.recordings.recording import Defect, Recording, Signal, recordings_of
 
-__all__ = ["MISTAKES", "Prepared", "inspect", "prepare", "prepared", "without_rows"]
+__all__ = ["MISTAKES", "Prepared", "inspect", "one_or_several", "prepare", "prepared", "without_rows"]
 
 _ROUNDS = 4
 _MUCH = 0.01  # share of a sensor's rows left out that may be why a calibration is not possible
@@ -73,6 +74,16 @@ class Prepared:
     left_out: dict[str, FloatArray]
 
     @property
+    def name(self) -> str:
+        """The recording's name."""
+        return self.recording.name
+
+    @property
+    def signals(self) -> dict[str, Signal]:
+        """The recording's signals, by name."""
+        return self.recording.signals
+
+    @property
     def spoiling(self) -> tuple[Finding, ...]:
         """The findings that stand, and while they stand no effect can be named."""
         return tuple(each for each in self.findings if each.spoils)
@@ -81,6 +92,14 @@ class Prepared:
     def notes(self) -> tuple[str, ...]:
         """Sentences for a calibration's notes."""
         return tuple(dict.fromkeys(each.text for each in self.findings))
+
+
+def one_or_several(given: Any) -> list[Recording | Prepared]:
+    """Return one recording or several, each of which may have been looked over, as a list; else raise `InputError`."""
+    several = list(given) if isinstance(given, (list, tuple)) else [given]
+    if not several:
+        raise InputError("no recording was given.")
+    return [one if isinstance(one, Prepared) else recordings_of(one)[0] for one in several]
 
 
 def inspect(recording: Recording) -> list[Finding]:
@@ -140,7 +159,7 @@ def prepare(recording: Recording, repair: bool = False, magnetometer: bool = Fal
 
 @contextmanager
 def prepared(
-    recordings: Sequence[Recording],
+    recordings: Sequence[Recording | Prepared],
     repair: bool = False,
     gyroscope: bool = True,
     magnetometer: bool = False,
@@ -148,11 +167,15 @@ def prepared(
 ) -> Iterator[tuple[Prepared, ...]]:
     """Make recordings ready; an error on the way begins with the mistake found in them, which is the likelier cause.
 
+    One that was looked over is taken as it is.
     `gyroscope`, `gravity`: whether they are needed. Raises InputError where what is needed is not there, with the
     finding's own sentence.
     """
     unneeded = {name for name, needed in (("gyroscope", gyroscope), ("gravity", gravity)) if not needed}
-    ready = tuple(prepare(recording, repair, magnetometer) for recording in recordings)
+    ready = tuple(
+        recording if isinstance(recording, Prepared) else prepare(recording, repair, magnetometer)
+        for recording in recordings
+    )
     for each in ready:
         for finding in each.findings:
             if finding.refuses and finding.refuses not in unneeded:

@@ -27,10 +27,11 @@ from jaximu.model.data_sheet import (
     parse_unit,
     to_discrete,
 )
-from jaximu.model.processes import Process
+from jaximu.model.noise_model import AxisNoise
+from jaximu.model.processes import FirstOrderGaussMarkov, Process, White
 from jaximu.model.state_space import BLOCK, BlockSystem, LinearSystem, combine, linear_system, run
 
-__all__ = ["Noise", "NoiseStream"]
+__all__ = ["Noise", "NoiseStream", "drawn_noise"]
 
 
 ALLAN_MINIMUM = float(np.sqrt(2 * np.log(2) / np.pi))
@@ -268,3 +269,14 @@ def _advance(still, blocks: BlockSystem | None, state, still_draws, moving_draws
         output, state = run(blocks, state, jnp.concatenate(moving_draws, axis=-2))
         total = total + output
     return jnp.moveaxis(total, -2, -1), state
+
+
+def drawn_noise(noise: AxisNoise, count: int, rate: float, seed: Sequence[int]) -> FloatArray:
+    """Return that many samples (n, 3), SI, of a triad's white noise and slow bias, at a rate in Hz."""
+    processes = [White(np.sqrt(noise.white))]
+    processes += [
+        FirstOrderGaussMarkov.of(np.sqrt(variance), time)
+        for variance, time in zip(noise.variance.T, noise.correlation_time, strict=True)
+        if variance.any()
+    ]
+    return np.asarray(Noise(tuple(processes), "specific_force").sample(count, rate, list(seed)))

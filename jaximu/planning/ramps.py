@@ -16,7 +16,7 @@ import numpy as np
 from jaximu.calibration.identifiability import ENOUGH, Separation, separated
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.data.rest_blocks import RestBlocks, joined
-from jaximu.data.track import Track
+from jaximu.estimation.track import Track
 from jaximu.model.stimulus import Stimulus
 
 __all__ = ["Ramp", "next_ramps"]

@@ -15,17 +15,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.observe_stations import observe_stations
+from jaximu.data.recorded_stations import RecordedStations
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, Option
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment
-from jaximu.diagnosis.hand_held import HandHeldExperiment
-from jaximu.diagnosis.turntable import Turntable
-from jaximu.diagnosis.twin import drawn_noise
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, noncentral_chi2_sf
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
+from jaximu.model.noise import drawn_noise
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
@@ -147,16 +147,16 @@ def _experiment(diagnosis: Diagnosis, protocol: Protocol, environment: Environme
     recording = _noisy(silent, noise)
     if protocol.reference:
         stations, _ = observe_stations(recording, truth.schedule, gravity, noise)
-        return Turntable(recording, stations, imu)
+        return Experiment(RecordedStations(recording, stations), imu)
     part = segment(recording)
-    return HandHeldExperiment((part,), observed_poses((part,), gravity, noise=noise), imu)
+    return Experiment(RecordedByHand((part,), observed_poses((part,), gravity, noise=noise)), imu)
 
 
 def _noisy(recording: Recording, noise: NoiseModel) -> Recording:
     changed = {}
     for number, name in enumerate(("accelerometer", "gyroscope")):
         signal, known = getattr(recording, name), getattr(noise, name)
-        drawn = drawn_noise(known, signal, [1, number]) * signal.nominal_scale
+        drawn = drawn_noise(known, len(signal), signal.rate, [1, number]) * signal.nominal_scale
         changed[name] = replace(signal, values=signal.values + drawn)
     return replace(recording, **changed)
 
@@ -166,8 +166,8 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
     linear, used = experiment.linearise(imu), experiment.used
     root = np.linalg.cholesky(linear.covariance[np.ix_(used, used)])
     base = _basis(np.linalg.solve(root, linear.slope[used]))
-    extent, lacking = experiment.extent(), experiment.lacks(linear)
-    if any(need in lacking for effect in effects for need in effect.needs):
+    extent = experiment.extent()
+    if any(experiment.lacking(type(effect), linear) for effect in effects):
         return {effect.name: 0.0 for effect in (effects[1:] or effects)}
 
     def columns(kind: type[Effect], inner: Sequence[dict[str, float]]) -> FloatArray:

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.diagnosis import Diagnosis, twin_of
-from jaximu.diagnosis.experiment import State
-from jaximu.diagnosis.hand_held import Experiment
+from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import LearnedTerm
 from jaximu.estimation.rows import TIME
 from jaximu.ground.array_types import FloatArray

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.calibration import Calibration, forces_and_angles
+from jaximu.calibration import Calibration
+from jaximu.data import forces_and_angles
 from jaximu.ground.array_types import FloatArray
 from jaximu.simulation.protocols.positions import spiral
 

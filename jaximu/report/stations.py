@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.calibration.turntable import station_errors
+from jaximu.data.stations import station_errors
 from jaximu.ground.quantities import number
 from jaximu.report.figures import AXES, dressed, new_figure
 from jaximu.report.html import write_calibration

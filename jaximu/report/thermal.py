@@ -16,7 +16,7 @@ from jaximu.calibration.thermal import ThermalCalibration
 from jaximu.calibration.thermal_regression import multifactor
 from jaximu.calibration.thermal_selection import CUBIC
 from jaximu.data.rest_blocks import LEAST_RANGE, RATE_BANDWIDTH
-from jaximu.data.track import TEMPERATURE_WINDOW
+from jaximu.estimation.track import TEMPERATURE_WINDOW
 from jaximu.ground.quantities import listed, number, readable, size, unit_text, with_interval
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title

@@ -108,7 +108,9 @@ def _change_figure(found: HandHeldThermal) -> Figure:
 def _error_figure(found: HandHeldThermal) -> Figure:
     """Draw the errors of poses and turns over temperature, without and with the effects."""
     real = found.experiment.real
-    temperature = np.asarray(found.experiment.observations.poses.temperature)
+    poses = real.of_kind("gravity_norm")
+    temperature = np.full(len(real.spans), np.nan)
+    temperature[real.first[poses]] = real.covariates["temperature [°C]"][poses]
     temperature = (temperature[real.first] + temperature[real.last]) / 2
     series = [("one bias and scale for all temperatures", BEFORE, found.base)]
     series += [("with the effects", AFTER, found.state)] if found.steps else []

@@ -47,7 +47,7 @@ class Track(eqx.Module):
         """
         assert stimulus.time is not None
         time = np.asarray(stimulus.time)
-        missing = -len(time) % _BUCKET
+        missing = _BUCKET - len(time) % _BUCKET  # one or more
         step = np.median(np.diff(time))
 
         def pad(leaf):
@@ -61,6 +61,11 @@ class Track(eqx.Module):
         """Return the track with other numbers of the observations, the last of them for samples of none."""
         observation = np.minimum(np.asarray(self.observation), len(numbers) - 1)
         return Track(self.stimulus, numbers[observation])
+
+    def inside(self) -> NDArray[np.bool_]:
+        """Return which samples (n,) lie before the last one that belongs to an observation: no padding at the end."""
+        observation = np.asarray(self.observation)
+        return np.arange(len(observation)) <= np.flatnonzero(observation < observation.max())[-1]
 
     def means(self, values: Float[Array, "... n m"], count: int) -> Float[Array, "count m"]:
         """Return the means over each observation of values at the samples; zero where it has none.

@@ -1,0 +1,211 @@
+"""Known poses and turns with the recording that was made there: the samples along which effects act.
+
+In a station the unit goes through what the set-up says, in between through what it measured itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.data.poses import EXCESS_NAMES
+from jaximu.data.stations import KnownStations, StationConditions, station_covariances, station_rms, station_rows
+from jaximu.estimation.data import About, Data, Observed
+from jaximu.estimation.problem import Name
+from jaximu.estimation.rows import Rows
+from jaximu.estimation.track import Track, added, mean_outputs, stimuli
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.model.noise import drawn_noise
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
+from jaximu.recordings.observations import Stations
+from jaximu.recordings.recording import Recording
+
+__all__ = ["AtStations", "RecordedStations", "output_reaction", "station_of"]
+
+
+@dataclass(frozen=True)
+class AtStations:
+    """Stations with what the effects add taken off their means, and what the unit went through, sample by sample."""
+
+    path: dict[str, Track]
+    stations: Stations
+
+    @property
+    def tracks(self) -> list[dict[str, Track]]:
+        """What the unit went through, part by part."""
+        return [self.path]
+
+
+@dataclass
+class RecordedStations(Data):
+    """A recording of one unit whose set-up says what the unit went through."""
+
+    recording: Recording
+    stations: Stations
+
+    excess_names = EXCESS_NAMES
+    coarse = KnownStations.coarse
+
+    def free(self, name: Name) -> bool:
+        """Return whether a number is free: all are, for the body frame is the fixture's."""
+        return True
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition is."""
+        return station_rows(imu, self.stations)
+
+    def about(self, imu: Imu) -> About:
+        """Return the errors of the mean outputs of one unit, the leading axis, and its effects' columns."""
+        unit = jax.tree.map(lambda leaf: leaf[0], imu)
+        path, stations = _path(self.recording, self.stations, unit), self.stations
+        if unit.all_effects():
+            stations = self._without_outputs(self._means(path, added(unit, path)))
+        details = AtStations(path, stations)
+        lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], stations)
+        columns = self.own_columns(unit, details, 6 * len(stations.turn))
+        return About(StationConditions(lifted), station_covariances(lifted), columns[None], details)
+
+    def reactions(self, details: AtStations):
+        """Return how the mean outputs react to effects."""
+        count = len(self.stations.turn)
+
+        def of(effect, imu, tracks):
+            return mean_outputs(tracks, added(imu.with_effects(effect), tracks), count).reshape(-1)
+
+        return f"stations {count}", of, details.tracks
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was recorded."""
+        return (self.recording,)
+
+    def spans(self) -> list[FloatArray]:
+        """Return start and stop (k, 2), s, of the stations that are used."""
+        return [_spans(self.stations, _used(self.stations))]
+
+    def rests(self) -> list[FloatArray]:
+        """Return the spans of the poses alone."""
+        return [_spans(self.stations, _used(self.stations) & ~np.asarray(self.stations.turn))]
+
+    def observed(self, imu: Imu, details: AtStations) -> Observed:
+        """Return the stations, padding included; orientation is compared in poses."""
+        stations, turn = self.stations, np.asarray(self.stations.turn)
+        used = {
+            "accelerometer": np.asarray(stations.accelerometer_used),
+            "gyroscope": np.asarray(stations.gyroscope_used),
+        }
+        middle, real = (np.asarray(stations.start) + np.asarray(stations.stop)) / 2, _used(stations)
+        force = np.asarray(stations.stimulus.specific_force).mean(axis=1)
+        return Observed(
+            lambda triad, shape: output_reaction(triad, shape, used[triad]),
+            (middle - middle[real].min()) / max(np.ptp(middle[real]), 1e-9),
+            up=force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-9),
+            still=~turn,
+            number=np.arange(len(turn)),
+            alone=np.flatnonzero(used["accelerometer"] & ~turn),
+        )
+
+    def without(self, observation: int) -> RecordedStations:
+        """Return the recording with a station left out."""
+        stations, kept = self.stations, np.arange(len(self.stations.turn)) != observation
+        used = {name: np.asarray(getattr(stations, name)) & kept for name in ("accelerometer_used", "gyroscope_used")}
+        return replace(self, stations=replace(stations, **used))
+
+    def rms(self, imu: Imu, details: AtStations, conditions: FloatArray) -> dict[str, tuple[float, str]]:
+        """Return the rms of each kind of residual, with its unit, as a calibration has it."""
+        return station_rms(imu, details.stations)
+
+    def twin(
+        self, imu: Imu, details: AtStations, conditions: FloatArray, noise: NoiseModel, seed: int
+    ) -> RecordedStations:
+        """Return the recording of a unit without effects, along the set-up's motion, noise included."""
+        changed, drawn, path = {}, {}, details.path
+        for number, (name, triad) in enumerate(imu.triads().items()):
+            signal = self.recording.signals[name]
+            true = np.asarray(getattr(path[name].stimulus, triad.quantity))[: len(signal)]
+            samples = drawn_noise(getattr(noise, name), len(signal), signal.rate, [seed, number])
+            drawn[name] = samples * signal.nominal_scale
+            outputs = true @ np.asarray(triad.gain).T + np.asarray(triad.bias) + drawn[name]
+            changed[name] = replace(signal, values=outputs)
+        stations = self._without_outputs(conditions - self._means(path, drawn))
+        return RecordedStations(replace(self.recording, **changed, notes=()), stations)
+
+    def _without_outputs(self, outputs: FloatArray) -> Stations:
+        """Return the stations with mean outputs (6 S,) taken off."""
+        force, rate = np.split(outputs.reshape(-1, 6), 2, axis=1)
+        return replace(
+            self.stations,
+            accelerometer_mean=np.asarray(self.stations.accelerometer_mean) - force,
+            gyroscope_mean=np.asarray(self.stations.gyroscope_mean) - rate,
+        )
+
+    def _means(self, path: dict[str, Track], outputs: Mapping[str, Array | FloatArray]) -> FloatArray:
+        """Return the mean outputs (6 S,) over the stations, accelerometer and gyroscope of one after another."""
+        return np.asarray(mean_outputs(path, outputs, len(self.stations.turn)), np.float64).ravel()
+
+
+def output_reaction(triad: str, shape: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+    """Return the reaction (6 o, 3 k) of mean outputs, accelerometer and gyroscope of one observation after another.
+
+    **Arguments:** `shape`: (o, k) of each axis alike; `used` (o,): observations in which the triad counts.
+    """
+    first = 0 if triad == "accelerometer" else 3
+    columns = np.zeros((len(shape), 6, shape.shape[1], 3))
+    for axis in range(3):
+        columns[used, first + axis, :, axis] = shape[used]
+    return columns.reshape(6 * len(shape), -1)
+
+
+def _used(stations: Stations) -> NDArray[np.bool_]:
+    return np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
+
+
+def _spans(stations: Stations, chosen: NDArray[np.bool_]) -> FloatArray:
+    return np.stack([np.asarray(stations.start)[chosen], np.asarray(stations.stop)[chosen]], axis=1)
+
+
+def _in_order(stations: Stations) -> NDArray[np.int64]:
+    """Return the places of the stations that are used, in the order of time."""
+    real = np.flatnonzero(_used(stations))
+    return real[np.argsort(np.asarray(stations.start)[real])]
+
+
+def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:
+    """Return the station (n,) that each stamp lies in, S where in none."""
+    order = _in_order(stations)
+    start, stop = np.asarray(stations.start)[order], np.asarray(stations.stop)[order]
+    latest = np.maximum(np.searchsorted(start, time, side="right") - 1, 0)
+    inside = (time >= start[latest]) & (time < stop[latest])
+    return np.where(inside, order[latest], len(stations.turn))
+
+
+def _path(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track]:
+    """Return the stimulus at every sample: in a station as the set-up says, in between as `imu` measured it."""
+    count, order = len(stations.turn), _in_order(stations)
+    nodes = jax.tree.map(lambda leaf: np.asarray(leaf)[order].reshape(-1, *np.shape(leaf)[2:]), stations.stimulus)
+    tracks = {}
+    for name, known in stimuli(recording, imu).items():
+        signal = recording.signals[name]
+        station = station_of(signal.time, stations)
+        inside = station < count
+        nearest = np.clip(np.searchsorted((nodes.time[1:] + nodes.time[:-1]) / 2, signal.time), 0, len(nodes.time) - 1)
+        motion = {field: np.array(getattr(known, field)) for field in ("specific_force", "angular_rate")}
+        for field, values in motion.items():
+            stated = getattr(nodes, field)
+            for axis in range(3):
+                values[inside, axis] = np.interp(signal.time[inside], nodes.time, stated[:, axis])
+        pose = inside & ~np.asarray(stations.turn)[np.minimum(station, count - 1)]
+        first = np.asarray(stations.stimulus.specific_force)[:, 0]
+        motion["specific_force"][pose] = first[station[pose]]
+        motion["angular_rate"][pose] = 0.0
+        acceleration = np.gradient(motion["angular_rate"], signal.time, axis=0)
+        acceleration[pose] = 0.0
+        attitude = None if nodes.attitude is None else nodes.attitude[nearest]
+        stimulus = replace(known, **motion, angular_acceleration=acceleration, attitude=attitude)
+        tracks[name] = Track.padded(stimulus, station, count)
+    return tracks

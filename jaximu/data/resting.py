@@ -1,0 +1,240 @@
+"""A unit at rest over temperature, both triads at once: mean outputs of blocks less those of the unit in its poses.
+
+The unit lies still in each rest, in a pose that nothing tells exactly: what it puts out there at the reference
+temperature is free (a level of large variance in the covariance), and only what changes within a rest is evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from jaximu.data.recorded_stations import output_reaction
+from jaximu.data.rest_blocks import WAYS, RestBlocks, folds_of
+from jaximu.estimation.covariance import Covariance
+from jaximu.estimation.data import About, Conditions, Data, Observed
+from jaximu.estimation.problem import Name
+from jaximu.estimation.rows import TIME, ResidualKind, Rows
+from jaximu.estimation.track import Track, added, mean_outputs
+from jaximu.estimation.uncertainty import pose_advice
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.rotation import apply_matrix
+from jaximu.model.effects.base import Extent
+from jaximu.model.noise import drawn_noise
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
+from jaximu.recordings.recording import Recording
+
+__all__ = ["Resting", "RestingConditions"]
+
+_TRIADS = ("accelerometer", "gyroscope")
+_LEVEL = (1.0, 0.1)  # m/s² and rad/s: how far a rest may lie from another, as good as free
+_SMOOTH = (1.0, 0.1)  # m/s² and rad/s: the same of a smooth function of temperature
+_IN_POSES = ("accel.scale_temperature", "accel.misalignment_temperature")
+_PLACES = 40  # at which a step is sought
+_RESIDUALS = (
+    ResidualKind("accelerometer", "specific force at rest", "m/s^2", 3, centred=True),
+    ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
+)
+
+
+class RestingConditions(Conditions):
+    """Mean outputs (n, 6) of blocks, without what effects add, less those of a unit at rest under the force (n, 3)."""
+
+    output: Float[Array, "n 6"]
+    force: Float[Array, "n 3"]
+    magnitude: Float[Array, ""]
+
+    def __call__(self, imu: Imu) -> Float[Array, " 6*n"]:
+        """Return the errors of the mean outputs, accelerometer and gyroscope of one block after another."""
+        assert imu.gyroscope is not None
+        force = apply_matrix(imu.accelerometer.gain, self.force) + imu.accelerometer.bias
+        rate = jnp.broadcast_to(imu.gyroscope.bias, force.shape)
+        return (self.output - jnp.concatenate([force, rate], axis=-1)).reshape(-1)
+
+    def at_magnitude(self, magnitude: Float[Array, ""]) -> RestingConditions:
+        """Return the same: the force is the measured one."""
+        return self
+
+
+@dataclass(frozen=True)
+class _AtRests:
+    """What the unit went through, recording by recording."""
+
+    tracks: list[dict[str, Track]]
+
+
+@dataclass
+class Resting(Data):
+    """A unit at rest over temperature, its noise known.
+
+    curves (n, k): smooth functions of temperature over the blocks. smooth: whether any sum of them is allowed
+    beforehand, so that only what goes beyond is asked.
+    """
+
+    blocks: RestBlocks
+    noise: NoiseModel
+    curves: FloatArray
+    smooth: bool = False
+
+    excess_names = _TRIADS
+    coarse = (0.0, 0.0)
+    no_fixture = "a recording at rest has no set-up to compare with"
+    advice = staticmethod(pose_advice)
+
+    def rows(self, imu: Imu) -> Rows:
+        """Return what each condition is: three of the accelerometer, then three of the gyroscope, of each block."""
+        count, blocks = len(self.blocks), self.blocks
+        block = np.repeat(np.arange(count), 6)
+        return Rows(
+            kinds=_RESIDUALS,
+            kind=np.tile(np.repeat([0, 1], 3), count),
+            first=block,
+            last=block,
+            to_si=np.tile(1 / self._scale, count),
+            used=np.ones(6 * count, bool),
+            covariates={
+                TIME: np.repeat(blocks.time, 6),
+                "temperature [°C]": np.repeat(blocks.temperature, 6),
+                "rate of temperature [K/min]": np.repeat(60 * blocks.rate, 6),
+            },
+            spans=np.stack([blocks.start, blocks.stop], axis=1),
+            observation="block",
+        )
+
+    def free(self, name: Name) -> bool:
+        """Return whether a number is free: gain does not show at rest."""
+        return name.part != "gain"
+
+    def about(self, imu: Imu) -> About:
+        """Return the mean outputs less those of one unit, the leading axis, and its effects' columns."""
+        unit = jax.tree.map(lambda leaf: leaf[0], imu)
+        force = self._force(unit)
+        tracks = self.blocks.tracks(force, unit.accelerometer.temperature_reference)
+        details = _AtRests([dict.fromkeys(_TRIADS, track) for track in tracks])
+        output = self._outputs - (self._added(unit, details.tracks) if unit.all_effects() else 0.0)
+        conditions = RestingConditions(output[None], force[None], np.zeros(1))  # pyright: ignore[reportArgumentType]
+        return About(conditions, self._covariance, self.own_columns(unit, details, output.size)[None], details)
+
+    def reactions(self, details: _AtRests):
+        """Return how the mean outputs react to effects, recording by recording."""
+        count = len(self.blocks)
+
+        def of(effect, imu, tracks):
+            return mean_outputs(tracks, added(imu.with_effects(effect), tracks), count).reshape(-1)
+
+        return f"rest {count}", of, details.tracks
+
+    @property
+    def recordings(self) -> tuple[Recording, ...]:
+        """What was recorded."""
+        return self.blocks.recordings
+
+    def spans(self) -> list[FloatArray]:
+        """Return start and stop (k, 2), s, of the blocks of each recording."""
+        edges = np.stack([self.blocks.start, self.blocks.stop], axis=1)
+        return [edges[self.blocks.log == log] for log in range(len(self.recordings))]
+
+    def extent(self) -> Extent:
+        """Return what the recordings span: effects may begin with some of the blocks."""
+        edges = np.sort(np.unique(self.blocks.start))[1:]
+        every = -(-len(edges) // _PLACES)
+        return Extent(
+            max(self.blocks.spans),
+            tuple(float(edge) for edge in edges[::every]),
+            float(np.ptp(self.blocks.range)),
+        )
+
+    def hidden(self) -> dict[str, str]:
+        """Return what in one pose is a part of bias over temperature there."""
+        if self.blocks.several_poses:
+            return {}
+        return dict.fromkeys(_IN_POSES, "in one pose it is a bias over temperature: poses tell them apart")
+
+    def parts(self, real: Rows, count: int) -> list[NDArray[np.int64]]:
+        """Return whole ways of the temperature, where there are enough."""
+        legs = self.blocks.legs()
+        return folds_of(legs) if len(legs) >= WAYS else super().parts(real, count)
+
+    def observed(self, imu: Imu, details: _AtRests) -> Observed:
+        """Return the blocks; a smooth function of temperature is a shape where it is not allowed beforehand."""
+        blocks, count = self.blocks, len(self.blocks)
+        gone = blocks.time - blocks.time.min()
+        return Observed(
+            lambda triad, shape: output_reaction(triad, shape, np.ones(count, bool)),
+            gone / gone.max(),
+            number=np.arange(count),
+            alone=np.arange(count),
+            curves=None if self.smooth else self.curves,
+        )
+
+    def without(self, observation: int) -> Resting:
+        """Return the recordings with a block left out."""
+        kept = np.arange(len(self.blocks)) != observation
+        return replace(self, blocks=self.blocks.only(kept), curves=self.curves[kept])
+
+    def twin(self, imu: Imu, details: _AtRests, conditions: FloatArray, noise: NoiseModel, seed: int) -> Resting:
+        """Return the recordings of a unit without effects, noise included."""
+        blocks, made = self.blocks, []
+        means: dict[str, list[FloatArray]] = {name: [] for name in blocks.means}
+        for log, recording in enumerate(blocks.recordings):
+            mine, changed = blocks.log == log, {}
+            start, stop = blocks.start[mine], blocks.stop[mine]
+            for number, (name, triad) in enumerate(imu.triads().items()):
+                signal = recording.signals[name]
+                samples = drawn_noise(getattr(noise, name), len(signal), signal.rate, [seed, log, number])
+                level = np.asarray(triad.bias)
+                if name == "accelerometer":
+                    nearest = np.clip(np.searchsorted(start, signal.time, side="right") - 1, 0, len(start) - 1)
+                    level = level + self._force(imu)[mine][nearest] @ np.asarray(triad.gain).T
+                changed[name] = replace(signal, values=level + samples * signal.nominal_scale)
+                values, edges = changed[name].si(), np.searchsorted(signal.time, np.stack([start, stop], axis=1))
+                means[name] += [values[a:b].mean(axis=0) for a, b in edges]
+            made.append(replace(recording, **changed, notes=()))
+        whole = {name: np.stack(parts) for name, parts in means.items()}
+        return replace(self, blocks=replace(blocks, recordings=tuple(made), means=whole), noise=noise)
+
+    @property
+    def _scale(self) -> FloatArray:
+        return np.concatenate([self.recordings[0].signals[name].nominal_scale for name in _TRIADS])
+
+    @property
+    def _outputs(self) -> FloatArray:
+        """Mean outputs (n, 6), in output units."""
+        offset = np.concatenate([self.recordings[0].signals[name].nominal_offset for name in _TRIADS])
+        return np.concatenate([self.blocks.means[name] for name in _TRIADS], axis=1) * self._scale + offset
+
+    def _force(self, imu: Imu) -> FloatArray:
+        """The specific force (n, 3) of each block's rest, by the mean over it."""
+        return imu.accelerometer.recover_on_host(self.blocks.by_rest(self._outputs[:, :3]))
+
+    @property
+    def _covariance(self) -> Covariance:
+        """Noise, the levels of the rests and what is smooth; an excess of each triad's noise, in means over blocks."""
+        count, blocks = len(self.blocks), self.blocks
+        whole = np.zeros((count, 6, count, 6))
+        unit = np.zeros((2, count, 6))
+        same = (blocks.level[:, None] == blocks.level).astype(float)
+        curved = self.curves @ self.curves.T if self.smooth else 0.0
+        for triad, name in enumerate(_TRIADS):
+            noise = blocks.covariance(getattr(self.noise, name))
+            covariance = noise + _LEVEL[triad] ** 2 * same + _SMOOTH[triad] ** 2 * curved
+            for axis in range(3):
+                place = 3 * triad + axis
+                whole[:, place, :, place] = covariance[axis] * self._scale[place] ** 2
+                unit[triad, :, place] = np.sqrt(np.mean(np.diag(noise[axis]))) * self._scale[place]
+        size = 6 * count
+        factors = tuple(each.ravel()[None] for each in unit)
+        group = np.tile(np.repeat([0, 1], 3), count)[None]
+        return Covariance(whole.reshape(size, size)[None], factors, np.ones((1, size)), group)  # pyright: ignore[reportArgumentType]
+
+    def _added(self, imu: Imu, tracks: Sequence[dict[str, Track]]) -> FloatArray:
+        """What the unit's effects add to the mean outputs (n, 6)."""
+        count = len(self.blocks)
+        return np.sum([np.asarray(mean_outputs(each, added(imu, each), count)) for each in tracks], axis=0)

@@ -1,0 +1,87 @@
+"""Hand-held recordings as the model would have them, along the motion that was estimated, noise included."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from jaximu.estimation.track import Track
+from jaximu.ground.array_types import FloatArray
+from jaximu.model.noise import drawn_noise
+from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
+from jaximu.recordings.observations import Observations
+from jaximu.recordings.recording import Recording
+from jaximu.recordings.segmentation import Segmentation
+
+__all__ = ["twin_recordings"]
+
+
+def twin_recordings(
+    segmentations: Sequence[Segmentation],
+    observations: Observations,
+    turn_samples: Sequence[NDArray[np.int64]],
+    shifts: FloatArray,
+    imu: Imu,
+    tracks: Sequence[dict[str, Track]],
+    noise: NoiseModel,
+    seed: int,
+) -> list[Recording]:
+    """Return hand-held recordings as a unit without effects would have them.
+
+    At rest the unit lies in the estimated orientation, under exactly local gravity; in a turn it rotates as measured,
+    corrected by what carries gravity from the one orientation exactly to the other. What it puts out is the model
+    without effects and noise drawn from the noise model, on the recording's own stamps. What noise the measured rates
+    of a turn held is motion to the twin.
+
+    **Arguments:** `turn_samples`, `shifts`, `tracks`: of each recording, as `RecordedByHand` has them.
+    """
+    gravity, turns, count = float(observations.gravity), observations.turns, len(observations.poses.mask)
+    first, made = 0, []
+    for number, (part, samples, shift, track) in enumerate(
+        zip(segmentations, turn_samples, shifts, tracks, strict=True)
+    ):
+        signals = part.recording.signals
+        force, pose = (
+            np.array(values)[: len(signals["accelerometer"])]
+            for values in (track["accelerometer"].stimulus.specific_force, track["accelerometer"].observation)
+        )
+        at_rest = pose < count
+        force[at_rest] *= gravity / np.linalg.norm(force[at_rest], axis=1, keepdims=True)
+        rate, attitude = (
+            np.array(getattr(track["gyroscope"].stimulus, name))[: len(signals["gyroscope"])]
+            for name in ("angular_rate", "attitude")
+        )
+        up = {int(k): force[row] / gravity for k, row in zip(*np.unique(pose, return_index=True), strict=True)}
+        for k in range(first, first + len(part.intervals) - 1):
+            if np.asarray(turns.mask)[k]:
+                inside = samples[k][np.asarray(turns.interval)[k] > 0]
+                rate[inside] += _correction(attitude[inside], up[k + 1], float(np.sum(turns.interval[k])))
+        first += len(part.intervals)
+        changed = {}
+        for place, ((name, triad), values) in enumerate(zip(imu.triads().items(), (force, rate), strict=True)):
+            signal = signals[name]
+            drawn = drawn_noise(getattr(noise, name), len(signal), signal.rate, [seed, number, place])
+            outputs = values @ np.asarray(triad.gain).T + np.asarray(triad.bias) + drawn * signal.nominal_scale
+            changed[name] = replace(signal, values=outputs + (shift if name == "gyroscope" else 0.0))
+        made.append(replace(part.recording, **changed, notes=()))
+    return made
+
+
+def _correction(attitude: FloatArray, after: FloatArray, duration: float) -> FloatArray:
+    """Return the rates (n, 3) that turn gravity's carried direction into the measured one, spread over a turn.
+
+    `attitude` (n, 4) is the body's after each sample, level at the start; to first order a rotation δ of the last frame
+    is the sum of the rates' parts brought there.
+    """
+    matrix = Rotation.from_quat(attitude, scalar_first=True).as_matrix()  # body to level
+    lab = np.array([0.0, 0.0, 1.0])
+    carried = matrix[-1].T @ lab
+    delta = np.cross(after, carried)  # turning the frame by δ moves a fixed direction by −δ × u
+    # δ in the last frame is R_kᵀ-transported to each sample's own frame
+    back = np.einsum("nji,jk,k->ni", matrix, matrix[-1], delta)
+    return back / max(duration, 1e-9)
