@@ -79,6 +79,12 @@ def calibrate_array(
     require_float64()
     if len(recordings) < 2:
         raise InputError("an array has two units or more: give a recording of each, made at the same time.")
+    files = [source.sha256 for each in recordings for source in each.sources]
+    if len(set(files)) < len(files):
+        raise InputError(
+            "the same file is given twice: an array needs a recording of each unit. Where one file holds several units "
+            "side by side (imu1, imu2), write one file for each."
+        )
     for each in recordings:
         if each.gyroscope is None:
             raise InputError(f"{each.name} has no gyroscope, by which units on one body are matched.")

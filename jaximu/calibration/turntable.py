@@ -8,6 +8,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
@@ -33,6 +34,8 @@ from jaximu.recordings.recording import Recording, recordings_of, same_outputs
 from jaximu.recordings.reference import Entry, entries_of_columns
 from jaximu.simulation.protocols import earth_rate
 
+_TURNED, _ARRANGED = 0.3, 45.0
+"""Degrees of a common rotation from which on it is said, and up to which it is no other arrangement of the axes."""
 _RECORD = (
     "Rest for a second or more in at least six orientations, each axis up and down, and turn about each axis between "
     "rests."
@@ -173,7 +176,7 @@ def calibrate_table_ready(
         *(note for recording in recordings for note in recording.remarks),
         *(note for one in ready for note in one.notes), *(() if noise is None else noise.notes), *said,
     )  # fmt: skip
-    return concluded(
+    calibration = concluded(
         found, gravity=gravity, method="turntable", loss=loss, advice=station_advice, notes=notes,
         excess_names=EXCESS_NAMES if nominal.gyroscope is not None else EXCESS_NAMES[:1],
         rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
@@ -181,6 +184,28 @@ def calibrate_table_ready(
         stations=stations, nominal=nominal, reading=recordings[0].reading,
         absent=() if "accelerometer" in recordings[0].signals else ("accelerometer",),
     )  # fmt: skip
+    return replace(calibration, notes=(*calibration.notes, *_turned_as_a_whole(calibration)))
+
+
+def _turned_as_a_whole(calibration: Calibration) -> list[str]:
+    """Say by how much the axes of a triad that was determined stand turned in the fixture, all alike.
+
+    The gain's polar factor (Higham, SIAM J. Sci. Stat. Comput. 7, 1986) is the rotation that comes closest to it.
+    """
+    open_gains = {name.partition(".")[0] for weak in calibration.weak if not weak.determined
+                  for name, _ in weak.parameters if ".gain[" in name}  # fmt: skip
+    notes = []
+    for sensor in sorted({name.owner for name in calibration.names if name.part == "gain"} - open_gains):
+        gain = np.asarray(calibration.triads()[sensor].gain)
+        rotation, _ = scipy.linalg.polar(gain / np.linalg.norm(gain, axis=1, keepdims=True))
+        vector = scipy.spatial.transform.Rotation.from_matrix(rotation).as_rotvec(degrees=True)
+        if _TURNED < np.linalg.norm(vector) < _ARRANGED:
+            about = ", ".join(f"{axis} {angle:+.2g}°" for axis, angle in zip("xyz", vector, strict=True))
+            notes.append(
+                f"the {sensor}'s axes are turned as a whole by {np.linalg.norm(vector):.2g}° in the fixture ({about}): "
+                "the unit, or its board, is mounted so. That is part of the misalignments."
+            )
+    return notes
 
 
 def _at_rest_where_open(found: Fit, start: Imu) -> Fit:

@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
@@ -98,6 +98,7 @@ def run(
     model = load_calibration(calibration)
     other = None if against is None else load_calibration(against)
     noise = None if allan is None else read_sensor_noise(allan)
+    _require_densities(targets, noise or {})
     gravity = model.gravity if local == options.LOCAL else local.value()
     place = Place(_LATITUDE if local.latitude is None else local.latitude, local.height, gravity)
     limits = _limits({"accelerometer": accel_range, "gyroscope": gyro_range})
@@ -163,6 +164,18 @@ def _targets(text: str | None, allan: Path | None, reference: Path | None, path:
             "Kalibr imu.yaml with the data sheet's figures."
         )
     return found
+
+
+def _require_densities(targets: list[str], noise: dict[str, Any]) -> None:
+    """Raise `NotPossibleError`, before anything is computed, where an estimator needs noise that is not known."""
+    from jaximu.report.export.noise import noise_values
+
+    known = {"update_rate": 1.0, "integration_covariance": 1.0}
+    for triad, terms in noise.items():
+        known |= {f"{triad}_noise_density": float("N" in terms)}
+        known |= {f"{triad}_random_walk": float("K" in terms or "B" in terms)}
+    for name in targets:
+        noise_values(name, known, 1.0)
 
 
 def _measured(path: Path, reference: Path, model: Calibration, place: Place, log: options.LogOptions) -> MeasuredErrors:

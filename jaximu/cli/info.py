@@ -61,7 +61,7 @@ def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None
     except JaximuError:
         from jaximu.recordings.readers import advise_reading
 
-        advice = advise_reading(path) if log.columns is None and log.gyro_log is None else None
+        advice = advise_reading(path, log.rate) if log.columns is None and log.gyro_log is None else None
         if advice is not None and not advice.readable:
             raise InputError(f"{path}: {advice.sentence()}{_shown(advice)}") from None
         columns = log.columns or (advice.columns if advice else None)
@@ -114,11 +114,14 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     if "accelerometer" not in signals:
         findings.append("no accelerometer: poses cannot be found")
         uses += [{"verb": "turntable", "why": "with a schedule of rests and turns (--reference)"},
-                 {"verb": "compensate", "why": "with a calibration of this gyroscope alone"}]  # fmt: skip
+                 {"verb": "compensate", "why": "with a calibration of this gyroscope"}]  # fmt: skip
         return {"file": recording.name, "signals": signals, "findings": findings, "uses": uses}
     poses = 0
     timeless = any("stamps from --rate" in note for note in recording.notes)
     physical = not (guessed and recording.accelerometer.unit == "count")
+    force = np.linalg.norm(recording.accelerometer.si(), axis=1)
+    near = bool(np.all(np.abs(force / STANDARD.value - 1) < _NEAR_GRAVITY))
+    means = timeless and physical and len(force) <= _TABLE and near
     try:
         findings += plausibility(recording, STANDARD) if physical else ()
         found = segment(ready.recording)
@@ -126,7 +129,8 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
         still = float(np.sum(found.intervals[:, 1] - found.intervals[:, 0]))
         findings.append(f"{poses} static poses, {still:.0f} s in all")
     except JaximuError as error:
-        findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
+        if not means:
+            findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
     rest, longest, begin = _rest(ready.recording) if physical else (0.0, 0.0, 0.0)
     length = signals["accelerometer"]["duration"]
     if rest:
@@ -138,14 +142,14 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     def use(verb: str, why: str) -> None:
         uses.append({"verb": verb, "why": why})
 
-    force = np.linalg.norm(recording.accelerometer.si(), axis=1)
-    if timeless and physical and len(force) <= _TABLE and np.all(np.abs(force / STANDARD.value - 1) < _NEAR_GRAVITY):
+    if means:
         use("calibrate --means", f"if each of the {len(force)} rows is the mean of a pose at rest")
     if recording.magnetometer is not None:
         use("magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round")
     if poses >= 9:
         use("calibrate", f"{poses} poses" + ("" if recording.gyroscope is None else " and the turns between them"))
-        use("diagnose", "the same, and what the model gets wrong")
+        if recording.gyroscope is not None:
+            use("diagnose", "the same, and what the model gets wrong")
     elif poses > 1:
         use("calibrate", f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one")
     moved = length - rest
@@ -164,7 +168,7 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     if recording.attitude is not None and recording.gyroscope is not None:
         use("reference", "the attitude beside it calibrates both sensors in any motion that turns about all axes")
     use("compensate", "to correct it with a calibration of this unit")
-    if poses > 1:
+    if poses > 1 and recording.gyroscope is not None:
         use("check", "whether a calibration of this unit is still valid")
     document = {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings)), "uses": uses}
     if advice is not None:

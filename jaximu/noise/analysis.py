@@ -127,6 +127,10 @@ def analyse_noise(recordings: Recording | Sequence[Recording]) -> NoiseAnalysis:
 
 _OF_ITS_OWN = {"data.periodic", "data.gap", "data.quantisation"}
 """Findings that the analysis makes itself, with numbers: lines, missing samples, quantisation."""
+_SLOW = 200
+"""Means over the recording in which what is slow shows."""
+_WARMED, _FOLLOWS = 1.0, 0.8
+"""K by which the temperature must change, and the share that must follow it, to be said."""
 _BELOW = 0.1
 """Times a filter's corner up to which it leaves the spectrum as it was: one per cent of the power of one pole."""
 
@@ -153,7 +157,7 @@ def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
                 raise
             notes.append(f"{error} The magnetometer was left out.")
             continue
-        notes += said
+        notes += [*said, *_by_temperature(longest, name)]
         axes[name], rates[name] = found, rate
         notes += _taken_out(name, found)
         strange = [
@@ -183,6 +187,28 @@ def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
         )
     files = tuple(source.path for recording in recordings for source in recording.sources)
     return NoiseAnalysis(axes, rates, files, repeatability, tuple(notes))
+
+
+def _by_temperature(recording: Recording, name: str) -> list[str]:
+    """Say how much of what is slow in a sensor's output a straight line of the logged temperature accounts for."""
+    signal, celsius = getattr(recording, name), recording.temperature
+    edges = np.linspace(0, len(signal), _SLOW + 1).astype(int)
+    if celsius is None or len(signal) < 2 * _SLOW:
+        return []
+    warm = np.interp(signal.time, celsius.time, celsius.values[:, 0])
+    means, warmth = (np.add.reduceat(values, edges[:-1], axis=0) / np.diff(edges).reshape(-1, *[1] * (values.ndim - 1))
+                     for values in (signal.si(), warm))  # fmt: skip
+    if np.ptp(warmth) < _WARMED:
+        return []
+    share = [float(np.corrcoef(warmth, axis)[0, 1] ** 2) for axis in means.T]
+    if max(share) < _FOLLOWS:
+        return []
+    shares = ", ".join(f"{axis} {100 * part:.0f} %" for axis, part in zip("xyz", share, strict=True))
+    return [
+        f"the temperature changed by {np.ptp(warmth):.3g} K meanwhile, and what is slow in the {name} follows it "
+        f"(share of its variance by a straight line: {shares}): it is no noise of the sensor alone. `jaximu thermal` "
+        "models it."
+    ]
 
 
 def _analysed(

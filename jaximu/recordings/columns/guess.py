@@ -8,6 +8,7 @@ quaternion. Where a column stands proves nothing. What neither settles is asked:
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
@@ -17,15 +18,15 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
-from jaximu.ground.quantities import unit_text
-from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit
+from jaximu.ground.quantities import listed, unit_text
+from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit, parse_column
 from jaximu.recordings.alignment import Turning, turning
 from jaximu.recordings.columns.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
 from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import Table
 
-__all__ = ["Advice", "advise"]
+__all__ = ["Advice", "advise", "without_gravity"]
 
 _GRAVITY_IN = {"m/s^2": STANDARD_GRAVITY, "g": 1.0, "mg": 1000.0, "cm/s^2": 980.665}
 _PLAUSIBLE = 0.5, 8000.0
@@ -43,6 +44,11 @@ _ANGLES = {"rad/s": 1.0, "deg/s": math.pi / 180, "mdeg/s": math.pi / 180e3, "mra
 _PLAIN = set("var column col field data channel ch ans unnamed imu c v x y out simout".split())
 """Words that say nothing of a column."""
 _SHOWN = 3
+_UNIT_LENGTH = 2e-3  # that the norm of a quaternion may be off by, as few digits make it
+_ATTITUDES = {"q", "quat", "quaternion", "orientation", "attitude"}
+_ROUGH = 0.15  # logarithm by which turns may be off what a gyroscope's scale makes of them
+_TURNING = 5.0  # times the scatter in them by which means of a gyroscope at rest do not differ
+_HOTTEST = 125.0  # °C that a sensor survives
 _TURN = "turn gravity as the accelerometer shows"
 _SINGLE = ("temperature", "ambient_temperature", "current", "table_angle", "table_rate")
 """Columns that are no triad's."""
@@ -159,6 +165,13 @@ def advise(table: Table, sensor: str | None = None) -> Advice:
     return _Guess(table, sensor).advice()
 
 
+def without_gravity(table: Table) -> str:
+    """Say what stands in a table in place of an accelerometer, where its gravity was taken out; else nothing."""
+    guess = _Guess(table, None)
+    guess._named_triads()
+    return guess._without_gravity()
+
+
 class _Guess:
     def __init__(self, table: Table, sensor: str | None):
         self.table, self.role = table, sensor
@@ -172,6 +185,7 @@ class _Guess:
         self.assumed: float | None = None
         self.rate = self.accel_scale = self.gyro_scale = None
         self.unknown: list[_Triad] = []
+        self.refused: list[tuple[_Triad, str]] = []  # triads that are named, and why they are no measurement
         self.attitude = False  # whether a quaternion is there: a trajectory may be beside it
         self.file, self.file_not = sensor_of(tuple(words_of(Path(table.path).stem)))
 
@@ -199,7 +213,7 @@ class _Guess:
     def advice(self) -> Advice:
         self.time = self._time_column()
         triads = self._named_triads()
-        accel = self._best(triads, "accel")
+        accel = self._best(triads, "accel") or self._with_gravity()
         gyro = self._best(triads, "gyro")
         if self.role == "gyro":
             accel = None
@@ -240,9 +254,16 @@ class _Guess:
     def _named_triads(self) -> list[_Triad]:
         """The triads that names show, of whatever sensor."""
         groups: dict[tuple, dict[str, int]] = {}
+        refused: dict[tuple, dict[str, int]] = {}
         for at, each in enumerate(self.fields):
-            if each.axis and each.axis in "xyz" and not each.why_not:
-                groups.setdefault((each.stem, each.sensor, each.unit), {}).setdefault(each.axis, at)
+            if each.axis and each.axis in "xyz":
+                kept = refused if each.why_not else groups
+                kept.setdefault((each.stem, each.why_not or each.sensor, each.unit), {}).setdefault(each.axis, at)
+        for (stem, why, unit), axes in refused.items():
+            triad = self._triad((axes["x"], axes["y"], axes["z"]), unit=unit) if len(axes) == 3 else None
+            if triad is not None:
+                triad.label = " ".join(stem)
+                self.refused.append((triad, why))
         quaternions = {each.stem for each in self.fields if "w" in each.stem[-1:]}
         found = []
         for (stem, sensor, unit), axes in groups.items():
@@ -263,6 +284,33 @@ class _Guess:
                 triad.label = f"{' '.join(stem) or 'x, y, z'}"
                 found.append(triad)
         return found
+
+    def _with_gravity(self) -> _Triad | None:
+        """The triad whose name says that gravity is gone, and which holds it all the same."""
+        for triad, why in self.refused:
+            if why == "gravity is taken out" and triad.gravity_unit:
+                triad.sensor = "accel"
+                self.reasons.append(f"{triad.label!r} holds {triad.level:.4g} at rest: gravity is in it")
+                return triad
+        return None
+
+    def _without_gravity(self) -> str:
+        """Say what is there in place of an accelerometer whose gravity was taken out; empty where nothing is."""
+        parts = {why: triad.label for triad, why in self.refused}
+        moved, alone = parts.get("gravity is taken out"), parts.get("gravity alone")
+        if moved and alone:
+            return (
+                f"The accelerometer stands apart in {moved!r} and {alone!r}: their sum is what it measured, gravity "
+                "with it. Write a file with the sum as accel_x, accel_y, accel_z."
+            )
+        return (
+            ""
+            if moved is None
+            else (
+                f"By its name {moved!r} has gravity taken out, and it holds {self.refused[0][0].level:.2g} at rest; a "
+                "calibration needs the accelerometer with gravity: record that in its place."
+            )
+        )
 
     def _best(self, triads: list[_Triad], sensor: str) -> _Triad | None:
         """The triad that is named after a sensor; of several the one that behaves like it, told with the others."""
@@ -300,7 +348,7 @@ class _Guess:
             if set(four) <= set(open_places) - quaternion:
                 stacked = np.stack([np.asarray(self.numbers[each]) for each in four], axis=1)
                 norm = np.linalg.norm(stacked, axis=1)
-                if np.nanmax(np.abs(norm - 1)) < 2e-3 and np.abs(stacked).max() <= 1.002:
+                if np.nanmax(np.abs(norm - 1)) < _UNIT_LENGTH and np.abs(stacked).max() <= 1.002:
                     quaternion |= set(four)
                     self.attitude = True
                     self.reasons.append(
@@ -541,7 +589,7 @@ class _Guess:
         unit = gyro.unit if find_unit(gyro.unit or "", GROUPS["gyro"].quantities) else None
         peak = float(np.abs(gyro.values).max())
         rest = float(np.abs(np.median(gyro.values, axis=0)).max())
-        resting = accel is not None and accel.still and not accel.posed
+        resting = accel is not None and accel.still and not accel.posed and not _turns_steadily(gyro)
         accel_unit = next((each.unit for each in self.chosen.values() if (each.name or "").startswith("accel")), None)
         if unit is None and slope is not None:
             near = {name: abs(math.log(slope / factor)) for name, factor in _ANGLES.items()}
@@ -568,6 +616,8 @@ class _Guess:
             unit = "count"
         elif unit is None and accel_unit != "m/s" and slope is None:
             fits = _plausible(peak, rest, gyro.noise if resting else None)
+            if accel is not None and accel.still and not accel.posed and not resting:  # about the vertical
+                fits = [name for name in ("rad/s", "deg/s") if name in fits]
             if len(fits) == 1:
                 unit = fits[0]
                 said = f", and at rest {rest:.3g} with a scatter of {gyro.noise:.2g}" if resting else ""
@@ -599,7 +649,9 @@ class _Guess:
                 self.gyro_scale = f"{near:g} count/(deg/s)"
                 self.reasons.append(f"{per_degree:.4g} counts to 1 deg/s {_TURN}; nominal are {near:g}")
                 return
-        known = f" About {math.pi / 180 / slope:.4g} {_TURN}." if slope else ""
+        near = [] if not slope else [f"{scale:g}" for scale in _PER_DEGREE
+                                     if abs(math.log(math.pi / 180 / slope / scale)) < _ROUGH]  # fmt: skip
+        known = f" Of the usual ones {listed(near, 'or')} would fit." if near else ""
         self.gyro_scale = "?"
         self.questions.append(f"How many counts are 1 deg/s (--gyro-scale)? The data sheet says.{known}")
 
@@ -618,6 +670,7 @@ class _Guess:
                     unit = "count"
                 if unit:
                     self._take(triad, "mag", unit)
+        self._quaternion()
         for at, each in enumerate(self.fields):
             values, name = self.numbers[at], each.sensor or ""
             if name.startswith("attitude_"):
@@ -625,10 +678,33 @@ class _Guess:
             if name not in _SINGLE or values is None or any(other.name == name for other in self.chosen.values()):
                 continue
             unit = each.unit if find_unit(each.unit or "", GROUPS[name].quantities) else None
-            if unit is None and "temperature" in name and -60 < np.nanmin(values) <= np.nanmax(values) < 60:
+            if unit is None and "temperature" in name and -60 < np.nanmin(values) <= np.nanmax(values) < _HOTTEST:
                 unit = "degC"
+            elif unit is None and "temperature" in name and np.ptp(values[np.isfinite(values)]) > 0:
+                self.reasons.append(
+                    f"{self.table.label(at)} is between {np.nanmin(values):.6g} and {np.nanmax(values):.6g}, which is "
+                    "no temperature in °C: counts of a chip, left out; converted as its data sheet says they are for "
+                    "`jaximu thermal`"
+                )
             if unit:
                 self.chosen[at] = Column(name, unit)
+
+    def _quaternion(self) -> None:
+        """An attitude by name, whose four numbers have norm 1."""
+        named: dict[str, dict[str, int]] = {}
+        for at, name in enumerate(self.table.names or ()):
+            if match := re.fullmatch(r"(.*?)[\W_]*([wxyz])", parse_column(name)[0].strip().lower()):
+                named.setdefault(match[1], {})[match[2]] = at
+        for head, places in named.items():
+            columns = [self.numbers[at] for at in places.values()]
+            if len(places) < 4 or not set(words_of(head)) & _ATTITUDES or any(each is None for each in columns):
+                continue
+            norm = np.linalg.norm(np.stack([each for each in columns if each is not None]), axis=0)
+            if np.nanmax(np.abs(norm - 1)) < _UNIT_LENGTH:
+                self.reasons.append(f"{head!r} is a quaternion of norm 1: an attitude")
+                for axis, at in places.items():
+                    self.chosen[at] = Column(f"attitude_{axis}")
+                return
 
     # --- the result
 
@@ -641,15 +717,27 @@ class _Guess:
         return f"This file holds a magnetometer alone: jaximu magnetometer {self.table.path}{option} calibrates it."
 
     def _result(self, accel: _Triad | None, gyro: _Triad | None) -> Advice:
-        if accel is None and gyro is not None and self.role != "gyro":
+        if accel is None and self.role != "gyro" and (said := self._without_gravity()):
+            self.questions = [said]
+        elif accel is None and gyro is not None and self.role != "gyro":
             self.questions.append(_lone_gyroscope(self.table))
         elif accel is None and self.role != "gyro" and not self.questions:
             self.questions.append("Which columns are the accelerometer?")
         if gyro is None and self.role == "gyro":
             self.questions.append("Which columns are the gyroscope?")
         if accel is None and gyro is None:
+            if self.attitude or any(why == "an estimated bias" for _, why in self.refused):
+                self.questions = [
+                    f"This is a trajectory (attitude, and position or biases beside it), no sensor's log: give it as "
+                    f"--reference {self.table.path} to `jaximu reference` with the log of the same motion."
+                ]
             if any(each.name == "mag_x" for each in self.chosen.values()):
                 self.questions = [self._lone_magnetometer()]
+            elif self.table.names is None and self.width == len("xyz") + (self.time is not None):
+                self.questions[:1] = [
+                    f"{' '.join(self.questions[:1])} If they are a magnetometer's, jaximu magnetometer "
+                    f"{self.table.path} --columns calibrates it, with its columns named (mag [uT], or mag [count])."
+                ]
             self.questions = self.questions[:1]
             return Advice(None, None, None, None, tuple(self.reasons), tuple(self.questions))
         columns = [self.chosen.get(at, Column(None)) for at in range(self.width)]
@@ -694,6 +782,16 @@ def column_text(columns: Sequence[Column]) -> str:
     return ",".join(entries)
 
 
+def _turns_steadily(gyro: _Triad) -> bool:
+    """Whether a gyroscope's means change by more than its noise: it turns, if only about the vertical."""
+    size = max(5, min(50, len(gyro.values) // 20))
+    count = len(gyro.values) // size
+    if count < 4:
+        return False
+    means = gyro.values[: count * size].reshape(count, size, 3).mean(axis=1)
+    return bool(np.std(means, axis=0).max() > _TURNING * gyro.noise)
+
+
 def _plausible(peak: float, bias: float, noise: float | None) -> list[str]:
     """The units in which a sensor may read so much: 2300 °/s at most, and at rest 25 °/s of bias, 3 °/s of scatter."""
     found = []
@@ -721,4 +819,7 @@ def _lone_gyroscope(table: Table) -> str:
     others = sorted(path.parent.glob(f"*{path.suffix}")) if path.is_file() else []
     names = [each.name for each in others if "acc" in each.name.lower() and "linear" not in each.name.lower()]
     where = f"read both: {names[0]} --gyro-log {path.name}" if names else "give its file, and this one as --gyro-log"
-    return f"Where is the accelerometer? This file holds a gyroscope alone; {where}."
+    return (
+        f"Where is the accelerometer? This file holds a gyroscope alone; {where}. Alone it can be calibrated on a "
+        "table (jaximu turntable, with its turns as --reference), and at rest its noise can be seen (jaximu allan)."
+    )

@@ -18,9 +18,9 @@ _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
     "beschleunigung gf f fb sf force specific",
     "gyro": "g gy gyr gyro gyros gyroscope gyroscopes w wb om omega rot rotation rotational rate rates ars angvel "
-    "angularvelocity angularrate rotationrate as angvelocity gyroskop gyroskope",
+    "angularvelocity angularrate rotationrate as angvelocity gyroskop gyroskope drehrate drehraten",
     "mag": "m mag mags magn magneto magnetometer magnetic b field compass",
-    "temperature": "temp temperature temperatures tmp",
+    "temperature": "temp temperature temperatures temperatur temperatura température tmp",
     "ambient_temperature": "ambient",
 }
 _WORDS = {word: sensor for sensor, words in _SENSORS.items() for word in words.split()}
@@ -31,7 +31,7 @@ _NEUTRAL = set(
     "smooth signals signal values value val field0 msg message axis component ln wr low wide range inertial motion "
     "reading readings output out meas measured noise noisy in of the rps log mpu bmi lsm icm adis xsens shimmer "
     "payload buffer atti corrected compensated "
-    "sensordata".split()
+    "sensordata android".split()
 )
 _REFUSED = {
     "linear": "gravity is taken out", "lin": "gravity is taken out", "user": "gravity is taken out",
@@ -47,7 +47,11 @@ _REFUSED = {
     "euler": "angles", "setpoint": "a set point",
 }  # fmt: skip
 """Words beside a sensor's by which a column is not its measurement, and what it is."""
-_TIME = set("t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec".split())
+_ESTIMATED = {("b", "w"), ("b", "a"), ("b", "g")}
+"""How the names of an estimated state's biases begin, as in EuRoC's b_w_RS_S_x."""
+_TIME = set(
+    "t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec zeit".split()
+)
 _TIME_ALONE = set("ms us ns sec secs seconds milliseconds microseconds nanoseconds epoch uptime".split())
 """Words that name a column of time where they are its whole name, and no other names one."""
 _TIME_BESIDE = _NEUTRAL | set(
@@ -62,8 +66,8 @@ _UNIT_WORDS = {
     "time": {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "msecs": "ms", "millis": "ms",
              "milliseconds": "ms", "us": "us", "usec": "us", "micros": "us", "microseconds": "us", "ns": "ns",
              "nsec": "ns", "nanos": "ns", "nanosec": "ns", "nanoseconds": "ns"},
-    "accel": {"g": "g", "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "m s 2": "m/s^2", "m s2": "m/s^2",
-              "m s s": "m/s^2", "m per s2": "m/s^2", "m s": "m/s^2"},
+    "accel": {"g": "g", "gs": "g", "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "m s 2": "m/s^2",
+              "m s2": "m/s^2", "m s s": "m/s^2", "m per s2": "m/s^2", "m s": "m/s^2"},
     "gyro": {"dps": "deg/s", "degs": "deg/s", "deg s": "deg/s", "deg sec": "deg/s", "deg per s": "deg/s",
              "rads": "rad/s", "rad s": "rad/s", "radps": "rad/s", "rps": "rad/s", "rad sec": "rad/s",
              "rad per s": "rad/s", "mdps": "mdeg/s"},
@@ -150,6 +154,8 @@ class Field:
             return cls((), None, "time", unit)
         if axis and sensor in ("temperature", "ambient_temperature"):
             sensor = None
+        if stem[:2] in _ESTIMATED and axis:
+            sensor, why_not = None, "an estimated bias"
         return cls(stem, axis, sensor, unit, why_not)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.table import Table
 
-__all__ = ["known_names", "whole_stamps"]
+__all__ = ["known_names", "sentence_names", "whole_stamps"]
 
 
 @dataclass(frozen=True)
@@ -83,12 +83,14 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
     What is not used keeps its name.
     """
     if table.names is None:
-        return _sentences(table)
+        return _without_header(table)
     names = [re.sub(r"\s*[\[(].*", "", name.strip('" #').rpartition(":")[2]).lower() for name in table.names]
     prefixes = {match[0] for name in names if (match := re.match(r".*\.(?=fb_x$)", name))}
     if len(prefixes) == 1:  # the structure that holds them all
         names = [name.removeprefix(*prefixes) for name in names]
     layout = next((each for each in _LAYOUTS if each.fits(names)), None)
+    if layout is None and (ours := _of_message(table, table.names)):
+        return ours
     if layout is None and set(_SENSOR_LOGGER) == set(names):  # one file a sensor, named after it
         file = PurePath(table.path).name.lower()
         if "gyro" in file or "accel" in file:
@@ -117,13 +119,48 @@ _SENTENCES = {
 }
 
 
-def _sentences(table: Table) -> tuple[tuple[str, ...], str] | None:
-    """The names of rows that begin with the name of a VectorNav sentence."""
+_MESSAGE = re.compile(r"(?:.*[./_])?(angular_velocity|linear_acceleration)[./_]([xyz])")
+_EPOCH = 1e9, 2.2e9  # s since 1970 that a log's stamps lie between
+
+
+def _of_message(table: Table, names: tuple[str, ...]) -> tuple[tuple[str, ...], str] | None:
+    """The names of a table of sensor_msgs/Imu, whatever stands before them: a topic, a message's name."""
+    titles = {"angular_velocity": "gyro_{} [rad/s]", "linear_acceleration": "accel_{} [m/s^2]"}
+    matches = [_MESSAGE.fullmatch(name.strip().lower()) for name in names]
+    known = [titles[match[1]].format(match[2]) if match else name for match, name in zip(matches, names, strict=True)]
+    if sum(match is not None for match in matches) != 6 or len(set(known)) < len(known):
+        return None
+    for place, (name, column) in enumerate(zip(names, table.columns, strict=True)):
+        since = column.dtype.kind == "f" and _EPOCH[0] < np.nanmin(column) <= np.nanmax(column) < _EPOCH[1]
+        if since and name.strip("_").lower() in ("time", "timestamp", "stamp"):
+            known[place] = "time [s]"
+    return tuple(known), (
+        "columns and units as sensor_msgs/Imu has them (rad/s, m/s^2): its linear_acceleration holds gravity."
+    )
+
+
+def sentence_names(name: str, count: int) -> list[str] | None:
+    """The names of the values after a VectorNav sentence's own name, None for another sentence or number of them."""
+    names = _SENTENCES.get(name)
+    return list(names[1:]) if names is not None and len(names) == count + 1 else None
+
+
+def _without_header(table: Table) -> tuple[tuple[str, ...], str] | None:
+    """The names of rows without a header that show what wrote them: VectorNav's sentences, ROS's own CSV."""
     first = table.columns[0]
+    if len(table.columns) == len(_ECHOED) and [each.dtype.kind for each in table.columns[:3]] == ["i", "i", "O"]:
+        return _ECHOED, "columns as `ros2 topic echo --csv` writes sensor_msgs/Imu (rad/s, m/s^2)."
     names = _SENTENCES.get(str(first[0])) if first.dtype == object and (first == first[0]).all() else None
     if names is None or len(names) != len(table.columns):
         return None
     return names, f"columns and units as VectorNav's {first[0]} has them (G, m/s^2, rad/s)."
+
+
+_NINE = tuple(f"covariance_{number}" for number in range(9))
+_ECHOED = (
+    "header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *(f"orientation.{axis}" for axis in "xyzw"), *_NINE,
+    *(f"gyro_{axis} [rad/s]" for axis in "xyz"), *_NINE, *(f"accel_{axis} [m/s^2]" for axis in "xyz"), *_NINE,
+)  # fmt: skip
 
 
 def _stated(name: str) -> bool:

@@ -166,7 +166,7 @@ def _is_number(cell: str, decimal: str = ".") -> bool:
 
 _MARKS = ("#", "//", "%")
 """Signs that a line is a remark, or the header behind such a sign."""
-_STYLES = (("\t", "."), (",", "."), (";", "."), (" ", "."), (";", ","), ("\t", ","), (" ", ","))
+_STYLES = (("\t", "."), (",", "."), (";", "."), (" ", "."), (";", ","), ("\t", ","), (",", ","), (" ", ","))
 """Delimiters and decimal signs, the likelier first."""
 
 
@@ -192,6 +192,8 @@ def _layout(data: bytes, path: str) -> _Layout:
             best = score, delimiter, decimal, width
     if best is None:
         only = "a header but no rows of data" if len(filled) < 3 else "no table of numbers"
+        if np.mean([_is_number(line.strip()) for _, line in filled]) > 0.5:
+            only = "one column of numbers; a triad has three axes, a column each, and time beside them or --rate"
         raise InputError(f"{path}: holds {only}.")
     _, delimiter, decimal, width = best
     rows = [_cells(line, delimiter) for _, line in filled]

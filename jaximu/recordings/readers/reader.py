@@ -2,8 +2,10 @@
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from importlib import import_module
@@ -19,7 +21,7 @@ from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, pa
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.columns import nominal
 from jaximu.recordings.columns.choose import choose_columns, choose_pair, column_units
-from jaximu.recordings.columns.guess import Advice, advise
+from jaximu.recordings.columns.guess import Advice, advise, without_gravity
 from jaximu.recordings.columns.known import known_names, whole_stamps
 from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, parse_columns
 from jaximu.recordings.columns.table import FEW, MessageSelection, Table, from_arrow, mapped_axes, named_with_units
@@ -53,6 +55,16 @@ _FEW_SHARED, _FEW_SHARES = 10, 0.02  # rows, and share of them, from which on re
 _SHARED = 0.1  # of the messages may share a stamp
 
 
+@contextmanager
+def _noted(notes: Sequence[str]) -> Iterator[None]:
+    """Say in a refusal what reading had to assume."""
+    try:
+        yield
+    except InputError as error:
+        more = [note[:1].upper() + note[1:] for note in notes if note not in str(error)]
+        raise InputError(" ".join([str(error), *more])) from error
+
+
 def read_recording(
     path: str | os.PathLike[str],
     gyro_log: str | os.PathLike[str] | None = None,
@@ -76,7 +88,8 @@ def read_recording(
                 f"{tables[0].path}: the calibrated log had its gyroscope in a separate file: name this log's, too "
                 "(--gyro-log)."
             )
-        parts = _parts(tables, options)
+        with _noted(tables[0].notes):
+            parts = _parts(tables, options)
     else:
         table, second = _stamped(tables[0], options.columns), _read(gyro_log, options)[0]
         second = _stamped(second, options.columns or options.gyro_columns)
@@ -219,7 +232,8 @@ def _finished(parts: "Sequence[_FilePart]", table: Table, options: ReadOptions) 
 def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None = None) -> tuple[Signal, float, Source]:
     """Return the magnetometer of a file that may hold nothing else, the absolute stamp of its t = 0, and its source.
 
-    Raises InputError naming the file where it has no such columns.
+    A field needs no clock: where neither stamps nor a rate are known, a row counts as a second. Raises InputError
+    naming the file where it has no such columns.
     """
     options = _sound(options)
     parts = []
@@ -227,6 +241,8 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
         options = options if place else _alike(options, table)
         table = _stamped(table, options.columns)
         columns = choose_columns(table, options.columns, "mag") if not table.messages else header_columns(table) or ()
+        if options.rate is None and table.rate is None and not any(column.name == TIME for column in columns):
+            options = replace(options, rate=1.0)
         parts.append(extract(table, columns, options, {"mag"}))
     part = next((each for each in parts if "mag" in each.signals), None)
     if part is None:
@@ -315,6 +331,7 @@ class _Format:
 
 _TEXT = _Format("text", "csv")
 _TAGGED = _Format("tagged text", "tagged")
+_PRINTED = _Format("printed text", "printed")
 _ROS1 = _Format("ROS 1 bag", "rosbag", "read_ros1", "rosbags")
 _ROS2 = _Format("ROS 2 bag", "rosbag", "read_ros2", "rosbags")
 _JSON = _Format("JSON", "records")
@@ -352,11 +369,22 @@ def _recognise(path: Path) -> _Format:
     if not head or head.isspace():
         raise InputError(f"{path}: is empty.")
     found = next((each for at, magic, each in _MAGIC if head[at : at + len(magic)] == magic), _TEXT)
-    if found is _TEXT:
-        from jaximu.recordings.readers.tagged import dialect
+    return _of_text(head, path) if found is _TEXT else found
 
-        return _TAGGED if dialect(head) else _JSON if head.lstrip(b"\xef\xbb\xbf \r\n\t")[:1] in (b"{", b"[") else _TEXT
-    return found
+
+def _of_text(head: bytes, path: Path) -> _Format:
+    """The format of text. Raises InputError for text that cannot be read as it stands, saying what it is."""
+    from jaximu.recordings.readers.printed import explained, prints
+    from jaximu.recordings.readers.tagged import dialect
+
+    if dialect(head):
+        return _TAGGED
+    start = head.lstrip(b"\xef\xbb\xbf \r\n\t")
+    if start[:1] == b"{" or (re.match(rb"\[\s*[\[{\d\-\"]", start) and b"] $" not in start[:100]):
+        return _JSON
+    if why := explained(head):
+        raise InputError(f"{path}: {why}.")
+    return _PRINTED if prints(head) else _TEXT
 
 
 def read_table(path: str | os.PathLike[str]) -> Table:
@@ -404,12 +432,13 @@ def read_tables(path: str | os.PathLike[str], selection: MessageSelection | None
     return tuple(_checked(each, source) for each in (tables if isinstance(tables, tuple) else (tables,)))
 
 
-def advise_reading(path: str | os.PathLike[str]) -> Advice | None:
+def advise_reading(path: str | os.PathLike[str], rate: float | None = None) -> Advice | None:
     """How to read a table whose header does not say it all; None for a log that names its columns itself.
 
-    Raises InputError as `read_tables` does.
+    `rate`: Hz, where it is known. Raises InputError as `read_tables` does.
     """
     table = read_tables(path)[0]
+    table = replace(table, rate=rate or table.rate)
     return None if table.messages else advise(whole_stamps(table))
 
 
@@ -469,6 +498,9 @@ def extract(
     for key in sorted(groups & {group_of[name] for name in found if name != TIME}, key=list(GROUPS).index):
         places = [found[name] for name in GROUPS[key].columns]
         values = [(table.numbers(at), at, _per_second(unit, key, stamps)) for at, unit in places]
+        if key == "mag" and len(groups) > 1 and any(np.ptp(axis) == 0 for axis, *_ in values):
+            notes.append("the magnetometer, or an axis of it, never changes: it is left out.")
+            continue
         signal, dropped = _signal(table, values, stamps)
         if dropped == len(stamps):
             if key in ("accel", "gyro"):
@@ -743,6 +775,7 @@ def _assemble(parts: Sequence[_FilePart], table: Table, options: ReadOptions) ->
     alone = options.alone and "accel" not in signals and "gyro" in signals
     if alone:
         signals["accel"] = Signal(np.empty(0), np.empty((0, 3)), "m/s^2")
+        notes += [why] if (why := without_gravity(table)) else []
     elif "accel" not in signals:
         raise InputError(f"{accel_file}: columns accel_x, accel_y, accel_z are missing.")
     for key, file in (("accel", accel_file), ("gyro", gyro_file))[alone:]:

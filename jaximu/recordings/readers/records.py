@@ -24,6 +24,7 @@ from jaximu.recordings.recording import Source
 
 _TAGS = ("sensor", "sensorname", "sensor_name", "type", "name", "topic")
 _TRIADS = {"accel", "gyro", "mag"}
+_ANDROID = {"accel": "m/s^2", "gyro": "rad/s", "mag": "uT"}
 
 
 def read(data: bytes, source: Source) -> Table | tuple[Table, ...]:
@@ -115,13 +116,20 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
     for each in records:
         if (sensor := _sensor(each.get(tag, ""))) and len(each) > 3:
             parts.setdefault(sensor, []).append(each)
+    android = str(records[0][tag]).startswith("android.sensor.")  # whose units are Android's, and stamps in ns
     for sensor, rows in parts.items():
         columns = _columns([{k: v for k, v in each.items() if k != tag} for each in rows])
         named = {}
         for name, values in columns.items():
             last = name.rpartition(".")[2].lower()
-            named[f"{sensor}_{last}" if last in ("x", "y", "z") else name] = values
-        yield sensor, _table(named, source)
+            title = f"{sensor}_{last}" if last in ("x", "y", "z") else name
+            if android:
+                unit = "ns" if name == "timestamp" else _ANDROID[sensor] if last in ("x", "y", "z") else ""
+                title = f"{title} [{unit}]" if unit else title
+            named[title] = values
+        table = _table(named, source)
+        notes = ('units are those of Android\'s sensors, by "type" in each line.',) if android else ()
+        yield sensor, replace(table, notes=(*table.notes, *notes))
 
 
 def apart(table: Table) -> Table:

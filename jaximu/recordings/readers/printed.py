@@ -1,0 +1,246 @@
+"""Text as programs print it for people: labels beside the numbers, several lines a sample, declared rows.
+
+A line's shape is the line with its numbers taken out. Where most lines have one shape, or a few shapes follow each
+other again and again, the numbers are columns, and the words before each are its name.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaximu.ground.errors import InputError
+from jaximu.ground.units import find_unit
+from jaximu.recordings.columns.table import Table
+from jaximu.recordings.readers.clock import seconds_of
+from jaximu.recordings.recording import Source
+
+__all__ = ["explained", "prints", "read"]
+
+_LOOKED_AT = 400  # lines in which a shape is looked for
+_LONGEST = 40  # lines of a sample
+_MOST = 0.6  # of the lines that must have the shape
+_FEWEST = 3  # numbers with a label, and numbers in all, of a sample
+_NUMBER = re.compile(r"(?<![\w.^])[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?![\w.])")
+_CLOCK = re.compile(r"(?<![\w:])\d{1,2}:\d{2}:\d{2}[.,]\d+")
+_CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2,8}\s*$")
+_LABELLED = re.compile(r"[A-Za-z_)\]\"]\s*[:=]\s*[\[(]?\s*#|->\s*#|^\[#\]\s*\$")
+_PROTOCOL = re.compile(r"[\w.\-]+(?:,[\w.\-]+=[\w.\-]+)* (?:[\w.\-]+=#i?,?)+ #")
+_DECLARED = re.compile(rb"^\$COL,IMU,(.*)$\n\$UNIT,IMU,(.*)$", re.MULTILINE)
+_HEX = re.compile(r"(?:[0-9A-Fa-f]{2}|[0-9A-Fa-f]{4})(?:[\s,]+(?:[0-9A-Fa-f]{2}|[0-9A-Fa-f]{4})){5,}\s*")
+_ARRAY = re.compile(r"\"[-+.\deE]+(?:\|[-+.\deE]+){2,}\"")
+_SENTENCE = re.compile(r"\[#\]\s*(\$\w+)")
+
+
+def _text(data: bytes) -> list[str]:
+    lines = data.decode("utf-8-sig", errors="replace").replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    return [line for line in lines if line.strip()]
+
+
+def _shape(line: str) -> str:
+    """The line with a # for each number, and @ for a time of day."""
+    return _NUMBER.sub("#", _CLOCK.sub("@", _CHECKSUM.sub("", line.rstrip())))
+
+
+def _values(line: str) -> list[str]:
+    line = _CHECKSUM.sub("", line.rstrip())
+    return [*_CLOCK.findall(line), *_NUMBER.findall(_CLOCK.sub("@", line))]
+
+
+def _sample(shapes: list[str]) -> tuple[str, ...] | None:
+    """The shapes of the lines of one sample, as most lines have them; None for none."""
+    if not shapes:
+        return None
+    (common, count), *_ = Counter(shapes).most_common(1)
+    if count >= _MOST * len(shapes):
+        return (common,)
+    for length in range(2, min(_LONGEST, len(shapes) // 3) + 1):
+        follow = np.mean([one == other for one, other in zip(shapes, shapes[length:], strict=False)])
+        first = shapes[length : 2 * length]
+        if follow >= _MOST and len(set(first)) > len(first) // 2:
+            start = first.index("---") + 1 if "---" in first else 0  # as YAML parts documents
+            return tuple(first[start:] + first[:start])
+    return None
+
+
+def _of(data: bytes) -> tuple[str, ...] | None:
+    """The shapes of a sample's lines in printed text, None where the text is a table or something else."""
+    lines = _text(data)[:_LOOKED_AT]
+    sample = _sample([_shape(line) for line in lines[:-1]])
+    if sample is None or sum(line.count("#") for line in sample) < _FEWEST:
+        return None
+    labels = sum(len(_LABELLED.findall(line)) for line in sample)
+    return sample if labels >= _FEWEST or (len(sample) == 1 and re.search(r"->\s*#|^\[#\]\s*\$", sample[0])) else None
+
+
+def prints(head: bytes) -> bool:
+    """Whether text is printed for people, or declares its rows, rather than a table."""
+    return bool(_DECLARED.search(head)) or _of(head) is not None
+
+
+def explained(head: bytes) -> str:
+    """Say what text is that cannot be read as it stands, and how to bring it in; empty for any other."""
+    lines = _text(head)[:_LOOKED_AT]
+    if sum(line.startswith(("%RAWIMU", "#RAWIMU")) for line in lines) > len(lines) / 2:
+        return (
+            "is a receiver's RAWIMU log (NovAtel): counts of velocity and angle increments, the y axis negated, whose "
+            "scale is the IMU's. Multiply by the scales of its manual, divide by the sampling interval, and write "
+            "columns time [s], accel_x [m/s^2], … gyro_z [rad/s]"
+        )
+    words = [bool(_HEX.fullmatch(line)) for line in lines]
+    if words and np.mean(words) > 0.9 and re.search("[A-Fa-f]", "".join(lines)):
+        return (
+            "holds hexadecimal words, as a sensor's registers have them. Convert each to a signed whole number (16 "
+            "bits, two's complement), write one column an axis, and state counts with --columns and the scales with "
+            "--accel-scale and --gyro-scale"
+        )
+    if sum(bool(_ARRAY.search(line)) for line in lines) > len(lines) / 2:
+        return (
+            "holds arrays: several samples in one cell, parted by vertical bars, as the CSV of a FIT file has them. "
+            "Write each sample in a row of its own, with the time that it was taken at"
+        )
+    return ""
+
+
+@dataclass
+class _Naming:
+    """Names of the numbers of a line, one after the other: words before them, and units after them.
+
+    heading: of the lines above that hold no number.
+    """
+
+    heading: str
+
+    def names(self, line: str) -> list[str]:
+        parts = re.split(r"[#@]", line)
+        names: list[str] = []
+        group, axis = "", 0
+        for number, text in enumerate(parts[:-1]):
+            words = self._label(text)
+            if words and len(words) == 1 and words[0].lower() in "wxyz" and len(words[0]) == 1 and group:
+                words = [group, *words]
+            elif words:
+                group = " ".join(word for word in words if not (len(word) == 1 and word.lower() in "wxyz"))
+                axis = 0
+                if self._vector(parts, number):
+                    words = [*words, "x"]
+            elif group and axis < 2 and "," in text:
+                axis += 1
+                words = [group, "xyz"[axis]]
+            names.append(f"{self.heading}{' '.join(words)}" if words else "")
+        return self._with_units(names, parts)
+
+    @staticmethod
+    def _vector(parts: list[str], number: int) -> bool:
+        """Whether a label stands before three numbers in brackets."""
+        between = [part.strip() for part in parts[number + 1 : number + 3]]
+        return parts[number].rstrip().endswith(("[", "(")) and between == [",", ","]
+
+    @staticmethod
+    def _label(text: str) -> list[str]:
+        """The words of a label between two numbers: what follows the last unit, bracket or comma."""
+        text = re.sub(r"[:=>\-]+\s*[\[(]?\s*$", "", text.rstrip().rstrip("[(").rstrip())
+        last = re.split(r"[,;|\])\t]", text)[-1].strip()
+        last = last.rpartition(" ")[2] if "=" in last else last  # tags of a protocol stand before its fields
+        words = re.findall(r"[A-Za-z_][\w./]*", last)
+        return words[1:] if len(words) > 1 and find_unit(words[0]) else words
+
+    @staticmethod
+    def _with_units(names: list[str], parts: list[str]) -> list[str]:
+        """The names with the unit that stands after each number, or after the last one of a line."""
+        units = [re.match(r"\s*\[?\(?([^\s,;\[\]()|:=]+)", text) for text in parts[1:]]
+        stated = [match[1] if match and find_unit(match[1]) else "" for match in units]
+        if stated and stated[-1] and not any(stated[:-1]):
+            stated = [stated[-1] if name.rpartition(" ")[0] == names[-1].rpartition(" ")[0]
+                      or len(names[-1].split()) > 1 else "" for name in names[:-1]] + [stated[-1]]  # fmt: skip
+        return [f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, stated, strict=True)]
+
+
+def _names(sample: tuple[str, ...]) -> list[str]:
+    """The names of a sample's numbers, under the headings of lines that hold none, as far as these are set in."""
+    names: list[str] = []
+    headings: list[tuple[int, str]] = []
+    for line in sample:
+        indent = len(line) - len(line.lstrip())
+        headings = [each for each in headings if each[0] < indent]
+        if "#" in line or "@" in line:
+            names += _Naming("".join(f"{name}." for _, name in headings)).names(line)
+        elif match := re.fullmatch(r"\s*([A-Za-z_]\w*):", line):
+            headings.append((indent, match[1]))
+    return names
+
+
+def _rows(lines: list[str], sample: tuple[str, ...]) -> Iterator[tuple[int, list[str]]]:
+    """The number of the first line, and the numbers, of each whole sample."""
+    shapes, at, length = [_shape(line) for line in lines], 0, len(sample)
+    while at <= len(lines) - length:
+        if shapes[at] == sample[0] and tuple(shapes[at : at + length]) == sample:
+            yield at + 1, [value for line in lines[at : at + length] for value in _values(line)]
+            at += length
+        else:
+            at += 1
+
+
+def _numbers(texts: list[str]) -> np.ndarray:
+    if all(re.fullmatch(r"[+-]?\d{1,18}", text) for text in texts[:1000]):
+        try:
+            return np.array(texts, np.int64)
+        except (ValueError, OverflowError):
+            pass
+    return np.array(texts, np.float64)
+
+
+def read(data: bytes, source: Source) -> Table:
+    """The table in printed text. Raises InputError where no whole sample is there."""
+    declared = _DECLARED.search(data)
+    if declared is not None:
+        return _declared(data, source, declared)
+    sample = _of(data[: 1 << 18])
+    rows = [] if sample is None else list(_rows(_text(data), sample))
+    if sample is None or len(rows) < 2:
+        raise InputError(f"{source.path}: holds no whole samples of text with labels.")
+    first, cells = zip(*rows, strict=True)
+    columns: list[np.ndarray] = []
+    names = _names(sample)
+    if _PROTOCOL.fullmatch(sample[0]):
+        names[-1], note = "time [ns]", "InfluxDB's line protocol: fields by name, the time in ns at the end."
+    elif sentence := _SENTENCE.match(sample[0]):
+        from jaximu.recordings.columns.known import sentence_names
+
+        known = sentence_names(sentence[1], len(names) - 1)
+        names = ["time [s]", *(known or [""] * (len(names) - 1))]
+        note = f"a terminal program's time stands before each {sentence[1]} sentence."
+    elif "@" in sample[0] and "->" in sample[0]:
+        note = "a serial monitor's time of day and arrow (->) stand before the values."
+    elif len(sample) > 1:
+        note = f"a sample is printed in {len(sample)} lines, with words and labels beside the numbers."
+        note = "YAML as `ros2 topic echo` prints it." if "---" in sample else note
+    else:
+        note = "labels stand beside the numbers (name:value pairs), and name the columns."
+    for at in range(len(names)):
+        texts = [row[at] for row in cells]
+        if _CLOCK.fullmatch(texts[0]):
+            stamps = seconds_of(np.array(texts, object))
+            assert stamps is not None
+            columns.append(stamps)
+            names[at] = "time of day [ns]"
+        else:
+            columns.append(_numbers(texts))
+    return Table(source, tuple(names) if any(names) else None, tuple(columns), np.array(first), notes=(note,))
+
+
+def _declared(data: bytes, source: Source, declared: re.Match[bytes]) -> Table:
+    """The rows of $IMU in a text that declares its columns and their units, as FlySight writes it."""
+    names, units = (each.decode().strip().split(",") for each in declared.groups())
+    rows = [line.split(b",")[1:] for line in data.split(b"\n") if line.startswith(b"$IMU,")]
+    whole = [row for row in rows if len(row) == len(names)]
+    if len(whole) < 2:
+        raise InputError(f"{source.path}: declares columns ($COL) of $IMU, and has no rows of it.")
+    columns = [_numbers([cell.decode().strip() for cell in column]) for column in zip(*whole, strict=True)]
+    titles = [f"{name} [{unit.replace('deg C', 'degC')}]" for name, unit in zip(names, units, strict=True)]
+    note = "rows of several kinds, declared by $COL and $UNIT as FlySight writes them: those of $IMU are read."
+    return Table(source, tuple(titles), tuple(columns), notes=(note,))
