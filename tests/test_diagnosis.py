@@ -12,6 +12,7 @@ from jaximu import LocalGravity, load_calibration, read_recording
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose, twin_of
 from jaximu.noise.at_rest import fit_noise
+from jaximu.report.words import lead
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 ANSWERS = "answers.json"
@@ -300,3 +301,17 @@ def test_a_bumped_pose_is_found_and_left_out(studied, clean_found):
     assert found.verdict == "adequate"
     (finding,) = [each for each in found.preflight if each.name == "data.bumped_pose"]
     assert f"{start:.1f}" in finding.text
+
+
+def test_an_exact_fit_is_no_evidence(clean_found):
+    """Where there are as many parameters as conditions, what is left is rounding: no sign of a good fit."""
+    rms = dict(clean_found.calibration.rms)
+    rms["gravity_norm"] = (0.1, 1e-10, "m/s^2")
+    exact = replace(clean_found.calibration, rms=rms)
+    assert exact.exact == ("gravity_norm",) and not clean_found.calibration.exact
+    assert (
+        "none by construction" in str(exact.summary()) and "→ 1" not in str(exact.summary()).partition("Direction")[0]
+    )
+    assert lead(exact).number == "not checked"
+    headline = replace(clean_found, calibration=exact).headline()
+    assert "gravity norm at rest cannot be checked" in headline and "explain this recording" not in headline

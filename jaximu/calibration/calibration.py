@@ -18,7 +18,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage, read_document
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
-from jaximu.ground.quantities import Z95, change, number, unit_text
+from jaximu.ground.quantities import Z95, change, number, size, unit_text
 from jaximu.ground.reexport import later
 from jaximu.ground.summary import Described, Parameter, ParameterTable, Summary, sentence
 from jaximu.ground.units import SENSOR_UNITS
@@ -49,6 +49,8 @@ _ERRORS = {
     "accelerometer": "Specific force at rest over temperature",
     "gyroscope": "Rate at rest over temperature",
 }
+EXACT = 1e-6
+"""Share of an error before the fit below which what is left is rounding: as many parameters as conditions."""
 _BEYOND = 3.0  # excess variance, in multiples of the noise's, from which an unmodelled effect is suspected
 
 
@@ -133,6 +135,11 @@ class Calibration(Described, Document):
         if triad is not None and self.reading is not None:
             self.reading.require_alike(recording.reading, recording.name, (name,))
         return triad
+
+    @property
+    def exact(self) -> tuple[str, ...]:
+        """The kinds of residual that the fit passes through exactly: no degrees of freedom are left of them."""
+        return tuple(name for name, (before, after, _) in self.rms.items() if after < EXACT * before)
 
     def gains_determined(self) -> bool:
         """Return whether the recording determined all gains that were estimated."""
@@ -471,7 +478,12 @@ def _summary_of(calibration: Calibration) -> Summary:
     title = f"Calibration of {files}: {', '.join([*counts, f'{calibration.method} fit'])}"
     verdict = []
     for name, (before, after, unit) in calibration.rms.items():
-        verdict.append(f"{_ERRORS[name]}: {change(before, after, unit)} (rms, before → after calibration).")
+        verdict.append(
+            f"{_ERRORS[name]}: {size(before, unit)} before calibration (rms); after it none by construction, for there "
+            "are as many parameters as conditions: no degrees of freedom are left to check it by."
+            if name in calibration.exact
+            else f"{_ERRORS[name]}: {change(before, after, unit)} (rms, before → after calibration)."
+        )
     count, undetermined = len(calibration.names), sum(not each.determined for each in calibration.weak)
     if undetermined:
         what = f"{undetermined} combination{'s' * (undetermined > 1)} of the {count} parameters"

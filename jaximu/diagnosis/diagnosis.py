@@ -285,6 +285,14 @@ class Diagnosis(Described, Document):
                     f"No effect shows (p {probability(self.p_value)}), but the noise is not all that was assumed: "
                     f"{beside.text} (p {probability(beside.adjusted)})."
                 )
+            if self.calibration.exact:
+                kinds = {kind.name: kind.words for kind in self.experiment.real.kinds}
+                unchecked = listed([kinds.get(name, name) for name in self.calibration.exact])
+                return (
+                    f"No effect shows (p {probability(self.p_value)}), but {unchecked} "
+                    "cannot be checked: there are as many parameters as conditions, and no degrees of freedom are "
+                    "left. Record more poses."
+                )
             return (
                 "The model fits: bias, scale and misalignment explain this recording to its noise "
                 f"(p {probability(self.p_value)})."

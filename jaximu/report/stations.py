@@ -21,6 +21,7 @@ from jaximu.report.words import (
     how_much_smaller,
     scatter_statements,
     weak_statements,
+    without_freedom,
 )
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ _WORDS = {
 
 
 def _lead(calibration: Calibration) -> Lead:
+    if calibration.exact:
+        return without_freedom(calibration)
     parts = [f"{_WORDS[name]} from {number(before)} to {number(after, 2)} {unit}"
              for name, (before, after, unit) in calibration.rms.items()]  # fmt: skip
     name, (before, after, unit) = next(iter(calibration.rms.items()))

@@ -14,7 +14,7 @@ from jaximu.ground.summary import sentence
 from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
 __all__ = ["Lead", "Statement", "gravity_statement", "how_much_smaller", "lead", "limits", "scatter_statements",
-           "trust", "weak_statements"]  # fmt: skip
+           "trust", "weak_statements", "without_freedom"]  # fmt: skip
 
 _BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
 
@@ -48,8 +48,21 @@ def how_much_smaller(before: float, after: float) -> str:
     return f"{round(ratio, digits):,.{max(0, digits)}f} times smaller"
 
 
+def without_freedom(calibration: Calibration) -> Lead:
+    """Say that a fit passes through its conditions by construction."""
+    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    return Lead(
+        f"{poses} poses and {turns} turns leave no degrees of freedom: the fit passes through them by construction, "
+        "and nothing is left to check it by. Record more of them.",
+        "not checked",
+        "there are as many parameters as conditions",
+    )
+
+
 def lead(calibration: Calibration) -> Lead:
     """Say how far the errors against gravity fall."""
+    if calibration.exact:
+        return without_freedom(calibration)
     poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
     before, after, _ = calibration.rms["gravity_norm"]
     factor, unit = readable("m/s^2", after)
