@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from jaximu.calibration.calibration import Calibration, concluded, provenance
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.refusals import relative_covariance, require_solved, require_spanning
-from jaximu.data.poses import EXCESS_NAMES, residual_rms
-from jaximu.estimation.problem import Loss
+from jaximu.data.poses import EXCESS_NAMES, PosesAndTurns, residual_rms
+from jaximu.estimation.fitting import Prior, fit
+from jaximu.estimation.problem import Loss, Name, names_of, without_equipment_or_effects
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.precision import require_float64
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import PoseMeans
 from jaximu.recordings.segmentation import observe_means
@@ -21,6 +27,9 @@ __all__ = ["calibrate_means"]
 
 _SPARE = 3
 """Poses beyond the parameters, from whose misfit an unknown noise is taken."""
+_ACROSS = 0.01
+"""Standard deviation of a misalignment, rad: data sheets of MEMS sensors state a cross-axis sensitivity of ±2 %
+(InvenSense, MPU-6000 and MPU-6050 Product Specification, rev. 3.4, 2013, sec. 6.2)."""
 
 
 def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = "linear") -> Calibration:
@@ -32,8 +41,9 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     - `gravity`: local gravity, m/s²; its uncertainty goes into the accelerometer's scales.
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
 
-    Raises `NotPossibleError` where the poses do not span enough orientations, are too few to tell their own noise, or
-    the fit does not converge.
+    Where there are too few poses to tell their own noise, misalignments are held near zero, which six positions
+    allow. Raises `NotPossibleError` where the poses do not span enough orientations or are fewer, or the fit does not
+    converge.
     """
     require_float64()
     gravity = as_gravity(gravity)
@@ -42,21 +52,36 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     observations = observe_means(means, gravity.value)
     nominal, notes = nominal_imu(recording)
     method = "accelerometer" if recording.gyroscope is None else "joint"
-    found = fit_hand_held(nominal, observations, method, loss)
+    free = [name for name in names_of(nominal) if name.owner == "accelerometer" and without_equipment_or_effects(name)]
+    across = [name for name in free if name.part == "gain" and name.axes[0] != name.axes[1]]
+    prior = None
+    if means.accelerometer_sigma is None and poses < len(free) + _SPARE:
+        prior = _square(nominal, across)
+        spare = poses - (len(free) - len(across))
+        if spare < 0:
+            raise NotPossibleError(
+                f"{where}: {poses} poses for {len(free)} parameters do not show how uncertain the means are: "
+                f"add {-spare} poses or more (each axis up and down once are six), or columns accel_sigma_x [m/s^2], … "
+                "with the samples' standard deviations, and samples, their number."
+            )
+        spread = np.full((poses, 3), _step(recording.accelerometer.values) / np.sqrt(12))
+        observations = observe_means(replace(means, accelerometer_sigma=spread), gravity.value)
+        data = PosesAndTurns.of(observations, "norm" if method == "accelerometer" else "all")
+        excess = None if spare >= _SPARE else np.zeros(len(EXCESS_NAMES))
+        found = fit(nominal, data, prior=prior, loss=loss, excess=excess, estimate_excess=excess is None)
+        notes += (
+            f"{poses} poses leave misalignments open: they were taken to be zero within ±{200 * _ACROSS:g} % (95 %), "
+            "as data sheets state the cross-axis sensitivity. The means are taken to be as good as their digits.",
+        )
+    else:
+        found = fit_hand_held(nominal, observations, method, loss)
     if bool(found.finite):
         require_spanning(relative_covariance(found), found.names, poses, where)
-    free = sum(name.owner == "accelerometer" for name in found.names)
-    if means.accelerometer_sigma is None and poses < free + _SPARE:
-        raise NotPossibleError(
-            f"{where}: {poses} poses for {free} parameters do not show how uncertain the means are: "
-            f"add {free + _SPARE - poses} poses, or columns accel_sigma_x [m/s^2], … with the samples' standard "
-            "deviations, and samples, their number. Poses known beforehand (six positions) are for `jaximu turntable`."
-        )
     require_solved(found, where)
     if method == "accelerometer":
         found = replace(found, imu=Imu(found.imu.accelerometer, None))
     before, after = (residual_rms(imu, observations, method == "joint") for imu in (nominal, found.imu))
-    stated = {"accelerometer": means.accelerometer_sigma is not None}
+    stated = {"accelerometer": means.accelerometer_sigma is not None or prior is not None}
     if method == "joint":
         stated["gyroscope"] = means.gyroscope_sigma is not None
         notes += ("a table of means has no turns: the gyroscope's gain stays at the data sheet's.",)
@@ -71,4 +96,23 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
         nominal=nominal, reading=recording.reading,
     )  # fmt: skip
     known = {name: size for name, size in calibration.excess.items() if stated.get(name)}
-    return replace(calibration, excess=known)
+    held = set() if prior is None else set(map(str, prior.names))
+    weak = tuple(each for each in calibration.weak if not held.issuperset(name for name, _ in each.parameters))
+    return replace(calibration, excess=known, weak=weak)
+
+
+def _step(values: FloatArray) -> float:
+    """Return the step (m/s²) of the digits in which a table is written, in m/s² or in g."""
+    for digits in range(7):
+        for unit in (1.0, STANDARD_GRAVITY):
+            scaled = values / unit * 10.0**digits
+            if np.all(np.abs(scaled - np.round(scaled)) < 1e-6 * np.maximum(np.abs(scaled), 1.0)):
+                return unit * 10.0**-digits
+    return 1e-6
+
+
+def _square(nominal: Imu, across: Sequence[Name]) -> Prior:
+    """Return what is known beforehand of an accelerometer's misalignments, as shares of its scales."""
+    scale = np.linalg.norm(np.asarray(nominal.accelerometer.gain), axis=1)
+    sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
+    return Prior(tuple(across), np.zeros(len(across)), np.diag(1 / sigma))
