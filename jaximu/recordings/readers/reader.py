@@ -61,8 +61,9 @@ def _noted(notes: Sequence[str]) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        more = [note[:1].upper() + note[1:] for note in notes if note not in str(error)]
-        raise InputError(" ".join([str(error), *more])) from error
+        text = str(error.args[0])  # as it was written, before it is worded for its reader
+        more = [note[:1].upper() + note[1:] for note in notes if note not in text]
+        raise InputError(" ".join([text, *more])) from error
 
 
 def read_recording(
