@@ -12,7 +12,7 @@ from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.refusals import relative_covariance, require_solved, require_spanning
 from jaximu.data.poses import EXCESS_NAMES, PosesAndTurns, residual_rms
-from jaximu.estimation.fitting import Prior, fit
+from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.problem import Loss, Name, names_of, without_equipment_or_effects
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
@@ -53,22 +53,9 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     nominal, notes = nominal_imu(recording)
     method = "accelerometer" if recording.gyroscope is None else "joint"
     free = [name for name in names_of(nominal) if name.owner == "accelerometer" and without_equipment_or_effects(name)]
-    across = [name for name in free if name.part == "gain" and name.axes[0] != name.axes[1]]
     prior = None
     if means.accelerometer_sigma is None and poses < len(free) + _SPARE:
-        prior = _square(nominal, across)
-        spare = poses - (len(free) - len(across))
-        if spare < 0:
-            raise NotPossibleError(
-                f"{where}: {poses} poses for {len(free)} parameters do not show how uncertain the means are: "
-                f"add {-spare} poses or more (each axis up and down once are six), or columns accel_sigma_x [m/s^2], … "
-                "with the samples' standard deviations, and samples, their number."
-            )
-        spread = np.full((poses, 3), _step(recording.accelerometer.values) / np.sqrt(12))
-        observations = observe_means(replace(means, accelerometer_sigma=spread), gravity.value)
-        data = PosesAndTurns.of(observations, "norm" if method == "accelerometer" else "all")
-        excess = None if spare >= _SPARE else np.zeros(len(EXCESS_NAMES))
-        found = fit(nominal, data, prior=prior, loss=loss, excess=excess, estimate_excess=excess is None)
+        found, prior = _with_few_poses(means, nominal, free, gravity.value, method, loss)
         notes += (
             f"{poses} poses leave misalignments open: they were taken to be zero within ±{200 * _ACROSS:g} % (95 %), "
             "as data sheets state the cross-axis sensitivity. The means are taken to be as good as their digits.",
@@ -97,8 +84,8 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     )  # fmt: skip
     known = {name: size for name, size in calibration.excess.items() if stated.get(name)}
     held = set() if prior is None else set(map(str, prior.names))
-    weak = tuple(each for each in calibration.weak if not held.issuperset(name for name, _ in each.parameters))
-    return replace(calibration, excess=known, weak=weak)
+    weak = [one for one in calibration.weak if not held.issuperset(name for name, _ in one.parameters)]
+    return replace(calibration, excess=known, weak=tuple(weak))
 
 
 def _step(values: FloatArray) -> float:
@@ -111,8 +98,24 @@ def _step(values: FloatArray) -> float:
     return 1e-6
 
 
-def _square(nominal: Imu, across: Sequence[Name]) -> Prior:
-    """Return what is known beforehand of an accelerometer's misalignments, as shares of its scales."""
+def _with_few_poses(
+    means: PoseMeans, nominal: Imu, free: Sequence[Name], gravity: float, method: str, loss: Loss
+) -> tuple[Fit, Prior]:
+    """Fit with misalignments that are zero within what sensors have, and return what was known of them beforehand."""
+    across = [name for name in free if name.part == "gain" and name.axes[0] != name.axes[1]]
+    signal = means.recording.accelerometer
+    spare = len(signal) - (len(free) - len(across))
+    if spare < 0:
+        raise NotPossibleError(
+            f"{means.recording.name}: {len(signal)} poses for {len(free)} parameters do not show how uncertain the "
+            f"means are: add {-spare} poses or more (each axis up and down once are six), or columns "
+            "accel_sigma_x [m/s^2], … with the samples' standard deviations, and samples, their number."
+        )
     scale = np.linalg.norm(np.asarray(nominal.accelerometer.gain), axis=1)
     sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
-    return Prior(tuple(across), np.zeros(len(across)), np.diag(1 / sigma))
+    prior = Prior(tuple(across), np.zeros(len(across)), np.diag(1 / sigma))
+    spread = np.full((len(signal), 3), _step(signal.values) / np.sqrt(12))  # of rounding
+    observations = observe_means(replace(means, accelerometer_sigma=spread), gravity)
+    data = PosesAndTurns.of(observations, "norm" if method == "accelerometer" else "all")
+    excess = None if spare >= _SPARE else np.zeros(len(EXCESS_NAMES))
+    return fit(nominal, data, prior=prior, loss=loss, excess=excess, estimate_excess=excess is None), prior

@@ -101,7 +101,7 @@ def explained(head: bytes) -> str:
     if sum(bool(_ARRAY.search(line)) for line in lines) > len(lines) / 2:
         return (
             "holds arrays: several samples in one cell, parted by vertical bars, as the CSV of a FIT file has them. "
-            "Write each sample in a row of its own, with the time that it was taken at"
+            "Write each sample in a separate row, with the time that it was taken at"
         )
     return ""
 
