@@ -375,3 +375,14 @@ def test_a_unit_that_sits_turned_in_its_fixture_is_said():
     assert "turned as a whole by 1.6°" in notes
     assert "turned as a whole" not in " ".join(calibrate_turntable(
         Recording(Signal(time, seat.inv().apply(force), "m/s^2")), entries).notes)  # fmt: skip
+
+
+def test_stops_in_one_orientation_are_no_poses(tmp_path, capsys):
+    """A vehicle that stops: its rests are all level, and nothing is offered that would be refused."""
+    random, t = np.random.default_rng(7), np.arange(0, 240, 0.02)
+    moving = (t % 24 > 10)[:, None]
+    a = [0.1, 0.0, G] + 0.02 * random.normal(size=(len(t), 3)) + 1.5 * moving * np.sin(2 * t)[:, None] * [1.0, 0.2, 0.0]
+    g = 0.002 * random.normal(size=(len(t), 3)) + 0.4 * moving * np.sin(0.9 * t)[:, None] * [0.0, 0.0, 1.0]
+    main(["info", str(written(tmp_path / "log.csv", ["time [s]", *BOTH], t, a, g))])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "poses are of one orientation" in said and "jaximu calibrate" not in said and "and the turns" not in said

@@ -223,8 +223,14 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
 
 
 def _headings_known(segmentations: Sequence[Segmentation], observations: Observations) -> bool:
-    """Whether the gyroscope carries the heading through a whole recording, and there is no other one."""
-    return len(segmentations) == 1 and int(np.sum(observations.turns.mask)) == len(segmentations[0].intervals) - 1
+    """Whether the gyroscope carries the heading through a whole recording, and there is no other one.
+
+    Between two rests that touch the unit did not turn.
+    """
+    intervals = segmentations[0].intervals
+    touching = intervals[1:, 0] <= intervals[:-1, 1]
+    carried = np.asarray(observations.turns.mask)[: len(touching)]
+    return len(segmentations) == 1 and bool(np.all(carried | touching))
 
 
 def _mean_temperature(recordings: Sequence[Recording], observations: Observations) -> dict[str, float]:

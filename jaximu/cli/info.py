@@ -12,6 +12,7 @@ from jaximu.ground.errors import InputError, JaximuError
 from jaximu.ground.gravity import STANDARD
 
 if TYPE_CHECKING:
+    from jaximu.ground.array_types import FloatArray
     from jaximu.recordings.columns.guess import Advice
     from jaximu.recordings.recording import Recording, Signal
 
@@ -24,6 +25,7 @@ _CUT = 600.0  # s at rest that are worth cutting out of a log
 _ASSUMED_RATE = 100.0
 _TABLE, _NEAR_GRAVITY = 200, 0.15
 """Rows, and how far off gravity each of them may be, up to which a file without time may be a table of pose means."""
+_TILTED = 25.0  # degrees from their mean that poses must lie at least to be several orientations
 _STATIONS = 6  # poses from which on a turntable fit tells all of an accelerometer
 
 
@@ -128,6 +130,13 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
         poses = len(found.intervals)
         still = float(np.sum(found.intervals[:, 1] - found.intervals[:, 0]))
         findings.append(f"{poses} static poses, {still:.0f} s in all")
+        tilt = _tilt(ready.recording.accelerometer, found.intervals)
+        if poses > 1 and tilt < _TILTED:
+            findings.append(
+                f"all {poses} poses are of one orientation, within {tilt:.2g}°: a calibration by poses needs nine or "
+                "more, all around"
+            )
+            poses = 0
     except JaximuError as error:
         if not means:
             findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
@@ -193,6 +202,17 @@ def _signal(signal: Signal, used: Signal) -> dict[str, Any]:
         "minimum": signal.values.min(axis=0).tolist(),
         "maximum": signal.values.max(axis=0).tolist(),
     }
+
+
+def _tilt(signal: Signal, intervals: FloatArray) -> float:
+    """Return the largest angle, degrees, of the force in a pose from its mean over all poses."""
+    import numpy as np
+
+    values = signal.si()
+    means = np.stack([values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in intervals])
+    up = means / np.linalg.norm(means, axis=1, keepdims=True)
+    middle = up.mean(axis=0)
+    return float(np.degrees(np.arccos(np.clip(up @ middle / max(np.linalg.norm(middle), 1e-9), -1.0, 1.0))).max())
 
 
 def _rest(recording: Recording) -> tuple[float, float, float]:
