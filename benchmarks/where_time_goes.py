@@ -26,7 +26,7 @@ import numpy as np
 from common import Table, arguments, finish, least
 
 from jaximu.data.poses import PosesAndTurns, condense
-from jaximu.data.poses_covariance import condition_covariance, integrate_turns
+from jaximu.data.poses_covariance import condition_covariance, turned_by
 from jaximu.estimation.covariance import update_excess
 from jaximu.estimation.problem import TOLERANCE, Parameters, without_equipment
 from jaximu.fleets import FleetUnit, fit_units
@@ -113,23 +113,23 @@ def main() -> None:
         information = jacobian.T @ jacobian + np.eye(z.shape[1]) / TOLERANCE**2
         return update_excess([covariance], [weights], residual, jacobian, information, excess)
 
-    integrated = measured("integrate turns, with noise and reactions", partial(integrate_turns, imu), batch.turns)
+    whole = measured("integrate turns, with their reactions", partial(turned_by, imu.gyroscope), batch.turns)
     measured("condense turns", lambda data: condense(imu, data)[:2], batch)
     conditions, _ = jax.jit(jax.vmap(lambda data: condense(imu, data)[:2]))(batch)
-    covariance = measured("covariance", partial(condition_covariance, imu), batch, integrated)
+    covariance = measured("covariance", partial(condition_covariance, imu), batch, whole)
     weights = measured("weights: Cholesky along the chain", lambda one, size: one.weights(size), covariance, excess)
     jacobian, residual = measured("whitened residual and Jacobian", whitened, weights, conditions, z)
     measured("improve the excess", improved, covariance, weights, residual, jacobian, excess)
 
     unit = FleetUnit(seen, imu, True)
-    whole = least(lambda: fit_units([unit] * LANES), repetitions) / LANES
+    fitting = least(lambda: fit_units([unit] * LANES), repetitions) / LANES
 
     table = Table(
         "Kernels of one unit, one core",
         ["kernel", "measured, µs", "operations", "bytes", "floor, µs", "bound by", "measured / floor"],
         f"Measured speeds: {peak / 1e9:.1f} · 10⁹ operations a second (matrix product of 768), "
         f"{bandwidth / 1e9:.1f} · 10⁹ bytes a second (copy of 128 MB). The whole fit of this unit in a batch takes "
-        f"{1e6 * whole:.0f} µs: four to six passes, each of which condenses turns anew. "
+        f"{1e6 * fitting:.0f} µs: four to six passes, each of which condenses turns anew. "
         f"Load of the machine at the start: {load:.1f}.",
     )
     figures = {}
@@ -142,7 +142,7 @@ def main() -> None:
         figures[name] = {"seconds": seconds, "operations": operations, "bytes": size, "floor_seconds": floor}
     finish(
         "where_time_goes", [table],
-        {"load": load, "operations_per_second": peak, "bytes_per_second": bandwidth, "fit_seconds": whole,
+        {"load": load, "operations_per_second": peak, "bytes_per_second": bandwidth, "fit_seconds": fitting,
          "kernels": figures}, keep=not small,
     )  # fmt: skip
 

@@ -114,14 +114,18 @@ def unpack(x):
 
 
 def integrate(gain, bias, output, intervals):
-    """Rotation of one turn and each sample's running rotation, by SciPy, one after the other."""
+    """Rotation of one turn, and how the rate of each sample turns the last frame over its time, by SciPy.
+
+    A rate that is off while a frame turns by θ turns it by the mean of exp(−sθ) over s from 0 to 1.
+    """
     angles = (output - bias) @ np.linalg.inv(gain).T * intervals[:, None]
     beside = np.vstack([np.zeros(3), angles, np.zeros(3)])
     total, running = Rotation.identity(), []
     for vector in angles + np.cross(7 * angles - beside[:-2] - beside[2:], beside[2:] - beside[:-2]) / 120:
         total = total * Rotation.from_rotvec(vector)
-        running.append(total)
-    return total, running
+        shares = -(np.arange(50) + 0.5)[:, None] / 50
+        running.append((total, Rotation.from_rotvec(shares * vector).as_matrix().mean(axis=0)))
+    return total, [(total.inv() * after).as_matrix() @ within for after, within in running]
 
 
 def all_attitudes_free(case):
@@ -145,11 +149,10 @@ def all_attitudes_free(case):
     inverse = np.linalg.inv(gain_g)
     white_t = []
     for k in range(count - 1):
-        total, running = integrate(gain_g, bias_g, turns.output[k, used], turns.interval[k, used])
         spread = np.zeros((3, 3))
-        for after, interval in zip(running, turns.interval[k, used], strict=True):
-            lever = (total.inv() * after).as_matrix() @ inverse
-            spread += lever @ turns.noise @ lever.T * interval
+        _, turning = integrate(gain_g, bias_g, turns.output[k, used], turns.interval[k, used])
+        for lever, interval in zip(turning, turns.interval[k, used], strict=True):
+            spread += lever @ inverse @ turns.noise @ inverse.T @ lever.T * interval
         white_t.append(np.linalg.inv(np.linalg.cholesky(spread)))
 
     def residual(x):

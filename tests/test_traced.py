@@ -14,7 +14,7 @@ import jaximu
 from jaximu.data.gravity_direction import gravity_direction
 from jaximu.data.gravity_norm import gravity_norm
 from jaximu.data.poses import PosesAndTurns, condense
-from jaximu.data.poses_covariance import integrate_turns
+from jaximu.data.poses_covariance import turned_by
 from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.model.effects import CATALOGUE
@@ -242,7 +242,7 @@ TRACEABLE = {
     "gravity_norm": _norm,
     "gravity_direction": _direction,
     "static_gyroscope": lambda imu, data: static_gyroscope(imu, data, jnp.ones((len(data.poses.mask), 3, 3))),
-    "integrate_turns": lambda imu, data: integrate_turns(imu, data.turns),
+    "turned_by": lambda imu, data: turned_by(imu.gyroscope, data.turns),
     "conditions": lambda imu, data: condense(imu, data)[0](imu),
     "covariance": lambda imu, data: condense(imu, data)[1],
     "whitening": _whitened,

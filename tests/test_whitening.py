@@ -15,7 +15,7 @@ from synthetic import GRAVITY, POSES, recording, simulated, unit
 
 from jaximu.calibration import calibrate
 from jaximu.data import joint_conditions, static_gyroscope_error
-from jaximu.data.poses_covariance import condition_covariance, integrate_turns, sensitivities
+from jaximu.data.poses_covariance import condition_covariance, sensitivities, turned_by
 from jaximu.estimation.covariance import Covariance, Weights, inverse_cholesky, update_excess
 from jaximu.model import Noise
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -287,11 +287,11 @@ def test_sensitivities_are_the_derivatives(samples, monkeypatch):
 
     Of rates held over their samples: the reactions leave out that of coning, which the next test measures.
     """
-    for module in ("ground.rotation", "data.poses_covariance"):
+    for module in ("ground.rotation", "data.preintegration"):
         monkeypatch.setattr(f"jaximu.{module}.rotation_vectors", lambda rates, times: rates * times[..., None])
     case = simulated(5, poses=10, noise=1.0, used_samples=samples)
     data, imu = case.observations, case.imu
-    found = sensitivities(imu, data, integrate_turns(imu, data.turns))
+    found = sensitivities(imu, data, turned_by(imu.gyroscope, data.turns))
     steps = len(data.turns.mask)
 
     by_mean, by_output = (np.asarray(each) for each in derivatives(imu, data))
@@ -317,7 +317,7 @@ def test_reactions_to_gain_and_bias_but_for_coning():
     """A gain or a bias that is off changes the conditions as the reactions say, within a thousandth, coning and all."""
     case = simulated(5, poses=10, noise=1.0)
     data, imu = case.observations, case.imu
-    found = sensitivities(imu, data, integrate_turns(imu, data.turns))
+    found = sensitivities(imu, data, turned_by(imu.gyroscope, data.turns))
     output = np.asarray(data.turns.output)
     for change in (
         output @ np.random.default_rng(0).normal(0, 1, (3, 3)),

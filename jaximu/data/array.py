@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from jaximu.data.gravity_direction import across, unit_vectors
 from jaximu.data.poses import EXCESS_NAMES, HandHeldConditions, condense
+from jaximu.data.poses_covariance import turn_noise
 from jaximu.estimation.covariance import Covariance, mean_root
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.ground import stored
@@ -100,8 +101,8 @@ def _about(board: Board, observations: Observations) -> tuple[SharedConditions, 
     """Return the conditions about a board and their covariance."""
 
     def lane(unit):
-        conditions, covariance, integrated, _ = condense(*unit)
-        return conditions, covariance.used, covariance.group, integrated.noise
+        conditions, covariance, whole, _ = condense(*unit)
+        return conditions, covariance.used, covariance.group, turn_noise(unit[0].gyroscope, unit[1].turns, whole)
 
     own, used, group, noise = jax.lax.map(lane, (_stacked(board), observations))
     up = unit_vectors(own.forces(jax.tree.map(lambda leaf: leaf[0], _stacked(board)))[0])

@@ -20,8 +20,7 @@ import scipy
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu.data.poses_covariance import integrate_turns
-from jaximu.data.preintegration import swing
+from jaximu.data.preintegration import linear_slope, preintegrate_samples, white_covariance
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, Data, Observed
 from jaximu.estimation.problem import Parameters
@@ -37,7 +36,6 @@ from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
-from jaximu.recordings.observations import Turns
 from jaximu.recordings.recording import Recording, Signal, smoothed_slope
 
 __all__ = [
@@ -81,7 +79,7 @@ class AttitudeConditions(Conditions):
     rotation, target: the unit's and the reference's, from the frame at an interval's end to that at its start; the
     former at (A | c) = `linear`, A = K⁻¹ and c = −K⁻¹ b, by which its last frame turns with `slope`. force: slope of a
     window's mean force (m/s², upright frame) by the accelerometer's (A | c); swung: by the gyroscope's, which turns the
-    frames in between; gain: the velocity gained, over the time.
+    frames in between; gain: the velocity gained, less what sculling adds, over the time.
     """
 
     rotation: Float[Array, "T 4"]
@@ -109,23 +107,20 @@ class AttitudeConditions(Conditions):
 
 
 class Reactions(eqx.Module):
-    """How the conditions react to what the samples of each interval put out, in SI; sample: their places.
+    """How an interval's rotation and its part of a window's mean force react to rate and force of its samples, in SI.
 
-    turn: of a rotation, to rates; swung, force: of a window's mean force, to rates and to forces.
+    sample: their places.
     """
 
-    turn: Float[Array, "T S 3 3"]
-    swung: Float[Array, "T S 3 3"]
-    force: Float[Array, "T S 3 3"]
+    reaction: Float[Array, "T S 6 6"]
     sample: Int[Array, "T S"]
 
     def react(
         self, force: Float[Array, "m 3 k"], rate: Float[Array, "m 3 k"], windows: int
     ) -> Float[Array, "n k"]:  # fmt: skip
         """Return how the conditions react to additions to the specific force and to the rate at every sample."""
-        turned = jnp.einsum("tsij,tsjk->tik", self.turn, rate[self.sample])
-        pushed = jnp.einsum("tsij,tsjk->tik", self.swung, rate[self.sample])
-        pushed = pushed + jnp.einsum("tsij,tsjk->tik", self.force, force[self.sample])
+        both = jnp.einsum("tsij,tsjk->tik", self.reaction, jnp.concatenate([rate, force], axis=1)[self.sample])
+        turned, pushed = both[:, :3], both[:, 3:]
         summed = jnp.sum(pushed.reshape(windows, -1, *pushed.shape[1:]), axis=1)
         return jnp.concatenate([turned.reshape(-1, turned.shape[-1]), summed.reshape(-1, turned.shape[-1])])
 
@@ -235,46 +230,37 @@ def evaluated(
     stamps = mounting.on_log(data.stamp)
     held = jnp.minimum(data.late[place], stamps[1:, None]) - jnp.maximum(data.early[place], stamps[:-1, None])
     held = jnp.maximum(held, 0.0) / (1 + mounting.clock_scale)  # of the reference's time, in which rates are meant
-    turns = Turns((data.rate - rate)[place], held, noise, jnp.zeros((len(place), 2, 3)), data.used)
-    whole = integrate_turns(bare, turns)
+    turning, sensed = (data.rate - rate)[place], (data.force - force)[place]
+    whole = preintegrate_samples(bare.gyroscope.recover(turning), bare.accelerometer.recover(sensed), held)
+    inverse = bare.gyroscope.inverse()[:, :3]
+    spread = white_covariance(whole.reaction[..., :3, :3], inverse @ noise @ inverse.T, held)
     true = multiply(multiply(data.attitude, mounting.turned), _smoothed(imu, data, stamps))
     before, after = true[:-1], true[1:]
     target = multiply(conjugate(before), after)
-    with_one = jnp.concatenate([turns.output, jnp.ones_like(held)[..., None]], axis=-1)
-
-    # in the middle of a sample the frame stands half way
-    start = jnp.zeros_like(whole.running[:, :1]).at[..., 0].set(1.0)
-    middle = jnp.concatenate([start, whole.running[:, :-1]], axis=1) + whole.running
-    middle = middle / jnp.linalg.norm(middle, axis=-1, keepdims=True)
+    turn_slope, swung = jnp.split(linear_slope(whole.reaction[..., :6, :3], turning), 2, axis=1)
+    slope = linear_slope(whole.reaction[..., 3:6, 3:], sensed)
+    sculled = whole.velocity - jnp.einsum("tijk,jk->ti", slope, bare.accelerometer.inverse())
     upright = rotation_matrix(multiply(mounting.tilted, before))
-    sensed = jnp.concatenate([(data.force - force)[place], jnp.ones_like(held)[..., None]], axis=-1)
-    summed = jnp.einsum("ts,tsij,tsk->tijk", held, rotation_matrix(middle), sensed)
-    local = jnp.einsum("tsij,tsj->tsi", rotation_matrix(middle), sensed @ bare.accelerometer.inverse().T)
-    swinging = swing(held[..., None] * local, whole.turned)
-    swung = jnp.einsum("tsij,tsk->tijk", swinging, with_one)
     duration = jnp.sum(held, axis=1) * data.used
     windows = len(place) // group
     total = jnp.sum(duration.reshape(windows, group), axis=1)
     complete = jnp.all(data.used.reshape(windows, group), axis=1) & (total > 0)
     safe = jnp.where(complete, total, 1.0)
 
-    def by_window(parts):
-        there = jnp.einsum("tai,tijk->tajk", upright, parts) * data.used[:, None, None, None]
-        return jnp.sum(there.reshape(windows, group, 3, 3, 4), axis=1) / safe[:, None, None, None]
+    share = upright * (jnp.repeat(complete / safe, group) * data.used)[:, None, None]
 
-    lever = jnp.einsum("tijk,jk->ti", summed, bare.accelerometer.inverse())
+    def by_window(parts):
+        return jnp.sum(jnp.einsum("tai,ti...->ta...", share, parts).reshape(windows, group, *parts.shape[1:]), axis=1)
+
     gained = rotate(mounting.tilted, jnp.sum(data.velocity.reshape(windows, group, 3), axis=1))
     conditions = AttitudeConditions(
-        whole.rotation, target, whole.slope(turns.output), bare.gyroscope.inverse(), by_window(summed),
-        by_window(swung), gained / safe[:, None], data.used, complete, data.gravity,
+        whole.rotation, target, turn_slope, bare.gyroscope.inverse(), by_window(slope), by_window(swung),
+        gained / safe[:, None] - by_window(sculled), data.used, complete, data.gravity,
     )  # fmt: skip
-    share = (upright * (jnp.repeat(complete / safe, group) * data.used)[:, None, None])[:, None]
-    leaning = share[:, 0] @ jnp.cross(jnp.eye(3), lever[:, None]).swapaxes(1, 2)
-    reactions = Reactions(
-        whole.back[:, None] @ whole.turned * data.used[:, None, None, None], share @ swinging,
-        share @ (held[..., None, None] * rotation_matrix(middle)), place,
-    )  # fmt: skip
-    return conditions, whole.noise, duration, leaning, reactions
+    leaning = share @ jnp.cross(jnp.eye(3), whole.velocity[:, None]).swapaxes(1, 2)
+    turned = whole.reaction[..., :3, :] * data.used[:, None, None, None]
+    reaction = jnp.concatenate([turned, share[:, None] @ whole.reaction[..., 3:6, :]], axis=-2)
+    return conditions, spread, duration, leaning, Reactions(reaction, place)
 
 
 def shared_ends(back: Float[Array, "T 3 3"]) -> Float[Array, "3*T 3*(T+1)"]:

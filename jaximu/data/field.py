@@ -21,13 +21,14 @@ import scipy
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from jaximu.data.preintegration import turned_by_rates
 from jaximu.estimation.covariance import BlockFactor, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.estimation.track import Track, added
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.rotation import exponential, inverse_matrix, rotate, running_rotations
+from jaximu.ground.rotation import exponential, inverse_matrix, rotate
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
@@ -262,19 +263,20 @@ def windows_of(
     place = np.minimum(edges[:-1, None] + np.arange(count.max()), stops[:, None] - 1)
     weight = (np.arange(count.max()) < count[:, None]) / count[:, None]
     centre = (time[edges[:-1]] + time[stops - 1]) / 2
-    attitude = None if gyroscope is None else _carried(gyroscope)
-    if attitude is None:
+    if gyroscope is None:
         turned = np.broadcast_to(np.eye(3), (*place.shape, 3, 3))
         carried, angle = np.broadcast_to(np.eye(3), (len(centre), 3, 3)), np.zeros(len(centre))
         swept = np.zeros((len(centre), 3, 3))
     else:
+        attitude, turned_until = _carried(gyroscope)
         middle = attitude(centre)
         frames = attitude(time[place.ravel()]).as_matrix().reshape(*place.shape, 3, 3)
         turned = np.einsum("nji,nsjk->nsik", middle.as_matrix(), frames)
         step = middle[:-1].inv() * middle[1:]
         carried = np.concatenate([step.as_matrix(), np.eye(3)[None]])
         angle = np.append(step.magnitude(), 0.0)
-        swept = np.concatenate([_swept(attitude, centre), np.zeros((1, 3, 3))])
+        swept = np.zeros((len(centre), 3, 3))
+        swept[:-1] = middle[:-1].inv().as_matrix() @ np.diff(turned_until(centre), axis=0)
     with_one = np.concatenate([values[place], np.ones((*place.shape, 1))], axis=2)
     slope = np.einsum("ns,nsij,nsk->nijk", weight, turned, with_one)
     up, off = np.zeros((len(centre), 3)), np.ones(len(centre))
@@ -320,24 +322,21 @@ def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> NDAr
     return np.unique(np.append(found[:-1].astype(np.int64), len(time) - 1))
 
 
-def _swept(attitude, centre: FloatArray, steps: int = 8) -> FloatArray:
-    """How far (n - 1, 3, 3), s, rates that are off by a constant turn each window's frame until the next window."""
-    share = (np.arange(steps) + 0.5) / steps
-    span = np.diff(centre)
-    times = centre[:-1, None] + span[:, None] * share
-    frames = attitude(times.ravel()).as_matrix().reshape(*times.shape, 3, 3).mean(axis=1)
-    return span[:, None, None] * np.einsum("nji,njk->nik", attitude(centre[:-1]).as_matrix(), frames)
-
-
 def _carried(gyroscope: Signal):
-    """Return, of times (n,), the attitude against the frame in which the recording began (SciPy rotations)."""
-    steps = 0.5 * (gyroscope.values[1:] + gyroscope.values[:-1]) * np.diff(gyroscope.time)[:, None]
-    size = 1 << len(steps).bit_length()  # few shapes are compiled
-    padded = np.concatenate([steps, np.zeros((size - len(steps), 3))])
-    running = stored.call(running_rotations, "carried attitude", padded)[: len(steps)]
-    whole = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], running])
-    known = scipy.spatial.transform.Rotation.from_quat(whole, scalar_first=True)
-    return scipy.spatial.transform.Slerp(gyroscope.time, known)
+    """Return, of times, attitudes (SciPy rotations) and how far (n, 3, 3), s, rates off by a constant have turned them.
+
+    Both against the frame in which the recording began.
+    """
+    middle, half = (gyroscope.time[1:] + gyroscope.time[:-1]) / 2, 0.5 / gyroscope.rate
+    edges = np.concatenate([[gyroscope.time[0] - half], middle, [gyroscope.time[-1] + half]])
+    count = len(gyroscope)
+    padding = (0, (1 << count.bit_length()) - count)  # few shapes are compiled
+    rates, held = np.pad(gyroscope.values, (padding, (0, 0))), np.pad(np.diff(edges), padding)
+    running, sweep = (leaf[:count] for leaf in stored.call(turned_by_rates, "carried attitude", rates, held))
+    frames = scipy.spatial.transform.Rotation.from_quat(np.vstack([[1.0, 0.0, 0.0, 0.0], running]), scalar_first=True)
+    swept = np.vstack([np.zeros(9), np.cumsum(sweep.reshape(-1, 9), axis=0)])
+    reached = scipy.interpolate.make_interp_spline(edges, swept, k=1)
+    return scipy.spatial.transform.Slerp(edges, frames), lambda times: reached(times).reshape(-1, 3, 3)
 
 
 class _At(eqx.Module):

@@ -36,7 +36,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu.data.preintegration import preintegrate_samples
+from jaximu.data.preintegration import preintegrate_samples, white_covariance
 from jaximu.data.sightings import SIZE, AttitudeSeen, FieldSeen, Sighting, Standing, VelocitySeen
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.data import About, Conditions, Data
@@ -274,9 +274,8 @@ def _of_motion(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -
         return jnp.concatenate([turned, varied.velocity]), earth, ended(samples), mounting
 
     increments, by_earth, by_ending, by_mounting = jax.jacfwd(moved)(numbers)
-    per_sample = reaction / jnp.sqrt(jnp.where(part.length > 0, part.length, 1.0))[:, None, None]
     return _Means(
-        whole.rotation, whole.velocity, jnp.einsum("sij,j,slj->il", per_sample, white, per_sample),
+        whole.rotation, whole.velocity, white_covariance(reaction, jnp.diag(white), length),
         reaction.sum(axis=0), increments, jnp.zeros(6), jnp.zeros_like(increments), earth, by_earth,
         ended(samples), by_ending, length[last] / 2, mounting, by_mounting, _duration(part),
     )  # fmt: skip

@@ -22,13 +22,8 @@ from numpy.typing import NDArray
 
 from jaximu.data.gravity_direction import gravity_direction_error, unit_vectors
 from jaximu.data.gravity_norm import gravity_norm_error
-from jaximu.data.poses_covariance import (
-    IntegratedTurns,
-    Sensitivities,
-    condition_covariance,
-    integrate_turns,
-    sensitivities,
-)
+from jaximu.data.poses_covariance import Sensitivities, condition_covariance, sensitivities, turned_by
+from jaximu.data.preintegration import Turned, linear_slope
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import Name
@@ -124,21 +119,21 @@ class HandHeldConditions(Conditions):
 
 def condense(
     imu: Imu, observations: Observations, method: str = "exponential"
-) -> tuple[HandHeldConditions, Covariance | Chain, IntegratedTurns, Sensitivities]:
+) -> tuple[HandHeldConditions, Covariance | Chain, Turned, Sensitivities]:
     """Return the conditions about a unit, without its effects, their covariance, and what both were made of."""
     imu, poses, turns = imu.with_effects(), observations.poses, observations.turns
     gyroscope = imu.gyroscope
     assert gyroscope is not None
-    integrated = integrate_turns(imu, turns)
-    rotation = integrated.rotation
+    whole = turned_by(gyroscope, turns)
+    rotation = whole.rotation
     if method != "exponential":
         rotation = integrate_rates(gyroscope.recover(turns.output), turns.interval, method)
     conditions = HandHeldConditions(
         poses.accelerometer_mean, poses.gyroscope_mean, poses.mask, turns.mask, turns.basis, rotation,
-        integrated.slope(turns.output), gyroscope.inverse(), observations.gravity,
+        linear_slope(whole.reaction, turns.output), gyroscope.inverse(), observations.gravity,
     )  # fmt: skip
-    covariance = condition_covariance(imu, observations, integrated)
-    return conditions, covariance, integrated, sensitivities(imu, observations, integrated)
+    covariance = condition_covariance(imu, observations, whole)
+    return conditions, covariance, whole, sensitivities(imu, observations, whole)
 
 
 class Condensed(NamedTuple):
@@ -171,8 +166,8 @@ def condensed(
     def batch(imu, observations, excess):
         def lane(unit):
             imu, observations, excess = unit
-            conditions, covariance, integrated, reaction = condense(imu, observations, method)
-            single = (reaction, integrated.running) if count == 1 else (None, None)
+            conditions, covariance, whole, reaction = condense(imu, observations, method)
+            single = (reaction, whole.running) if count == 1 else (None, None)
             return Condensed(conditions, only(covariance, rows, excess), *_errors(conditions, imu), *single)
 
         return jax.lax.map(lane, (imu, observations, excess))

@@ -17,51 +17,20 @@ from jaxtyping import Float
 
 from jaximu.data.gravity_direction import unit_vectors
 from jaximu.data.gravity_norm import recover_specific_force, recovery_jacobian
-from jaximu.data.preintegration import turned_by_rates
+from jaximu.data.preintegration import Turned, turned_by_rates, white_covariance
 from jaximu.estimation.covariance import Chain, Covariance, following, in_order, mean_root
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import (
-    conjugate,
-    inverse_matrix,
-    rotate,
-    rotation_matrix,
-    rotation_vectors,
-    running_rotations,
-)
-from jaximu.model.sensor import Imu
+from jaximu.ground.rotation import conjugate, inverse_matrix, rotate, rotation_matrix
+from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.observations import Observations, Turns
 
 __all__ = [
-    "IntegratedTurns",
     "Sensitivities",
     "condition_covariance",
-    "integrate_turns",
     "sensitivities",
+    "turn_noise",
+    "turned_by",
 ]
-
-
-class IntegratedTurns(eqx.Module):
-    """Turns integrated at one gyroscope calibration.
-
-    rotation: quaternion from the last body frame to the first; running: after every sample. turned: how the rate of
-    every sample turns the frames after it (s), in the first frame. noise: covariance (rad²) of the last body frame's
-    rotation vector by white noise.
-    """
-
-    rotation: Float[Array, "T 4"]
-    running: Float[Array, "T S 4"]
-    turned: Float[Array, "T S 3 3"]
-    noise: Float[Array, "T 3 3"]
-
-    @property
-    def back(self) -> Float[Array, "T 3 3"]:
-        """Return the matrix of each rotation from the first body frame to the last."""
-        return rotation_matrix(conjugate(self.rotation))
-
-    def slope(self, output: Float[Array, "T S 3"]) -> Float[Array, "T 3 3 4"]:
-        """Return how the last body frame's rotation vector reacts to (A | c), of rates that are A y + c."""
-        with_one = jnp.concatenate([output, jnp.ones_like(output[..., :1])], axis=-1)
-        return jnp.einsum("tij,tjkl->tikl", self.back, jnp.einsum("tsij,tsk->tijk", self.turned, with_one))
 
 
 class Sensitivities(eqx.Module):
@@ -73,21 +42,15 @@ class Sensitivities(eqx.Module):
     turn: Float[Array, "T 2 S 3"]  # … and to every sample of the gyroscope during it
 
 
-def integrate_turns(imu: Imu, turns: Turns) -> IntegratedTurns:
-    """Integrate the turns with the gyroscope's gain and bias.
+def turned_by(gyroscope: Triad, turns: Turns) -> Turned:
+    """Return the turns' rotations by the gyroscope's gain and bias."""
+    return turned_by_rates(gyroscope.recover(turns.output), turns.interval)
 
-    How frames react to the rates: `turned_by_rates`. White rate noise of density N in each sample turns the end of the
-    turn by R_k K⁻¹ n dt: the sum of R_k K⁻¹ N K⁻ᵀ R_kᵀ dt over the samples, brought to the last frame.
-    """
-    assert imu.gyroscope is not None
-    vectors = rotation_vectors(imu.gyroscope.recover(turns.output), turns.interval)
-    running = running_rotations(vectors)
-    final = running[..., -1, :]
-    forward, back = rotation_matrix(running), rotation_matrix(conjugate(final))
-    inverse = inverse_matrix(imu.gyroscope.gain)
-    density = inverse @ turns.noise @ inverse.T
-    noise = back @ jnp.einsum("tsij,tslj,ts->til", forward @ density, forward, turns.interval) @ back.swapaxes(1, 2)
-    return IntegratedTurns(final, running, turned_by_rates(running, vectors, turns.interval), noise)
+
+def turn_noise(gyroscope: Triad, turns: Turns, whole: Turned) -> Float[Array, "T 3 3"]:
+    """Return the covariance (rad²) of the turns' last frames by the gyroscope's white noise."""
+    inverse = inverse_matrix(gyroscope.gain)
+    return white_covariance(whole.reaction, inverse @ turns.noise @ inverse.T, turns.interval)
 
 
 def _pose_sensitivities(imu: Imu, observations: Observations, rotations: Float[Array, "T 4"]):
@@ -108,46 +71,44 @@ def _pose_sensitivities(imu: Imu, observations: Observations, rotations: Float[A
     return norm, after, before, lever
 
 
-def sensitivities(imu: Imu, observations: Observations, integrated: IntegratedTurns) -> Sensitivities:
+def sensitivities(imu: Imu, observations: Observations, whole: Turned) -> Sensitivities:
     """Return the derivatives of the conditions by mean accelerometer outputs and by gyroscope samples."""
     assert imu.gyroscope is not None
-    norm, after, before, lever = _pose_sensitivities(imu, observations, integrated.rotation)
+    norm, after, before, lever = _pose_sensitivities(imu, observations, whole.rotation)
     inverse = inverse_matrix(imu.gyroscope.gain)
-    return Sensitivities(
-        norm, after, before, ((lever @ integrated.back)[:, None] @ integrated.turned @ inverse).swapaxes(1, 2)
-    )
+    return Sensitivities(norm, after, before, (lever[:, None] @ whole.reaction @ inverse).swapaxes(1, 2))
 
 
-def condition_covariance(
-    imu: Imu, observations: Observations, integrated: IntegratedTurns | None = None
-) -> Covariance | Chain:
+def condition_covariance(imu: Imu, observations: Observations, whole: Turned | None = None) -> Covariance | Chain:
     """Propagate the covariances of what was measured into the conditions at the given model.
 
     Conditions: norms of P poses, two components of each of T turns, three of each mean gyroscope output at rest.
     Components of the excess: poses, turns, means at rest. A chain, or a whole matrix where slow noise ties all of them.
-    `integrated`: the turns at this model, where at hand.
+    `whole`: the turns' rotations at this model, where at hand.
     """
     poses, turns, slow = observations.poses, observations.turns, observations.slow
-    integrated = integrate_turns(imu, turns) if integrated is None else integrated
-    norm, after, before, lever = _pose_sensitivities(imu, observations, integrated.rotation)
+    assert imu.gyroscope is not None
+    whole = turned_by(imu.gyroscope, turns) if whole is None else whole
+    norm, after, before, lever = _pose_sensitivities(imu, observations, whole.rotation)
+    spread = turn_noise(imu.gyroscope, turns, whole)
     real, moved = poses.mask[:, None, None], turns.mask[:, None, None]
     none = jnp.zeros((1, 2, 3))
     # what a pose reaches: its norm and the turn after it, of which the last has none, and the turn before it
     own = jnp.concatenate([real * norm[:, None], jnp.concatenate([moved * before, none])], axis=1)
     earlier = jnp.pad(jnp.concatenate([none, moved * after]), ((0, 0), (1, 0), (0, 0)))
-    turned = jnp.pad(jnp.concatenate([moved * lever, none]), ((0, 0), (1, 0), (0, 0)))
-    noise = jnp.concatenate([integrated.noise, jnp.zeros((1, 3, 3))])
+    by_turn = jnp.pad(jnp.concatenate([moved * lever, none]), ((0, 0), (1, 0), (0, 0)))
+    noise = jnp.concatenate([spread, jnp.zeros((1, 3, 3))])
     force, rest = (real * each for each in (poses.accelerometer_covariance, poses.gyroscope_covariance))
-    roots = mean_root(force, poses.mask), mean_root(integrated.noise, turns.mask), mean_root(rest, poses.mask)
+    roots = mean_root(force, poses.mask), mean_root(spread, turns.mask), mean_root(rest, poses.mask)
     used = jnp.concatenate([poses.mask, jnp.repeat(turns.mask, 2), jnp.repeat(poses.mask, 3)]).astype(norm.dtype)
     counts = len(norm), 2 * len(lever), 3 * len(norm)
     group = jnp.repeat(jnp.arange(3), jnp.array(counts), total_repeat_length=sum(counts))
     white = 1.0 if slow is None else 0.0  # slow noise has that of the means in it
     chain = Chain(
         white * (own @ force @ own.swapaxes(1, 2) + following(earlier @ force @ earlier.swapaxes(1, 2)))
-        + turned @ noise @ turned.swapaxes(1, 2),
+        + by_turn @ noise @ by_turn.swapaxes(1, 2),
         white * own @ force @ earlier.swapaxes(1, 2), white * rest,
-        own @ roots[0], earlier @ roots[0], turned @ roots[1], real * roots[2], used, group,
+        own @ roots[0], earlier @ roots[0], by_turn @ roots[1], real * roots[2], used, group,
     )  # fmt: skip
     if slow is None:
         return chain
@@ -157,10 +118,10 @@ def condition_covariance(
         at = own[..., axis, None] * matrix[:, None] + following(earlier[..., axis, None] * matrix[:, None])
         return in_order(at, jnp.zeros_like(at))
 
-    inverse = inverse_matrix(imu.gyroscope.gain)  # pyright: ignore[reportOptionalMemberAccess]
+    inverse = inverse_matrix(imu.gyroscope.gain)
     member = slow.part[..., None] == jnp.arange((slow.gyroscope.shape[-1] - len(norm)) // len(lever))
-    turned = jnp.einsum("tsb,tsij->tbij", member.astype(norm.dtype), integrated.turned)
-    by_part = ((lever @ integrated.back)[:, None] @ turned @ inverse).swapaxes(1, 2)
+    by_part = jnp.einsum("tsb,tsij->tbij", member.astype(norm.dtype), whole.reaction)
+    by_part = (lever[:, None] @ by_part @ inverse).swapaxes(1, 2)
 
     def by_rates(matrix, axis):
         """The same to an axis' mean rates (I, q), of all poses and then of the parts of each turn."""

@@ -35,12 +35,21 @@ from jaximu.ground.rotation import (
     rotation_matrix,
     rotation_vectors,
     running_rotations,
+    transport,
 )
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["Preintegrated", "increments", "preintegrate", "preintegrate_samples", "swing",
-           "turned_by_rates"]  # fmt: skip
+__all__ = [
+    "Preintegrated",
+    "Turned",
+    "increments",
+    "linear_slope",
+    "preintegrate",
+    "preintegrate_samples",
+    "turned_by_rates",
+    "white_covariance",
+]
 
 
 def increments(
@@ -57,27 +66,47 @@ def increments(
     return jax.jvp(lambda rate: rotation_vectors(rate, intervals), (rates,), (forces,))
 
 
-def turned_by_rates(
-    running: Float[Array, "... S 4"], vectors: Float[Array, "... S 3"], intervals: Float[Array, "... S"]
-) -> Float[Array, "... S 3 3"]:
-    """Return how the rate of each sample turns all frames after it (s), in coordinates of the first frame.
+class Turned(NamedTuple):
+    """What rates add up to, and how frames react to them.
 
-    A rotation vector θ_k off by δ turns the frame after it by J_r(θ_k) δ. How a change of the rates changes coning is
-    left out, h²/12 of what the change itself changes by a second.
-
-    **Arguments:** `running`: rotations after each sample, to the first frame; `vectors`: of each sample (rad).
+    running: the rotation after each sample, to the first frame. sweep: how the rate of each sample turns all frames
+    after it (s), in the first frame. A rotation vector θ_k off by δ turns the frame after it by J_r(θ_k) δ; how a
+    change of the rates changes coning is left out, h²/12 of what the change itself changes by a second.
     """
-    return rotation_matrix(running) @ right_jacobian(vectors) * intervals[..., None, None]
+
+    running: Float[Array, "... S 4"]
+    sweep: Float[Array, "... S 3 3"]
+
+    @property
+    def rotation(self) -> Float[Array, "... 4"]:
+        """From the last body frame to the first."""
+        return self.running[..., -1, :]
+
+    @property
+    def reaction(self) -> Float[Array, "... S 3 3"]:
+        """How the rate of each sample turns the last frame (s), in that frame."""
+        return rotation_matrix(conjugate(self.rotation))[..., None, :, :] @ self.sweep
 
 
-def swing(gained: Float[Array, "... S 3"], turned: Float[Array, "... S 3 3"]) -> Float[Array, "... S 3 3"]:
-    """Return how a sum of vectors reacts to the rate of each sample, which turns those after it and half of its own.
+def turned_by_rates(rates: Float[Array, "... S 3"], intervals: Float[Array, "... S"]) -> Turned:
+    """Return the rotations of rates (rad/s) that hold over `intervals` (s; zero for padding)."""
+    vectors = rotation_vectors(rates, intervals)
+    running = running_rotations(vectors)
+    return Turned(running, transport(running, vectors) * intervals[..., None, None])
 
-    **Arguments:** `gained`: the sum's terms, in the first frame; `turned`: how the first frame's rotation vector
-    reacts to the rate of each sample (s).
-    """
-    later = jnp.cumsum(gained[..., ::-1, :], axis=-2)[..., ::-1, :] - gained / 2
-    return -jnp.cross(later[..., :, None], turned, axis=-2)
+
+def linear_slope(reaction: Float[Array, "... S k 3"], output: Float[Array, "... S 3"]) -> Float[Array, "... k 3 4"]:
+    """Return how sums react to (A | c), of samples A y + c, by their reaction to each sample and its output y."""
+    with_one = jnp.concatenate([output, jnp.ones_like(output[..., :1])], axis=-1)
+    return jnp.einsum("...sij,...sk->...ijk", reaction, with_one)
+
+
+def white_covariance(
+    reaction: Float[Array, "... S k n"], density: Float[Array, "n n"], intervals: Float[Array, "... S"]
+) -> Float[Array, "... k k"]:
+    """Return the covariance of sums whose samples have white noise of a density (two-sided, unit² s)."""
+    by_root = reaction / jnp.sqrt(jnp.where(intervals > 0, intervals, 1.0))[..., None, None]
+    return jnp.einsum("...sij,...slj->...il", by_root @ density, by_root)
 
 
 class Preintegrated(NamedTuple):
@@ -111,20 +140,20 @@ def preintegrate_samples(
     """Return the increments of rates (rad/s) and specific forces (m/s²) that hold over `intervals` (s)."""
     vectors, gained = increments(rates, forces, intervals)
     left_jacobian = jnp.swapaxes(right_jacobian(vectors), -1, -2)
-    running = running_rotations(vectors)
-    start = jnp.zeros_like(running[..., :1, :]).at[..., 0].set(1.0)
-    before = rotation_matrix(jnp.concatenate([start, running[..., :-1, :]], axis=-2))
-    final = running[..., -1, :]
-    turn = turned_by_rates(running, vectors, intervals)
+    whole = turned_by_rates(rates, intervals)
+    start = jnp.zeros_like(whole.running[..., :1, :]).at[..., 0].set(1.0)
+    before = rotation_matrix(jnp.concatenate([start, whole.running[..., :-1, :]], axis=-2))
     left = (jnp.cumsum(intervals[..., ::-1], axis=-1)[..., ::-1] - intervals / 2)[..., None]
     by_force = before @ left_jacobian * intervals[..., None, None]
     parts = apply_matrix(before @ left_jacobian, gained)
     bent = apply_matrix(before, jnp.cross(vectors, gained)) * intervals[..., None] / 12
-    rows = [jnp.concatenate([rotation_matrix(conjugate(final))[..., None, :, :] @ turn, jnp.zeros_like(turn)], axis=-1)]
+    rows = [jnp.concatenate([whole.reaction, jnp.zeros_like(whole.sweep)], axis=-1)]
     for moved, weight in ((parts, jnp.ones_like(left)), (parts * left, left)):
-        rows.append(jnp.concatenate([swing(moved, turn), by_force * weight[..., None]], axis=-1))
+        later = jnp.cumsum(moved[..., ::-1, :], axis=-2)[..., ::-1, :] - moved / 2  # half of its own sample's, too
+        swung = -jnp.cross(later[..., :, None], whole.sweep, axis=-2)
+        rows.append(jnp.concatenate([swung, by_force * weight[..., None]], axis=-1))
     return Preintegrated(
-        final,
+        whole.rotation,
         parts.sum(axis=-2),
         (parts * left - bent).sum(axis=-2),
         intervals.sum(axis=-1),

@@ -35,6 +35,7 @@ __all__ = [
     "rotation_rows",
     "rotation_vectors",
     "running_rotations",
+    "transport",
 ]
 
 MEAN_RATES, POINT_RATES = (7 / 120, 1 / 120), (41 / 1440, 11 / 2880)
@@ -172,6 +173,16 @@ def running_rotations(rotation_vectors: Float[Array, "... S 3"]) -> Float[Array,
     return jnp.moveaxis(jnp.stack(_prefixes(rotation_vectors)), (0, 1), (-1, -2))
 
 
+def transport(running: Float[Array, "... S 4"], rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... S 3 3"]:
+    """Return how a small change of each rotation vector turns all frames after it, in the first frame: R(P_k) J_r(θ_k).
+
+    **Arguments:** `running`: P_k, as `running_rotations` has it of the vectors (rad).
+    """
+    rotation, jacobian = rotation_matrix(running), right_jacobian(rotation_vectors)
+    x, y, z = (rotation[..., :, k, None] * jacobian[..., None, k, :] for k in range(3))
+    return x + y + z
+
+
 @jax.custom_jvp
 def compose_rotation_vectors(rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... 4"]:
     """Return exp(θ_1) ⊗ … ⊗ exp(θ_S): the rotation of S successive body rotation vectors (rad), exactly.
@@ -189,10 +200,8 @@ def _compose_rotation_vectors_jvp(primals, tangents):
     (vectors,), (tangent,) = primals, tangents
     running = running_rotations(vectors)
     final = running[..., -1, :]
-    rotation, jacobian = rotation_matrix(running), right_jacobian(vectors)
     # Each sample's change is turned into the first body frame and summed there; one rotation takes the sum to the last.
-    transport = sum(rotation[..., :, k, None] * jacobian[..., None, k, :] for k in range(3))
-    local = rotate(conjugate(final), jnp.einsum("...sij,...sj->...i", transport, tangent))
+    local = rotate(conjugate(final), jnp.einsum("...sij,...sj->...i", transport(running, vectors), tangent))
     half = jnp.concatenate([jnp.zeros_like(local[..., :1]), local / 2], axis=-1)
     return final, multiply(final, half)
 

@@ -240,7 +240,7 @@ def linearised(
     """Return F and G of the errors along a path, e ← F e + G (δω, δf), by forward-mode derivatives of the step.
 
     e: as `deviation` has it. δω, δf: of each sample's mean rate (rad/s) and specific force (m/s²); that a change of one
-    sample moves the coning of its neighbours is left out, as in `jaximu.data.poses_covariance.integrate_turns`.
+    sample moves the coning of its neighbours is left out, as in `jaximu.data.preintegration.turned_by_rates`.
     """
     states = mechanise(start, rotation, gained, intervals)
     before = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest[:-1]]), start, states)
