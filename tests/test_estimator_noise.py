@@ -331,7 +331,7 @@ def test_the_command_writes_the_estimators_files(tmp_path, capsys):
         ([*path, "--noise-for", "px4", "--noise-interval", "20"], 1, "too short|states are 20 s apart"),
         ([*path, "--reference", str(tmp_path / "imu.yaml")], 2, "--reference goes with --path LOG"),
         ([*line, "--noise-for", "px4", "--allan", str(noise_file(tmp_path / "a.json", ""))], 2, "no unit"),
-        ([*line, "--noise-for", "px4", "--allan", str(noise_file(tmp_path / "b.json"))], 2, "of the accelerometer"),
+        ([*line, "--noise-for", "px4", "--allan", str(noise_file(tmp_path / "b.json"))], 1, "accelerometer_noise"),
     ):
         assert main(wrong) == status
         assert re.search(said, capsys.readouterr().err), said

@@ -1,16 +1,19 @@
 """The terms of the Allan variance come back from simulated noise with intervals that cover, and from measured noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import scipy.fft
+import scipy.signal
 from scipy.stats import binom
 
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model import BiasInstability, FirstOrderGaussMarkov, Noise, Quantisation, RandomWalk, RateRamp, White
 from jaximu.noise import identify
 from jaximu.noise.analysis import analyse_noise
-from jaximu.noise.identification import TERMS, _binned, _bins, _column, _markov
+from jaximu.noise.identification import TERMS, Term, _binned, _bins, _column, _markov
 from jaximu.recordings.recording import Recording, Signal
 
 SAMPLES, RATE = 1 << 15, 50.0
@@ -118,6 +121,35 @@ def test_a_gap_hardly_changes_what_is_found():
     holed = identify(signal, RATE, "NK").terms
     assert holed["N"].value == pytest.approx(whole["N"].value, rel=0.01)
     assert holed["K"].low < whole["K"].value < holed["K"].high
+
+
+def high_passed(values, seconds):
+    """What is left where a running mean that began at the first sample is subtracted."""
+    kept = np.exp(-1 / (RATE * seconds))
+    slow = scipy.signal.lfilter([1 - kept], [1, -kept], values - values[:, :1], axis=1)
+    return values - values[:, :1] - slow
+
+
+def test_a_high_pass_is_named_and_the_terms_are_those_before_it():
+    count, seconds = 30, 12.0
+    before = axes_of((White(0.004), BiasInstability(2e-3), RandomWalk(4e-3)), count, 1 << 16, seed=2)
+    found = identify(high_passed(before, seconds), RATE)
+    times = [each.high_pass for each in found if each.high_pass is not None]
+    assert len(times) >= 0.8 * count
+    assert sum(time.low <= seconds <= time.high for time in times) >= binom.ppf(1e-4, len(times), 0.93)
+    named = [each for each in found if each.high_pass is not None]
+    assert sum(each.terms["N"].low <= 0.004 <= each.terms["N"].high for each in named) >= binom.ppf(
+        1e-4, len(named), 0.93
+    )
+    # the curve of the true terms turns down as the data do, where terms alone would rise
+    true = {"Q": None, "R": None} | {name: Term(size, 0, 0) for name, size in (("N", 4e-3), ("B", 2e-3), ("K", 4e-3))}
+    true = replace(named[0], terms=true, high_pass=Term(seconds, 0, 0))
+    tau = true.deviation.tau
+    measured = np.sqrt(np.mean([each.deviation.value**2 for each in found], axis=0))
+    np.testing.assert_allclose(measured[tau < 10], true.allan_deviation(tau[tau < 10]), rtol=0.03)
+    np.testing.assert_allclose(measured, true.allan_deviation(tau), rtol=0.12)
+    assert measured[-1] < 0.85 * measured.max(initial=0, where=tau > 10)
+    assert not any(each.high_pass for each in identify(before, RATE))
 
 
 def test_a_process_outside_the_terms_shows_as_misfit():

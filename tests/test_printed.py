@@ -293,6 +293,14 @@ def test_a_hot_sensor_is_a_temperature_and_counts_are_said(made, tmp_path):
     assert hot is not None and "temperature [degC]" in (hot.columns or "")
     chip = advise_reading(written(tmp_path / "chip.csv", names, t, a, g, np.round(-3000 + t)))
     assert chip is not None and any("no temperature in °C" in reason for reason in chip.reasons)
+    columns = chip.columns or ""
+    assert columns.endswith("temperature [count]")
+    log = tmp_path / "chip.csv"
+    counted = read_recording(log, options=ReadOptions(columns))
+    assert counted.temperature is None and any("in counts" in note for note in counted.notes)
+    celsius = read_recording(log, options=ReadOptions(columns.replace("count]", "count/340 + 36.53]")))
+    assert celsius.temperature is not None
+    np.testing.assert_allclose(celsius.temperature.values[:, 0], np.round(-3000 + t) / 340 + 36.53)
 
 
 def test_a_rate_that_was_given_is_not_asked_for(made, tmp_path, capsys):

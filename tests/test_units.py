@@ -38,7 +38,17 @@ def test_known_units(text, quantity, factor):
     assert found.base == BASE_UNITS[quantity]
 
 
-@pytest.mark.parametrize(("text", "value"), [("K", 273.15), ("degF", 32.0), ("degC", 0.0), ("°C", 0.0)])
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("K", 273.15),
+        ("degF", 32.0),
+        ("degC", 0.0),
+        ("°C", 0.0),
+        ("count/340+36.53", -12420.2),
+        ("LSB / 256 − 25", 6400.0),
+    ],
+)
 def test_temperatures_have_an_offset(text, value):
     found = unit(text)
     assert found.factor * value + found.offset == pytest.approx(0.0, abs=1e-12)

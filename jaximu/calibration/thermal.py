@@ -270,7 +270,8 @@ def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], 
             said.append(
                 f"the {name}'s {'xyz'[axis]} output jumps by {jump} at {blocks.start[at]:.0f} s, "
                 f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times the usual change: a knock, or a part that gave "
-                "way. It was kept apart from temperature: what comes after has its own bias."
+                "way. It was kept apart from temperature: what comes after has its own bias. `compensate` leaves the "
+                "jump in."
             )
             places.append(at)
             times[np.abs(edges - at) < 2 * _BESIDE] = 0.0

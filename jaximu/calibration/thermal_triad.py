@@ -51,8 +51,8 @@ class TriadFit:
 
     families: of each axis's model. fit: of the unit with the model's effects, in output units, whose bias is the mean
     of the rests' levels; effects: of the triad. level (3, L): by axis and rest, at the reference temperature. residual
-    (n, 3): of the blocks; fitted (n, 3): what temperature adds to them. before, after (3,): rms about the mean of each
-    rest. chi_squared (3,): per degree of freedom, against the noise. All but the fit in SI.
+    (n, 3): of the blocks; fitted (n, 3): what temperature adds to them. before, after (3,): rms, as `compensate` leaves
+    it, of `RestBlocks.left`. chi_squared (3,): per degree of freedom, against the noise. All but the fit in SI.
     """
 
     candidate: Candidate
@@ -148,10 +148,10 @@ def _concluded(
     rest = data.means - added
     level = np.stack([np.linalg.lstsq(data.levels[axis], data.root[axis] @ rest[:, axis], rcond=None)[0]
                       for axis in range(3)])  # fmt: skip
+    before, after = (blocks.left(data.name, output) for output in (data.means, rest))
     rest = rest - level.T[blocks.level]
     white = np.einsum("aij,ja->ai", data.root, rest)
     chi = np.sum(white**2, axis=1) / freedom
-    before, after = (np.sqrt(np.mean((each - blocks.by_rest(each)) ** 2, axis=0)) for each in (data.means, rest))
     return TriadFit(chosen, families, candidates, found, effects, level, rest, added, before, after, chi)
 
 

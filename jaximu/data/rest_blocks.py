@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.summary import sentence
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import Stimulus
+from jaximu.recordings.columns.names import COUNTS_ADVICE
 from jaximu.recordings.recording import Recording, Signal, recordings_of, same_outputs, smoothed_slope
 
 __all__ = [
@@ -89,16 +91,18 @@ class Leg:
 class RestBlocks:
     """Mean outputs over n blocks of one unit at rest, in one or several poses and recordings.
 
-    start, stop (n,): s, on the clock of the block's recording. log (n,): which recording. level (n,): which rest, from
-    0 on over all recordings; in each the unit lay still. temperature (n,) °C and rate (n,) K/s: means over the blocks.
-    means: by triad (n, 3), SI. nodes: of each recording, where time, temperature and its rate are known, and the blocks
-    that they lie in. ambient (n,): °C, where every recording has it. dropped: blocks in which the unit moved.
+    start, stop (n,): s, on the clock of the block's recording. log (n,): which recording. rest (n,): which rest, from 0
+    on over all recordings; in each the unit lay still. level (n,): which bias; a jump begins another. temperature (n,)
+    °C and rate (n,) K/s: means over the blocks. means: by triad (n, 3), SI. nodes: of each recording, where time,
+    temperature and its rate are known, and the blocks that they lie in. ambient (n,): °C, where every recording has it.
+    dropped: blocks in which the unit moved.
     """
 
     recordings: tuple[Recording, ...]
     start: FloatArray
     stop: FloatArray
     log: NDArray[np.int64]
+    rest: NDArray[np.int64]
     level: NDArray[np.int64]
     temperature: FloatArray
     rate: FloatArray
@@ -114,7 +118,7 @@ class RestBlocks:
 
     @property
     def levels(self) -> int:
-        """How many rests there are."""
+        """How many biases there are."""
         return int(self.level.max(initial=-1)) + 1
 
     @property
@@ -148,8 +152,15 @@ class RestBlocks:
 
     def by_rest(self, values: FloatArray) -> FloatArray:
         """Return the mean of values (n, m) over the rest of each block, (n, m)."""
-        member = np.eye(self.levels)[self.level]
-        return member @ (member.T @ values / member.sum(axis=0)[:, None])
+        return _about(self.rest, values)
+
+    def left(self, name: str, values: FloatArray) -> FloatArray:
+        """Return the rms (3,) of a triad's outputs (n, 3) as `compensate` leaves them, jumps included.
+
+        About the mean of each rest, whose gravity nothing tells; of a gyroscope about that of each recording.
+        """
+        group = self.rest if name == "accelerometer" else self.log
+        return np.sqrt(np.mean((values - _about(group, values)) ** 2, axis=0))
 
     @property
     def spans(self) -> list[float]:
@@ -200,9 +211,9 @@ class RestBlocks:
         """Return the blocks that are kept (n,), with the whole path of temperature."""
         numbers = np.full(len(self) + 1, int(keep.sum()))
         numbers[:-1][keep] = np.arange(keep.sum())
-        levels = np.unique(self.level[keep], return_inverse=True)[1]
+        rest, level = (np.unique(part[keep], return_inverse=True)[1] for part in (self.rest, self.level))
         return replace(
-            self, start=self.start[keep], stop=self.stop[keep], log=self.log[keep], level=levels,
+            self, start=self.start[keep], stop=self.stop[keep], log=self.log[keep], rest=rest, level=level,
             temperature=self.temperature[keep], rate=self.rate[keep],
             means={name: values[keep] for name, values in self.means.items()},
             nodes=tuple(track.renumbered(numbers) for track in self.nodes),
@@ -210,12 +221,18 @@ class RestBlocks:
         )  # fmt: skip
 
     def parted(self, edges: Sequence[int]) -> RestBlocks:
-        """Return the same with a rest of its own from each of some blocks on."""
+        """Return the same with a bias of its own from each of some blocks on."""
         level = self.level.copy()
         for edge in edges:
             same = (self.level == self.level[edge]) & (np.arange(len(self)) >= edge) & (self.log == self.log[edge])
             level[same] = level.max() + 1
         return replace(self, level=np.unique(level, return_inverse=True)[1])
+
+
+def _about(group: NDArray[np.int64], values: FloatArray) -> FloatArray:
+    """Return the mean of values (n, m) over the group of each, (n, m)."""
+    member = np.eye(int(group.max(initial=-1)) + 1)[group]
+    return member @ (member.T @ values / member.sum(axis=0)[:, None])
 
 
 def folds_of(legs: Sequence[Leg]) -> list[NDArray[np.int64]]:
@@ -307,21 +324,23 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
 
 def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
     """Return the blocks of several recordings as those of one unit; every recording has rests of its own."""
-    total, first, log, level = sum(map(len, parts)), 0, 0, 0
-    logs, levels, nodes = [], [], []
+    total, first, log, rest, level = sum(map(len, parts)), 0, 0, 0, 0
+    logs, rests, levels, nodes = [], [], [], []
     for part in parts:
         logs.append(part.log + log)
+        rests.append(part.rest + rest)
         levels.append(part.level + level)
         numbers = np.append(first + np.arange(len(part)), total)
         nodes += [track.renumbered(numbers) for track in part.nodes]
         first, log, level = first + len(part), log + len(part.nodes), level + part.levels
+        rest += int(part.rest.max(initial=-1)) + 1
 
     def whole(name: str) -> FloatArray:
         return np.concatenate([getattr(part, name) for part in parts])
 
     return RestBlocks(
         tuple(recording for part in parts for recording in part.recordings), whole("start"), whole("stop"),
-        np.concatenate(logs), np.concatenate(levels), whole("temperature"), whole("rate"),
+        np.concatenate(logs), np.concatenate(rests), np.concatenate(levels), whole("temperature"), whole("rate"),
         {name: np.concatenate([part.means[name] for part in parts]) for name in parts[0].means}, tuple(nodes),
         None if any(part.ambient is None for part in parts) else whole("ambient"), parts[0].duration,
         sum(part.dropped for part in parts), (),
@@ -366,9 +385,10 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
     place = np.full(count + 1, len(keep))
     place[keep] = np.arange(len(keep))
     start, ambient = np.asarray(begin + block * keep, np.float64), recording.ambient_temperature
+    rest = np.cumsum(np.concatenate([[0], jumps]), dtype=np.int64)[: len(keep)]
     return RestBlocks(
-        (recording,), start, np.asarray(start + block, np.float64), np.zeros(len(keep), np.int64),
-        np.cumsum(np.concatenate([[0], jumps]), dtype=np.int64)[: len(keep)], by_block(celsius), by_block(slope), means,
+        (recording,), start, np.asarray(start + block, np.float64), np.zeros(len(keep), np.int64), rest, rest,
+        by_block(celsius), by_block(slope), means,
         (Track(Stimulus(temperature=celsius, temperature_rate=slope, time=time),
                place[np.minimum(np.arange(nodes) // _NODES, count)]),),
         None if ambient is None else by_block(_cells(ambient, edges)), float(block), int(np.sum(good & moved)), (),
@@ -400,14 +420,15 @@ def _with_finite_temperature(recording: Recording) -> Recording:
 def _require_temperature(recording: Recording) -> None:
     where, temperature = recording.name, recording.temperature
     if temperature is None or len(temperature) < 2:
+        remarks = "".join(f" {sentence(note)}" for note in recording.remarks)
         raise NotPossibleError(
             f"{where}: there is no temperature in this recording. Log the sensor's own temperature beside its output, "
-            "as a column such as temperature [degC]."
+            f"as a column such as temperature [degC].{remarks}"
         )
     low, high = float(temperature.values.min()), float(temperature.values.max())
     middle = float(np.median(temperature.values))
     if not -120.0 < middle < 200.0 or np.quantile(temperature.values, 0.9) > 200.0:
-        likely = "K: state temperature [K]" if 200.0 <= middle < 400.0 else "raw counts: convert it to degC first"
+        likely = "K: state temperature [K]" if 200.0 <= middle < 400.0 else f"raw counts: {COUNTS_ADVICE}"
         raise InputError(
             f"{where}: the temperature lies between {low:.5g} and {high:.5g} °C, which no sensor survives; it looks "
             f"like {likely}, in the header or with --columns."

@@ -100,17 +100,24 @@ _FACTOR = re.compile(r"(\S+?)\s*[\s*·.]\s*([a-zA-Z]+)(?:\^|\*\*)?(?:[-−]([12]
 _SCALED = re.compile(r"(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*([a-zA-Zµμ°].*)")
 
 
+_OF_COUNTS = re.compile(r"(?:counts?|lsb)\s*/\s*(\d+\.?\d*)\s*([-−+]\s*\d+\.?\d*)?", re.IGNORECASE)
+"""A chip's temperature as its data sheet has it, in °C: "count/340 + 36.53"."""
+
+
 def find_unit(text: str, quantity: str | tuple[str, ...] | None = None) -> Unit | None:
     """The unit called `text`, None if unknown or of another quantity. A number scales it: "0.061 mg", "100 us".
 
     Letter case counts only where it must (mg and mG, s and S differ), and not where the quantity decides: an
-    acceleration in "G" is in g, a temperature in "°" is in degC.
+    acceleration in "G" is in g, a temperature in "°" is in degC, and may be a line through counts: "count/340+36.53".
     """
     wanted = (quantity,) if isinstance(quantity, str) else quantity
     text = text.strip().replace("º", "°")
     if match := _SCALED.fullmatch(text):
         scaled = find_unit(match[2], quantity)
         return scaled and Unit(text, scaled.quantity, scaled.factor * float(match[1]), scaled.offset)
+    if (wanted is None or "temperature" in wanted) and (match := _OF_COUNTS.fullmatch(text)) and float(match[1]) > 0:
+        offset = (match[2] or "0").replace(" ", "").replace("−", "-")
+        return Unit(text, "temperature", 1 / float(match[1]), float(offset))
     if product := _FACTOR.fullmatch(text):
         text = f"{product[1]}/{product[2]}" + ("^2" if (product[3] or product[4]) in ("2", "²") else "")
     if wanted == ("temperature",) and text == "°":

@@ -89,7 +89,7 @@ class NoiseAnalysis(Described, Comparable):
                 "deviation": found.deviation.value.tolist(),
                 "deviation_low": found.deviation.low.tolist(),
                 "deviation_high": found.deviation.high.tolist(),
-            }
+            } | ({} if found.high_pass is None else {"high_pass": found.high_pass.document("s")})
 
         document: dict[str, Any] = {"schema": SCHEMA}
         for name, quantity in SENSOR_QUANTITIES.items():
@@ -274,6 +274,14 @@ def _taken_out(name: str, found: Sequence[Identified]) -> list[str]:
             notes.append(
                 f"{name} {axis}: periodic at {lines}, frequency after aliasing and amplitude; taken out. It is "
                 "vibration, the mains or a clock, and no noise of the sensor."
+            )
+        if each.high_pass is not None:
+            time = each.high_pass
+            notes.append(
+                f"{name} {axis}: what is slow was taken out before it was logged, as by a high pass of "
+                f"{time.value:.2g} s ({time.low:.2g} to {time.high:.2g}): a driver that subtracts a running mean of "
+                "the bias, or zeroes it. A bias that is drawn back to its mean by itself looks alike. The terms are "
+                "those before it; the bias that is left wanders no further with time."
             )
         if each.warm_up is not None:
             notes.append(

@@ -44,6 +44,8 @@ _PENALTY = {"N": 4.0, "K": 4.0, "Q": 6.0, "R": 9.0, "B": 9.0}
 are chosen by simulation (benchmarks/noise_terms.py). B and R pay more: over the ten or so coefficients that hold a walk
 it may look like either, −2 log L then scatters more than χ² does, and a walk is the simpler process.
 """
+_UNLIKELY = 1e-3
+"""Probability of a misfit below which the terms do not describe the noise."""
 _OVERWHELMING = 40.0
 """Twice the gain in log likelihood from which a drift is a warm-up and no walk."""
 
@@ -84,7 +86,8 @@ class Identified:
     misfit: χ² of the fit, octave by octave of frequency, and its degrees of freedom. excess: where χ² is far too large,
     the share by which the spectrum of each octave is let differ from the terms (a correlated process, a filter, a drift
     beside them), which widens intervals. lines, warm_up and outliers (a number of samples) were found first and taken
-    out of the samples, of the deviation too. gauss_markov: those asked for. limits: how large the terms that are not
+    out of the samples, of the deviation too. high_pass: time constant (s) of what took out what is slow before it was
+    logged; the terms are those before it. gauss_markov: those asked for. limits: how large the terms that are not
     supported could be beside those that are (SI, the upper end of a two-sided interval).
     """
 
@@ -96,6 +99,7 @@ class Identified:
     lines: tuple[PeriodicLine, ...] = ()
     warm_up: WarmUp | None = None
     outliers: int = 0
+    high_pass: Term | None = None
     gauss_markov: tuple[GaussMarkov, ...] = ()
 
     def allan_deviation(self, tau: ArrayLike) -> FloatArray:
@@ -104,6 +108,8 @@ class Identified:
         rate = self.deviation.factor[0] / self.deviation.tau[0]
         theta = np.array([0.0 if term is None else term.value**2 for term in self.terms.values()])
         variance = _basis(tau * rate, rate, "".join(self.terms)) @ theta
+        if self.high_pass is not None:
+            variance = variance - _held_back(tau, rate, dict(zip(self.terms, theta, strict=True)), self.high_pass.value)
         for each in self.gauss_markov:
             process = FirstOrderGaussMarkov.of(each.sigma.value, each.correlation_time.value)
             variance = variance + process.allan_variance(tau)
@@ -181,17 +187,22 @@ def _identify(
     found = _deviation(filled(values, BRIDGED), rate, confidence)
     if not (found.value > 0).all():
         raise NotPossibleError("the signal is constant, or quantised to whole steps: there is no noise to identify.")
+    threshold = float(chi2_isf(1 - confidence, 1)) / 2
     # How far the most general model is off, octave by octave, then which of its terms are needed
     general = _fit(_Model(spectrum, terms, _times(spectrum, terms, markov)))
     misfit, freedom = general.misfit()
-    excess = 0.0
-    if misfit > chi2_isf(0.001, freedom):
+    excess, high_pass, offered = 0.0, None, terms
+    if misfit > chi2_isf(1 - confidence, freedom) and not markov:
+        high_pass = _high_pass(general, threshold)
+    if high_pass is not None:
+        offered = terms.replace("R", "")
+        general = _fit(replace(general.model, spectrum=replace(spectrum, high_pass=high_pass.value), terms=offered))
+    elif misfit > chi2_isf(_UNLIKELY, freedom):
         # The terms do not describe this noise, and the high frequencies, known best, would dictate all others. Every
         # octave may then differ from the terms by a share that makes the misfit what it should be.
         excess = _excess(general, freedom)
-    best = _select(replace(general.model, excess=excess), terms)
+    best = _select(replace(general.model, excess=excess), offered)
     result: dict[str, Term | None] = dict.fromkeys(terms)
-    threshold = float(chi2_isf(1 - confidence, 1)) / 2
     for place, term in enumerate(best.model.letters):
         result[term] = _term(best, place, threshold)
     if best.model.ramp:
@@ -204,9 +215,9 @@ def _identify(
         GaussMarkov(_term(best, first + 2 * i, threshold), _term(best, first + 2 * i + 1, threshold, power=1.0))
         for i in range(markov)
     )
-    limits = {term: _limit(best, term, threshold) for term, each in result.items() if each is None}
+    limits = {term: _limit(best, term, threshold) for term in offered if result[term] is None}
     misfit, freedom = replace(best, model=replace(best.model, excess=0.0)).misfit()
-    return Identified(result, found, (misfit, freedom), limits, excess, lines, warm_up, outliers, processes)
+    return Identified(result, found, (misfit, freedom), limits, excess, lines, warm_up, outliers, high_pass, processes)
 
 
 def _deviation(values: FloatArray, rate: float, confidence: float) -> Deviation:
@@ -234,6 +245,22 @@ def _basis(factors: FloatArray, rate: float, terms: Sequence[str]) -> FloatArray
     return np.stack([columns[term] for term in terms], axis=-1)
 
 
+def _held_back(tau: FloatArray, rate: float, theta: dict[str, float], time_constant: float) -> FloatArray:
+    """Allan variance (T,) of what a high pass takes out of terms whose squares are `theta`.
+
+    4 ∫ S(f) (1 − |H|²) sin⁴(πfτ) / (m sin(πf/rate))² df over m samples, S two-sided.
+    """
+    frequency = np.geomspace(1e-6 / tau.max(), rate / 2, 1000)
+    half = np.pi * frequency / rate
+    density = (
+        theta.get("N", 0.0) + theta.get("B", 0.0) / (2 * np.pi * frequency)
+        + theta.get("K", 0.0) / (4 * np.sin(half) ** 2 * rate**2) + theta.get("Q", 0.0) * rate * 4 * np.sin(half) ** 2
+    )  # fmt: skip
+    density = density * (1 - _passed(2 * half * rate, time_constant))
+    kernel = np.sin(np.pi * frequency * tau[:, None]) ** 4 / (tau[:, None] * rate * np.sin(half)) ** 2
+    return 4 * np.trapezoid(density * kernel, frequency, axis=1)
+
+
 # Cosine coefficients and the terms' shares in their variance
 
 
@@ -253,6 +280,7 @@ class _Spectrum:
     coefficient: FloatArray  # (J,) lowest coefficients, by place from 1
     inside: NDArray[np.int64]  # (J,) bin of each, −1 if left out
     slope: float
+    high_pass: float | None = None  # time constant (s) of what took out what is slow
 
     @property
     def angle(self) -> FloatArray:
@@ -347,7 +375,12 @@ def _column(spectrum: _Spectrum, term: str) -> FloatArray:
     else:  # the flicker noise of `jaximu.model.processes`: a bank of Gauss–Markov processes
         bank = BiasInstability(1.0, longest=max(1e5, 100 * spectrum.samples / rate)).bank(1 / rate)
         density = sum((_markov(spectrum, time) for time in bank), start=np.zeros_like(half)) * np.log(4) / np.pi
-    return density @ _WEIGHT
+    return (density * _passed(spectrum.angle * rate, spectrum.high_pass)) @ _WEIGHT
+
+
+def _passed(circular: FloatArray, time_constant: float | None) -> FloatArray | float:
+    """Share of the power that a first-order high pass leaves at circular frequencies, rad/s; all of it without one."""
+    return 1.0 if time_constant is None else 1 / (1 + (circular * time_constant) ** -2)
 
 
 _WEIGHT = np.array([5, 8, 5]) / 18
@@ -662,6 +695,38 @@ def _limit(fit: _Fit, term: str, threshold: float) -> float:
     return float(np.exp(_root(rise, max(beside.theta[place], most - 25), most + 12, 1e-2) / 2))
 
 
+def _high_pass(general: _Fit, threshold: float) -> Term | None:
+    """Return the time constant (s) of a first-order high pass after which the terms describe what they do not alone.
+
+    A ramp does not come through it. A driver that subtracts a running mean of the output, or that takes its drift out
+    with every rest, is one.
+    """
+    spectrum = general.model.spectrum
+    grid = np.log(np.geomspace(_SHORTEST / spectrum.rate, spectrum.samples / spectrum.rate / 3, 16))
+
+    def at(logarithm: float) -> _Fit:
+        passed = replace(spectrum, high_pass=float(np.exp(logarithm)))
+        return _fit(replace(general.model, spectrum=passed, terms=general.model.terms.replace("R", "")))
+
+    losses = [at(logarithm).loss for logarithm in grid]
+    best = int(np.argmin(losses))
+    if 2 * (general.loss - losses[best]) < chi2_isf(_UNLIKELY / len(grid), 1):
+        return None
+    ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    middle = float(lowest(lambda logarithm: at(logarithm).loss, ends, 1e-3))
+    fit = at(middle)
+    misfit, freedom = fit.misfit()
+    if misfit > chi2_isf(_UNLIKELY, freedom):
+        return None
+
+    def rise(distance: float) -> float:
+        return at(middle + distance).loss - fit.loss - threshold
+
+    far = float(np.ptp(grid))
+    low, high = (sign * _root(lambda distance, sign=sign: rise(sign * distance), 0.0, far, 1e-3) for sign in (-1, 1))
+    return Term(*np.exp([middle, middle + low, middle + high]).tolist())
+
+
 def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
     """Return an exponential drift where the likelihood says overwhelmingly that it is one and no walk or ramp.
 
@@ -695,7 +760,7 @@ def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
     time = float(np.exp(lowest(loss, bounds, 1e-4)))
     fit = _fit(replace(without.model, extra=spectrum.decay(time)))
     misfit, freedom = fit.misfit()
-    if misfit > chi2_isf(0.001, freedom):
+    if misfit > chi2_isf(_UNLIKELY, freedom):
         excess = _excess(fit, freedom)
         fit = _fit(replace(fit.model, excess=excess))
         without = _fit(replace(without.model, excess=excess))

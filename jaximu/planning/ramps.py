@@ -80,6 +80,6 @@ def _with(blocks: RestBlocks, ends: Sequence[float], rate: float) -> tuple[RestB
     means = {name: np.tile(values[-1], (count, 1)) for name, values in blocks.means.items()}
     none = np.zeros(count, np.int64)
     track = Track(Stimulus(temperature=path, temperature_rate=slope, time=time), np.arange(8 * count) // 8)
-    more = RestBlocks((), edges[:-1:8], edges[8::8], none, none, celsius, rates, means,
+    more = RestBlocks((), edges[:-1:8], edges[8::8], none, none, none, celsius, rates, means,
                       (track,), None, blocks.duration, 0, ())  # fmt: skip
     return joined([blocks, more]), float(knots[-1])

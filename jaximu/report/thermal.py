@@ -53,12 +53,13 @@ def _unit(found: ThermalCalibration, name: str) -> tuple[float, str]:
 def headline(found: ThermalCalibration) -> list[str]:
     """Return the sentences that a person wants first: what temperature did, what is left, by which model."""
     span, said = "{:.0f} and {:.0f} °C".format(*found.blocks.range).replace("-", "−"), []
+    included, apart = (", jumps included", ", jumps apart") if found.jumps else ("", "")
     for name, fit in found.fits.items():
         effects = [effect_title(f"{PREFIXES[name]}.{each}") for each in fit.candidate.names]
         said.append(
             f"The {name}'s output at rest moves by {_size(name, fit.before)} rms between {span}. "
-            f"With {listed(effects) if effects else 'no effect'} modelled, {_size(name, fit.after)} remain, "
-            f"{_size(name, fit.candidate.held.rms)} on {_folds(found)} left out."
+            f"With {listed(effects) if effects else 'no effect'} modelled, {_size(name, fit.after)} remain"
+            f"{included}, {_size(name, fit.candidate.held.rms)} on {_folds(found)} left out{apart}."
         )
     return said
 

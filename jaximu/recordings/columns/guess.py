@@ -22,7 +22,7 @@ from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit, parse_column
 from jaximu.recordings.alignment import Turning, turning
 from jaximu.recordings.columns.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
-from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, rises
+from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import Table
 
@@ -681,10 +681,10 @@ class _Guess:
             if unit is None and "temperature" in name and -60 < np.nanmin(values) <= np.nanmax(values) < _HOTTEST:
                 unit = "degC"
             elif unit is None and "temperature" in name and np.ptp(values[np.isfinite(values)]) > 0:
+                unit = "count"
                 self.reasons.append(
                     f"{self.table.label(at)} is between {np.nanmin(values):.6g} and {np.nanmax(values):.6g}, which is "
-                    "no temperature in °C: counts of a chip, left out; converted as its data sheet says they are for "
-                    "`jaximu thermal`"
+                    f"no temperature in °C but a chip's counts: {COUNTS_ADVICE}, for jaximu thermal"
                 )
             if unit:
                 self.chosen[at] = Column(name, unit)

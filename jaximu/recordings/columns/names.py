@@ -32,9 +32,16 @@ GROUPS = {  # a triad may be in counts, and in increments over each sampling int
     "accel": Group("accelerometer", _axes("accel_{}"), ("acceleration", "raw count", "velocity increment")),
     "gyro": Group("gyroscope", _axes("gyro_{}"), ("angular rate", "raw count", "angle")),
     "mag": Group("magnetometer", _axes("mag_{}"), ("magnetic field", "raw count")),
-    **{name: Group(name, (name,), (quantity,)) for name, quantity in _SINGLE.items()},
+    **{
+        name: Group(name, (name,), (quantity, "raw count") if quantity == "temperature" else (quantity,))
+        for name, quantity in _SINGLE.items()
+    },
     "attitude": Group("attitude", _axes("attitude_{}", "wxyz"), ("ratio",)),
 }
+COUNTS_ADVICE = (
+    "state the data sheet's formula as its unit, such as temperature [count/340+36.53] (MPU-6050) or "
+    "[count/333.87+21] (MPU-9250)"
+)
 QUANTITIES = {TIME: ("time",)} | {name: group.quantities for group in GROUPS.values() for name in group.columns}
 _SKIPPED = re.compile(r"(?:_|-|skip|)(?:\*(\d{1,4}))?")
 

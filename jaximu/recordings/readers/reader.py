@@ -23,7 +23,14 @@ from jaximu.recordings.columns import nominal
 from jaximu.recordings.columns.choose import choose_columns, choose_pair, column_units
 from jaximu.recordings.columns.guess import Advice, advise, without_gravity
 from jaximu.recordings.columns.known import known_names, whole_stamps
-from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, parse_columns
+from jaximu.recordings.columns.names import (
+    COUNTS_ADVICE,
+    GROUPS,
+    TIME,
+    Column,
+    header_columns,
+    parse_columns,
+)
 from jaximu.recordings.columns.table import FEW, MessageSelection, Table, from_arrow, mapped_axes, named_with_units
 from jaximu.recordings.readers.records import apart, of_device
 from jaximu.recordings.recording import (
@@ -501,6 +508,9 @@ def extract(
         values = [(table.numbers(at), at, _per_second(unit, key, stamps)) for at, unit in places]
         if key == "mag" and len(groups) > 1 and any(np.ptp(axis) == 0 for axis, *_ in values):
             notes.append("the magnetometer, or an axis of it, never changes: it is left out.")
+            continue
+        if "temperature" in key and places[0][1].quantity == "raw count":
+            notes.append(f"the {key.replace('_', ' ')} is in counts and left out: {COUNTS_ADVICE}.")
             continue
         signal, dropped = _signal(table, values, stamps)
         if dropped == len(stamps):

@@ -163,7 +163,7 @@ class _Targets:
         self.loss[name] = _rms(error)
         if self.working is not None:
             rest = self.working.blocks.means[name] - written
-            self.left[name] = _rms(rest - self.working.blocks.by_rest(rest))
+            self.left[name] = self.working.blocks.left(name, rest)
         reading = self.calibration.reading
         return cubic if reading is None else cubic @ reading.autopilot_maps[name]
 
