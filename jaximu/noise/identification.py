@@ -258,7 +258,7 @@ def _held_back(tau: FloatArray, rate: float, theta: dict[str, float], time_const
     )  # fmt: skip
     density = density * (1 - _passed(2 * half * rate, time_constant))
     kernel = np.sin(np.pi * frequency * tau[:, None]) ** 4 / (tau[:, None] * rate * np.sin(half)) ** 2
-    return 4 * np.trapezoid(density * kernel, frequency, axis=1)
+    return np.asarray(4 * np.trapezoid(density * kernel, frequency))
 
 
 # Cosine coefficients and the terms' shares in their variance
