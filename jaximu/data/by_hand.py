@@ -107,20 +107,20 @@ class RecordedByHand(Data):
         offsets: list[Any] = [None] * len(recorded)
         outputs, observations, change = recorded, self.observations, np.inf
         for number in range(_ROUNDS):  # the tracks tell what effects add, and what they add changes the tracks
-            found = condensed(bare, jax.tree.map(lambda leaf: np.asarray(leaf)[None], observations))
-            assert found.running is not None
-            made = partial(tracks_by_hand, self.segmentations, self.turn_samples, imu, outputs, found.running)
+            whole = condensed(bare, jax.tree.map(lambda leaf: np.asarray(leaf)[None], observations))
+            assert whole.running is not None
+            made = partial(tracks_by_hand, self.segmentations, self.turn_samples, imu, outputs, whole.running)
             if not effects or change < _CHANGED or number == _ROUNDS - 1:
                 break
             before, tracks = offsets, made()
-            offsets = [jax.tree.map(np.asarray, added(imu.with_effects(*effects), each)) for each in tracks]
+            offsets = [jax.tree.map(np.asarray, added(imu.with_effects(*effects), track)) for track in tracks]
             change = max(_change(old, new) for old, new in zip(before, offsets, strict=True))
             outputs = [
-                {name: values - offset[name][: len(values)] for name, values in whole.items()}
-                for whole, offset in zip(recorded, offsets, strict=True)
+                {name: values - offset[name][: len(values)] for name, values in signals.items()}
+                for signals, offset in zip(recorded, offsets, strict=True)
             ]
             observations = self._without_outputs(tracks, offsets)
-        return Along(found, observations, made)
+        return Along(whole, observations, made)
 
     def reactions(self, details: Along):
         """Return how norms, directions and means at rest react to effects, recording by recording."""
@@ -242,7 +242,7 @@ class RecordedByHand(Data):
         made = twin_recordings(
             self.segmentations, self.observations, self.turn_samples, self.shifts, imu, details.tracks, noise, seed
         )
-        parts = tuple(replace(part, recording=each) for part, each in zip(self.segmentations, made, strict=True))
+        parts = tuple(replace(part, recording=twin) for part, twin in zip(self.segmentations, made, strict=True))
         return RecordedByHand(parts, observed_poses(parts, float(self.observations.gravity), noise=noise))
 
 
@@ -269,7 +269,7 @@ def _change(before: dict[str, FloatArray] | None, after: dict[str, FloatArray]) 
 def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
     """Return the level frame's axes in the body's (poses, 9) in each pose, padding included, as tracks have them."""
     axes = np.zeros((poses, 9))
-    for track in (each["gyroscope"] for each in tracks):
+    for track in (pair["gyroscope"] for pair in tracks):
         pose, first = np.unique(np.asarray(track.observation), return_index=True)
         inside = pose < poses
         attitude = np.asarray(track.stimulus.attitude)[first[inside]]

@@ -94,28 +94,28 @@ def condition_covariance(imu: Imu, observations: Observations, whole: Turned | N
     real, moved = poses.mask[:, None, None], turns.mask[:, None, None]
     none = jnp.zeros((1, 2, 3))
     # what a pose reaches: its norm and the turn after it, of which the last has none, and the turn before it
-    own = jnp.concatenate([real * norm[:, None], jnp.concatenate([moved * before, none])], axis=1)
+    reached = jnp.concatenate([real * norm[:, None], jnp.concatenate([moved * before, none])], axis=1)
     earlier = jnp.pad(jnp.concatenate([none, moved * after]), ((0, 0), (1, 0), (0, 0)))
     by_turn = jnp.pad(jnp.concatenate([moved * lever, none]), ((0, 0), (1, 0), (0, 0)))
     noise = jnp.concatenate([spread, jnp.zeros((1, 3, 3))])
-    force, rest = (real * each for each in (poses.accelerometer_covariance, poses.gyroscope_covariance))
+    force, rest = (real * noisy for noisy in (poses.accelerometer_covariance, poses.gyroscope_covariance))
     roots = mean_root(force, poses.mask), mean_root(spread, turns.mask), mean_root(rest, poses.mask)
     used = jnp.concatenate([poses.mask, jnp.repeat(turns.mask, 2), jnp.repeat(poses.mask, 3)]).astype(norm.dtype)
     counts = len(norm), 2 * len(lever), 3 * len(norm)
     group = jnp.repeat(jnp.arange(3), jnp.array(counts), total_repeat_length=sum(counts))
     white = 1.0 if slow is None else 0.0  # slow noise has that of the means in it
     chain = Chain(
-        white * (own @ force @ own.swapaxes(1, 2) + following(earlier @ force @ earlier.swapaxes(1, 2)))
+        white * (reached @ force @ reached.swapaxes(1, 2) + following(earlier @ force @ earlier.swapaxes(1, 2)))
         + by_turn @ noise @ by_turn.swapaxes(1, 2),
-        white * own @ force @ earlier.swapaxes(1, 2), white * rest,
-        own @ roots[0], earlier @ roots[0], by_turn @ roots[1], real * roots[2], used, group,
+        white * reached @ force @ earlier.swapaxes(1, 2), white * rest,
+        reached @ roots[0], earlier @ roots[0], by_turn @ roots[1], real * roots[2], used, group,
     )  # fmt: skip
     if slow is None:
         return chain
 
     def by_forces(matrix, axis):
         """Return what conditions (n, q) react to an axis' mean forces (P, q) with."""
-        at = own[..., axis, None] * matrix[:, None] + following(earlier[..., axis, None] * matrix[:, None])
+        at = reached[..., axis, None] * matrix[:, None] + following(earlier[..., axis, None] * matrix[:, None])
         return in_order(at, jnp.zeros_like(at))
 
     inverse = inverse_matrix(imu.gyroscope.gain)

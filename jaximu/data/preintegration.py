@@ -186,6 +186,6 @@ def preintegrate(
         return jnp.concatenate([rate, force], axis=-1)
 
     samples = recovered(numbers)
-    found = preintegrate_samples(samples[:, :3], samples[:, 3:], intervals)
+    whole = preintegrate_samples(samples[:, :3], samples[:, 3:], intervals)
     slopes = jax.jacfwd(recovered)(numbers)
-    return found._replace(parameters=jnp.einsum("sij,sjm->im", found.reaction, slopes))
+    return whole._replace(parameters=jnp.einsum("sij,sjm->im", whole.reaction, slopes))

@@ -226,15 +226,15 @@ class Resting(Data):
             noise = blocks.covariance(getattr(self.noise, name))
             covariance = noise + _LEVEL[triad] ** 2 * same + _SMOOTH[triad] ** 2 * curved
             for axis in range(3):
-                place = 3 * triad + axis
-                whole[:, place, :, place] = covariance[axis] * self._scale[place] ** 2
-                unit[triad, :, place] = np.sqrt(np.mean(np.diag(noise[axis]))) * self._scale[place]
+                column = 3 * triad + axis
+                whole[:, column, :, column] = covariance[axis] * self._scale[column] ** 2
+                unit[triad, :, column] = np.sqrt(np.mean(np.diag(noise[axis]))) * self._scale[column]
         size = 6 * count
-        factors = tuple(each.ravel()[None] for each in unit)
+        factors = tuple(factor.ravel()[None] for factor in unit)
         group = np.tile(np.repeat([0, 1], 3), count)[None]
         return Covariance(whole.reshape(size, size)[None], factors, np.ones((1, size)), group)  # pyright: ignore[reportArgumentType]
 
     def _added(self, imu: Imu, tracks: Sequence[dict[str, Track]]) -> FloatArray:
         """What the unit's effects add to the mean outputs (n, 6)."""
         count = len(self.blocks)
-        return np.sum([np.asarray(mean_outputs(each, added(imu, each), count)) for each in tracks], axis=0)
+        return np.sum([np.asarray(mean_outputs(track, added(imu, track), count)) for track in tracks], axis=0)

@@ -63,9 +63,9 @@ def twin_recordings(
                 rate[inside] += _correction(attitude[inside], up[k + 1], float(np.sum(turns.interval[k])))
         first += len(part.intervals)
         changed = {}
-        for place, ((name, triad), values) in enumerate(zip(imu.triads().items(), (force, rate), strict=True)):
+        for order, ((name, triad), values) in enumerate(zip(imu.triads().items(), (force, rate), strict=True)):
             signal = signals[name]
-            drawn = drawn_noise(getattr(noise, name), len(signal), signal.rate, [seed, number, place])
+            drawn = drawn_noise(getattr(noise, name), len(signal), signal.rate, [seed, number, order])
             outputs = values @ np.asarray(triad.gain).T + np.asarray(triad.bias) + drawn * signal.nominal_scale
             changed[name] = replace(signal, values=outputs + (shift if name == "gyroscope" else 0.0))
         made.append(replace(part.recording, **changed, notes=()))

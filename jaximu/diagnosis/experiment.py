@@ -243,7 +243,7 @@ class Experiment(Data):
 
     def askable(self, linear: Linear) -> tuple[dict[str, type[Effect]], dict[str, str]]:
         """Return the effects that can be asked of these recordings, and why others cannot."""
-        asked, refused = {}, {}
+        askable, refused = {}, {}
         warming, hidden = self.extent().temperature_range, self.data.hidden()
         several = len(self.recordings) > 1 and self.data.by_hand  # each has its own time and heading
         for name, kind in CATALOGUE.items():
@@ -263,8 +263,8 @@ class Experiment(Data):
             elif name in hidden:
                 refused[name] = hidden[name]
             else:
-                asked[name] = kind
-        return asked, refused
+                askable[name] = kind
+        return askable, refused
 
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's output in these recordings."""
@@ -407,13 +407,13 @@ class Experiment(Data):
     def _blocks(
         self, imu: Imu, linear: Linear, weights: FloatArray, fitted: set[str], asking: Container[str] | None
     ) -> tuple[list[EffectBlock], dict[str, str]]:
-        asked, refused = self.askable(linear)
+        askable, refused = self.askable(linear)
         if asking is not None:
-            asked = {name: kind for name, kind in asked.items() if kind.plain in asking}
+            askable = {name: kind for name, kind in askable.items() if kind.plain in asking}
         extent, used, blocks = self.extent(), self.used, []
-        grids = {kind: kind.grid(extent) for kind in asked.values()}
+        grids = {kind: kind.grid(extent) for kind in askable.values()}
         reactions = self.dormant_columns(imu, linear.details, grids)
-        for name, kind in asked.items():
+        for name, kind in askable.items():
             if name in fitted:
                 continue
             size = _sizes(kind, imu)
@@ -447,5 +447,5 @@ def _sizes(kind: type[Effect], imu: Imu) -> FloatArray:
     """Typical sizes of an effect's coefficients, to scale columns by."""
     triad = imu.triads().get(kind.owner, imu.accelerometer)
     scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
-    typical = {name: each.typical for name, each in kind.inner.items()}
+    typical = {name: parameter.typical for name, parameter in kind.inner.items()}
     return np.asarray(kind(np.zeros(kind.size), **typical).typical_sizes(scale).coefficients)

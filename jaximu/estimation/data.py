@@ -52,7 +52,7 @@ class Conditions(eqx.Module):
 
     def at_magnitude(self, magnitude: Float[Array, ""]) -> Self:
         """Return the same with another magnitude."""
-        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)  # pyright: ignore[reportAttributeAccessIssue]
+        return eqx.tree_at(lambda conditions: conditions.magnitude, self, magnitude)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Data(ABC):
         `details`: of the measurement about the unit.
         """
         key, react, parts = self.reactions(details)
-        found = [np.zeros((rows, 0))]
+        columns = [np.zeros((rows, 0))]
         for effect in imu.all_effects().values():
             kind = type(effect)
 
@@ -163,26 +163,30 @@ class Data(ABC):
 
             inner = [float(getattr(effect, name)) for name in effect.inner]
             numbers = np.concatenate([np.asarray(effect.coefficients), inner])
-            own = [stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers) for part in parts]
-            found += [-sum(own[1:], start=own[0])]
-        return array_module(found).concatenate(found, axis=1)
+            parted = [
+                stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers) for part in parts
+            ]
+            columns += [-sum(parted[1:], start=parted[0])]
+        return array_module(columns).concatenate(columns, axis=1)
 
     def dormant_columns(
-        self, imu: Imu, details: Any, asked: Mapping[type[Effect], Sequence[Mapping[str, float]]]
+        self, imu: Imu, details: Any, grids: Mapping[type[Effect], Sequence[Mapping[str, float]]]
     ) -> dict[type[Effect], FloatArray]:
         """Return the reactions (G, n, q) by the coefficients of effects at zero, each at G inner parameters.
 
         One program for all effects: loading one from the cache takes as long as running it ten times. A diagnosis runs
         it four times and more, which pays for compiling it in full.
         """
-        if not asked:
+        if not grids:
             return {}
         key, react, parts = self.reactions(details)
-        kinds, inner = list(asked), []
-        for kind, grid in asked.items():
-            given = np.array([[each[name] for name in kind.inner] for each in grid]).reshape(len(grid), len(kind.inner))
-            missing = -len(given) % _GRID if len(given) > _GRID else 0  # few lengths, and so few programs
-            inner.append(np.concatenate([given, np.repeat(given[-1:], missing, axis=0)]))
+        kinds, inner = list(grids), []
+        for kind, grid in grids.items():
+            values = np.array([[point[name] for name in kind.inner] for point in grid]).reshape(
+                len(grid), len(kind.inner)
+            )
+            missing = -len(values) % _GRID if len(values) > _GRID else 0  # few lengths, and so few programs
+            inner.append(np.concatenate([values, np.repeat(values[-1:], missing, axis=0)]))
 
         def derivatives(imu, part, *inner):
             def at(kind, values):
@@ -196,11 +200,10 @@ class Data(ABC):
                 for kind, grid in zip(kinds, inner, strict=True)
             )
 
-        names = ",".join(kind.name for kind in kinds)
-        key = f"{key} dormant {names}"
-        found = [stored.call(derivatives, key, imu, part, *inner, quick=False) for part in parts]
-        sums = [np.sum(own, axis=0) for own in zip(*found, strict=True)]
-        return {kind: each[: len(asked[kind])] for kind, each in zip(kinds, sums, strict=True)}
+        key = " ".join([key, "dormant", *(kind.name for kind in kinds)])
+        by_part = [stored.call(derivatives, key, imu, part, *inner, quick=False) for part in parts]
+        sums = [np.sum(slopes, axis=0) for slopes in zip(*by_part, strict=True)]
+        return {kind: total[: len(grids[kind])] for kind, total in zip(kinds, sums, strict=True)}
 
     # --- what a diagnosis needs to know ---------------------------------------------------------------------------
 
@@ -220,7 +223,9 @@ class Data(ABC):
     def extent(self) -> Extent:
         """Return what the recordings span: effects may begin between two observations."""
         spans = self.spans()
-        temperatures = [each.temperature.values for each in self.recordings if each.temperature is not None]
+        temperatures = [
+            recording.temperature.values for recording in self.recordings if recording.temperature is not None
+        ]
         return Extent(
             max(float(part[-1, 1] - part[0, 0]) for part in spans),
             tuple(float(time) for part in spans for time in (part[:-1, 1] + part[1:, 0]) / 2),
@@ -295,9 +300,9 @@ def _slope(kind: type[Effect], of: Callable[[Array], Array], numbers: Array) -> 
     if not kind.probes:
         return jax.jacfwd(of)(numbers)
     # the derivative vanishes nearly everywhere: the change over a quarter of what there is, or the least probe
-    reach = jnp.maximum(jnp.abs(numbers) / 4, kind.probes[0])
+    step = jnp.maximum(jnp.abs(numbers) / 4, kind.probes[0])
     return jax.vmap(lambda e, h: (of(numbers + h * e) - of(numbers - h * e)) / (2 * h), out_axes=1)(
-        jnp.eye(len(numbers)), reach
+        jnp.eye(len(numbers)), step
     )
 
 

@@ -166,7 +166,7 @@ def _names(sample: tuple[str, ...]) -> list[str]:
     headings: list[tuple[int, str]] = []
     for line in sample:
         indent = len(line) - len(line.lstrip())
-        headings = [each for each in headings if each[0] < indent]
+        headings = [heading for heading in headings if heading[0] < indent]
         if "#" in line or "@" in line:
             names += _Naming("".join(f"{name}." for _, name in headings)).names(line)
         elif match := re.fullmatch(r"\s*([A-Za-z_]\w*):", line):
@@ -235,7 +235,7 @@ def read(data: bytes, source: Source) -> Table:
 
 def _declared(data: bytes, source: Source, declared: re.Match[bytes]) -> Table:
     """The rows of $IMU in a text that declares its columns and their units, as FlySight writes it."""
-    names, units = (each.decode().strip().split(",") for each in declared.groups())
+    names, units = (part.decode().strip().split(",") for part in declared.groups())
     rows = [line.split(b",")[1:] for line in data.split(b"\n") if line.startswith(b"$IMU,")]
     whole = [row for row in rows if len(row) == len(names)]
     if len(whole) < 2:
