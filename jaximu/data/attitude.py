@@ -147,17 +147,17 @@ class AttitudeDetails:
 class Intervals(eqx.Module):
     """What was recorded: the unit at its gyroscope's m samples, the reference at T + 1 of its stamps.
 
-    early, late: between which a sample holds, s. slope, curve: first and second derivative of the rate's output. force:
-    the accelerometer's output at the same times. stamp: of the reference, on its own clock; velocity: gained over each
-    interval (m/s), zero where unknown.
+    since, until: between which a sample holds, s. slope, curve: first and second derivative of the rate's output.
+    force: the accelerometer's output at the same times. stamp: of the reference, on its own clock; velocity: gained
+    over each interval (m/s), zero where unknown.
     """
 
     rate: Float[Array, "m 3"]
     slope: Float[Array, "m 3"]
     curve: Float[Array, "m 3"]
     force: Float[Array, "m 3"]
-    early: Float[Array, " m"]
-    late: Float[Array, " m"]
+    since: Float[Array, " m"]
+    until: Float[Array, " m"]
     stamp: Float[Array, " T+1"]
     attitude: Float[Array, "T+1 4"]
     velocity: Float[Array, "T 3"]
@@ -168,7 +168,7 @@ class Intervals(eqx.Module):
 def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Array, "k 4"]:
     """Return the rotations by which the unit stands behind what a smoothed reference says, at times of the log."""
     assert imu.gyroscope is not None
-    time, matrix = (data.early + data.late) / 2, imu.gyroscope.inverse()[:, :3]
+    time, matrix = (data.since + data.until) / 2, imu.gyroscope.inverse()[:, :3]
     acceleration, jerk = (
         jnp.stack([jnp.interp(stamps, time, axis) for axis in slope.T], axis=-1) @ matrix.T
         for slope in (data.slope, data.curve)
@@ -179,7 +179,7 @@ def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Ar
 def reference_sigmas(excess: Mapping[str, float]) -> tuple[float, float]:
     """Return the noise of a reference's attitude (rad) and velocity (m/s), each axis, from a fit's excess by name."""
     attitude, velocity = (
-        _UNITS[place] * float(np.sqrt(excess[EXCESS_NAMES[place]])) for place in (1, 4)
+        _UNITS[component] * float(np.sqrt(excess[EXCESS_NAMES[component]])) for component in (1, 4)
     )  # fmt: skip
     return attitude, velocity
 
@@ -189,7 +189,7 @@ def _added(imu: Imu, data: Intervals, around: Stimulus | None) -> tuple[Array, A
 
     around: what else the unit went through; None where it has no effects but those of how the reference is mounted.
     """
-    bare, time = imu.with_effects(), (data.early + data.late) / 2
+    bare, time = imu.with_effects(), (data.since + data.until) / 2
     force, rate = jnp.zeros_like(data.force), jnp.zeros_like(data.rate)
     unit = replace(imu, setup=_recorded(imu))
     if around is None:
@@ -212,7 +212,7 @@ def _recorded(imu: Imu) -> tuple[Effect, ...]:
 
 
 def evaluated(
-    imu: Imu, data: Intervals, around: Stimulus | None, place: Int[Array, "T S"], noise: Float[Array, "3 3"],
+    imu: Imu, data: Intervals, around: Stimulus | None, samples: Int[Array, "T S"], noise: Float[Array, "3 3"],
     group: int,
 ):  # fmt: skip
     """Return the conditions about a unit, rotations' white noise (T, 3, 3), times (T,), and reactions.
@@ -220,7 +220,7 @@ def evaluated(
     Reactions: of a window's mean force to the rotation vector by which the reference stands wrong at an interval's
     start (T, 3, 3), and of all conditions to samples.
 
-    **Arguments:** `around`: what else the unit went through, for its effects; `place`: samples of each interval, with
+    **Arguments:** `around`: what else the unit went through, for its effects; `samples`: samples of each interval, with
     some beside it; `noise`: density of the gyroscope's, output² s; `group`: intervals to a window of the force.
     """
     bare = imu.with_effects()
@@ -228,9 +228,9 @@ def evaluated(
     mounting = Mounting.of(imu)
     force, rate = _added(imu, data, around)
     stamps = mounting.on_log(data.stamp)
-    held = jnp.minimum(data.late[place], stamps[1:, None]) - jnp.maximum(data.early[place], stamps[:-1, None])
+    held = jnp.minimum(data.until[samples], stamps[1:, None]) - jnp.maximum(data.since[samples], stamps[:-1, None])
     held = jnp.maximum(held, 0.0) / (1 + mounting.clock_scale)  # of the reference's time, in which rates are meant
-    turning, sensed = (data.rate - rate)[place], (data.force - force)[place]
+    turning, sensed = (data.rate - rate)[samples], (data.force - force)[samples]
     whole = preintegrate_samples(bare.gyroscope.recover(turning), bare.accelerometer.recover(sensed), held)
     inverse = bare.gyroscope.inverse()[:, :3]
     spread = white_covariance(whole.reaction[..., :3, :3], inverse @ noise @ inverse.T, held)
@@ -242,7 +242,7 @@ def evaluated(
     sculled = whole.velocity - jnp.einsum("tijk,jk->ti", slope, bare.accelerometer.inverse())
     upright = rotation_matrix(multiply(mounting.tilted, before))
     duration = jnp.sum(held, axis=1) * data.used
-    windows = len(place) // group
+    windows = len(samples) // group
     total = jnp.sum(duration.reshape(windows, group), axis=1)
     complete = jnp.all(data.used.reshape(windows, group), axis=1) & (total > 0)
     safe = jnp.where(complete, total, 1.0)
@@ -260,7 +260,7 @@ def evaluated(
     leaning = share @ jnp.cross(jnp.eye(3), whole.velocity[:, None]).swapaxes(1, 2)
     turned = whole.reaction[..., :3, :] * data.used[:, None, None, None]
     reaction = jnp.concatenate([turned, share[:, None] @ whole.reaction[..., 3:6, :]], axis=-2)
-    return conditions, spread, duration, leaning, Reactions(reaction, place)
+    return conditions, spread, duration, leaning, Reactions(reaction, samples)
 
 
 def shared_ends(back: Float[Array, "T 3 3"]) -> Float[Array, "3*T 3*(T+1)"]:
@@ -300,7 +300,7 @@ class AgainstAttitude(Data):
         assert gyroscope is not None
         middle, period = (gyroscope.time[1:] + gyroscope.time[:-1]) / 2, 1 / gyroscope.rate
         edges = np.concatenate([[gyroscope.time[0] - period / 2], middle, [gyroscope.time[-1] + period / 2]])
-        force = np.stack([np.interp(gyroscope.time, accelerometer.time, each) for each in accelerometer.values.T], 1)
+        force = np.stack([np.interp(gyroscope.time, accelerometer.time, axis) for axis in accelerometer.values.T], 1)
         stamps = attitude.time + self.offset
         knots, group = self._knots
         count = len(knots) - 1
@@ -343,10 +343,10 @@ class AgainstAttitude(Data):
         """Samples (T, S) of each interval, with some more on either side for the delay to move."""
         data = self.intervals
         stamps = Mounting.of(imu).on_log(np.asarray(data.stamp))
-        first = np.searchsorted(data.late, stamps[:-1]) - _MARGIN
-        longest = np.searchsorted(data.late, stamps[1:]) - first + _MARGIN
+        first = np.searchsorted(data.until, stamps[:-1]) - _MARGIN
+        longest = np.searchsorted(data.until, stamps[1:]) - first + _MARGIN
         size = -(-longest[np.asarray(data.used)].max() // _SAMPLES) * _SAMPLES
-        return np.clip(first[:, None] + np.arange(size), 0, len(data.late) - 1)
+        return np.clip(first[:, None] + np.arange(size), 0, len(data.until) - 1)
 
     def unsmoothed(self, imu: Imu) -> Attitude:
         """Return the reference as it would be without the filter that a fitted unit's set-up says it has."""
@@ -423,26 +423,26 @@ class AgainstAttitude(Data):
         """Return the conditions about the unit, their covariance, and columns of effects, of the set-up's included."""
         single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
         data, group = self.intervals, self.group
-        place = self._places(single)
+        samples = self._places(single)
         noise, white = self.densities()
         parameters = Parameters.select(single, lambda name: name.effect is not None)
 
         touched = single.accelerometer.effects or single.gyroscope.effects or _recorded(single)
         around = self.around(single) if touched else None
 
-        def compute(single, parameters, data, around, place, noise):
-            conditions, spread, duration, leaning, reactions = evaluated(single, data, around, place, noise, group)
+        def compute(single, parameters, data, around, samples, noise):
+            conditions, spread, duration, leaning, reactions = evaluated(single, data, around, samples, noise, group)
 
             def of(z):
-                varied = evaluated(parameters.model(single, z), data, around, place, noise, group)[0]
+                varied = evaluated(parameters.model(single, z), data, around, samples, noise, group)[0]
                 return varied(single.with_effects())
 
             columns = jax.jacfwd(of)(jnp.zeros(len(parameters.index))) / parameters.size
             return conditions, spread, duration, leaning, columns, reactions
 
-        description = f"against attitude {group} {' '.join(each.name for each in single.all_effects().values())}"
+        description = f"against attitude {group} {' '.join(effect.name for effect in single.all_effects().values())}"
         conditions, spread, duration, leaning, columns, reactions = stored.call(
-            compute, description, single, parameters, data, around, place, noise
+            compute, description, single, parameters, data, around, samples, noise
         )
         conditions = jax.tree.map(lambda leaf: leaf[None], conditions)
         covariance = self._covariance(conditions, spread, duration, leaning, white)
@@ -511,7 +511,7 @@ class AgainstAttitude(Data):
 
         Neighbouring intervals share an end, and where the reference stands wrong there the force of the window leans.
         """
-        turn, window = (np.asarray(each)[0] for each in (conditions.turn, conditions.window))
+        turn, window = (np.asarray(leaf)[0] for leaf in (conditions.turn, conditions.window))
         turns, windows = len(turn), len(window)
         total = duration.reshape(windows, -1).sum(axis=1)
         total = np.where(window, total, 1.0)
@@ -531,8 +531,8 @@ class AgainstAttitude(Data):
         back = _matrices(np.asarray(conditions.target)[0]).swapaxes(1, 2)
         ends = np.zeros((n, 3 * (turns + 1)))
         ends[rows.ravel()] = shared_ends(back)
-        for place in range(turns):
-            ends[later[place * windows // turns], 3 * place : 3 * place + 3] = leaning[place]
+        for interval in range(turns):
+            ends[later[interval * windows // turns], 3 * interval : 3 * interval + 3] = leaning[interval]
         step = np.sqrt(np.maximum(duration, 0.0))
         walk = np.kron(np.tril(np.ones((turns, turns))) * step * duration[:, None], np.eye(3))
         changes = np.kron((np.eye(windows + 1)[1:] - np.eye(windows + 1)[:-1]) / total[:, None], np.eye(3))
@@ -542,15 +542,15 @@ class AgainstAttitude(Data):
             placed(later, changes) * _UNITS[4],
         )  # fmt: skip
         kind = np.repeat([0, 3], [3 * turns, 3 * windows])
-        return Covariance(measured[None], tuple(each[None] for each in factors), used[None], kind[None])
+        return Covariance(measured[None], tuple(factor[None] for factor in factors), used[None], kind[None])
 
     def errors(self, imu: Imu) -> dict[str, tuple[FloatArray, FloatArray, str]]:
         """Return times (k,), errors (k, 3) and unit of the rotations, over their time, and of the mean forces."""
-        found = self.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu))
-        conditions = jax.tree.map(lambda leaf: np.asarray(leaf)[0], found.conditions)
+        about = self.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu))
+        conditions = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.conditions)
         values = np.asarray(conditions(imu.with_effects()))
         turn, window = conditions.turn, conditions.window
-        rate = values[: 3 * len(turn)].reshape(-1, 3)[turn] / found.details.duration[turn, None]
+        rate = values[: 3 * len(turn)].reshape(-1, 3)[turn] / about.details.duration[turn, None]
         stamps = np.asarray(self.intervals.stamp)
         middle = (stamps[1:] + stamps[:-1]) / 2
         forces = values[3 * len(turn) :].reshape(-1, 3)[window]
@@ -562,8 +562,8 @@ class AgainstAttitude(Data):
 
 def _slopes(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return first and second derivative of values (m, 3), each of lines through `_SMOOTH` seconds."""
-    slope = np.stack([smoothed_slope(time, each, _SMOOTH) for each in values.T], axis=1)
-    return slope, np.stack([smoothed_slope(time, each, _SMOOTH) for each in slope.T], axis=1)
+    slope = np.stack([smoothed_slope(time, axis, _SMOOTH) for axis in values.T], axis=1)
+    return slope, np.stack([smoothed_slope(time, axis, _SMOOTH) for axis in slope.T], axis=1)
 
 
 def _matrices(quaternions: FloatArray) -> FloatArray:

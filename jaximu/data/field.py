@@ -225,9 +225,9 @@ class FieldWindows:
     def joined(cls, parts: Sequence[FieldWindows]) -> FieldWindows:
         """Return windows of several recordings of one unit as one."""
         names = ("output", "slope", "carried", "swept", "up", "off", "angle", "time", "count", "used", "turn", "level")
-        together = {name: np.concatenate([getattr(each, name) for each in parts]) for name in names}
-        noise = float(np.sqrt(np.mean([each.noise**2 for each in parts])))
-        samples = FieldSamples.joined([each.samples for each in parts])
+        together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        noise = float(np.sqrt(np.mean([part.noise**2 for part in parts])))
+        samples = FieldSamples.joined([part.samples for part in parts])
         return cls(**together, noise=noise, origin=parts[0].origin, samples=samples, vertical=parts[0].vertical)
 
 
@@ -260,38 +260,38 @@ def windows_of(
     size = max(1, signal.samples(longest))
     stops = np.minimum(edges[1:], edges[:-1] + size)
     count = stops - edges[:-1]
-    place = np.minimum(edges[:-1, None] + np.arange(count.max()), stops[:, None] - 1)
+    index = np.minimum(edges[:-1, None] + np.arange(count.max()), stops[:, None] - 1)
     weight = (np.arange(count.max()) < count[:, None]) / count[:, None]
     centre = (time[edges[:-1]] + time[stops - 1]) / 2
     if gyroscope is None:
-        turned = np.broadcast_to(np.eye(3), (*place.shape, 3, 3))
+        turned = np.broadcast_to(np.eye(3), (*index.shape, 3, 3))
         carried, angle = np.broadcast_to(np.eye(3), (len(centre), 3, 3)), np.zeros(len(centre))
         swept = np.zeros((len(centre), 3, 3))
     else:
         attitude, turned_until = _carried(gyroscope)
         middle = attitude(centre)
-        frames = attitude(time[place.ravel()]).as_matrix().reshape(*place.shape, 3, 3)
+        frames = attitude(time[index.ravel()]).as_matrix().reshape(*index.shape, 3, 3)
         turned = np.einsum("nji,nsjk->nsik", middle.as_matrix(), frames)
         step = middle[:-1].inv() * middle[1:]
         carried = np.concatenate([step.as_matrix(), np.eye(3)[None]])
         angle = np.append(step.magnitude(), 0.0)
         swept = np.zeros((len(centre), 3, 3))
         swept[:-1] = middle[:-1].inv().as_matrix() @ np.diff(turned_until(centre), axis=0)
-    with_one = np.concatenate([values[place], np.ones((*place.shape, 1))], axis=2)
+    with_one = np.concatenate([values[index], np.ones((*index.shape, 1))], axis=2)
     slope = np.einsum("ns,nsij,nsk->nijk", weight, turned, with_one)
     up, off = np.zeros((len(centre), 3)), np.ones(len(centre))
     if motion is not None:
         force = motion.accelerometer
-        at = np.stack([np.interp(time[place.ravel()], force.time, each) for each in force.values.T], 1)
-        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, at.reshape(*place.shape, 3))
+        at = np.stack([np.interp(time[index.ravel()], force.time, axis) for axis in force.values.T], 1)
+        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, at.reshape(*index.shape, 3))
         length = np.linalg.norm(mean, axis=1)
         up, off = mean / length[:, None], np.abs(length / STANDARD_GRAVITY - 1)
-    at = time[place]
+    at = time[index]
 
     def known(other: Signal | None) -> FloatArray | None:
         if other is None:
             return None
-        return np.stack([np.interp(at, other.time, each) for each in other.values.T], axis=-1)
+        return np.stack([np.interp(at, other.time, axis) for axis in other.values.T], axis=-1)
 
     warm, flow = (None, None) if motion is None else (known(motion.temperature), known(motion.current))
     stimulus = Stimulus(
@@ -299,11 +299,11 @@ def windows_of(
         angular_rate=known(gyroscope),
     )  # pyright: ignore # fmt: skip
     window = np.where(weight > 0, np.arange(len(count))[:, None], len(count))
-    samples = FieldSamples(values[place], np.array(turned), Track(stimulus, window))
+    samples = FieldSamples(values[index], np.array(turned), Track(stimulus, window))
     everywhere = np.ones(len(centre), bool)
     following = np.append(everywhere[1:], False)
     return FieldWindows(
-        (weight[:, :, None] * values[place]).sum(axis=1), slope, np.array(carried), swept, up, off, angle,
+        (weight[:, :, None] * values[index]).sum(axis=1), slope, np.array(carried), swept, up, off, angle,
         np.stack([time[edges[:-1]], time[edges[1:] - 1]], axis=1), count.astype(float), everywhere,
         following if gyroscope is not None else ~everywhere, everywhere if motion is not None else ~everywhere,
         white_noise(signal), origin, samples, np.zeros((12, 12)) if vertical is None else vertical,
@@ -318,8 +318,8 @@ def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> NDAr
     path = np.linalg.norm(np.diff(centred[::every], axis=0), axis=1) / np.median(np.linalg.norm(centred, axis=1))
     path = np.concatenate([[0.0], np.cumsum(path + _STEADY * np.diff(time[::every]))])
     count = min(most, max(8, len(time) // every))
-    found = np.interp(np.linspace(0, path[-1], count + 1), path, np.arange(len(path)) * every)
-    return np.unique(np.append(found[:-1].astype(np.int64), len(time) - 1))
+    edges = np.interp(np.linspace(0, path[-1], count + 1), path, np.arange(len(path)) * every)
+    return np.unique(np.append(edges[:-1].astype(np.int64), len(time) - 1))
 
 
 def _carried(gyroscope: Signal):
@@ -396,7 +396,7 @@ class MagneticField(Data):
         )  # pyright: ignore # fmt: skip
         field = windows.field(whole)
         basis = _across(field)
-        conditions = eqx.tree_at(lambda each: each.basis, blank, basis)
+        conditions = eqx.tree_at(lambda conditions: conditions.basis, blank, basis)
         covariance = self._covariance(whole, field, basis)
         lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions)
         details = _At(conditions, windows.samples)
@@ -427,10 +427,10 @@ class MagneticField(Data):
         assert imu.magnetometer is not None
         length = np.linalg.norm(field, axis=1)
         along = field / length[:, None]
-        each = np.arange(n)
+        window = np.arange(n)
         # what a window's field reaches: its norm, the turns after and before it, its angle to the vertical
-        turns, before = n + 2 * each[:, None] + np.arange(2), (each - 1) % n
-        places = np.concatenate([each[:, None], turns, turns[before], 3 * n + each[:, None]], axis=1)
+        turns, before = n + 2 * window[:, None] + np.arange(2), (window - 1) % n
+        places = np.concatenate([window[:, None], turns, turns[before], 3 * n + window[:, None]], axis=1)
         carried = (basis @ windows.carried)[before]
         level = (windows.up - np.sum(windows.up * along, axis=1)[:, None] * along) / length[:, None]
         values = np.concatenate([along[:, None], -basis, carried, level[:, None]], axis=1)
@@ -444,8 +444,8 @@ class MagneticField(Data):
         sizes = np.concatenate([np.full(n, _UNITS[0]), np.repeat(turned, 2), _UNITS[2] + windows.off])[:rows] * used
         group = np.repeat([0, 1, 2], [n, 2 * n, n])[:rows]
         level = np.where(group == 2, used, 0.0)
-        own = [np.where(group == k, sizes, 0.0) for k in range(3)]  # independent: the roots alone
-        factors = own if windows.alone else [BlockFactor(places, _UNITS[0] * values), *own[1:]]  # pyright: ignore
+        roots = [np.where(group == k, sizes, 0.0) for k in range(3)]  # independent: the roots alone
+        factors = roots if windows.alone else [BlockFactor(places, _UNITS[0] * values), *roots[1:]]  # pyright: ignore
         measured = shaken.component(rows) + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
         if not windows.alone:
             bent = windows.bent(field) * windows.level[:, None]

@@ -172,11 +172,11 @@ def condensed(
 
         return jax.lax.map(lane, (imu, observations, excess))
 
-    found: Condensed = stored.call(
+    units: Condensed = stored.call(
         batch, f"condensed {rows} {method}", imu.with_effects(), observations, excess, quick=count == 1
     )
-    reaction, running = jax.tree.map(lambda leaf: leaf[0], (found.reaction, found.running))
-    return found._replace(reaction=reaction, running=running)
+    reaction, running = jax.tree.map(lambda leaf: leaf[0], (units.reaction, units.running))
+    return units._replace(reaction=reaction, running=running)
 
 
 class PosesAndTurns(Observations, Data):
@@ -230,9 +230,9 @@ class PosesAndTurns(Observations, Data):
                 "name them as effects of jaximu.calibrate."
             )
         data = self._by_unit()
-        found = condensed(imu, data, self.conditions, self.method, data.accelerometer_excess)
-        none = np.zeros((*found.covariance.used.shape, 0))
-        return About(found.conditions, found.covariance, none, found)
+        details = condensed(imu, data, self.conditions, self.method, data.accelerometer_excess)
+        none = np.zeros((*details.covariance.used.shape, 0))
+        return About(details.conditions, details.covariance, none, details)
 
     def _by_unit(self) -> Self:
         """Return the data with a leading axis."""
@@ -255,11 +255,11 @@ def observe(
     Rows that are no measurement are left out. Raises `InputError` where gyroscopes are missing from some recordings,
     and `NotPossibleError` where there are no poses.
     """
-    given = one_or_several(recordings)
-    without = [each.name for each in given if "gyroscope" not in each.signals]
-    if 0 < len(without) < len(given):
+    several = one_or_several(recordings)
+    without = [one.name for one in several if "gyroscope" not in one.signals]
+    if 0 < len(without) < len(several):
         raise InputError(f"{without[0]} has no gyroscope and others have: observe them apart.")
-    with prepared(given, gyroscope=not without) as ready:
+    with prepared(several, gyroscope=not without) as ready:
         segmentations = [segment(one.recording) for one in ready]
         observations = observed_poses(segmentations, as_gravity(gravity).value, noise=noise)
     return PosesAndTurns.of(observations, "norm" if without else "all")
@@ -378,8 +378,8 @@ def forces_and_angles(imu: Imu, observations: Observations) -> tuple[FloatArray,
     """
     full = imu if imu.gyroscope is not None else Imu(imu.accelerometer, Imu.nominal().gyroscope)
     lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))
-    found = condensed(*lifted)
-    return found.force[0], found.angle[0]
+    unit = condensed(*lifted)
+    return unit.force[0], unit.angle[0]
 
 
 def _rms(values: FloatArray) -> float:

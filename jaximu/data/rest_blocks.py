@@ -83,7 +83,7 @@ class Leg:
         low, high = sorted(self.rates, key=abs)
         steady = abs(high) < _STEADY * abs(low)
         rates = [self.rate] if steady else [high, low]
-        text = f"{self.begin:.0f} → {self.end:.0f} °C at {' to '.join(f'{60 * each:+.2g}' for each in rates)} K/min"
+        text = f"{self.begin:.0f} → {self.end:.0f} °C at {' to '.join(f'{60 * rate:+.2g}' for rate in rates)} K/min"
         return text.replace("-", "−")
 
 
@@ -134,20 +134,20 @@ class RestBlocks:
     @property
     def time(self) -> FloatArray:
         """Middle of each block, s, recordings one after another."""
-        gap, shift, found = 0.02 * float(np.sum(self.stop - self.start)), 0.0, np.zeros(len(self))
+        gap, shift, middle = 0.02 * float(np.sum(self.stop - self.start)), 0.0, np.zeros(len(self))
         for log in range(len(self.recordings)):
-            own = self.log == log
-            if own.any():
-                found[own] = shift + (self.start[own] + self.stop[own]) / 2
-                shift = found[own].max() + gap
-        return found
+            here = self.log == log
+            if here.any():
+                middle[here] = shift + (self.start[here] + self.stop[here]) / 2
+                shift = middle[here].max() + gap
+        return middle
 
     def covariance(self, noise: AxisNoise) -> FloatArray:
         """Return the covariance (3, n, n), SI², of the means; recordings are independent."""
         whole = np.zeros((3, len(self), len(self)))
         for log in range(len(self.recordings)):
-            own = np.flatnonzero(self.log == log)
-            whole[:, own[:, None], own] = noise.covariance(self.start[own], self.stop[own])
+            here = np.flatnonzero(self.log == log)
+            whole[:, here[:, None], here] = noise.covariance(self.start[here], self.stop[here])
         return whole
 
     def by_rest(self, values: FloatArray) -> FloatArray:
@@ -190,22 +190,22 @@ class RestBlocks:
 
     def legs(self) -> list[Leg]:
         """Return the stretches in which the temperature goes one way; half of a soak belongs to each side."""
-        found = []
+        legs = []
         least = _TURNING * (self.range[1] - self.range[0])
         for log in range(len(self.recordings)):
-            own = np.flatnonzero(self.log == log)
-            edges = [0, *_turning_points(self.temperature[own], least), len(own)]
+            here = np.flatnonzero(self.log == log)
+            edges = [0, *_turning_points(self.temperature[here], least), len(here)]
             for a, b in pairwise(edges):
-                part = own[a:b]
-                kelvin = self.temperature[part]
+                part = here[a:b]
+                celsius = self.temperature[part]
                 rate = np.sort(self.rate[part])
                 moving = np.abs(rate) >= 0.5 * np.max(np.abs(rate))
                 gone = np.cumsum(np.abs(rate)) / np.sum(np.abs(rate))
                 low, high = (float(rate[min(np.searchsorted(gone, share), len(rate) - 1)]) for share in (0.1, 0.9))
-                found.append(
-                    Leg(part, float(kelvin[0]), float(kelvin[-1]), float(np.median(rate[moving])), (low, high))
+                legs.append(
+                    Leg(part, float(celsius[0]), float(celsius[-1]), float(np.median(rate[moving])), (low, high))
                 )
-        return found
+        return legs
 
     def only(self, keep: NDArray[np.bool_]) -> RestBlocks:
         """Return the blocks that are kept (n,), with the whole path of temperature."""
@@ -248,25 +248,25 @@ def folds_of(legs: Sequence[Leg]) -> list[NDArray[np.int64]]:
     return parts
 
 
-def _turning_points(kelvin: FloatArray, least: float) -> list[int]:
+def _turning_points(celsius: FloatArray, least: float) -> list[int]:
     """Return where the temperature turns by `least` or more: in the middle of the plateau about each extreme."""
-    found, low, high, first = [], 0, 0, 0
+    turning, low, high, first = [], 0, 0, 0
     direction = 0
-    for k, value in enumerate(kelvin):
-        low, high = (k if value < kelvin[low] else low), (k if value > kelvin[high] else high)
-        if direction >= 0 and value < kelvin[high] - least:
+    for k, value in enumerate(celsius):
+        low, high = (k if value < celsius[low] else low), (k if value > celsius[high] else high)
+        if direction >= 0 and value < celsius[high] - least:
             if direction:
-                found.append(_plateau(kelvin, high, first, k, least))
+                turning.append(_plateau(celsius, high, first, k, least))
             direction, low, first = -1, k, high
-        elif direction <= 0 and value > kelvin[low] + least:
+        elif direction <= 0 and value > celsius[low] + least:
             if direction:
-                found.append(_plateau(kelvin, low, first, k, least))
+                turning.append(_plateau(celsius, low, first, k, least))
             direction, high, first = 1, k, low
-    return found
+    return turning
 
 
-def _plateau(kelvin: FloatArray, extreme: int, first: int, last: int, least: float) -> int:
-    near = np.flatnonzero(np.abs(kelvin[first : last + 1] - kelvin[extreme]) < 0.3 * least) + first
+def _plateau(celsius: FloatArray, extreme: int, first: int, last: int, least: float) -> int:
+    near = np.flatnonzero(np.abs(celsius[first : last + 1] - celsius[extreme]) < 0.3 * least) + first
     return int((near[0] + near[-1]) // 2)
 
 
@@ -280,31 +280,31 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     or stamps that are not in their stated unit, `NotPossibleError` where there is no temperature, it does not change,
     or the unit did not rest.
     """
-    given = [_with_finite_temperature(recording) for recording in recordings_of(recordings)]
-    same_outputs(given)
-    for recording in given:
+    logs = [_with_finite_temperature(recording) for recording in recordings_of(recordings)]
+    same_outputs(logs)
+    for recording in logs:
         _require_temperature(recording)
-    used = [without_startup(recording) for recording in given]
-    span = sum(float(each.accelerometer.time[-1] - each.accelerometer.time[0]) for each in used)
-    rate = min(each.accelerometer.rate for each in used)
+    used = [without_startup(recording) for recording in logs]
+    span = sum(float(part.accelerometer.time[-1] - part.accelerometer.time[0]) for part in used)
+    rate = min(part.accelerometer.rate for part in used)
     if block is None:
         block = max(span / _MOST_BLOCKS, 8 / rate, 1.0)
     elif not (np.isfinite(block) and block >= 2 / rate):
         raise InputError(f"a block of {block:g} s holds less than two samples at {rate:g} Hz: state a longer one.")
-    found = joined([_cut(recording, block) for recording in used])
-    count = len(found)
+    blocks = joined([_cut(recording, block) for recording in used])
+    count = len(blocks)
     if count > 3 * _MOST_BLOCKS:
         raise InputError(
             f"blocks of {block:g} s are {count}, more than {3 * _MOST_BLOCKS}, whose noise cannot be "
             f"handled together: state a block of {span / _MOST_BLOCKS:.2g} s or more."
         )
     names = ", ".join(recording.name for recording in used)
-    if count < _FEWEST_BLOCKS or found.dropped > count:
+    if count < _FEWEST_BLOCKS or blocks.dropped > count:
         raise NotPossibleError(
-            f"{names}: the unit was stationary in {count} of {count + found.dropped} blocks of {block:.3g} s, too few. "
-            "Record it at rest, in one pose or a few, while the temperature changes slowly up and down."
+            f"{names}: the unit was stationary in {count} of {count + blocks.dropped} blocks of {block:.3g} s, too "
+            "few. Record it at rest, in one pose or a few, while the temperature changes slowly up and down."
         )
-    low, high = found.range
+    low, high = blocks.range
     if high - low < LEAST_RANGE:
         raise NotPossibleError(
             f"{names}: the temperature only goes from {low:.2f} to {high:.2f} °C; {LEAST_RANGE:g} K or more are needed "
@@ -317,9 +317,9 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
             f"the temperature reaches {extreme:.0f} °C; most sensors are made for {_COLDEST:g} to {_HOTTEST:g} °C. "
             "If it is in °F, state temperature [degF], in the header or with --columns."
         )
-    if found.dropped:
-        notes.append(f"{found.dropped} blocks of {block:.3g} s in which the unit moved were left out.")
-    return replace(found, notes=tuple(dict.fromkeys(notes)))
+    if blocks.dropped:
+        notes.append(f"{blocks.dropped} blocks of {block:.3g} s in which the unit moved were left out.")
+    return replace(blocks, notes=tuple(dict.fromkeys(notes)))
 
 
 def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
@@ -362,14 +362,14 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
         signal = getattr(recording, name)
         if signal is None:
             continue
-        place = np.floor((signal.time - begin) / block).astype(int)
-        inside = (place >= 0) & (place < count)
-        place, values = place[inside], signal.si()[inside]
-        number = np.bincount(place, minlength=count)
+        at = np.floor((signal.time - begin) / block).astype(int)
+        inside = (at >= 0) & (at < count)
+        at, values = at[inside], signal.si()[inside]
+        number = np.bincount(at, minlength=count)
         good &= number >= max(2, 0.5 * block * signal.rate)
         safe = np.maximum(number, 1)
-        mean = np.stack([np.bincount(place, column, count) / safe for column in values.T], axis=1)
-        scatter = sum(np.bincount(place, column, count) for column in ((values - mean[place]) ** 2).T) / safe
+        mean = np.stack([np.bincount(at, column, count) / safe for column in values.T], axis=1)
+        scatter = sum(np.bincount(at, column, count) for column in ((values - mean[at]) ** 2).T) / safe
         moved |= scatter > _MOVING * (np.median(scatter[good]) if good.any() else 0.0)
         means[name] = mean
     keep = np.flatnonzero(good & ~moved)
@@ -382,15 +382,15 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
     def by_block(values: FloatArray) -> FloatArray:
         return values[: count * _NODES].reshape(count, _NODES).mean(axis=1)[keep]
 
-    place = np.full(count + 1, len(keep))
-    place[keep] = np.arange(len(keep))
+    kept = np.full(count + 1, len(keep))
+    kept[keep] = np.arange(len(keep))
     start, ambient = np.asarray(begin + block * keep, np.float64), recording.ambient_temperature
     rest = np.cumsum(np.concatenate([[0], jumps]), dtype=np.int64)[: len(keep)]
     return RestBlocks(
         (recording,), start, np.asarray(start + block, np.float64), np.zeros(len(keep), np.int64), rest, rest,
         by_block(celsius), by_block(slope), means,
         (Track(Stimulus(temperature=celsius, temperature_rate=slope, time=time),
-               place[np.minimum(np.arange(nodes) // _NODES, count)]),),
+               kept[np.minimum(np.arange(nodes) // _NODES, count)]),),
         None if ambient is None else by_block(_cells(ambient, edges)), float(block), int(np.sum(good & moved)), (),
     )  # fmt: skip
 
@@ -500,9 +500,9 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     flicker, walk = np.ones(len(times)), np.zeros(len(times))
     walk[-1] = 1.0  # so slow that it is a random walk here
     nothing = np.zeros(3)
-    slow = [null.T @ blocks.covariance(AxisNoise(nothing, nothing, np.tile(each, (3, 1)), times))[0] @ null
-            for each in (flicker, walk)]  # fmt: skip
-    sizes = [max(float(np.trace(each)), 1e-300) / len(each) for each in slow]
+    slow = [null.T @ blocks.covariance(AxisNoise(nothing, nothing, np.tile(shape, (3, 1)), times))[0] @ null
+            for shape in (flicker, walk)]  # fmt: skip
+    sizes = [max(float(np.trace(covariance)), 1e-300) / len(covariance) for covariance in slow]
     tried: dict[str, list[tuple[FloatArray, ...]]] = {name: [] for name in left}
     for share in _WALKS:
         mixed = [(1 - share) / sizes[0], share / sizes[1]]
@@ -516,11 +516,11 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
             best = np.arange(3), np.argmin(cost, axis=1)
             variance = (scale[best] * _RATIOS[best[1]])[:, None] * (mixed[0] * flicker + mixed[1] * walk)
             tried[name].append((cost[best], scale[best], variance))
-    found = {}
-    for name, each in tried.items():
-        cost, white, variance = (np.stack(values) for values in zip(*each, strict=True))
+    noise = {}
+    for name, fits in tried.items():
+        cost, white, variance = (np.stack(values) for values in zip(*fits, strict=True))
         best = np.argmin(cost, axis=0), np.arange(3)
         usual = _FLICKER**2 * white[best] * shortest * np.log(4.0) / np.pi
         slowly = np.maximum(variance[best], usual[:, None])
-        found[name] = AxisNoise(white[best] * shortest, nothing, slowly, times, longest / 4)
-    return NoiseModel(found["accelerometer"], found.get("gyroscope"))
+        noise[name] = AxisNoise(white[best] * shortest, nothing, slowly, times, longest / 4)
+    return NoiseModel(noise["accelerometer"], noise.get("gyroscope"))

@@ -99,13 +99,11 @@ def station_excess(stations: Stations) -> Float[Array, "3 6 S"]:
 
     A unit is the mean measured variance of the stations of a kind.
     """
-    diagonal = jnp.concatenate([
-        jnp.diagonal(each, axis1=-2, axis2=-1) for each in (stations.accelerometer_covariance,
-                                                           stations.gyroscope_covariance)])  # fmt: skip
+    covariance = jnp.concatenate([stations.accelerometer_covariance, stations.gyroscope_covariance])
     accelerometer, gyroscope = stations.accelerometer_used, stations.gyroscope_used
     none = jnp.zeros_like(accelerometer)
     kinds = [(accelerometer, none), (none, gyroscope & stations.turn), (none, gyroscope & ~stations.turn)]
-    units = []
+    diagonal, units = covariance.diagonal(axis1=-2, axis2=-1), []
     for first, second in kinds:
         member = jnp.repeat(jnp.stack([first, second]), 3, axis=0).astype(diagonal.dtype)
         mean = jnp.sum(member * diagonal, axis=-1) / jnp.maximum(jnp.sum(member, axis=-1), 1.0)

@@ -62,22 +62,22 @@ class DriftComponents:
         """The standard deviation of each kind, relative to its unit, and the relative uncertainty of it."""
         spread = np.sqrt(np.diag(self.uncertainty)) / 2
         return {
-            name: (float(np.exp(half)), float(each))
-            for name, half, each in zip(self.names, self.log_size / 2, spread, strict=True)
+            name: (float(np.exp(half)), float(relative))
+            for name, half, relative in zip(self.names, self.log_size / 2, spread, strict=True)
         }
 
     @property
     def implausible(self) -> list[str]:
         """What no sensor or hand of this class does, in sentences: such sizes stand for a misfit of another kind."""
-        found = []
+        sentences = []
         for name, (size, _) in self.sizes.items():
-            median, spread = next(each for kind, each in _USUAL.items() if name.endswith(kind))
+            median, spread = next(usual for kind, usual in _USUAL.items() if name.endswith(kind))
             if np.log(size / median) > _STRANGE * spread:
-                found.append(
+                sentences.append(
                     f"To explain the misfit, the size of {name} would have to be {size:.3g}, where {median:g} is "
                     "usual: the cause is another."
                 )
-        return found
+        return sentences
 
     @property
     def by_hand(self) -> FloatArray:
@@ -100,7 +100,7 @@ class DriftComponents:
 
         def changed(values: FloatArray, logarithms: FloatArray) -> FloatArray:
             change = np.clip(logarithms, -1.0, 1.0) / 2
-            return values + sum(own * (part @ values) for own, part in zip(change, parts, strict=True))
+            return values + sum(amount * (part @ values) for amount, part in zip(change, parts, strict=True))
 
         drawn = changed(drawn, np.linalg.cholesky(self.uncertainty) @ random.standard_normal((len(sizes), DRAWS)))
         basis = orthonormal_basis(np.concatenate([jacobian, weights @ self.beside[used]], axis=1))

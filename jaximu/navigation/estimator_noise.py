@@ -188,7 +188,7 @@ class MeasuredErrors:
         found, measurement = calibrate_against_attitude(recording, attitude, gravity, unit=unit)
         data, known = measurement.intervals, measurement.attitude
         mounting = Mounting.of(found.imu)
-        middle = (np.asarray(data.early) + np.asarray(data.late)) / 2
+        middle = (np.asarray(data.since) + np.asarray(data.until)) / 2
         beside = replace(
             measurement.around(found.imu), specific_force=None, angular_rate=None, angular_acceleration=None
         )
@@ -214,7 +214,7 @@ class MeasuredErrors:
                 "accelerometer's multiplier contains."
             )
         return cls(
-            np.asarray(rate), np.asarray(force), np.asarray(data.early), np.asarray(data.late), stamp,
+            np.asarray(rate), np.asarray(force), np.asarray(data.since), np.asarray(data.until), stamp,
             whole.as_quat(scalar_first=True), velocity, None if known.position is None else tilt.apply(known.position),
             found.gravity.value, steady, f"measured against {attitude.name} along {recording.name}", tuple(notes),
         )  # fmt: skip
