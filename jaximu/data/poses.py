@@ -130,7 +130,8 @@ def condense(
         rotation = integrate_rates(gyroscope.recover(turns.output), turns.interval, method)
     conditions = HandHeldConditions(
         poses.accelerometer_mean, poses.gyroscope_mean, poses.mask, turns.mask, turns.basis, rotation,
-        linear_slope(whole.reaction, turns.output), gyroscope.inverse(), observations.gravity,
+        jnp.einsum("tij,tjkl->tikl", whole.back, linear_slope(whole.sweep, turns.output)), gyroscope.inverse(),
+        observations.gravity,
     )  # fmt: skip
     covariance = condition_covariance(imu, observations, whole)
     return conditions, covariance, whole, sensitivities(imu, observations, whole)

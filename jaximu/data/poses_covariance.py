@@ -50,7 +50,8 @@ def turned_by(gyroscope: Triad, turns: Turns) -> Turned:
 def turn_noise(gyroscope: Triad, turns: Turns, whole: Turned) -> Float[Array, "T 3 3"]:
     """Return the covariance (rad²) of the turns' last frames by the gyroscope's white noise."""
     inverse = inverse_matrix(gyroscope.gain)
-    return white_covariance(whole.reaction, inverse @ turns.noise @ inverse.T, turns.interval)
+    swept = white_covariance(whole.sweep, inverse @ turns.noise @ inverse.T, turns.interval)
+    return whole.back @ swept @ whole.back.swapaxes(-1, -2)
 
 
 def _pose_sensitivities(imu: Imu, observations: Observations, rotations: Float[Array, "T 4"]):

@@ -85,7 +85,12 @@ class Turned(NamedTuple):
     @property
     def reaction(self) -> Float[Array, "... S 3 3"]:
         """How the rate of each sample turns the last frame (s), in that frame."""
-        return rotation_matrix(conjugate(self.rotation))[..., None, :, :] @ self.sweep
+        return self.back[..., None, :, :] @ self.sweep
+
+    @property
+    def back(self) -> Float[Array, "... 3 3"]:
+        """The matrix that takes vectors of the first frame to the last."""
+        return rotation_matrix(conjugate(self.rotation))
 
 
 def turned_by_rates(rates: Float[Array, "... S 3"], intervals: Float[Array, "... S"]) -> Turned:
@@ -98,15 +103,22 @@ def turned_by_rates(rates: Float[Array, "... S 3"], intervals: Float[Array, "...
 def linear_slope(reaction: Float[Array, "... S k 3"], output: Float[Array, "... S 3"]) -> Float[Array, "... k 3 4"]:
     """Return how sums react to (A | c), of samples A y + c, by their reaction to each sample and its output y."""
     with_one = jnp.concatenate([output, jnp.ones_like(output[..., :1])], axis=-1)
-    return jnp.einsum("...sij,...sk->...ijk", reaction, with_one)
+    sums = _flat(reaction).swapaxes(-1, -2) @ with_one
+    return sums.reshape(*sums.shape[:-2], *reaction.shape[-2:], 4)
+
+
+def _flat(reaction):
+    """Return the entries of each sample's matrix in a row: one product of matrices sums over all samples."""
+    return reaction.reshape(*reaction.shape[:-2], reaction.shape[-2] * reaction.shape[-1])
 
 
 def white_covariance(
     reaction: Float[Array, "... S k n"], density: Float[Array, "n n"], intervals: Float[Array, "... S"]
 ) -> Float[Array, "... k k"]:
     """Return the covariance of sums whose samples have white noise of a density (two-sided, unit² s)."""
-    by_root = reaction / jnp.sqrt(jnp.where(intervals > 0, intervals, 1.0))[..., None, None]
-    return jnp.einsum("...sij,...slj->...il", by_root @ density, by_root)
+    entries, shape = _flat(reaction), reaction.shape[-2:]
+    squares = (entries / jnp.where(intervals > 0, intervals, 1.0)[..., None]).swapaxes(-1, -2) @ entries
+    return jnp.einsum("...ijkl,jl->...ik", squares.reshape(*squares.shape[:-2], *shape, *shape), density)
 
 
 class Preintegrated(NamedTuple):

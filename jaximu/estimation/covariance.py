@@ -76,7 +76,7 @@ class Weights(eqx.Module):
 
     def whiten(self, rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         """Return W times rows."""
-        return self.root @ rows if self.root.ndim == 2 else (self.root * rows.T).T
+        return jnp.tensordot(self.root, rows, axes=1) if self.root.ndim == 2 else (self.root * rows.T).T
 
     def back(self, rows: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         """Return Wᵀ times whitened rows."""
@@ -427,8 +427,8 @@ def update_excess(
         own = [seen.T @ rows[:, 1:] for rows in moved]
         gradient += [pull @ rows[:, 0] - trace + jnp.trace(inner)
                      for rows, trace, inner in zip(moved, first, own, strict=True)]  # fmt: skip
-        white = jnp.stack([root.whiten(rows[:, 1:]) for rows in moved])
-        second = second - 2 * jnp.einsum("inp,jnp->ij", white, white)
+        white = root.whiten(jnp.stack([rows[:, 1:] for rows in moved], axis=1))
+        second = second - 2 * jnp.einsum("nip,njp->ij", white, white)
         scoring = scoring.at[slice(*numbers), slice(*numbers)].add(second)
         within += own
     inner = jnp.stack(within)

@@ -136,14 +136,17 @@ def right_jacobian(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 
     J_r = I − (1 − cos θ)/θ² [θ]× + (θ − sin θ)/θ³ [θ]×² (Chirikjian, Stochastic Models, Information Theory, and Lie
     Groups, vol. 2, 2012).
     """
+    return jnp.stack([jnp.stack(row, axis=-1) for row in _right_jacobian_rows(rotation_vector)], axis=-2)
+
+
+def _right_jacobian_rows(rotation_vector):
+    """The rows of J_r by component, from the half angle, which `exponential` computes as well."""
     squared = jnp.sum(rotation_vector**2, axis=-1)
-    small = squared < 1e-4  # the closed forms cancel well above the square root of machine precision
-    safe = jnp.where(small, 1.0, squared)
-    angle = jnp.sqrt(safe)
-    first = jnp.where(small, 0.5 - squared / 24 + squared**2 / 720, (1 - jnp.cos(angle)) / safe)
-    second = jnp.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, (angle - jnp.sin(angle)) / (safe * angle))
-    rows = right_jacobian_rows(_parts(rotation_vector), first, second)
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    small = squared < 1e-4  # the closed form cancels well above the square root of machine precision
+    cosine, sine = _half_angle(rotation_vector)  # 1 − cos θ = 2 sin²(θ/2), sin θ = 2 sin(θ/2) cos(θ/2)
+    closed = (1 - 2 * cosine * sine) / jnp.where(small, 1.0, squared)
+    second = jnp.where(small, 1 / 6 - squared / 120 + squared**2 / 5040, closed)
+    return right_jacobian_rows(_parts(rotation_vector), 2 * sine**2, second)
 
 
 def right_jacobian_rows(vector: Sequence[Any], first: Any, second: Any) -> list[list[Any]]:
@@ -176,11 +179,15 @@ def running_rotations(rotation_vectors: Float[Array, "... S 3"]) -> Float[Array,
 def transport(running: Float[Array, "... S 4"], rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... S 3 3"]:
     """Return how a small change of each rotation vector turns all frames after it, in the first frame: R(P_k) J_r(θ_k).
 
+    Laid out component by component: half the time, and sums over the samples become products of matrices.
+
     **Arguments:** `running`: P_k, as `running_rotations` has it of the vectors (rad).
     """
-    rotation, jacobian = rotation_matrix(running), right_jacobian(rotation_vectors)
-    x, y, z = (rotation[..., :, k, None] * jacobian[..., None, k, :] for k in range(3))
-    return x + y + z
+    jacobian = _right_jacobian_rows(rotation_vectors)
+    entries = [sum(r * j for r, j in zip(row, column, strict=True))
+               for row in rotation_rows(_parts(running)) for column in zip(*jacobian, strict=True)]  # fmt: skip
+    by_component = jnp.moveaxis(jnp.stack(entries, axis=-2), -2, -1)
+    return by_component.reshape(*rotation_vectors.shape, 3)
 
 
 @jax.custom_jvp
