@@ -159,8 +159,68 @@ def test_free_numbers_can_be_chosen_under_a_trace(data):
 
 def test_effects_need_samples(data):
     unit = NOMINAL.with_effects(jaximu.CATALOGUE["accel.asymmetry"].dormant())
-    with pytest.raises(jaximu.InputError, match=r"accel.asymmetry cannot be fitted.*jaximu.calibrate"):
+    with pytest.raises(jaximu.InputError, match=r"accel.asymmetry cannot be fitted.*samples=True"):
         jaximu.fit(unit, data[0])
+    log = recording(1)[0]
+    with pytest.raises(jaximu.InputError, match="no gyroscope, without which no effect can be fitted"):
+        jaximu.observe(jaximu.Recording(log.accelerometer), GRAVITY, samples=True)
+
+
+@pytest.fixture(scope="module")
+def with_effects():
+    """Return a unit of two effects to be fitted, and the data of two logs of different length with their samples."""
+    names = "accel.quadratic", "gyro.g_sensitivity"
+    unit = NOMINAL.with_effects(*(jaximu.CATALOGUE[name].dormant() for name in names))
+    logs = [recording(seed, poses=poses)[0] for seed, poses in ((1, 12), (2, 14))]
+    return jax.tree.map(np.asarray, unit), [jaximu.observe(log, GRAVITY, samples=True) for log in logs]
+
+
+def test_effects_are_fitted_under_a_trace_and_side_by_side(with_effects):
+    """As on the host, one unit alone; each effect's prior is felt, and the fit reacts to gravity as it says."""
+    unit, data = with_effects
+    alone = [jaximu.fit(unit, each) for each in data]
+    many = jaximu.stack(data)
+    traced = jax.jit(jax.vmap(lambda each: jaximu.fit(unit, each)))(many)
+    together = jaximu.fit(jax.tree.map(lambda leaf: np.stack([leaf] * 2), unit), many)
+    for fits in (traced, together):
+        assert fits.converged.all()
+        assert max(off(jax.tree.map(lambda leaf, k=k: leaf[k], fits), alone[k]) for k in range(2)) < 1e-9
+
+    place = next(k for k, name in enumerate(alone[0].names) if name.part == "coefficients")
+    width = float(alone[0].sigmas()[place])
+
+    def values(share):
+        """Return the fitted numbers where gravity and what is known of a coefficient are changed together."""
+        prior = jaximu.Prior((alone[0].names[place],), width * share[None], np.eye(1) / width)
+        moved = eqx.tree_at(lambda each: each.gravity, data[0], data[0].gravity + 1e-4 * share)
+        return jaximu.fit(unit, moved, prior=prior, excess=EXCESS, estimate_excess=False).values
+
+    slope = values(np.array(0.5)) - values(np.array(-0.5))
+    forward = jax.jit(jax.jacfwd(values))(jnp.array(0.0))
+    assert float(np.max(np.abs((forward - slope) / alone[0].sigmas()))) < 1e-4
+    assert 0.2 < forward[place] / width < 0.9
+
+
+def test_what_effects_add_in_one_recording_leaves_the_turns_of_another():
+    """The columns of an effect of the gyroscope are what the conditions change by, over both recordings."""
+    logs = [recording(seed, poses=12)[0] for seed in (1, 2)]
+    data = jaximu.observe(logs, GRAVITY, samples=True)
+    kind = jaximu.CATALOGUE["gyro.g_sensitivity"]
+    numbers, none = kind.typical * np.linspace(0.2, 1.0, kind.size), np.zeros(kind.size)
+    unit = jaximu.calibrate(logs, GRAVITY).imu.with_effects()
+
+    def conditions(change):
+        moved = unit.with_effects(kind.make(numbers + change))
+        seen = data.along(moved, tuple(moved.all_effects().values())).condensed.conditions
+        return np.asarray(jax.tree.map(lambda leaf: np.asarray(leaf[0]), seen)(unit))
+
+    lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.with_effects(kind.make(numbers)))
+    columns = data.about(lifted).columns[0]
+    for place in range(kind.size):
+        step = none.copy()
+        step[place] = 0.1 * kind.typical
+        slope = (conditions(step) - conditions(-step)) / (0.2 * kind.typical)
+        assert np.max(np.abs(columns[:, place] - slope)) < 2e-2 * np.max(np.abs(slope))
 
 
 def test_another_solver_finds_the_same(data):

@@ -8,7 +8,7 @@ bias alone). A turn about a fixed axis is linear in (A, c) however far it goes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, Self
@@ -24,10 +24,12 @@ from jaximu.data.gravity_direction import gravity_direction_error, unit_vectors
 from jaximu.data.gravity_norm import gravity_norm_error
 from jaximu.data.poses_covariance import Sensitivities, condition_covariance, sensitivities, turned_by
 from jaximu.data.preintegration import Turned, linear_slope
+from jaximu.data.tracks_by_hand import SamplesByHand, during_turns, samples_by_hand, tracks_by_hand
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
+from jaximu.estimation.track import Track, added, mean_outputs
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import InputError
@@ -41,8 +43,9 @@ from jaximu.ground.rotation import (
     multiply,
     rotate,
 )
-from jaximu.ground.tracing import array_module
+from jaximu.ground.tracing import array_module, one_by_one, repeated
 from jaximu.mistakes import Prepared, one_or_several, prepared
+from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
@@ -76,6 +79,10 @@ RESIDUALS = (
     ResidualKind("gravity_direction", "gravity carried over a turn", "deg", 2, float(np.degrees(1.0))),
     ResidualKind("static_gyroscope", "rate at rest", "rad/s", 3, centred=True),
 )
+
+
+_ROUNDS = 4
+"""Times that tracks are taken anew with what effects add taken off: effects of a twentieth leave a millionth of it."""
 
 
 class HandHeldConditions(Conditions):
@@ -180,15 +187,33 @@ def condensed(
     return units._replace(reaction=reaction, running=running)
 
 
+class Along(NamedTuple):
+    """Poses and turns about one unit with effects: what was condensed (a leading axis of one), and the tracks.
+
+    observations: with what the effects add taken off. tracks: of both triads, recording by recording.
+    """
+
+    observations: PosesAndTurns
+    condensed: Condensed
+    tracks: list[dict[str, Track]]
+
+    @property
+    def reaction(self) -> Sensitivities:
+        """How the conditions react to the outputs."""
+        assert self.condensed.reaction is not None
+        return self.condensed.reaction
+
+
 class PosesAndTurns(Observations, Data):
-    """What was observed of a unit, or of units with a leading axis on every array; their effects are not looked at.
+    """What was observed of a unit, or of units with a leading axis on every array.
 
     conditions: "all"; "norm", gravity's magnitude alone; or "turning", all but that, neighbouring turns taken as
-    independent and the accelerometer as known. accelerometer_excess: of its poses, with "turning". method: how rates
-    are integrated.
+    independent and the accelerometer as known. accelerometer_excess: of its poses, with "turning". samples: of each
+    recording, along which effects act; without them effects are refused. method: how rates are integrated.
     """
 
     accelerometer_excess: Float[Array, ...] | None = None
+    samples: tuple[SamplesByHand, ...] = ()
     conditions: str = eqx.field(static=True, default="all")
     method: str = eqx.field(static=True, default="exponential")
 
@@ -210,30 +235,85 @@ class PosesAndTurns(Observations, Data):
         """Return the data of some of the units."""
         return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self._by_unit())
 
-    def widened(self, poses: int, samples: int) -> Self:
-        """Return the data of a unit with padding up to so many poses, and samples in a turn."""
+    def widened(self, poses: int, samples: int, lengths: Sequence[Mapping[str, int]] = ()) -> Self:
+        """Return the data of a unit with padding up to so many poses, and samples in a turn, and of each recording."""
         longer = partial(resized, numerics=array_module(self))
         turns = {name: longer(getattr(self.turns, name), poses - 1) for name in ("basis", "mask")}
         turns |= {name: longer(getattr(self.turns, name), poses - 1, samples) for name in ("output", "interval")}
         wider = jax.tree.map(lambda leaf: longer(leaf, poses), self.poses), replace(self.turns, **turns)
-        return eqx.tree_at(lambda data: (data.poses, data.turns), self, wider)
+        if not self.samples:
+            return eqx.tree_at(lambda data: (data.poses, data.turns), self, wider)
+        lengths = lengths or [recording.lengths() for recording in self.samples]
+        longest = zip(self.samples, lengths, strict=True)
+        part = tuple(recording.widened(length, poses - 1, samples) for recording, length in longest)
+        return eqx.tree_at(lambda data: (data.poses, data.turns, data.samples), self, (*wider, part))
 
     def rows(self, imu: Imu) -> Rows:
         """Return what each condition of one unit is."""
         return pose_rows(imu, self)
 
     def about(self, imu: Imu) -> About:
-        """Return the conditions about units without effects; raise `InputError` for a unit that has some."""
-        if effects := imu.all_effects():
+        """Return the conditions about units; raise `InputError` for effects where there are no samples."""
+        data, effects = self._by_unit(), imu.all_effects()
+        if not effects:
+            details = condensed(imu, data, self.conditions, self.method, data.accelerometer_excess)
+            none = np.zeros((*details.covariance.used.shape, 0))
+            return About(details.conditions, details.covariance, none, details)
+        if not self.samples:
             names = ", ".join(effect.name for effect in effects.values())
             raise InputError(
                 f"{names} cannot be fitted to poses and turns alone, which hold no samples along which effects act: "
-                "name them as effects of jaximu.calibrate."
+                "observe them with samples=True, or name the effects to jaximu.calibrate."
             )
-        data = self._by_unit()
-        details = condensed(imu, data, self.conditions, self.method, data.accelerometer_excess)
-        none = np.zeros((*details.covariance.used.shape, 0))
-        return About(details.conditions, details.covariance, none, details)
+
+        def one(imu: Imu, data: Self) -> tuple[Any, ...]:
+            details = data.along(imu, tuple(imu.all_effects().values()))
+            seen = jax.tree.map(lambda leaf: leaf[0], (details.condensed.conditions, details.condensed.covariance))
+            return *seen, data.own_columns(imu, details, len(seen[1].used))
+
+        return About(*one_by_one(one, imu, data))
+
+    def along(self, imu: Imu, effects: Sequence[Effect]) -> Along:
+        """Return what one unit went through about it, and the poses and turns without what its effects add.
+
+        The tracks tell what effects add, and what they add changes the tracks: an error of theirs shrinks every time by
+        as much as the effects are small beside what the unit measures.
+        """
+        bare, unit = imu.with_effects(), imu.with_effects(*effects)
+
+        samples = [part.sample for part in self.samples]
+        start = replace(self, samples=()), [part.outputs for part in self.samples]
+
+        def tracks(data: PosesAndTurns, outputs: list[dict[str, Array]]) -> tuple[Condensed, list[dict[str, Track]]]:
+            lifted, of = jax.tree.map(lambda leaf: array_module(leaf).asarray(leaf)[None], (bare, data))
+            whole = condensed(lifted, of, self.conditions, self.method, of.accelerometer_excess)
+            parts = zip(self.samples, outputs, strict=True)
+            return whole, [tracks_by_hand(bare, part, output, whole.running) for part, output in parts]
+
+        def without(
+            state: tuple[PosesAndTurns, list[dict[str, Array]]],
+        ) -> tuple[PosesAndTurns, list[dict[str, Array]]]:
+            return _without_added(unit, *start, samples, tracks(*state)[1])
+
+        state = repeated(without, start, _ROUNDS, imu) if effects else start
+        return Along(state[0], *tracks(*state))
+
+    def reactions(self, details: Along):
+        """Return how norms, directions and means at rest react to effects, recording by recording."""
+
+        def of(effect, imu, part):
+            tracks, samples, reaction = part
+            outputs = added(imu.with_effects(effect), tracks)
+            means = mean_outputs(tracks, outputs, reaction.norm.shape[0])
+            force = means[:, :3]
+            norm = jnp.sum(reaction.norm * force, axis=-1)
+            turn = jnp.einsum("tai,ti->ta", reaction.after, force[1:])
+            turn = turn + jnp.einsum("tai,ti->ta", reaction.before, force[:-1])
+            turn = turn + jnp.einsum("tasi,tsi->ta", reaction.turn, during_turns(outputs["gyroscope"], samples))
+            return jnp.concatenate([norm, turn.reshape(-1), means[:, 3:].reshape(-1)])
+
+        parts = zip(details.tracks, self.samples, strict=True)
+        return "by hand", of, [(tracks, part.sample, details.reaction) for tracks, part in parts]
 
     def _by_unit(self) -> Self:
         """Return the data with a leading axis."""
@@ -241,17 +321,41 @@ class PosesAndTurns(Observations, Data):
         return jax.tree.map(lambda leaf: numerics.asarray(leaf)[None], self) if np.ndim(self.gravity) == 0 else self
 
 
+@partial(stored.compiled, quick=True)
+def _without_added(
+    imu: Imu,
+    data: PosesAndTurns,
+    outputs: Sequence[dict[str, Array]],
+    samples: Sequence[Array],
+    tracks: Sequence[dict[str, Track]],
+) -> tuple[PosesAndTurns, list[dict[str, Array]]]:
+    """Return observations, and the outputs of each recording, without what a unit's effects add along tracks."""
+    means, turned, left = jnp.zeros((len(data.poses.mask), 6)), data.turns.output, []
+    for output, sample, track in zip(outputs, samples, tracks, strict=True):
+        more = added(imu, track)
+        means = means + mean_outputs(track, more, len(means))
+        turned = turned - during_turns(more["gyroscope"], sample)
+        left.append({name: values - more[name] for name, values in output.items()})
+    changed = data.poses.accelerometer_mean - means[:, :3], data.poses.gyroscope_mean - means[:, 3:], turned
+
+    def where(data):
+        return data.poses.accelerometer_mean, data.poses.gyroscope_mean, data.turns.output
+
+    return eqx.tree_at(where, data, changed), left
+
+
 def observe(
     recordings: Recording | Prepared | Sequence[Recording | Prepared],
     gravity: Gravity = STANDARD,
     noise: NoiseModel | None = None,
+    samples: bool = False,
 ) -> PosesAndTurns:
     """Return poses and turns of recordings of one unit as data of a fit; chosen on the host, a PyTree of arrays.
 
     **Arguments:** `recordings`: one or several; each may have been looked over by [`jaximu.mistakes.prepare`][], which
     says what was found in it. `gravity`: local gravity, m/s². `noise`: fitted to the unit at rest; without it the
-    scatter within the poses tells the noise. A fit starts at the data sheet's values,
-    [`jaximu.calibration.nominal_imu`][].
+    scatter within the poses tells the noise. `samples`: keep the samples, which a fit of effects needs. A fit starts at
+    the data sheet's values, [`jaximu.calibration.nominal_imu`][].
 
     Rows that are no measurement are left out. Raises `InputError` where gyroscopes are missing from some recordings,
     and `NotPossibleError` where there are no poses.
@@ -260,10 +364,13 @@ def observe(
     without = [one.name for one in several if "gyroscope" not in one.signals]
     if 0 < len(without) < len(several):
         raise InputError(f"{without[0]} has no gyroscope and others have: observe them apart.")
+    if samples and without:
+        raise InputError(f"{without[0]} has no gyroscope, without which no effect can be fitted: leave samples out.")
     with prepared(several, gyroscope=not without) as ready:
         segmentations = [segment(one.recording) for one in ready]
         observations = observed_poses(segmentations, as_gravity(gravity).value, noise=noise)
-    return PosesAndTurns.of(observations, "norm" if without else "all")
+    kept = samples_by_hand(segmentations, observations) if samples else ()
+    return PosesAndTurns.of(observations, "norm" if without else "all", samples=kept)
 
 
 def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
@@ -274,8 +381,14 @@ def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
     if not data:
         raise InputError("nothing to stack: give the data of one unit or more.")
     poses, samples = (max(unit.turns.interval.shape[axis] for unit in data) for axis in (0, 1))
-    wide = [unit.widened(poses + 1, samples) for unit in data]
-    if len({(jax.tree.structure(unit), *map(np.shape, jax.tree.leaves(unit))) for unit in wide}) > 1:
+    alike, wide = {jax.tree.structure(unit) for unit in data}, data
+    if len(alike) == 1:
+        lengths = [
+            {name: max(part.lengths()[name] for part in parts) for name in parts[0].lengths()}
+            for parts in zip(*(unit.samples for unit in data), strict=True)
+        ]
+        wide = [unit.widened(poses + 1, samples, lengths) for unit in data]
+    if len(alike) > 1 or len({tuple(map(np.shape, jax.tree.leaves(unit))) for unit in wide}) > 1:
         raise InputError("these units' data differ in kind (gyroscope, slow noise, its intervals): stack those alike.")
     return jax.tree.map(lambda *leaves: array_module(leaves).stack(leaves), *wide)
 

@@ -7,106 +7,189 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from typing import Self
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-import scipy
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from jaximu.estimation.track import Track, measured
-from jaximu.ground.array_types import FloatArray
+from jaximu.estimation.track import Recorded, Track
+from jaximu.ground import stored
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.rotation import multiply, rotate
+from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation
 
-__all__ = ["tracks_by_hand", "turn_samples"]
+__all__ = ["SamplesByHand", "during_turns", "rest_shifts", "samples_by_hand", "tracks_by_hand"]
+
+_NONE = 2**30
+"""Stands for the pose or the turn of a sample that is of none, and for a sample that there is not."""
 
 
-def turn_samples(segmentations: Sequence[Segmentation], observations: Observations) -> list[NDArray[np.int64]]:
-    """Return, of each recording, where the samples (T, S) of each turn are among its gyroscope's; 0 for none."""
-    interval, first, recordings = np.asarray(observations.turns.interval), 0, []
-    for part in segmentations:
-        time, samples = part.recording.signals["gyroscope"].time, np.zeros(interval.shape, np.int64)
-        for turn, (start, stop) in enumerate(zip(part.intervals[:-1, 1], part.intervals[1:, 0], strict=True), first):
-            if (interval[turn] > 0).any():
-                inside = np.flatnonzero((time >= start) & (time < stop))
-                samples[turn, : len(inside)] = inside
-        recordings.append(samples)
-        first += len(part.intervals)
-    return recordings
+class SamplesByHand(eqx.Module):
+    """The samples of one recording by hand, and the poses and turns of its unit that they belong to; padded.
 
-
-def tracks_by_hand(
-    segmentations: Sequence[Segmentation],
-    samples: Sequence[NDArray[np.int64]],
-    imu: Imu,
-    outputs: Sequence[Mapping[str, FloatArray]],
-    running: FloatArray,
-) -> list[dict[str, Track]]:
-    """Return the tracks of both triads in each recording, whose observations are the poses, as `imu` tells them.
-
-    **Arguments:** `imu`: its effects are not looked at; `samples`: as of `turn_samples`; `outputs`: of each recording
-    and triad, at its samples, without what effects add; `running` (T, S, 4): the turns' rotations, sample by sample.
+    outputs: of each triad (n, 3), the gyroscope's without what the observations took off it. recorded: what is known of
+    them without a unit. pose: of each triad (n,). turn, place (m,): the turn that a sample of the gyroscope lies in and
+    where; sample (T, S): where the samples of each turn are among the gyroscope's. nearest: of each triad (n,), the
+    gyroscope's sample at the time.
     """
-    tracks, first = [], 0
-    for part, turns, values in zip(segmentations, samples, outputs, strict=True):
-        tracks.append(_tracks(part, turns, imu, values, first, running))
+
+    outputs: dict[str, Float[Array, "... n 3"]]
+    recorded: Recorded
+    pose: dict[str, Int[Array, "... n"]]
+    turn: Int[Array, "... m"]
+    place: Int[Array, "... m"]
+    sample: Int[Array, "... T S"]
+    nearest: dict[str, Int[Array, "... n"]]
+
+    @classmethod
+    def of(cls, part: Segmentation, first: int, interval: FloatArray, shift: FloatArray) -> Self:
+        """Return the samples of a recording whose poses are numbered from `first` on; `interval` (T, S): of all turns.
+
+        **Arguments:** `shift` (3,): what the observations took off the gyroscope's output.
+        """
+        signals = {name: part.recording.signals[name] for name in ("accelerometer", "gyroscope")}
+        gyroscope = signals["gyroscope"]
+        turn, place = np.full((2, len(gyroscope)), _NONE)
+        sample = np.full(interval.shape, _NONE)
+        for number, (start, stop) in enumerate(zip(part.intervals[:-1, 1], part.intervals[1:, 0], strict=True), first):
+            if (interval[number] > 0).any():
+                inside = np.flatnonzero((gyroscope.time >= start) & (gyroscope.time < stop))
+                sample[number, : len(inside)] = inside
+                turn[inside], place[inside] = number, np.arange(len(inside))
+        nearest = {
+            name: np.clip(np.searchsorted(gyroscope.time, signal.time - 0.5 / gyroscope.rate), 0, len(gyroscope) - 1)
+            for name, signal in signals.items()
+        }
+        outputs = {name: signal.values - (shift if name == "gyroscope" else 0.0) for name, signal in signals.items()}
+        pose = {name: _pose_of(signal, part.intervals, first) for name, signal in signals.items()}
+        whole = cls(outputs, Recorded.of(part.recording), pose, turn, place, sample, nearest)
+        return whole.widened({name: Track.length(len(signal)) for name, signal in signals.items()}, *interval.shape)
+
+    def lengths(self) -> dict[str, int]:
+        """Return how many samples each triad has, padding included."""
+        return {name: pose.shape[-1] for name, pose in self.pose.items()}
+
+    def widened(self, lengths: Mapping[str, int], turns: int, samples: int) -> Self:
+        """Return the same of one unit with padding up to so many samples, and so many turns of so many samples."""
+        numerics = array_module(self)
+
+        def longer(values, name="gyroscope", none=False):
+            missing = [(0, lengths[name] - len(values)), *[(0, 0)] * (np.ndim(values) - 1)]
+            how = {"constant_values": _NONE} if none else {"mode": "edge"}
+            return numerics.pad(values, missing, **how)
+
+        sample = self.sample[:turns, :samples]
+        missing = [(0, wanted - have) for wanted, have in zip((turns, samples), sample.shape, strict=True)]
+        sample = numerics.pad(sample, missing, constant_values=_NONE)
+        return type(self)(
+            {name: longer(values, name) for name, values in self.outputs.items()},
+            self.recorded.widened(lengths),
+            {name: longer(values, name, none=True) for name, values in self.pose.items()},
+            longer(self.turn, none=True), longer(self.place, none=True), sample,
+            {name: longer(values, name) for name, values in self.nearest.items()},
+        )  # fmt: skip
+
+
+def during_turns(values: Float[Array, "m 3"], sample: Int[Array, "T S"]) -> Float[Array, "T S 3"]:
+    """Return values at the gyroscope's samples turn by turn, which are where `sample` says; zero for none."""
+    return jnp.asarray(values).at[sample].get(mode="fill", fill_value=0.0)
+
+
+def samples_by_hand(segmentations: Sequence[Segmentation], observations: Observations) -> tuple[SamplesByHand, ...]:
+    """Return the samples of each recording that poses and turns were cut from."""
+    interval, first, samples = np.asarray(observations.turns.interval), 0, []
+    for part, shift in zip(segmentations, rest_shifts(segmentations), strict=True):
+        samples.append(SamplesByHand.of(part, first, interval, shift))
         first += len(part.intervals)
-    return tracks
+    return tuple(samples)
 
 
-def _tracks(
-    part: Segmentation,
-    samples: NDArray[np.int64],
-    imu: Imu,
-    outputs: Mapping[str, FloatArray],
-    first: int,
-    running: FloatArray,
+def rest_shifts(segmentations: Sequence[Segmentation]) -> FloatArray:
+    """Return the difference (k, 3) of each recording's gyroscope output at rest to the first recording's.
+
+    The observations have it taken off.
+    """
+    middles = []
+    for part in segmentations:
+        signal = part.recording.signals["gyroscope"]
+        means = [signal.values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in part.intervals]
+        middles.append(np.median(means, axis=0))
+    return np.array(middles) - middles[0]
+
+
+@partial(stored.compiled, quick=True)
+def tracks_by_hand(
+    imu: Imu, samples: SamplesByHand, outputs: Mapping[str, Float[Array, "n 3"]], running: Float[Array, "T S 4"]
 ) -> dict[str, Track]:
-    recording, intervals, poses = part.recording, part.intervals, len(samples) + 1
-    triads = imu.triads()
-    force, rate = (triads[name].recover_on_host(outputs[name]) for name in ("accelerometer", "gyroscope"))
-    poses_of = {name: _pose_of(recording.signals[name], intervals) for name in outputs}
-    means = np.stack([force[poses_of["accelerometer"] == k].mean(axis=0) for k in range(len(intervals))])
-    rate[poses_of["gyroscope"] >= 0] = 0.0
+    """Return the tracks of both triads in a recording, whose observations are the poses, as `imu` tells them.
 
-    attitude = np.tile([1.0, 0.0, 0.0, 0.0], (len(rate), 1))
-    rotation = scipy.spatial.transform.Rotation
-    now = rotation.identity()
-    for k, mean in enumerate(means):
-        now = _levelled(now, mean)
-        attitude[poses_of["gyroscope"] == k] = now.as_quat(scalar_first=True)
-        inside = samples[first + k][samples[first + k] > 0] if k + 1 < len(means) else []
-        if len(inside):
-            turned = now * rotation.from_quat(running[first + k, : len(inside)], scalar_first=True)
-            attitude[inside], now = turned.as_quat(scalar_first=True), turned[-1]
+    **Arguments:** `imu`: its effects are not looked at; `outputs`: of each triad, without what effects add; `running`:
+    the turns' rotations, sample by sample.
+    """
+    poses, pose = len(running) + 1, samples.pose
+    triads = imu.with_effects().triads()
+    force, rate = (triads[name].recover(outputs[name]) for name in ("accelerometer", "gyroscope"))
+    means, counts = _means(force, pose["accelerometer"], poses)
+    rate = jnp.where((pose["gyroscope"] < poses)[:, None], 0.0, rate)
+    attitudes = _attitudes(means, counts > 0, running[:, -1])
 
-    gyroscope, tracks = recording.signals["gyroscope"], {}
-    for name, known in measured(recording, force, rate).items():
-        assert known.specific_force is not None
-        time, pose = recording.signals[name].time, poses_of[name]
-        acceleration = np.array(known.angular_acceleration)
-        acceleration[pose >= 0] = 0.0
-        nearest = np.clip(np.searchsorted(gyroscope.time, time - 0.5 / gyroscope.rate), 0, len(gyroscope) - 1)
+    level = jnp.array([1.0, 0.0, 0.0, 0.0])
+    begun = jnp.minimum(pose["gyroscope"], samples.turn)  # the pose that a sample lies in, or the one before its turn
+    attitude = attitudes.at[begun].get(mode="fill", fill_value=0.0)
+    turned = running.at[samples.turn, samples.place].get(mode="fill", fill_value=0.0)
+    attitude = multiply(attitude, jnp.where(samples.turn[:, None] < poses, turned, level))
+    attitude = jnp.where(begun[:, None] < poses, attitude, level)
+    tracks = {}
+    for name, known in samples.recorded.stimuli(force, rate).items():
+        assert known.specific_force is not None and known.angular_acceleration is not None
+        at_rest = pose[name][:, None] < poses
+        of_pose = means.at[pose[name]].get(mode="fill", fill_value=0.0)
         stimulus = replace(
             known,
-            specific_force=np.where(pose[:, None] >= 0, means[np.maximum(pose, 0)], known.specific_force),
-            angular_acceleration=acceleration,
-            attitude=attitude[nearest],
+            specific_force=jnp.where(at_rest, of_pose, known.specific_force),
+            angular_acceleration=jnp.where(at_rest, 0.0, known.angular_acceleration),
+            attitude=attitude[samples.nearest[name]],
         )
-        tracks[name] = Track.padded(stimulus, np.where(pose >= 0, pose + first, poses), poses)
+        tracks[name] = Track(stimulus, pose[name])
     return tracks
 
 
-def _pose_of(signal: Signal, intervals: FloatArray) -> NDArray[np.int64]:
-    """The pose each sample lies in, −1 in between."""
+def _pose_of(signal: Signal, intervals: FloatArray, first: int) -> NDArray[np.int64]:
+    """The pose each sample lies in."""
     pose = np.searchsorted(intervals[:, 0], signal.time, side="right") - 1
     inside = (pose >= 0) & (signal.time < intervals[np.maximum(pose, 0), 1])
-    return np.where(inside, pose, -1)
+    return np.where(inside, first + pose, _NONE)
 
 
-def _levelled(attitude: scipy.spatial.transform.Rotation, force: FloatArray) -> scipy.spatial.transform.Rotation:
+def _means(values: Float[Array, "n 3"], pose: Int[Array, " n"], poses: int) -> tuple[Array, Array]:
+    """The means (P, 3) over poses, and of how many samples each is (P,)."""
+    counts = jax.ops.segment_sum(jnp.ones(len(values)), pose, poses)
+    return jax.ops.segment_sum(values, pose, poses) / jnp.maximum(counts, 1.0)[:, None], counts
+
+
+def _attitudes(force: Float[Array, "P 3"], real: Array, turned: Float[Array, "T 4"]) -> Float[Array, "P 4"]:
+    """The attitude in each pose that is real: carried over the turn from the one before, and levelled by its force."""
+    level = jnp.array([1.0, 0.0, 0.0, 0.0])
+
+    def step(carried, pose):
+        force, real, turned = pose
+        attitude = _levelled(carried, jnp.where(real, force, jnp.array([0.0, 0.0, 1.0])))
+        return jnp.where(real, multiply(attitude, turned), level), attitude
+
+    return jax.lax.scan(step, level, (force, real, jnp.concatenate([turned, level[None]])))[1]
+
+
+def _levelled(attitude: Float[Array, 4], force: Float[Array, 3]) -> Float[Array, 4]:
     """The attitude turned by the smallest rotation that brings the specific force upright."""
-    x, y, z = attitude.apply(force / np.linalg.norm(force))
-    half = [1 + z, y, -x, 0.0] if 1 + z > 1e-9 else [0.0, 1.0, 0.0, 0.0]  # straight down: a half turn
-    return scipy.spatial.transform.Rotation.from_quat(half, scalar_first=True) * attitude
+    x, y, z = rotate(attitude, force / jnp.linalg.norm(force))
+    half = jnp.where(1 + z > 1e-9, jnp.stack([1 + z, y, -x, 0 * z]), jnp.array([0.0, 1.0, 0.0, 0.0]))
+    return multiply(half / jnp.linalg.norm(half), attitude)  # straight down: half a turn

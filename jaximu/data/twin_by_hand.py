@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.track import Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise import drawn_noise
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation
 
@@ -23,8 +22,7 @@ __all__ = ["twin_recordings"]
 
 def twin_recordings(
     segmentations: Sequence[Segmentation],
-    observations: Observations,
-    turn_samples: Sequence[NDArray[np.int64]],
+    data: PosesAndTurns,
     shifts: FloatArray,
     imu: Imu,
     tracks: Sequence[dict[str, Track]],
@@ -38,12 +36,12 @@ def twin_recordings(
     without effects and noise drawn from the noise model, on the recording's own stamps. What noise the measured rates
     of a turn held is motion to the twin.
 
-    **Arguments:** `turn_samples`, `shifts`, `tracks`: of each recording, as `RecordedByHand` has them.
+    **Arguments:** `shifts` (k, 3): what the data took off each recording's gyroscope output; `tracks`: of each.
     """
-    gravity, turns, count = float(observations.gravity), observations.turns, len(observations.poses.mask)
+    gravity, turns, count = float(data.gravity), data.turns, len(data.poses.mask)
     first, made = 0, []
     for number, (part, samples, shift, track) in enumerate(
-        zip(segmentations, turn_samples, shifts, tracks, strict=True)
+        zip(segmentations, data.samples, shifts, tracks, strict=True)
     ):
         signals = part.recording.signals
         force, pose = (
@@ -59,7 +57,7 @@ def twin_recordings(
         up = {int(k): force[row] / gravity for k, row in zip(*np.unique(pose, return_index=True), strict=True)}
         for k in range(first, first + len(part.intervals) - 1):
             if np.asarray(turns.mask)[k]:
-                inside = samples[k][np.asarray(turns.interval)[k] > 0]
+                inside = np.asarray(samples.sample)[k][np.asarray(turns.interval)[k] > 0]
                 rate[inside] += _correction(attitude[inside], up[k + 1], float(np.sum(turns.interval[k])))
         first += len(part.intervals)
         changed = {}

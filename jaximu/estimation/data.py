@@ -154,20 +154,21 @@ class Data(ABC):
         `details`: of the measurement about the unit.
         """
         key, react, parts = self.reactions(details)
-        columns = [np.zeros((rows, 0))]
+        numerics = array_module(imu, details)
+        columns = [numerics.zeros((rows, 0))]
         for effect in imu.all_effects().values():
             kind = type(effect)
 
             def derivatives(imu, part, numbers, kind=kind):
                 return derivatives_by_numbers(kind, lambda varied: react(varied, imu, part), numbers)
 
-            inner = [float(getattr(effect, name)) for name in effect.inner]
-            numbers = np.concatenate([np.asarray(effect.coefficients), inner])
+            inner = [numerics.asarray(getattr(effect, name), float)[None] for name in effect.inner]
+            numbers = numerics.concatenate([numerics.asarray(effect.coefficients, float), *inner])
             parted = [
                 stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers) for part in parts
             ]
             columns += [-sum(parted[1:], start=parted[0])]
-        return array_module(columns).concatenate(columns, axis=1)
+        return numerics.concatenate(columns, axis=1)
 
     def dormant_columns(
         self, imu: Imu, details: Any, grids: Mapping[type[Effect], Sequence[Mapping[str, float]]]

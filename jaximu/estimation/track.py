@@ -13,20 +13,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array
+from jaximu.ground.differences import slopes
+from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
-from jaximu.recordings.recording import Recording, Signal, smoothed_slope
+from jaximu.recordings.recording import Recording, smoothed_slope
 
-__all__ = ["TEMPERATURE_WINDOW", "Track", "added", "mean_outputs", "measured", "stimuli"]
+__all__ = ["TEMPERATURE_WINDOW", "Recorded", "Track", "added", "mean_outputs", "stimuli"]
 
 TEMPERATURE_WINDOW = 20.0
 """Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
-_VIBRATION_WINDOW = 0.5
+_VIBRATION_WINDOW, _QUIETEST = 0.5, 0.1
+"""Seconds over which vibration is measured, and the share of a recording, the quietest, that tells its noise."""
 _BUCKET = 4096
 
 
@@ -47,15 +50,13 @@ class Track(eqx.Module):
         """
         assert stimulus.time is not None
         time = np.asarray(stimulus.time)
-        missing = _BUCKET - len(time) % _BUCKET  # one or more
-        step = np.median(np.diff(time))
+        missing = cls.length(len(time)) - len(time)
+        return cls(_longer(stimulus, missing), np.pad(observation, (0, missing), constant_values=count))
 
-        def pad(leaf):
-            return np.concatenate([leaf, np.repeat(leaf[-1:], missing, axis=0)])
-
-        later = np.concatenate([time, time[-1] + step * np.arange(1, missing + 1)])
-        whole = replace(jax.tree.map(pad, stimulus), time=later)
-        return cls(whole, np.pad(observation, (0, missing), constant_values=count))
+    @staticmethod
+    def length(samples: int) -> int:
+        """Return the next bucket's length beyond so many samples."""
+        return samples + _BUCKET - samples % _BUCKET
 
     def renumbered(self, numbers: NDArray[np.int64]) -> Track:
         """Return the track with other numbers of the observations, the last of them for samples of none."""
@@ -106,6 +107,87 @@ def _mean_outputs(tracks, outputs, rows):
     return jnp.concatenate([track.means(outputs[name], len(rows)) for name, track in tracks.items()], axis=-1)
 
 
+def _longer(stimulus: Stimulus, missing: int) -> Stimulus:
+    """Return a stimulus whose last sample is repeated so many times, while the time goes on."""
+    numerics, time = array_module(stimulus), stimulus.time
+    assert time is not None
+    later = time[-1] + numerics.median(numerics.diff(time)) * np.arange(1, missing + 1)
+    repeated = jax.tree.map(lambda leaf: numerics.concatenate([leaf, numerics.repeat(leaf[-1:], missing, 0)]), stimulus)
+    return replace(repeated, time=numerics.concatenate([time, later]))
+
+
+class Recorded(eqx.Module):
+    """What a recording says of the samples of accelerometer and gyroscope without a unit.
+
+    known: of each triad its stamps and temperatures. real (n,): the accelerometer's samples that are no padding.
+    together: whether both have the same stamps. window: samples over which vibration is measured, none where none
+    stands out.
+    """
+
+    known: dict[str, Stimulus]
+    real: Bool[Array, "... n"]
+    together: bool = eqx.field(static=True)
+    window: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, recording: Recording) -> Recorded:
+        """Return what a recording of both says."""
+        accelerometer, gyroscope = recording.accelerometer, recording.signals["gyroscope"]
+        known = {}
+        for name, time in (("accelerometer", accelerometer.time), ("gyroscope", gyroscope.time)):
+            known[name] = Stimulus(time=time)  # pyright: ignore[reportArgumentType]
+            if recording.temperature is not None:
+                celsius = np.interp(time, recording.temperature.time, recording.temperature.values[:, 0])
+                slope = smoothed_slope(time, celsius, TEMPERATURE_WINDOW)
+                known[name] = replace(known[name], temperature=celsius, temperature_rate=slope)
+        together = np.array_equal(accelerometer.time, gyroscope.time)
+        window = max(4, accelerometer.samples(_VIBRATION_WINDOW))
+        recorded = cls(known, np.ones(len(accelerometer), bool), together, window)
+        if len(accelerometer) >= 4 * window:
+            power = recorded._vibration(accelerometer.si())
+            if np.median(power) > 2 * np.quantile(power, _QUIETEST):
+                return recorded
+        return replace(recorded, window=0)
+
+    def widened(self, lengths: Mapping[str, int]) -> Recorded:
+        """Return the same of one unit with padding up to so many samples of each triad."""
+        known = {name: _longer(each, lengths[name] - len(self.stamps(name))) for name, each in self.known.items()}
+        real = np.pad(self.real, (0, lengths["accelerometer"] - len(self.real)))
+        return replace(self, known=known, real=real)
+
+    def stamps(self, name: str) -> Float[Array, "... n"]:
+        """Return a triad's stamps."""
+        time = self.known[name].time
+        assert time is not None
+        return time
+
+    def stimuli(self, force: Float[Array, "n 3"], rate: Float[Array, "m 3"]) -> dict[str, Stimulus]:
+        """Return what the unit went through at the samples of each triad, of force and rate at those of their own."""
+        sensed, turning = self.stamps("accelerometer"), self.stamps("gyroscope")
+        numerics, power, stimuli = array_module(force, self), None, {}
+        if self.window:
+            power = self._vibration(force)
+            power = (power - numerics.nanquantile(numerics.where(self.real, power, np.nan), _QUIETEST))[:, None]
+        for name, known in self.known.items():
+            own = name == "accelerometer"
+            here = rate if self.together or not own else _at(turning, rate, sensed)
+            stimuli[name] = replace(
+                known,
+                specific_force=force if self.together or own else _at(sensed, force, turning),
+                angular_rate=here,
+                angular_acceleration=slopes(here, self.stamps(name)),
+                vibration_power=None if power is None else (power if own else _at(sensed, power, turning))[:, 0],
+            )
+        return stimuli
+
+    def _vibration(self, force: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """Mean square of what is quicker than the window, (m/s²)²."""
+        numerics = array_module(force, self)
+        kernel, real = np.ones(self.window) / self.window, self.real[:, None]
+        smooth = numerics.stack([numerics.convolve(axis, kernel, "same") for axis in (real * force).T], axis=1)
+        return numerics.convolve(numerics.sum((real * (force - smooth)) ** 2, axis=1), kernel, "same")
+
+
 def stimuli(recording: Recording, imu: Imu) -> dict[str, Stimulus]:
     """Return what the unit went through at the samples of accelerometer and gyroscope, as its outputs tell it.
 
@@ -117,40 +199,10 @@ def stimuli(recording: Recording, imu: Imu) -> dict[str, Stimulus]:
         triad.recover_on_host(signal.values)
         for triad, signal in ((imu.accelerometer, accelerometer), (imu.gyroscope, gyroscope))
     )
-    return measured(recording, force, rate)
+    return Recorded.of(recording).stimuli(force, rate)
 
 
-def measured(recording: Recording, force: FloatArray, rate: FloatArray) -> dict[str, Stimulus]:
-    """Return the same of known forces and rates, each at the samples of its own sensor."""
-    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
-    assert gyroscope is not None
-    known = {}
-    for name, time in (("accelerometer", accelerometer.time), ("gyroscope", gyroscope.time)):
-        turning = _at(gyroscope.time, rate, time)
-        known[name] = Stimulus(
-            _at(accelerometer.time, force, time), turning, np.gradient(turning, time, axis=0), time=time,
-            vibration_power=_vibration(accelerometer, force, time),
-        )  # pyright: ignore[reportArgumentType] # fmt: skip
-        if recording.temperature is not None:
-            celsius = np.interp(time, recording.temperature.time, recording.temperature.values[:, 0])
-            slope = smoothed_slope(time, celsius, TEMPERATURE_WINDOW)
-            known[name] = replace(known[name], temperature=celsius, temperature_rate=slope)
-    return known
-
-
-def _at(time: FloatArray, values: FloatArray, wanted: FloatArray) -> FloatArray:
-    if np.array_equal(time, wanted):
-        return values.copy()
-    return np.stack([np.interp(wanted, time, column) for column in values.T], axis=1)
-
-
-def _vibration(accelerometer: Signal, force: FloatArray, time: FloatArray) -> FloatArray | None:
-    """Mean square of the vibration (n,), (m/s²)², beyond the quietest tenth; None where nothing stands out."""
-    width = max(4, accelerometer.samples(_VIBRATION_WINDOW))
-    if len(force) < 4 * width:
-        return None
-    kernel = np.ones(width) / width
-    smooth = np.stack([np.convolve(axis, kernel, "same") for axis in force.T], axis=1)
-    power = np.convolve(np.sum((force - smooth) ** 2, axis=1), kernel, "same")
-    floor = np.quantile(power, 0.1)
-    return np.interp(time, accelerometer.time, power - floor) if np.median(power) > 2 * floor else None
+def _at(time: Float[Array, " n"], values: Float[Array, "n k"], wanted: Float[Array, " m"]) -> Float[Array, "m k"]:
+    """Return values at other times, along straight lines."""
+    numerics = array_module(time, values, wanted)
+    return numerics.stack([numerics.interp(wanted, time, column) for column in values.T], axis=1)

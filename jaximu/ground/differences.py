@@ -1,9 +1,9 @@
 """Rates of change from samples."""
 
-import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.tracing import array_module
 
 __all__ = ["slopes"]
 
@@ -14,13 +14,14 @@ def slopes(values: Float[Array, "... n m"], time: Float[Array, "... n"]) -> Floa
     Second order in the interval, also where stamps are uneven; for even ones the central difference. Zero where stamps
     do not increase (padding) and for a path of one sample.
     """
+    numerics = array_module(values, time)
     if time.shape[-1] < 2:
-        return jnp.zeros_like(values)
-    step = jnp.diff(time, axis=-1)[..., None]
+        return numerics.zeros_like(values)
+    step = numerics.diff(time, axis=-1)[..., None]
     rising = step > 0
-    chord = jnp.where(rising, jnp.diff(values, axis=-2) / jnp.where(rising, step, 1.0), 0.0)
+    chord = numerics.where(rising, numerics.diff(values, axis=-2) / numerics.where(rising, step, 1.0), 0.0)
     before, after = step[..., :-1, :], step[..., 1:, :]
     span = before + after
     weighted = after * chord[..., :-1, :] + before * chord[..., 1:, :]
-    inner = jnp.where(span > 0, weighted / jnp.where(span > 0, span, 1.0), 0.0)
-    return jnp.concatenate([chord[..., :1, :], inner, chord[..., -1:, :]], axis=-2)
+    inner = numerics.where(span > 0, weighted / numerics.where(span > 0, span, 1.0), 0.0)
+    return numerics.concatenate([chord[..., :1, :], inner, chord[..., -1:, :]], axis=-2)

@@ -1,9 +1,13 @@
 """One text for arrays on the host and for arrays that are being traced."""
 
 import sys
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
-__all__ = ["array_module", "is_traced"]
+__all__ = ["array_module", "is_traced", "one_by_one", "repeated"]
+
+Result = TypeVar("Result")
+State = TypeVar("State")
 
 
 def is_traced(*trees: Any) -> bool:
@@ -22,3 +26,29 @@ def array_module(*trees: Any) -> Any:
     import numpy
 
     return jax.numpy if is_traced(*trees) else numpy
+
+
+def repeated(step: Callable[[State], State], state: State, times: int, *others: Any) -> State:
+    """Return a state after so many steps: one after the other, or where JAX traces it or `others`, in a loop of JAX.
+
+    The loop has a derivative both ways.
+    """
+    if not is_traced(state, others):
+        for _ in range(times):
+            state = step(state)
+        return state
+    import jax
+
+    state = jax.tree.map(jax.numpy.asarray, state)
+    return jax.lax.scan(lambda before, _: (step(before), None), state, length=times)[0]
+
+
+def one_by_one(function: Callable[..., Result], *trees: Any) -> Result:
+    """Return what a function makes of each entry along the leading axis of every array, along a leading axis."""
+    import jax
+
+    if is_traced(trees):
+        return jax.lax.map(lambda entry: function(*entry), trees)
+    count = len(jax.tree.leaves(trees)[0])
+    results = [function(*jax.tree.map(lambda leaf, k=k: leaf[k], trees)) for k in range(count)]
+    return jax.tree.map(lambda *leaves: array_module().stack(leaves), *results)
