@@ -29,7 +29,7 @@ from jaximu.recordings.segmentation import Segmentation
 
 __all__ = ["SamplesByHand", "during_turns", "rest_shifts", "samples_by_hand", "tracks_by_hand"]
 
-_NONE = 2**30
+_NONE = np.iinfo(np.int64).max
 """Stands for the pose or the turn of a sample that is of none, and for a sample that there is not."""
 
 
@@ -37,7 +37,7 @@ class SamplesByHand(eqx.Module):
     """The samples of one recording by hand, and the poses and turns of its unit that they belong to; padded.
 
     outputs: of each triad (n, 3), the gyroscope's without what the observations took off it. recorded: what is known of
-    them without a unit. pose: of each triad (n,). turn, place (m,): the turn that a sample of the gyroscope lies in and
+    them without a unit. pose: of each triad (n,). turn, order (m,): the turn that a sample of the gyroscope lies in and
     where; sample (T, S): where the samples of each turn are among the gyroscope's. nearest: of each triad (n,), the
     gyroscope's sample at the time.
     """
@@ -46,7 +46,7 @@ class SamplesByHand(eqx.Module):
     recorded: Recorded
     pose: dict[str, Int[Array, "... n"]]
     turn: Int[Array, "... m"]
-    place: Int[Array, "... m"]
+    order: Int[Array, "... m"]
     sample: Int[Array, "... T S"]
     nearest: dict[str, Int[Array, "... n"]]
 
@@ -58,20 +58,20 @@ class SamplesByHand(eqx.Module):
         """
         signals = {name: part.recording.signals[name] for name in ("accelerometer", "gyroscope")}
         gyroscope = signals["gyroscope"]
-        turn, place = np.full((2, len(gyroscope)), _NONE)
+        turn, order = np.full((2, len(gyroscope)), _NONE)
         sample = np.full(interval.shape, _NONE)
         for number, (start, stop) in enumerate(zip(part.intervals[:-1, 1], part.intervals[1:, 0], strict=True), first):
             if (interval[number] > 0).any():
                 inside = np.flatnonzero((gyroscope.time >= start) & (gyroscope.time < stop))
                 sample[number, : len(inside)] = inside
-                turn[inside], place[inside] = number, np.arange(len(inside))
+                turn[inside], order[inside] = number, np.arange(len(inside))
         nearest = {
             name: np.clip(np.searchsorted(gyroscope.time, signal.time - 0.5 / gyroscope.rate), 0, len(gyroscope) - 1)
             for name, signal in signals.items()
         }
         outputs = {name: signal.values - (shift if name == "gyroscope" else 0.0) for name, signal in signals.items()}
         pose = {name: _pose_of(signal, part.intervals, first) for name, signal in signals.items()}
-        whole = cls(outputs, Recorded.of(part.recording), pose, turn, place, sample, nearest)
+        whole = cls(outputs, Recorded.of(part.recording), pose, turn, order, sample, nearest)
         return whole.widened({name: Track.length(len(signal)) for name, signal in signals.items()}, *interval.shape)
 
     def lengths(self) -> dict[str, int]:
@@ -94,9 +94,11 @@ class SamplesByHand(eqx.Module):
             {name: longer(values, name) for name, values in self.outputs.items()},
             self.recorded.widened(lengths),
             {name: longer(values, name, none=True) for name, values in self.pose.items()},
-            longer(self.turn, none=True), longer(self.place, none=True), sample,
+            longer(self.turn, none=True),
+            longer(self.order, none=True),
+            sample,
             {name: longer(values, name) for name, values in self.nearest.items()},
-        )  # fmt: skip
+        )
 
 
 def during_turns(values: Float[Array, "m 3"], sample: Int[Array, "T S"]) -> Float[Array, "T S 3"]:
@@ -145,7 +147,7 @@ def tracks_by_hand(
     level = jnp.array([1.0, 0.0, 0.0, 0.0])
     begun = jnp.minimum(pose["gyroscope"], samples.turn)  # the pose that a sample lies in, or the one before its turn
     attitude = attitudes.at[begun].get(mode="fill", fill_value=0.0)
-    turned = running.at[samples.turn, samples.place].get(mode="fill", fill_value=0.0)
+    turned = running.at[samples.turn, samples.order].get(mode="fill", fill_value=0.0)
     attitude = multiply(attitude, jnp.where(samples.turn[:, None] < poses, turned, level))
     attitude = jnp.where(begun[:, None] < poses, attitude, level)
     tracks = {}

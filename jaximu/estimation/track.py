@@ -151,7 +151,7 @@ class Recorded(eqx.Module):
 
     def widened(self, lengths: Mapping[str, int]) -> Recorded:
         """Return the same of one unit with padding up to so many samples of each triad."""
-        known = {name: _longer(each, lengths[name] - len(self.stamps(name))) for name, each in self.known.items()}
+        known = {name: _longer(path, lengths[name] - len(self.stamps(name))) for name, path in self.known.items()}
         real = np.pad(self.real, (0, lengths["accelerometer"] - len(self.real)))
         return replace(self, known=known, real=real)
 
@@ -169,14 +169,18 @@ class Recorded(eqx.Module):
             power = self._vibration(force)
             power = (power - numerics.nanquantile(numerics.where(self.real, power, np.nan), _QUIETEST))[:, None]
         for name, known in self.known.items():
-            own = name == "accelerometer"
-            here = rate if self.together or not own else _at(turning, rate, sensed)
+            sampled, turned, shaken = force, rate, power
+            if not self.together and name == "accelerometer":
+                turned = _at(turning, rate, sensed)
+            elif not self.together:
+                sampled = _at(sensed, force, turning)
+                shaken = None if power is None else _at(sensed, power, turning)
             stimuli[name] = replace(
                 known,
-                specific_force=force if self.together or own else _at(sensed, force, turning),
-                angular_rate=here,
-                angular_acceleration=slopes(here, self.stamps(name)),
-                vibration_power=None if power is None else (power if own else _at(sensed, power, turning))[:, 0],
+                specific_force=sampled,
+                angular_rate=turned,
+                angular_acceleration=slopes(turned, self.stamps(name)),
+                vibration_power=None if shaken is None else shaken[:, 0],
             )
         return stimuli
 

@@ -184,8 +184,8 @@ def transport(running: Float[Array, "... S 4"], rotation_vectors: Float[Array, "
     **Arguments:** `running`: P_k, as `running_rotations` has it of the vectors (rad).
     """
     jacobian = _right_jacobian_rows(rotation_vectors)
-    entries = [sum(r * j for r, j in zip(row, column, strict=True))
-               for row in rotation_rows(_parts(running)) for column in zip(*jacobian, strict=True)]  # fmt: skip
+    rows, columns = rotation_rows(_parts(running)), list(zip(*jacobian, strict=True))
+    entries = [sum(r * j for r, j in zip(row, column, strict=True)) for row in rows for column in columns]
     by_component = jnp.moveaxis(jnp.stack(entries, axis=-2), -2, -1)
     return by_component.reshape(*rotation_vectors.shape, 3)
 
