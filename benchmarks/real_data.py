@@ -14,7 +14,7 @@ from common import Table, finish  # noqa: E402
 
 from jaximu import LocalGravity, ReadOptions, calibrate, read_recording  # noqa: E402
 from jaximu.calibration import fit_hand_held, nominal_imu  # noqa: E402
-from jaximu.data import turn_angle_errors  # noqa: E402
+from jaximu.data import forces_and_angles  # noqa: E402
 from jaximu.data.gravity_norm import recover_specific_force  # noqa: E402
 from jaximu.estimation.problem import names_of  # noqa: E402
 from jaximu.model.conventions import ImuTk, lower_triangular_frame  # noqa: E402
@@ -48,7 +48,7 @@ def rms(values) -> float:
 
 
 def angles(model, observations, mask) -> np.ndarray:
-    return np.degrees(np.asarray(turn_angle_errors(model, observations)))[np.asarray(mask)]
+    return np.degrees(forces_and_angles(model, observations)[1])[np.asarray(mask)]
 
 
 def norms(model, observations) -> np.ndarray:

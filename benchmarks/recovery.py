@@ -19,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import binom
 
 from jaximu.calibration.hand_held import fit_hand_held
-from jaximu.data import joint_conditions, static_gyroscope_error
+from jaximu.data.poses import condense
 from jaximu.data.poses_covariance import condition_covariance
 from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.problem import names_of
@@ -70,8 +70,7 @@ def bounds(imus, observations, index):
 
         def residual(free):
             model = unravel(flat.at[index].set(free))
-            rest = static_gyroscope_error(model, observations).reshape(-1)
-            return weights @ jnp.concatenate([joint_conditions(model, observations), rest])
+            return weights @ condense(model, observations)[0](model)
 
         jacobian = jax.jacfwd(residual)(flat[index])
         return jnp.sqrt(jnp.diagonal(jnp.linalg.inv(jacobian.T @ jacobian)))

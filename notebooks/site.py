@@ -43,7 +43,7 @@ MODULES = (
     "jaximu.data.sightings",
     "jaximu.data.gravity_norm",
     "jaximu.data.gravity_direction",
-    "jaximu.data.joint",
+    "jaximu.data.poses",
     "jaximu.data.station_error",
     "jaximu.data.poses_covariance",
     "jaximu.estimation.uncertainty",

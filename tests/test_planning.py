@@ -14,7 +14,8 @@ from scipy.stats import chi2
 from jaximu import InputError, LocalGravity
 from jaximu.calibration import fit_hand_held
 from jaximu.cli import main
-from jaximu.data import joint_conditions
+from jaximu.data.gravity_direction import gravity_direction
+from jaximu.data.gravity_norm import gravity_norm
 from jaximu.data.poses_covariance import condition_covariance
 from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.covariance import inverse_cholesky
@@ -105,9 +106,12 @@ def test_information_by_hand_is_that_of_the_real_problem():
 
         def residual(z):
             model = parameters.model(imu, z)
-            return jnp.concatenate(
-                [weights @ joint_conditions(model, observations), static_gyroscope(model, observations, rest)]
+            norm = gravity_norm(model, observations, jnp.ones(len(observations.poses.mask)))
+            turned = gravity_direction(
+                model, observations, None, jnp.tile(jnp.eye(2), (len(observations.turns.mask), 1, 1))
             )
+            still = static_gyroscope(model, observations, rest)
+            return jnp.concatenate([weights @ jnp.concatenate([norm, turned]), still])
 
         jacobian = jax.jacfwd(residual)(jnp.zeros(len(parameters.names)))
         return jacobian.T @ jacobian

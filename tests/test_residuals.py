@@ -8,9 +8,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from synthetic import GRAVITY, POSES, recording, simulated
 
-from jaximu.data import joint_conditions, turn_angle_errors
+from jaximu.data import forces_and_angles
 from jaximu.data.gravity_direction import gravity_direction, turn_rotations
 from jaximu.data.gravity_norm import gravity_norm
+from jaximu.data.poses import condense
 from jaximu.data.poses_covariance import condition_covariance
 from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.covariance import inverse_cholesky
@@ -19,10 +20,13 @@ from jaximu.estimation.solver import solve
 from jaximu.ground.rotation import logarithm, multiply
 from jaximu.recordings.segmentation import observed_poses, segment
 
-angle_errors = jax.jit(turn_angle_errors, static_argnums=2)
-conditions_of = jax.jit(joint_conditions, static_argnums=2)
+conditions_of = jax.jit(lambda imu, data: condense(imu, data)[0](imu)[: 3 * len(data.poses.mask) - 2])
 direction_of, norm_of, rest_of = jax.jit(gravity_direction), jax.jit(gravity_norm), jax.jit(static_gyroscope)
 rotations_of = jax.jit(turn_rotations, static_argnums=2)
+
+
+def angle_errors(imu, data, method="exponential"):
+    return forces_and_angles(imu, data, method)[1]
 
 
 @pytest.fixture(scope="module", params=[12, 9])
@@ -90,7 +94,7 @@ def test_runge_kutta_and_exponential_agree_for_fine_sampling():
 
 def joint_residual(imu, data):
     observations, weights, rest = data
-    return jnp.concatenate([weights @ joint_conditions(imu, observations), static_gyroscope(imu, observations, rest)])
+    return jnp.concatenate([weights @ conditions_of(imu, observations), static_gyroscope(imu, observations, rest)])
 
 
 @jax.jit

@@ -9,7 +9,7 @@ from simulated_person import Person
 from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, unit
 
 from jaximu import calibrate
-from jaximu.data import turn_angle_errors
+from jaximu.data import forces_and_angles
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.recordings.readers import ReadOptions, read_recording
@@ -70,7 +70,7 @@ def test_observations_are_what_the_unit_felt():
     rest = np.asarray(data.poses.gyroscope_mean)[:9] - np.asarray(imu.gyroscope.bias)
     white = np.linalg.solve(np.linalg.cholesky(np.asarray(data.poses.gyroscope_covariance)[:9]), rest[..., None])
     assert 0.6 < np.mean(white**2) < 1.6
-    assert np.max(turn_angle_errors(imu, data)) < np.radians(0.1)
+    assert np.max(forces_and_angles(imu, data)[1]) < np.radians(0.1)
     np.testing.assert_array_equal(
         data.poses.accelerometer_mean[9:], np.tile([0, 0, GRAVITY], (len(data.poses.mask) - 9, 1))
     )
@@ -218,7 +218,7 @@ def test_several_recordings_of_one_unit():
     turns = np.asarray(data.turns.mask)
     assert turns[:12].tolist() == [True] * 5 + [False] + [True] * 6
     np.testing.assert_allclose(data.poses.gyroscope_mean[:13], np.tile(unit(15).gyroscope.bias, (13, 1)), atol=5e-4)
-    assert np.max(turn_angle_errors(unit(15), data)) < np.radians(0.1)
+    assert np.max(forces_and_angles(unit(15), data)[1]) < np.radians(0.1)
 
 
 def test_options():

@@ -5,21 +5,15 @@ from typing import TYPE_CHECKING
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
-    from jaximu.data.gravity_direction import turn_angle_errors
-    from jaximu.data.joint import joint_conditions
     from jaximu.data.poses import forces_and_angles, residual_rms
     from jaximu.data.rest_blocks import Leg, RestBlocks, without_startup
-    from jaximu.data.static_gyroscope import static_gyroscope_error
     from jaximu.data.station_error import turntable_error
 
 __all__ = [
     "Leg",
     "RestBlocks",
     "forces_and_angles",
-    "joint_conditions",
     "residual_rms",
-    "static_gyroscope_error",
-    "turn_angle_errors",
     "turntable_error",
     "without_startup",
 ]

@@ -11,6 +11,7 @@ from jaximu.data.gravity_norm import recover_specific_force
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, integrate_rates, rotate
 from jaximu.model.sensor import Imu
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Turns
 
 __all__ = ["across", "gravity_direction", "gravity_direction_error", "turn_rotations", "unit_vectors"]
@@ -21,10 +22,15 @@ def unit_vectors(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     return vectors / jnp.sqrt(jnp.sum(vectors**2, axis=-1, keepdims=True))
 
 
-def turn_rotations(imu: Imu, turns: Turns, method: str = "exponential") -> Float[Array, "T 4"]:
-    """Return the rotation of each turn, a quaternion from the later body frame to the earlier one."""
+def turn_rotations(
+    imu: Imu, turns: Turns, method: str = "exponential", stimulus: Stimulus | None = None
+) -> Float[Array, "T 4"]:
+    """Return the rotation of each turn, a quaternion from the later body frame to the earlier one.
+
+    `stimulus` (T, S): what else the gyroscope's effects need at the samples.
+    """
     assert imu.gyroscope is not None
-    return integrate_rates(imu.gyroscope.recover(turns.output), turns.interval, method)
+    return integrate_rates(imu.gyroscope.recover(turns.output, stimulus), turns.interval, method)
 
 
 def across(basis: Float[Array, "T 2 3"], vectors: Float[Array, "T 3"]) -> Float[Array, "T 2"]:
@@ -46,6 +52,8 @@ def gravity_direction(
     directions: Float[Array, "P 3"] | None,
     weights: Float[Array, "T 2 2"],
     method: str = "exponential",
+    stimulus: Stimulus | None = None,
+    during: Stimulus | None = None,
 ) -> Float[Array, " 2*T"]:
     """Return the whitened residual of each turn, two components after another, zero for padding.
 
@@ -55,19 +63,11 @@ def gravity_direction(
       method), else None to take them from `imu`.
     - `weights`: the inverse Cholesky factor of each turn's covariance.
     - `method`: how rates are integrated, see `jaximu.ground.rotation.integrate_rates`.
+    - `stimulus` (P,), `during` (T, S): what else effects need, in the poses and at the samples of the turns.
     """
     if directions is None:
-        directions = unit_vectors(recover_specific_force(imu, observations.poses))
+        directions = unit_vectors(recover_specific_force(imu, observations.poses, stimulus))
     turns = observations.turns
-    error = gravity_direction_error(turn_rotations(imu, turns, method), directions, turns.basis)
+    error = gravity_direction_error(turn_rotations(imu, turns, method, during), directions, turns.basis)
     whitened = jnp.sum(weights * error[..., None, :], axis=-1)
     return jnp.where(turns.mask[..., None], whitened, 0.0).reshape(-1)
-
-
-def turn_angle_errors(imu: Imu, observations: Observations, method: str = "exponential") -> Float[Array, " T"]:
-    """Return the angle (rad) between measured and carried gravity of each turn, the figure that imu_tk reports."""
-    directions = unit_vectors(recover_specific_force(imu, observations.poses))
-    rotations = turn_rotations(imu, observations.turns, method)
-    predicted = rotate(conjugate(rotations), directions[:-1])
-    chord = jnp.sqrt(jnp.sum((predicted - directions[1:]) ** 2, axis=-1))
-    return jnp.where(observations.turns.mask, 2 * jnp.arcsin(jnp.clip(chord / 2, 0, 1)), 0.0)

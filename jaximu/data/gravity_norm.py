@@ -16,9 +16,10 @@ from jaximu.recordings.observations import Observations, Poses
 __all__ = ["gravity_norm", "gravity_norm_error", "recover_specific_force", "recovery_jacobian"]
 
 
-def recover_specific_force(imu: Imu, poses: Poses) -> Float[Array, "P 3"]:
-    """Return each pose's specific force (m/s²) from its mean output."""
-    return imu.accelerometer.recover(poses.accelerometer_mean, Stimulus(temperature=poses.temperature))
+def recover_specific_force(imu: Imu, poses: Poses, stimulus: Stimulus | None = None) -> Float[Array, "P 3"]:
+    """Return each pose's specific force (m/s²) from its mean output; `stimulus` (P,): what else its effects need."""
+    known = Stimulus(temperature=poses.temperature) if stimulus is None else stimulus
+    return imu.accelerometer.recover(poses.accelerometer_mean, known)
 
 
 def recovery_jacobian(imu: Imu, poses: Poses) -> Float[Array, "P 3 3"]:
@@ -35,10 +36,13 @@ def gravity_norm_error(force: Float[Array, "P 3"], gravity: Float[Array, ""]) ->
     return (gravity**2 - jnp.sum(force**2, axis=-1)) / (2 * gravity)
 
 
-def gravity_norm(imu: Imu, observations: Observations, weights: Float[Array, " P"]) -> Float[Array, " P"]:
+def gravity_norm(
+    imu: Imu, observations: Observations, weights: Float[Array, " P"], stimulus: Stimulus | None = None
+) -> Float[Array, " P"]:
     """Return the whitened residual of each pose, zero for padding.
 
-    **Arguments:** `weights`: one over the standard deviation of each pose's norm.
+    **Arguments:** `weights`: one over the standard deviation of each pose's norm. `stimulus` (P,): what the effects
+    need in the poses; without it, the temperature alone.
     """
-    error = gravity_norm_error(recover_specific_force(imu, observations.poses), observations.gravity)
+    error = gravity_norm_error(recover_specific_force(imu, observations.poses, stimulus), observations.gravity)
     return jnp.where(observations.poses.mask, error * weights, 0.0)

@@ -1,5 +1,13 @@
 """Poses and turns by hand: gravity's norm, its direction carried over each turn, and the gyroscope at rest.
 
+Unknown are the unit and each pose's attitude; measured are the mean outputs at rest and the rotation of each turn.
+Headings are fixed by nothing but the turns and take up one component of each; the direction of gravity in a pose has
+two more unknowns. With the attitudes eliminated a pose leaves the norm of its specific force, and a turn two components
+of carried gravity: the residuals of the two-step method, but as functions of the whole unit and, since neighbouring
+turns share a pose, correlated. Whitened with their full covariance (`jaximu.data.poses_covariance`) they are the
+maximum-likelihood problem to first order in the noise (Gauss–Helmert model; Förstner and Wrobel, Photogrammetric
+Computer Vision, 2016, sec. 4.8); the second order is the noise squared, 1e-8.
+
 Turns are integrated here, once for each unit that the measurement is evaluated about: the rate ω = A y + c, A = K⁻¹ and
 c = −K⁻¹ b, is linear in (A, c), so a change of them turns the last body frame by a sum over the samples that is made
 beforehand (pre-integration; Forster et al., IEEE Transactions on Robotics 33, 2017, sec. VI, with all of K and not the
@@ -24,7 +32,7 @@ from jaximu.data.gravity_direction import gravity_direction_error, unit_vectors
 from jaximu.data.gravity_norm import gravity_norm_error
 from jaximu.data.poses_covariance import Sensitivities, condition_covariance, sensitivities, turned_by
 from jaximu.data.preintegration import Turned, linear_slope
-from jaximu.data.tracks_by_hand import SamplesByHand, during_turns, samples_by_hand, tracks_by_hand
+from jaximu.data.tracks_by_hand import SamplesByHand, during_turns, pose_means, samples_by_hand, tracks_by_hand
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import Name
@@ -86,7 +94,7 @@ _ROUNDS = 4
 
 
 class HandHeldConditions(Conditions):
-    """Poses and turns without their samples: as `jaximu.data.joint_conditions` and the means at rest have them.
+    """Poses and turns without their samples: `gravity_norm`, `gravity_direction` and `static_gyroscope`, unweighted.
 
     rotation: of each turn, integrated where (A | c) was `linear`; slope: of its last body frame's rotation vector by
     (A | c).
@@ -281,22 +289,37 @@ class PosesAndTurns(Observations, Data):
         """
         bare, unit = imu.with_effects(), imu.with_effects(*effects)
 
-        samples = [part.sample for part in self.samples]
-        start = replace(self, samples=()), [part.outputs for part in self.samples]
-
-        def tracks(data: PosesAndTurns, outputs: list[dict[str, Array]]) -> tuple[Condensed, list[dict[str, Track]]]:
-            lifted, of = jax.tree.map(lambda leaf: array_module(leaf).asarray(leaf)[None], (bare, data))
+        def tracks(data: PosesAndTurns) -> tuple[Condensed, list[dict[str, Track]]]:
+            lifted, of = jax.tree.map(
+                lambda leaf: array_module(leaf).asarray(leaf)[None], (bare, replace(data, samples=()))
+            )
             whole = condensed(lifted, of, self.conditions, self.method, of.accelerometer_excess)
-            parts = zip(self.samples, outputs, strict=True)
-            return whole, [tracks_by_hand(bare, part, output, whole.running) for part, output in parts]
+            return whole, [tracks_by_hand(bare, part, whole.running) for part in data.samples]
 
-        def without(
-            state: tuple[PosesAndTurns, list[dict[str, Array]]],
-        ) -> tuple[PosesAndTurns, list[dict[str, Array]]]:
-            return _without_added(unit, *start, samples, tracks(*state)[1])
+        def without(data: PosesAndTurns) -> PosesAndTurns:
+            return _without_added(unit, self, tracks(data)[1])
 
-        state = repeated(without, start, _ROUNDS, imu) if effects else start
-        return Along(state[0], *tracks(*state))
+        left = repeated(without, self, _ROUNDS, imu) if effects else self
+        return Along(left, *tracks(left))
+
+    def moved(self, changes: Sequence[Mapping[str, Float[Array, "n 3"]]]) -> PosesAndTurns:
+        """Return the data of one unit had the outputs of both triads differed by so much at each recording's samples.
+
+        In the same poses and turns; so what follows from the data is differentiated by raw samples. **Arguments:**
+        `changes`: of each recording and triad, as long as in `samples`, padding included.
+        """
+        means, turned, parts = [], self.turns.output, []
+        for part, change in zip(self.samples, changes, strict=True):
+            means.append([pose_means(change[name], pose, len(self.poses.mask))[0] for name, pose in part.pose.items()])
+            turned = turned + during_turns(change["gyroscope"], part.sample)
+            parts.append(replace(part, outputs={name: part.outputs[name] + change[name] for name in part.outputs}))
+        force, rate = (sum(of_part) for of_part in zip(*means, strict=True))
+        poses = replace(
+            self.poses,
+            accelerometer_mean=self.poses.accelerometer_mean + force,
+            gyroscope_mean=self.poses.gyroscope_mean + rate,
+        )
+        return replace(self, poses=poses, turns=replace(self.turns, output=turned), samples=tuple(parts))
 
     def reactions(self, details: Along):
         """Return how norms, directions and means at rest react to effects, recording by recording."""
@@ -322,26 +345,9 @@ class PosesAndTurns(Observations, Data):
 
 
 @partial(stored.compiled, quick=True)
-def _without_added(
-    imu: Imu,
-    data: PosesAndTurns,
-    outputs: Sequence[dict[str, Array]],
-    samples: Sequence[Array],
-    tracks: Sequence[dict[str, Track]],
-) -> tuple[PosesAndTurns, list[dict[str, Array]]]:
-    """Return observations, and the outputs of each recording, without what a unit's effects add along tracks."""
-    means, turned, left = jnp.zeros((len(data.poses.mask), 6)), data.turns.output, []
-    for output, sample, track in zip(outputs, samples, tracks, strict=True):
-        more = added(imu, track)
-        means = means + mean_outputs(track, more, len(means))
-        turned = turned - during_turns(more["gyroscope"], sample)
-        left.append({name: values - more[name] for name, values in output.items()})
-    changed = data.poses.accelerometer_mean - means[:, :3], data.poses.gyroscope_mean - means[:, 3:], turned
-
-    def where(data):
-        return data.poses.accelerometer_mean, data.poses.gyroscope_mean, data.turns.output
-
-    return eqx.tree_at(where, data, changed), left
+def _without_added(imu: Imu, data: PosesAndTurns, tracks: Sequence[dict[str, Track]]) -> PosesAndTurns:
+    """Return data without what a unit's effects add along the tracks of each recording."""
+    return data.moved([{name: -values for name, values in added(imu, track).items()} for track in tracks])
 
 
 def observe(
@@ -485,14 +491,16 @@ def residual_rms(
     return sizes
 
 
-def forces_and_angles(imu: Imu, observations: Observations) -> tuple[FloatArray, FloatArray]:
+def forces_and_angles(
+    imu: Imu, observations: Observations, method: str = "exponential"
+) -> tuple[FloatArray, FloatArray]:
     """Return each pose's specific force (P, 3), m/s², and each turn's angle (T,), rad, from carried to measured.
 
     Padding included; the angles mean nothing where `imu` has no gyroscope. Effects are not looked at.
     """
     full = imu if imu.gyroscope is not None else Imu(imu.accelerometer, Imu.nominal().gyroscope)
     lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))
-    unit = condensed(*lifted)
+    unit = condensed(*lifted, method=method)
     return unit.force[0], unit.angle[0]
 
 

@@ -8,21 +8,20 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations
 
-__all__ = ["static_gyroscope", "static_gyroscope_error"]
+__all__ = ["static_gyroscope"]
 
 
-def static_gyroscope_error(imu: Imu, observations: Observations) -> Float[Array, "P 3"]:
-    """Return the difference of each mean output at rest to the model's, output units; zero for padding."""
-    assert imu.gyroscope is not None
-    poses = observations.poses
-    rest = Stimulus(angular_rate=jnp.zeros_like(poses.gyroscope_mean), temperature=poses.temperature)
-    return jnp.where(poses.mask[..., None], poses.gyroscope_mean - imu.gyroscope.respond(rest), 0.0)
-
-
-def static_gyroscope(imu: Imu, observations: Observations, weights: Float[Array, "P 3 3"]) -> Float[Array, " 3*P"]:
+def static_gyroscope(
+    imu: Imu, observations: Observations, weights: Float[Array, "P 3 3"], stimulus: Stimulus | None = None
+) -> Float[Array, " 3*P"]:
     """Return the whitened difference of the mean output at rest to the model's, three components after another.
 
-    **Arguments:** `weights`: the inverse Cholesky factor of each mean's covariance.
+    **Arguments:** `weights`: the inverse Cholesky factor of each mean's covariance. `stimulus` (P,): what the effects
+    need in the poses, angular rate included; without it, no rate and the temperature.
     """
-    error = static_gyroscope_error(imu, observations)
+    assert imu.gyroscope is not None
+    poses = observations.poses
+    if stimulus is None:
+        stimulus = Stimulus(angular_rate=jnp.zeros_like(poses.gyroscope_mean), temperature=poses.temperature)
+    error = jnp.where(poses.mask[..., None], poses.gyroscope_mean - imu.gyroscope.respond(stimulus), 0.0)
     return jnp.sum(weights * error[..., None, :], axis=-1).reshape(-1)

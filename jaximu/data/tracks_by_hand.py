@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Self
 
 import equinox as eqx
 import jax
@@ -27,7 +26,7 @@ from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation
 
-__all__ = ["SamplesByHand", "during_turns", "rest_shifts", "samples_by_hand", "tracks_by_hand"]
+__all__ = ["SamplesByHand", "during_turns", "pose_means", "rest_shifts", "samples_by_hand", "tracks_by_hand"]
 
 _NONE = np.iinfo(np.int64).max
 """Stands for the pose or the turn of a sample that is of none, and for a sample that there is not."""
@@ -51,7 +50,7 @@ class SamplesByHand(eqx.Module):
     nearest: dict[str, Int[Array, "... n"]]
 
     @classmethod
-    def of(cls, part: Segmentation, first: int, interval: FloatArray, shift: FloatArray) -> Self:
+    def of(cls, part: Segmentation, first: int, interval: FloatArray, shift: FloatArray) -> SamplesByHand:
         """Return the samples of a recording whose poses are numbered from `first` on; `interval` (T, S): of all turns.
 
         **Arguments:** `shift` (3,): what the observations took off the gyroscope's output.
@@ -78,7 +77,7 @@ class SamplesByHand(eqx.Module):
         """Return how many samples each triad has, padding included."""
         return {name: pose.shape[-1] for name, pose in self.pose.items()}
 
-    def widened(self, lengths: Mapping[str, int], turns: int, samples: int) -> Self:
+    def widened(self, lengths: Mapping[str, int], turns: int, samples: int) -> SamplesByHand:
         """Return the same of one unit with padding up to so many samples, and so many turns of so many samples."""
         numerics = array_module(self)
 
@@ -129,18 +128,16 @@ def rest_shifts(segmentations: Sequence[Segmentation]) -> FloatArray:
 
 
 @partial(stored.compiled, quick=True)
-def tracks_by_hand(
-    imu: Imu, samples: SamplesByHand, outputs: Mapping[str, Float[Array, "n 3"]], running: Float[Array, "T S 4"]
-) -> dict[str, Track]:
+def tracks_by_hand(imu: Imu, samples: SamplesByHand, running: Float[Array, "T S 4"]) -> dict[str, Track]:
     """Return the tracks of both triads in a recording, whose observations are the poses, as `imu` tells them.
 
-    **Arguments:** `imu`: its effects are not looked at; `outputs`: of each triad, without what effects add; `running`:
-    the turns' rotations, sample by sample.
+    **Arguments:** `imu`: its effects are not looked at; `samples`: without what effects add; `running`: the turns'
+    rotations, sample by sample.
     """
     poses, pose = len(running) + 1, samples.pose
     triads = imu.with_effects().triads()
-    force, rate = (triads[name].recover(outputs[name]) for name in ("accelerometer", "gyroscope"))
-    means, counts = _means(force, pose["accelerometer"], poses)
+    force, rate = (triads[name].recover(samples.outputs[name]) for name in ("accelerometer", "gyroscope"))
+    means, counts = pose_means(force, pose["accelerometer"], poses)
     rate = jnp.where((pose["gyroscope"] < poses)[:, None], 0.0, rate)
     attitudes = _attitudes(means, counts > 0, running[:, -1])
 
@@ -172,8 +169,8 @@ def _pose_of(signal: Signal, intervals: FloatArray, first: int) -> NDArray[np.in
     return np.where(inside, first + pose, _NONE)
 
 
-def _means(values: Float[Array, "n 3"], pose: Int[Array, " n"], poses: int) -> tuple[Array, Array]:
-    """The means (P, 3) over poses, and of how many samples each is (P,)."""
+def pose_means(values: Float[Array, "n 3"], pose: Int[Array, " n"], poses: int) -> tuple[Array, Array]:
+    """Return the means (P, 3) of values over the poses that samples lie in, and of how many samples each is (P,)."""
     counts = jax.ops.segment_sum(jnp.ones(len(values)), pose, poses)
     return jax.ops.segment_sum(values, pose, poses) / jnp.maximum(counts, 1.0)[:, None], counts
 

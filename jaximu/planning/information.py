@@ -3,7 +3,7 @@
 Measured are outputs y, each with a covariance C. What a unit with parameters θ would put out follows from the forward
 model, `Imu.respond`, so any effect whose stimulus a pose or a turn tells can be among the parameters. On a table the
 motion is known and the information is JᵀC⁻¹J with J = ∂y/∂θ. In the hand it is not: there the conditions c(θ₀, y) of
-`jaximu.data.joint` hold instead, whatever the motion was. They vanish along y(θ) for θ₀ = θ, so ∂c/∂θ₀ = −∂c/∂y ∂y/∂θ,
+`jaximu.data.poses` hold instead, whatever the motion was. They vanish along y(θ) for θ₀ = θ, so ∂c/∂θ₀ = −∂c/∂y ∂y/∂θ,
 and the conditions' covariance (`jaximu.data.poses_covariance`) takes the place of C. On a robot the conditions are
 those of `jaximu.data.attitude`, against the attitude it reports. Nothing of the physics is written here.
 """
@@ -17,8 +17,8 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
-from jaximu.data import joint_conditions, static_gyroscope_error
 from jaximu.data.attitude import INTERVALS, WINDOW, Intervals, evaluated, shared_ends
+from jaximu.data.poses import condense
 from jaximu.data.poses_covariance import condition_covariance
 from jaximu.estimation.problem import Parameters
 from jaximu.ground.array_types import Array
@@ -159,8 +159,7 @@ def hand_held_information(
 
     def found(z):
         observed = _observed(parameters.model(imu, z), design.attitude, accuracy, gravity)
-        rest = static_gyroscope_error(unit, observed).reshape(-1)
-        return jnp.concatenate([joint_conditions(unit, observed), rest])[:conditions]
+        return condense(unit, observed)[0](unit)[:conditions]
 
     jacobian = jax.jacfwd(found)(jnp.zeros(len(parameters.names)))
     observed = _observed(unit, design.attitude, accuracy, gravity)
