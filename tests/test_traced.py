@@ -342,3 +342,28 @@ def test_every_piece_of_the_way_is_compiled_batched_and_differentiated(name, dat
     assert float(reverse) == pytest.approx(float(forward), rel=1e-10, abs=1e-12)
     difference = float(share @ (many[2] - many[3])) / 2e-5
     assert float(forward) == pytest.approx(difference, rel=1e-5, abs=1e-7)
+
+
+def test_data_move_with_the_samples():
+    """As if the recording had been another one: a sample in a pose, and one in a turn, of each triad."""
+    log = recording(1, poses=12)[0]
+    data = jaximu.observe(log, GRAVITY, samples=True)
+    part = data.samples[0]
+    changes = {name: np.zeros(np.shape(values)) for name, values in part.outputs.items()}
+    places = [np.flatnonzero(np.asarray(part.pose["gyroscope"]) == 3)[7], np.asarray(part.sample)[4, 20]]
+    signals = {name: log.signals[name].values.copy() for name in changes}
+    for number, place in enumerate(places):
+        for name, values in signals.items():
+            changes[name][place] = 1e-4 * (1 + np.arange(3)) * (1 + number)
+            values[place] += changes[name][place]
+    other = replace(log, **{name: replace(log.signals[name], values=values) for name, values in signals.items()})
+    wanted, moved = jaximu.observe(other, GRAVITY, samples=True), data.moved([changes])
+    for where in (
+        lambda d: d.poses.accelerometer_mean,
+        lambda d: d.poses.gyroscope_mean,
+        lambda d: d.turns.output,
+        lambda d: d.samples[0].outputs,
+    ):
+        for one, two, before in zip(*(jax.tree.leaves(where(d)) for d in (moved, wanted, data)), strict=True):
+            np.testing.assert_allclose(one, two, rtol=0, atol=1e-12)
+            assert np.any(np.asarray(one) != before)
