@@ -19,6 +19,7 @@ from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.segmentation import segment
+from jaximu.simulation.protocols import HandHeld
 
 NOMINAL = jax.tree.map(np.asarray, jaximu.Imu.nominal())
 EXCESS = np.array([0.5, 0.5, 0.5])
@@ -251,6 +252,13 @@ def test_what_is_host_by_nature_says_so():
 
     with pytest.raises(jaximu.InputError, match=r"cannot be traced.*observe"):
         jax.jit(observed)(log.accelerometer.values)
+
+    def simulated_output(bias):
+        unit = eqx.tree_at(lambda imu: imu.accelerometer.bias, NOMINAL, bias)
+        return jaximu.simulate(unit, HandHeld(3, 1.0))[0].accelerometer.values
+
+    with pytest.raises(jaximu.InputError, match=r"traced cannot be simulated.*Imu.respond"):
+        jax.jit(simulated_output)(jnp.zeros(3))
 
 
 @pytest.mark.parametrize("solver", [optx.Dogleg, optx.LevenbergMarquardt], ids=lambda solver: solver.__name__)

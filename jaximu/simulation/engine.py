@@ -20,6 +20,7 @@ from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
+from jaximu.ground.tracing import is_traced
 from jaximu.model import Noise
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
@@ -66,6 +67,11 @@ class Case:
     ) -> Case:
         """Make out the protocol and check what goes with it. Arguments as for `simulate`."""
         require_float64()
+        if is_traced(imu):
+            raise InputError(
+                "a unit that is traced cannot be simulated, which draws noise and cuts logs on the host: what it puts "
+                "out along a path is jaximu.Imu.respond."
+            )
         if not (np.isfinite(rate) and rate > 0):
             raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
         seeds = tuple(seed) if isinstance(seed, Sequence) else (seed,)
