@@ -528,7 +528,7 @@ class AgainstAttitude(Data):
             whole[rows.ravel()] = factor
             return (whole.T * used).T
 
-        back = _matrices(np.asarray(conditions.target)[0]).swapaxes(1, 2)
+        back = rotation_matrix(np.asarray(conditions.target)[0]).swapaxes(1, 2)
         ends = np.zeros((n, 3 * (turns + 1)))
         ends[rows.ravel()] = shared_ends(back)
         for interval in range(turns):
@@ -564,7 +564,3 @@ def _slopes(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
     """Return first and second derivative of values (m, 3), each of lines through `_SMOOTH` seconds."""
     slope = np.stack([smoothed_slope(time, axis, _SMOOTH) for axis in values.T], axis=1)
     return slope, np.stack([smoothed_slope(time, axis, _SMOOTH) for axis in slope.T], axis=1)
-
-
-def _matrices(quaternions: FloatArray) -> FloatArray:
-    return np.asarray(rotation_matrix(jnp.asarray(quaternions)), np.float64)

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from scipy.linalg import cho_solve
 
 from jaximu.data.poses import condensed
 from jaximu.data.poses_covariance import Sensitivities
@@ -291,11 +290,12 @@ def restricted_likelihood(
 def _projector(covariance: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, float]:
     """Return P = C⁻¹ − C⁻¹J(JᵀC⁻¹J)⁻¹JᵀC⁻¹ and log |C| + log |JᵀC⁻¹J|."""
     root = np.linalg.cholesky(covariance)
-    inverse = cho_solve((root, True), np.eye(len(root)))
-    seen = inverse @ jacobian
-    inner = np.linalg.cholesky(jacobian.T @ seen)
+    white = np.linalg.inv(root)
+    basis = white @ jacobian
+    inner = np.linalg.cholesky(basis.T @ basis)
     volume = 2 * float(np.sum(np.log(np.diagonal(root))) + np.sum(np.log(np.diagonal(inner))))
-    return inverse - seen @ cho_solve((inner, True), seen.T), volume
+    across = np.linalg.solve(inner, basis.T @ white)
+    return white.T @ white - across.T @ across, volume
 
 
 def orthonormal_basis(columns: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
@@ -94,8 +95,9 @@ def rotation_rows(quaternion: Sequence[Any]) -> list[list[Any]]:
 
 
 def rotation_matrix(q: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
-    """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`."""
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rotation_rows(_parts(q))], axis=-2)
+    """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`; as NumPy of NumPy."""
+    numerics = np if isinstance(q, np.ndarray) else jnp
+    return numerics.stack([numerics.stack(row, axis=-1) for row in rotation_rows(_parts(q))], axis=-2)
 
 
 def rotate(q: Float[Array, "... 4"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
