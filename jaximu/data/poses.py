@@ -276,8 +276,8 @@ class PosesAndTurns(Observations, Data):
 
         def one(imu: Imu, data: Self) -> tuple[Any, ...]:
             details = data.along(imu, tuple(imu.all_effects().values()))
-            seen = jax.tree.map(lambda leaf: leaf[0], (details.condensed.conditions, details.condensed.covariance))
-            return *seen, data.own_columns(imu, details, len(seen[1].used))
+            evaluated = jax.tree.map(lambda leaf: leaf[0], (details.condensed.conditions, details.condensed.covariance))
+            return *evaluated, data.own_columns(imu, details, len(evaluated[1].used))
 
         return About(*one_by_one(one, imu, data))
 

@@ -142,11 +142,11 @@ def tracks_by_hand(imu: Imu, samples: SamplesByHand, running: Float[Array, "T S 
     attitudes = _attitudes(means, counts > 0, running[:, -1])
 
     level = jnp.array([1.0, 0.0, 0.0, 0.0])
-    begun = jnp.minimum(pose["gyroscope"], samples.turn)  # the pose that a sample lies in, or the one before its turn
-    attitude = attitudes.at[begun].get(mode="fill", fill_value=0.0)
+    before = jnp.minimum(pose["gyroscope"], samples.turn)  # the pose that a sample lies in, or the one before its turn
+    attitude = attitudes.at[before].get(mode="fill", fill_value=0.0)
     turned = running.at[samples.turn, samples.order].get(mode="fill", fill_value=0.0)
     attitude = multiply(attitude, jnp.where(samples.turn[:, None] < poses, turned, level))
-    attitude = jnp.where(begun[:, None] < poses, attitude, level)
+    attitude = jnp.where(before[:, None] < poses, attitude, level)
     tracks = {}
     for name, known in samples.recorded.stimuli(force, rate).items():
         assert known.specific_force is not None and known.angular_acceleration is not None

@@ -12,11 +12,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
 from jaximu.ground.prefixes import running
+from jaximu.ground.tracing import array_module
 
 __all__ = [
     "apply_matrix",
@@ -95,8 +95,11 @@ def rotation_rows(quaternion: Sequence[Any]) -> list[list[Any]]:
 
 
 def rotation_matrix(q: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
-    """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`; as NumPy of NumPy."""
-    numerics = np if isinstance(q, np.ndarray) else jnp
+    """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`.
+
+    Of NumPy unless it is traced.
+    """
+    numerics = array_module(q)
     return numerics.stack([numerics.stack(row, axis=-1) for row in rotation_rows(_parts(q))], axis=-2)
 
 
