@@ -450,6 +450,12 @@ def test_thermal_lag_solves_its_equation_at_irregular_stamps(prefix, lag):
     np.testing.assert_allclose(found, np.outer(state, coefficients), atol=1e-9)
 
 
+def test_the_square_of_a_thermal_lag_is_one():
+    lagged = added("accel.thermal_lag", 1.0, {"time_constant": 40.0}, temperature=25 + WARMTH, time=STAMPS)
+    squared = added("accel.thermal_lag_squared", 2.0, {"time_constant": 40.0}, temperature=25 + WARMTH, time=STAMPS)
+    np.testing.assert_allclose(squared, 2 * lagged**2, atol=1e-13)
+
+
 def test_thermal_lag_converges_for_a_smooth_temperature():
     """A curve taken linear between samples: the error falls to a quarter with twice the samples."""
 

@@ -101,6 +101,34 @@ def test_the_model_that_was_put_in_is_chosen_with_its_numbers(found):
             assert np.all(np.abs(np.asarray(effect.coefficients) - EFFECTS[effect.name]) < 4.5 * np.array(sigmas))
 
 
+def test_what_bends_may_lag_too():
+    """A die that follows its thermometer, and a bias that bends with the die's temperature, not the thermometer's."""
+    hidden = {"temperature": [2e-3, -3e-3, 1e-3], "temperature_squared": [3e-5, 0.0, -2e-5]}
+    lagging = {"thermal_lag": "temperature", "thermal_lag_squared": "temperature_squared"}
+    effects = [
+        CATALOGUE[f"{prefix}.{name}"].make(share * np.array(hidden[like]), time_constant=60.0)
+        for prefix, share in (("accel", 1.0), ("gyro", 0.1))
+        for name, like in lagging.items()
+    ]
+    down_and_up = Environment(temperature=[[0.0, 25.0], [900.0, -15.0], [2100.0, 45.0]])
+    log = simulate(UNIT.with_effects(*effects), Static(2100.0), consumer_noise(), rate=4.0, seed=2,
+                   environment=down_and_up)[0]  # fmt: skip
+    found = calibrate_thermal(log)
+    for triad, share in (("accelerometer", 1.0), ("gyroscope", 0.1)):
+        fit = found.fits[triad]
+        assert set(fit.families) == {"thermal lag"}
+        value, sigma = fit.inner["thermal_lag", "time_constant"]
+        assert abs(value - 60.0) < 4 * sigma < 6.0
+        assert ("thermal_lag_squared", "time_constant") not in fit.inner  # it is the other's
+        squared = next(effect for effect in fit.effects if effect.plain == "thermal_lag_squared")
+        assert float(squared.time_constant) == pytest.approx(value, rel=0.02)
+        wanted = share * np.array(hidden["temperature_squared"])
+        np.testing.assert_allclose(np.asarray(squared.coefficients), wanted, rtol=0, atol=share * 2e-6)
+        assert np.all(fit.candidate.held.rms < 1.3 * fit.after)
+    corrected = compensate(found.calibration, log)
+    assert np.ptp(corrected.accelerometer.values[:, 1].reshape(-1, 400).mean(axis=1)) < 0.02
+
+
 def test_the_residual_is_the_noise_and_the_cubic_is_not(found):
     for name, fit in found.fits.items():
         assert np.all(fit.chi_squared < 1.15)

@@ -18,7 +18,7 @@ from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.thermal_linear import Whitened
 from jaximu.calibration.thermal_selection import richest
 from jaximu.calibration.thermal_shapes import ThermalShapes
-from jaximu.calibration.thermal_terms import HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
+from jaximu.calibration.thermal_terms import BESIDE, HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
 from jaximu.calibration.thermal_triad import TriadFit, fit_triad
 from jaximu.data.rest import mean_terms
 from jaximu.data.rest_blocks import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
@@ -43,7 +43,7 @@ from jaximu.recordings.recording import Recording, Signal
 __all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady_change"]
 
 SCHEMA = "jaximu.thermal/1"
-THERMAL = (*POWERS, *RATES, *HISTORY, LEARNED, NETWORK, SCALE)
+THERMAL = (*POWERS, *RATES, *HISTORY, *BESIDE, LEARNED, NETWORK, SCALE)
 _GRID = 41
 _BUCKET = 512
 _LONG = 1e6  # s that a steady way has lasted

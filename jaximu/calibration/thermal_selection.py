@@ -15,6 +15,7 @@ from jaximu.calibration.identifiability import Identifiability
 from jaximu.calibration.thermal_linear import Held, ReducedTerms, Whitened
 from jaximu.calibration.thermal_shapes import GRID, ThermalShapes
 from jaximu.calibration.thermal_terms import (
+    BESIDE,
     HISTORY,
     LEARNED,
     POWERS,
@@ -23,7 +24,9 @@ from jaximu.calibration.thermal_terms import (
     SPLINES,
     Model,
     ThermalTerm,
+    at_inner,
     history,
+    memories,
 )
 from jaximu.ground.array_types import FloatArray
 
@@ -81,7 +84,7 @@ class Candidate:
 def parameters_of(terms: Sequence[ThermalTerm]) -> float:
     """Coefficients of an axis and its inner parameters; that pieces of a curve were picked from all counts as well."""
     pieces = sum(term.name == LEARNED for term in terms)
-    return len(terms) + sum(term.name in HISTORY for term in terms) + _PICKED * log(comb(SPLINES, pieces))
+    return len(terms) + len(memories(term.name for term in terms)) + _PICKED * log(comb(SPLINES, pieces))
 
 
 def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArray) -> Model:
@@ -98,7 +101,7 @@ def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArr
             return offered.misfit(axis, chosen) / scale[axis] + penalty * parameters_of(chosen)
 
         def stays(term: ThermalTerm, kept: Sequence[ThermalTerm]) -> bool:
-            return term.name in fixed or (term.name in _AT_ONCE and any(each.name in HISTORY for each in kept))
+            return term.name in fixed or (term.name in _AT_ONCE and bool(memories(other.name for other in kept)))
 
         found.append(tuple(exchanged(full, criterion, stays)))
     return tuple(found)
@@ -121,15 +124,17 @@ def exchanged(
 
 def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
     """Return the model with its inner parameters, which the axes share, at the least misfit: a grid, refined."""
-    names = [name for name in HISTORY if any(term.name == name for terms in model for term in terms)]
+    used = {term.name for terms in model for term in terms}
+    names = [name for name in HISTORY if name in memories(used)]
     if not names:
         return model
     shapes = data.shapes
     bounds = {name: (grid[0], grid[-1]) for name, grid in shapes.grids.items()}
     options = {name: [history(name, value) for value in shapes.grids[name]] for name in names}
     spacing = {name: float(grid[1] / grid[0]) for name, grid in shapes.grids.items()}
-    touched = [axis for axis, terms in enumerate(model) if any(term.name in names for term in terms)]
-    plain = [term for axis in touched for term in model[axis] if term.name not in HISTORY]
+    touched = [axis for axis, terms in enumerate(model) if memories(term.name for term in terms)]
+    plain = [term for axis in touched for term in model[axis] if not memories([term.name])]
+    beside = [(ThermalTerm(name), leader) for name, leader in BESIDE.items() if name in used]
     best: tuple[ThermalTerm, ...] = ()
     for zoom in range(_ZOOMS):
         if zoom:
@@ -139,18 +144,18 @@ def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
                 tried[name] = np.clip(value * np.geomspace(1 / spacing[name], spacing[name], GRID), *bounds[name])
                 spacing[name] **= 2 / (GRID - 1)
             options = shapes.prepare(tried)
-        offered = ReducedTerms(data, [*plain, *(term for terms in options.values() for term in terms)])
+        others = [at_inner(term, {leader: option}) for term, leader in beside for option in options[leader]]
+        offered = ReducedTerms(data, [*plain, *(term for terms in options.values() for term in terms), *others])
 
         def cost(chosen: tuple[ThermalTerm, ...], offered: ReducedTerms = offered) -> float:
             own = {term.name: term for term in chosen}
             return sum(
-                offered.misfit(axis, [own.get(term.name, term) for term in model[axis]]) / scale[axis]
-                for axis in touched
+                offered.misfit(axis, [at_inner(term, own) for term in model[axis]]) / scale[axis] for axis in touched
             )
 
         best = min(product(*options.values()), key=cost)
     own = {term.name: term for term in best}
-    return tuple(tuple(own.get(term.name, term) for term in terms) for terms in model)
+    return tuple(tuple(at_inner(term, own) for term in terms) for terms in model)
 
 
 def families_of(told: Sequence[str], more: Sequence[str]) -> dict[str, tuple[list[str], tuple[str, ...]]]:
@@ -160,6 +165,7 @@ def families_of(told: Sequence[str], more: Sequence[str]) -> dict[str, tuple[lis
     """
     rates = [name for name in RATES if name in told]
     memory = [name for name in HISTORY if name in told]
+    beside = [name for name, leader in BESIDE.items() if leader in memory]
     found: dict[str, tuple[list[str], tuple[str, ...]]] = {
         "constant": ([], ()),
         CUBIC: (list(POWERS), POWERS),
@@ -167,10 +173,13 @@ def families_of(told: Sequence[str], more: Sequence[str]) -> dict[str, tuple[lis
         "spline": ([LEARNED, *rates, *more], ()),
     }
     for name in memory:
-        found[name.replace("_", " ")] = ([*POWERS, name, *more], (name,))
+        found[name.replace("_", " ")] = (
+            [*POWERS, name, *(each for each in beside if BESIDE[each] == name), *more],
+            (name,),
+        )
     if memory:
-        found["all"] = ([*POWERS, *rates, *memory, *more], ())
-        found["spline and memory"] = ([LEARNED, *rates, *memory, *more], ())
+        found["all"] = ([*POWERS, *rates, *memory, *beside, *more], ())
+        found["spline and memory"] = ([LEARNED, *rates, *memory, *beside, *more], ())
     return found
 
 
@@ -181,7 +190,8 @@ def terms_of(names: Sequence[str], shapes: ThermalShapes) -> tuple[ThermalTerm, 
         if name == LEARNED:
             found += [ThermalTerm(LEARNED, (), k) for k in range(SPLINES)]
         else:
-            found.append(history(name, shapes.grids[name][GRID // 2]) if name in HISTORY else ThermalTerm(name))
+            leader = BESIDE.get(name, name)
+            found.append(history(name, shapes.grids[leader][GRID // 2]) if leader in HISTORY else ThermalTerm(name))
     return tuple(found)
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaximu.calibration.thermal_terms import (
+    BESIDE,
     HISTORY,
     LEARNED,
     NETWORK,
@@ -20,6 +21,7 @@ from jaximu.calibration.thermal_terms import (
     Net,
     ThermalTerm,
     history,
+    memories,
 )
 from jaximu.data.rest import mean_terms, padded_count
 from jaximu.data.rest_blocks import RestBlocks
@@ -94,7 +96,9 @@ class ThermalShapes:
 
     def prepare(self, tried: Mapping[str, FloatArray]) -> dict[str, list[ThermalTerm]]:
         """Return terms of effects with memory at values (12,) of their inner parameters."""
-        self._add({name: values[:, None] for name, values in {**self.grids, **tried}.items()})
+        values = {**self.grids, **tried}
+        values |= {name: values[leader] for name, leader in BESIDE.items()}
+        self._add({name: each[:, None] for name, each in values.items()})
         return {name: [history(name, value) for value in values] for name, values in tried.items()}
 
     def _add(self, asked: Mapping[str, FloatArray]) -> None:
@@ -105,7 +109,7 @@ class ThermalShapes:
         recordings = [stored.call(of, key, track, *asked.values()) for track in self.tracks]
         for name, grid, *parts in zip(names, asked.values(), *recordings, strict=True):
             for values, own in zip(grid, np.sum([part[:, :count] for part in parts], axis=0), strict=True):
-                term = history(name, values[0]) if name in HISTORY else ThermalTerm(name)
+                term = history(name, values[0]) if memories([name]) else ThermalTerm(name)
                 for shape, column in enumerate(own.T):  # (3, n)
                     self._columns[term._replace(shape=shape) if name == LEARNED else term] = column
 
@@ -114,7 +118,7 @@ class ThermalShapes:
         if term.net is not None:
             return self.network(term.net)[1][:, :, term.shape]
         if term not in self._columns:
-            self.prepare({term.name: np.full(GRID, term.inner[0][1])})
+            self.prepare({BESIDE.get(term.name, term.name): np.full(GRID, term.inner[0][1])})
         return self._columns[term]
 
     def network(self, net: Net) -> tuple[FloatArray, FloatArray]:

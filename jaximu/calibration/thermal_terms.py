@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from jaximu.model.effects.learned import SHAPES
 
-__all__ = ["HISTORY", "LEARNED", "NETWORK", "POWERS", "RATES", "SCALE", "SPLINES", "Model", "Net", "ThermalTerm",
-           "history"]  # fmt: skip
+__all__ = ["BESIDE", "HISTORY", "LEARNED", "NETWORK", "POWERS", "RATES", "SCALE", "SPLINES", "Model", "Net",
+           "ThermalTerm", "at_inner", "history", "memories"]  # fmt: skip
 
 POWERS = ("temperature", "temperature_squared", "temperature_cubed")
 RATES = ("temperature_rate", "temperature_rate_squared", "temperature_times_rate")
 HISTORY = {"thermal_lag": "time_constant", "thermal_hysteresis": "half_width"}
+BESIDE = {"thermal_lag_squared": "thermal_lag"}
+"""Effects that share the inner parameter of the one that they stand beside."""
 LEARNED = "learned_temperature"
 SPLINES = len(SHAPES) - 1
 SCALE = "scale_temperature"
@@ -40,4 +43,15 @@ Model = tuple[tuple[ThermalTerm, ...], ...]
 
 def history(name: str, value: float) -> ThermalTerm:
     """Return the term of an effect with memory at a value of its inner parameter."""
-    return ThermalTerm(name, ((HISTORY[name], float(value)),))
+    return ThermalTerm(name, ((HISTORY[BESIDE.get(name, name)], float(value)),))
+
+
+def memories(names: Iterable[str]) -> set[str]:
+    """Return whose inner parameters effects have, by name."""
+    return {BESIDE.get(name, name) for name in names} & set(HISTORY)
+
+
+def at_inner(term: ThermalTerm, chosen: Mapping[str, ThermalTerm]) -> ThermalTerm:
+    """Return a term at the inner parameter that is chosen, by name, for its effect or the one that it stands beside."""
+    like = chosen.get(BESIDE.get(term.name, term.name))
+    return term if like is None else term._replace(inner=like.inner)

@@ -31,7 +31,7 @@ from jaximu.calibration.thermal_selection import (
     terms_of,
     tuned,
 )
-from jaximu.calibration.thermal_terms import HISTORY, RATES, Model
+from jaximu.calibration.thermal_terms import BESIDE, HISTORY, RATES, Model, at_inner, memories
 from jaximu.data.rest import RestOverTemperature, mean_terms
 from jaximu.data.rest_blocks import folds_of
 from jaximu.estimation.fitting import Fit, Prior, fit
@@ -98,13 +98,13 @@ def fit_triad(data: Whitened, found: Identifiability, families: Sequence[str] | 
         model = tuned(data, (terms_of(names, data.shapes),) * 3, scale)
         tried[family] = tuned(data, stepwise(data, model, fixed, scale), scale)
     candidates = [candidate_of(data, family, model, folds, scale) for family, model in tried.items()]
-    if remembering := [each for each in candidates if set(HISTORY) & set(each.names)]:
+    if remembering := [each for each in candidates if memories(each.names)]:
         best = max(float(np.sum(each.scores)) for each in remembering)
         anchor = min((each for each in remembering if np.sum(each.scores) > best - PAYS), key=lambda c: c.parameters)
-        own = {term.name: term for term in anchor.terms if term.name in HISTORY}
+        own = {BESIDE.get(term.name, term.name): term for term in anchor.terms if memories([term.name])}
         for place, each in enumerate(candidates):
             names, fixed = offered[each.family]
-            terms = tuple(own.get(term.name, term) for term in terms_of(names, data.shapes))
+            terms = tuple(at_inner(term, own) for term in terms_of(names, data.shapes))
             if each is not anchor and set(own) & set(names):
                 tried[each.family] = stepwise(data, (terms,) * 3, fixed, scale)
                 candidates[place] = candidate_of(data, each.family, tried[each.family], folds, scale)
@@ -181,8 +181,10 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
                 known[number] = np.reshape(term.net.prior, (3, WEIGHTS))[axis, shape] * np.sqrt(scale[axis]) * unit
 
     def free(number: Name) -> bool:
-        of_all = number.part == "bias" if number.effect is None else number.part in HISTORY.values()
-        return number.owner == name and (of_all or number in told)
+        if number.effect is None:
+            return number.owner == name and number.part == "bias"
+        tied = BESIDE.get(list(kinds)[number.effect]) in kinds  # held where the effect that it stands beside has it
+        return number.owner == name and (number in told or (number.part in HISTORY.values() and not tied))
 
     effects = [kind(numbers[plain], **{key: np.float64(each) for key, each in inner[plain].items()})
                for plain, kind in kinds.items()]  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaximu.calibration import calibrate_thermal
 from jaximu.calibration.thermal_shapes import ThermalShapes
-from jaximu.calibration.thermal_terms import HISTORY, RATES
+from jaximu.calibration.thermal_terms import BESIDE, HISTORY, RATES
 from jaximu.data import RestBlocks
 from jaximu.data.rest_blocks import rest_blocks
 from jaximu.data.resting import Resting
@@ -65,7 +65,7 @@ def diagnose_thermal(
     held = None if heldout is None else _coarse(recordings_of(heldout))
     notes = [*thermal.blocks.notes, *known.notes, *(note for note in thermal.notes if "jumps by" in note)]
     chosen = [effect for triad in thermal.calibration.triads().values() for effect in triad.effects]
-    beyond = [effect for effect in chosen if effect.plain in (*RATES, *HISTORY)]
+    beyond = [effect for effect in chosen if effect.plain in (*RATES, *HISTORY, *BESIDE)]
 
     def asked(smooth: bool, taken: Sequence[Effect]) -> Diagnosis:
         other = None if held is None else _remade(held, start, smooth)

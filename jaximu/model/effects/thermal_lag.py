@@ -9,7 +9,7 @@ from jaximu.ground.array_types import Array
 from jaximu.ground.prefixes import running
 from jaximu.model.effects.base import Effect, Inner, pair
 
-__all__ = ["EFFECTS", "AccelThermalLag", "GyroThermalLag"]
+__all__ = ["EFFECTS", "AccelThermalLag", "AccelThermalLagSquared", "GyroThermalLag", "GyroThermalLagSquared"]
 
 
 class _ThermalLag(Effect):
@@ -68,6 +68,20 @@ class _ThermalLag(Effect):
         return jnp.stack([jnp.atleast_1d(each)[..., -1] for each in now], axis=-1)
 
 
-EFFECTS = AccelThermalLag, GyroThermalLag = pair(
-    _ThermalLag, "thermal_lag", (1e-3, 1e-4), "temperature", "thermal_hysteresis"
+class _ThermalLagSquared(_ThermalLag):
+    """A bias in proportion to the square of T_lag: what bends beside a thermal lag, at the same time constant."""
+
+    formula = "c_i T_lag², τ Ṫ_lag = (T − T_ref) − T_lag"
+    unit = "output/K^2"
+    excited_by = "up and down ramps over a wide range of temperature"
+    cause = False
+
+    def term(self, stimulus):
+        return self.coefficients * self.lagged(stimulus)[..., None] ** 2
+
+
+AccelThermalLag, GyroThermalLag = pair(_ThermalLag, "thermal_lag", (1e-3, 1e-4), "temperature", "thermal_hysteresis")
+AccelThermalLagSquared, GyroThermalLagSquared = pair(
+    _ThermalLagSquared, "thermal_lag_squared", (3e-5, 3e-6), "temperature_squared", "thermal_lag"
 )
+EFFECTS = AccelThermalLag, GyroThermalLag, AccelThermalLagSquared, GyroThermalLagSquared

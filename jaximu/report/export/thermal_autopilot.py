@@ -17,7 +17,7 @@ import numpy as np
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.thermal import ThermalCalibration, steady_change
-from jaximu.calibration.thermal_terms import HISTORY, NETWORK, RATES, SCALE
+from jaximu.calibration.thermal_terms import NETWORK, RATES, SCALE, memories
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 
@@ -172,7 +172,7 @@ class _Targets:
         effects = [effect for triad in self.calibration.triads().values() for effect in triad.effects]
         found = []
         lost = [effect.name for effect in effects if effect.plain in (*RATES, SCALE, NETWORK)]
-        lagging = [effect.name for effect in effects if effect.plain in HISTORY]
+        lagging = [effect.name for effect in effects if memories([effect.plain])]
         if lost:
             found.append(f"a cubic of temperature cannot hold {', '.join(lost)}: left out.")
         if lagging:
