@@ -173,10 +173,8 @@ def families_of(told: Sequence[str], more: Sequence[str]) -> dict[str, tuple[lis
         "spline": ([LEARNED, *rates, *more], ()),
     }
     for name in memory:
-        found[name.replace("_", " ")] = (
-            [*POWERS, name, *(each for each in beside if BESIDE[each] == name), *more],
-            (name,),
-        )
+        with_it = [other for other in beside if BESIDE[other] == name]
+        found[name.replace("_", " ")] = ([*POWERS, name, *with_it, *more], (name,))
     if memory:
         found["all"] = ([*POWERS, *rates, *memory, *beside, *more], ())
         found["spline and memory"] = ([LEARNED, *rates, *memory, *beside, *more], ())

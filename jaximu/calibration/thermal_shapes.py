@@ -98,7 +98,7 @@ class ThermalShapes:
         """Return terms of effects with memory at values (12,) of their inner parameters."""
         values = {**self.grids, **tried}
         values |= {name: values[leader] for name, leader in BESIDE.items()}
-        self._add({name: each[:, None] for name, each in values.items()})
+        self._add({name: grid[:, None] for name, grid in values.items()})
         return {name: [history(name, value) for value in values] for name, values in tried.items()}
 
     def _add(self, asked: Mapping[str, FloatArray]) -> None:
