@@ -28,7 +28,16 @@ from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import Track, added, stimuli
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.rotation import conjugate, exponential, inverse_matrix, logarithm, multiply, rotate, rotation_matrix
+from jaximu.ground.rotation import (
+    conjugate,
+    exponential,
+    inverse_matrix,
+    logarithm,
+    multiply,
+    rotate,
+    rotation_matrix,
+    rotation_matrix_on_host,
+)
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_filter import behind
 from jaximu.model.mounting import Mounting
@@ -528,7 +537,7 @@ class AgainstAttitude(Data):
             whole[rows.ravel()] = factor
             return (whole.T * used).T
 
-        back = rotation_matrix(np.asarray(conditions.target)[0]).swapaxes(1, 2)
+        back = rotation_matrix_on_host(np.asarray(conditions.target)[0]).swapaxes(1, 2)
         ends = np.zeros((n, 3 * (turns + 1)))
         ends[rows.ravel()] = shared_ends(back)
         for interval in range(turns):

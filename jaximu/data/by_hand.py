@@ -19,7 +19,7 @@ from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.rotation import rotation_matrix
+from jaximu.ground.rotation import rotation_matrix_on_host
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
@@ -164,5 +164,5 @@ def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
         pose, first = np.unique(np.asarray(track.observation), return_index=True)
         inside = pose < poses
         attitude = np.asarray(track.stimulus.attitude)[first[inside]]
-        axes[pose[inside]] = rotation_matrix(attitude).reshape(-1, 9)
+        axes[pose[inside]] = rotation_matrix_on_host(attitude).reshape(-1, 9)
     return axes

@@ -10,7 +10,7 @@ import numpy as np
 from jaximu.data.poses import PosesAndTurns
 from jaximu.estimation.track import Track
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.rotation import rotation_matrix
+from jaximu.ground.rotation import rotation_matrix_on_host
 from jaximu.model.noise import drawn_noise
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
@@ -76,7 +76,7 @@ def _correction(attitude: FloatArray, after: FloatArray, duration: float) -> Flo
     `attitude` (n, 4) is the body's after each sample, level at the start; to first order a rotation δ of the last frame
     is the sum of the rates' parts brought there.
     """
-    matrix = rotation_matrix(attitude)  # body to level
+    matrix = rotation_matrix_on_host(attitude)  # body to level
     lab = np.array([0.0, 0.0, 1.0])
     carried = matrix[-1].T @ lab
     delta = np.cross(after, carried)  # turning the frame by δ moves a fixed direction by −δ × u

@@ -12,11 +12,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
-from jaximu.ground.array_types import Array
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.prefixes import running
-from jaximu.ground.tracing import array_module
 
 __all__ = [
     "apply_matrix",
@@ -33,6 +33,7 @@ __all__ = [
     "right_jacobian_rows",
     "rotate",
     "rotation_matrix",
+    "rotation_matrix_on_host",
     "rotation_rows",
     "rotation_vectors",
     "running_rotations",
@@ -95,12 +96,13 @@ def rotation_rows(quaternion: Sequence[Any]) -> list[list[Any]]:
 
 
 def rotation_matrix(q: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
-    """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`.
+    """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`."""
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rotation_rows(_parts(q))], axis=-2)
 
-    Of NumPy unless it is traced.
-    """
-    numerics = array_module(q)
-    return numerics.stack([numerics.stack(row, axis=-1) for row in rotation_rows(_parts(q))], axis=-2)
+
+def rotation_matrix_on_host(q: FloatArray) -> FloatArray:
+    """Return rotation matrices (..., 3, 3) of unit quaternions (..., 4) in NumPy, where nothing is to be traced."""
+    return np.moveaxis(np.array(rotation_rows(_parts(q))), (0, 1), (-2, -1))
 
 
 def rotate(q: Float[Array, "... 4"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
