@@ -63,7 +63,9 @@ class RecordedByHand(Data):
 
     def along(self, imu: Imu, effects: tuple[Effect, ...]) -> Along:
         """Return the recordings about a unit with effects: the tracks, and the observations without what they add."""
-        return jax.tree.map(np.asarray, self.data.along(imu, effects))
+        along = jax.tree.map(np.asarray, self.data.along(imu, effects))
+        left = along.observations
+        return along._replace(observations=Observations(left.poses, left.turns, left.gravity, left.slow))
 
     def reactions(self, details: Along):
         """Return how norms, directions and means at rest react to effects, recording by recording."""

@@ -201,7 +201,7 @@ class Along(NamedTuple):
     observations: with what the effects add taken off. tracks: of both triads, recording by recording.
     """
 
-    observations: PosesAndTurns
+    observations: Observations
     condensed: Condensed
     tracks: list[dict[str, Track]]
 

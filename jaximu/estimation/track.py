@@ -152,7 +152,7 @@ class Recorded(eqx.Module):
     def widened(self, lengths: Mapping[str, int]) -> Recorded:
         """Return the same of one unit with padding up to so many samples of each triad."""
         known = {name: _longer(path, lengths[name] - len(self.stamps(name))) for name, path in self.known.items()}
-        real = np.pad(self.real, (0, lengths["accelerometer"] - len(self.real)))
+        real = array_module(self).pad(self.real, (0, lengths["accelerometer"] - len(self.real)))
         return replace(self, known=known, real=real)
 
     def stamps(self, name: str) -> Float[Array, "... n"]:
