@@ -15,6 +15,7 @@ from jaximu.calibration import calibrate_array, fit_together, leave_out_turns
 from jaximu.cli.app import main
 from jaximu.data.array import UnitsOnOneBody
 from jaximu.data.poses import condensed
+from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import ReadOptions, read_recording
@@ -88,6 +89,18 @@ def test_the_units_own_conditions_have_the_covariance_that_they_have_alone(toget
         used = own.used[unit][:, None] * own.used[unit]
         known = used * own.measured[unit]
         np.testing.assert_allclose((used * whole.measured[0, part, part]), known, atol=1e-6 * np.abs(known).max())
+
+
+def test_what_an_effect_adds_is_taken_off_before_units_are_fitted_together(found, together):
+    """An effect of no size changes nothing; one of the gyroscope's acceleration sensitivity changes its fit."""
+    kind, fits = CATALOGUE["gyro.g_sensitivity"], []
+    for size in (0.0, 1e-4):
+        imu = found.units[1].calibration.imu.with_effects(kind.make(size))
+        other = replace(found.units[1], calibration=replace(found.units[1].calibration, imu=imu))
+        fits.append(fit_together(replace(found, units=(found.units[0], other, *found.units[2:]))).together)
+    sigma = np.sqrt(np.diag(together.together.covariance))
+    none, some = (np.abs((each.values - together.together.values) / sigma).max() for each in fits)
+    assert none < 1e-6 < 10.0 < some
 
 
 def test_turns_left_out_are_met_better_together(found):

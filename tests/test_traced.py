@@ -17,7 +17,9 @@ from jaximu.data.poses import PosesAndTurns, condense
 from jaximu.data.poses_covariance import turned_by
 from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.problem import Name, without_equipment
+from jaximu.estimation.track import Recorded
 from jaximu.model.effects import CATALOGUE
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.segmentation import segment
 from jaximu.simulation.protocols import HandHeld
 
@@ -200,6 +202,77 @@ def test_effects_are_fitted_under_a_trace_and_side_by_side(with_effects):
     forward = jax.jit(jax.jacfwd(values))(jnp.array(0.0))
     assert float(np.max(np.abs((forward - slope) / alone[0].sigmas()))) < 1e-4
     assert 0.2 < forward[place] / width < 0.9
+
+
+def test_units_whose_logs_differ_are_fitted_side_by_side(with_effects):
+    """In length, in rate, in whether vibration stands out, in whether both sensors share their stamps."""
+    unit, data = with_effects
+    log, random = recording(3, poses=12, rates=(50.0, 80.0))[0], np.random.default_rng(3)
+    shaken = log.accelerometer.values + 0.3 * random.normal(size=(len(log.accelerometer), 1)) * np.array(
+        [0.5, 1.0, 0.2]
+    )
+    rests = segment(log).intervals
+    still = ((log.accelerometer.time[:, None] > rests[:, 0]) & (log.accelerometer.time[:, None] < rests[:, 1])).any(1)
+    values = np.where(still[:, None], log.accelerometer.values, shaken)
+    shaking = replace(log, accelerometer=replace(log.accelerometer, values=values))
+    data = [data[0], jaximu.observe(shaking, GRAVITY, samples=True)]
+    assert [each.samples[0].recorded.shaken is not None for each in data] == [False, True]
+    alone = [jaximu.fit(unit, each) for each in data]
+    fits = jax.jit(jax.vmap(lambda each: jaximu.fit(unit, each)))(jaximu.stack(data))
+    assert max(off(jax.tree.map(lambda leaf, k=k: leaf[k], fits), alone[k]) for k in range(2)) < 1e-9
+    rectified = NOMINAL.with_effects(jaximu.CATALOGUE["accel.vibration_rectification"].dormant())
+    with pytest.raises(jaximu.InputError, match="vibration"):
+        jaximu.fit(rectified, data[0])
+    both = jax.jit(jax.vmap(lambda each: jaximu.fit(rectified, each)))(jaximu.stack(data))
+    place = next(k for k, name in enumerate(both.names) if name.part == "coefficients")
+    assert both.sigmas()[0, place] > 10 * both.sigmas()[1, place]  # nothing shook the first
+    with pytest.raises(jaximu.InputError, match="number of recordings"):
+        jaximu.stack([data[0], jaximu.observe([log, shaking], GRAVITY, samples=True)])
+
+
+def test_vibration_is_the_mean_square_over_a_window():
+    """Against a convolution, about both ends and with padding."""
+    random = np.random.default_rng(1)
+    for count, window in ((400, 12), (401, 13)):
+        log = recording(1, poses=3)[0]
+        force = random.normal(size=(count, 3)) + 9.0
+        known = replace(Recorded.of(log), real=np.arange(count) < count - 20, window=np.int64(window))
+        kernel = np.ones(window) / window
+        used = force * known.real[:, None]
+        smooth = np.stack([np.convolve(axis, kernel, "same") for axis in used.T], 1)
+        square = np.sum((known.real[:, None] * (force - smooth)) ** 2, 1)
+        np.testing.assert_allclose(known.vibration(force), np.convolve(square, kernel, "same"), atol=1e-11)
+
+
+def test_residuals_take_what_effects_need(with_effects):
+    """Given the stimulus they take off what effects add, and without it say what is missing."""
+    _, data = with_effects
+    effects = (
+        jaximu.CATALOGUE["accel.warm_up"].make(0.1, time_constant=30.0),
+        jaximu.CATALOGUE["gyro.warm_up"].make(1e-3, time_constant=30.0),
+    )
+    unit, poses, turns = NOMINAL.with_effects(*effects), data[0].poses, data[0].turns
+    middle = Stimulus(time=(poses.start + poses.stop) / 2)
+    inside = Stimulus(time=poses.stop[:-1, None] + np.cumsum(turns.interval, axis=1))
+    bare = eqx.tree_at(
+        lambda d: (d.poses.accelerometer_mean, d.turns.output),
+        data[0],
+        (
+            poses.accelerometer_mean - np.asarray(effects[0].term(middle)),
+            turns.output - np.asarray(effects[1].term(inside)),
+        ),
+    )
+    ones, square = np.ones(len(poses.mask)), np.tile(np.eye(2), (len(turns.mask), 1, 1))
+    for with_them, without in (
+        (gravity_norm(unit, data[0], ones, middle), gravity_norm(NOMINAL, bare, ones)),
+        (
+            gravity_direction(unit, data[0], None, square, stimulus=middle, during=inside),
+            gravity_direction(NOMINAL, bare, None, square),
+        ),
+    ):
+        np.testing.assert_allclose(with_them, without, atol=1e-12)
+    with pytest.raises(jaximu.InputError, match="time"):
+        gravity_norm(unit, data[0], ones)
 
 
 def test_what_effects_add_in_one_recording_leaves_the_turns_of_another():

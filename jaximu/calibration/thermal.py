@@ -379,7 +379,8 @@ def change(
     effects, reference = [triad.effects[place] for place in places], triad.temperature_reference
     there, back = (steady(effects, *at, reference, force) for at in ((celsius, rate), (reference, 0.0)))
     values, slopes = (each - origin for each, origin in zip(there, back, strict=True))
-    numbers = [name for name in effect_numbers(calibration.imu)[0] if name.owner == owner and name.effect in places]
+    own = effect_numbers(calibration.imu.with_effects(*effects))[0]
+    numbers = [Name(owner, name.part, name.axes, places[name.effect]) for name in own if name.effect is not None]
     known = [(column, calibration.names.index(name)) for column, name in enumerate(numbers)
              if name in calibration.names]  # fmt: skip
     columns, rows = np.array(known, int).reshape(-1, 2).T

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import SHAPES
 
 __all__ = ["BESIDE", "HISTORY", "LEARNED", "NETWORK", "POWERS", "RATES", "SCALE", "SPLINES", "Model", "Net",
@@ -13,7 +14,7 @@ __all__ = ["BESIDE", "HISTORY", "LEARNED", "NETWORK", "POWERS", "RATES", "SCALE"
 POWERS = ("temperature", "temperature_squared", "temperature_cubed")
 RATES = ("temperature_rate", "temperature_rate_squared", "temperature_times_rate")
 HISTORY = {"thermal_lag": "time_constant", "thermal_hysteresis": "half_width"}
-BESIDE = {"thermal_lag_squared": "thermal_lag"}
+BESIDE = {kind.plain: kind.shares for kind in CATALOGUE.values() if kind.shares}
 """Effects that share the inner parameter of the one that they stand beside."""
 LEARNED = "learned_temperature"
 SPLINES = len(SHAPES) - 1

@@ -35,7 +35,7 @@ from jaximu.calibration.thermal_terms import BESIDE, HISTORY, RATES, Model, at_i
 from jaximu.data.rest import RestOverTemperature, mean_terms
 from jaximu.data.rest_blocks import folds_of
 from jaximu.estimation.fitting import Fit, Prior, fit
-from jaximu.estimation.problem import TOLERANCE, Name
+from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import PREFIXES
 from jaximu.model.effects import CATALOGUE, Effect
@@ -43,9 +43,6 @@ from jaximu.model.effects.network import UNITS, WEIGHTS
 from jaximu.model.sensor import Imu
 
 __all__ = ["TriadFit", "fit_triad"]
-
-_ALIKE = 1e-4
-"""Share by which time constants that are one number may differ."""
 
 
 @dataclass(frozen=True)
@@ -199,11 +196,5 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
     unit = Imu(triads["accelerometer"], triads["gyroscope"]).with_effects(*effects)
     # a network is solved already, and is asked for its uncertainty: full steps, as the passes take, lead it astray
     prior = Prior(tuple(known), np.zeros(len(known)), np.diag(1 / np.array(list(known.values())))) if known else None
-    for beside, leader in BESIDE.items():
-        if not known and beside in kinds and leader in kinds:  # one number, which both are free to move together
-            pair = tuple(Name(name, HISTORY[leader], (), places[plain]) for plain in (leader, beside))
-            value = inner[leader][HISTORY[leader]]
-            root = np.array([[1 / _ALIKE, -1 / _ALIKE], [0.5 / TOLERANCE, 0.5 / TOLERANCE]]) / value
-            prior = Prior(pair, np.full(2, value), root)
     return fit(unit, measurement, free, prior=prior, excess=scale - 1, estimate_excess=not known,
                max_passes=1 if known else 32)  # fmt: skip

@@ -382,10 +382,13 @@ def observe(
 def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
     """Return data of units as one, with a leading axis: padded to as many poses and samples as the longest has.
 
-    Raises `InputError` where conditions differ, or where slow noise ties intervals whose numbers differ.
+    Rates may differ. Raises `InputError` where conditions or thermometers differ, samples or the number of recordings,
+    and where slow noise ties intervals whose numbers differ.
     """
     if not data:
         raise InputError("nothing to stack: give the data of one unit or more.")
+    if any(part.recorded.shaken is not None for unit in data for part in unit.samples):
+        data = [replace(unit, samples=tuple(part.asked_for_vibration() for part in unit.samples)) for unit in data]
     poses, samples = (max(unit.turns.interval.shape[axis] for unit in data) for axis in (0, 1))
     alike, wide = {jax.tree.structure(unit) for unit in data}, data
     if len(alike) == 1:
@@ -395,7 +398,10 @@ def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
         ]
         wide = [unit.widened(poses + 1, samples, lengths) for unit in data]
     if len(alike) > 1 or len({tuple(map(np.shape, jax.tree.leaves(unit))) for unit in wide}) > 1:
-        raise InputError("these units' data differ in kind (gyroscope, slow noise, its intervals): stack those alike.")
+        raise InputError(
+            "these units' data differ in kind (gyroscope, thermometer, slow noise, its intervals, samples, number of "
+            "recordings): stack those alike."
+        )
     return jax.tree.map(lambda *leaves: array_module(leaves).stack(leaves), *wide)
 
 

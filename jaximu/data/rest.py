@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.data import About, Conditions, Data, derivatives_by_numbers
+from jaximu.estimation.data import About, Conditions, Data, derivatives_by_numbers, free_columns
 from jaximu.estimation.track import Track
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -98,8 +98,9 @@ def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -
 
     In output units; numbers are in the order of `effect_numbers`.
     """
-    added, slopes, rows = np.zeros((count, 3)), [np.zeros((count, 3, 0))], padded_count(count)
-    for effect in effects:
+    added, slopes, rows = np.zeros((count, 3)), {}, padded_count(count)
+    placed = dict(enumerate(effects))
+    for place, effect in placed.items():
         kind = CATALOGUE[f"accel.{effect.plain}"]  # its term is the gyroscope's, too: half as many to compile
         numbers = np.concatenate([effect.coefficients, [float(getattr(effect, name)) for name in effect.inner]])
 
@@ -113,8 +114,8 @@ def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -
         recordings = [stored.call(means, f"rest {kind.name} {rows}", track, numbers) for track in tracks]
         value, slope = (sum(part[:count] for part in parts) for parts in zip(*recordings, strict=True))
         added = added + value
-        slopes.append(np.asarray(slope))
-    return added, np.concatenate(slopes, axis=2)
+        slopes[place] = np.asarray(slope)
+    return added, np.concatenate([np.zeros((count, 3, 0)), *free_columns(placed, slopes)], axis=2)
 
 
 def padded_count(count: int) -> int:

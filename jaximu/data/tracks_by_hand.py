@@ -73,6 +73,10 @@ class SamplesByHand(eqx.Module):
         whole = cls(outputs, Recorded.of(part.recording), pose, turn, order, sample, nearest)
         return whole.widened({name: Track.length(len(signal)) for name, signal in signals.items()}, *interval.shape)
 
+    def asked_for_vibration(self) -> SamplesByHand:
+        """Return the same with vibration among what the unit went through."""
+        return replace(self, recorded=self.recorded.asked_for_vibration())
+
     def lengths(self) -> dict[str, int]:
         """Return how many samples each triad has, padding included."""
         return {name: pose.shape[-1] for name, pose in self.pose.items()}

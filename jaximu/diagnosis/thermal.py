@@ -74,7 +74,7 @@ def diagnose_thermal(
         about = calibration, known, _remade(blocks, start, smooth), other, tuple(findings), sentences, level
         return examine(Examination(*about, trusted=noise is None, taken=tuple(taken), measured=left_out))
 
-    wanted = {effect.name for effect in beyond}
+    wanted = {effect.name for effect in beyond if effect.cause}
     first = found = asked(False, ()) if len(chosen) <= _NAMED else None
     if first is None or first.verdict == "unexplained" or (first.verdict == "effects" and _misses(first, wanted)):
         found = asked(True, beyond)

@@ -28,13 +28,13 @@ from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.tracing import array_module
-from jaximu.model.effects.base import Effect, Extent
+from jaximu.model.effects.base import Effect, Extent, Place, inner_owners
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
-__all__ = ["About", "Conditions", "Data", "Handling", "Observed", "derivatives_by_numbers"]
+__all__ = ["About", "Conditions", "Data", "Handling", "Observed", "derivatives_by_numbers", "free_columns"]
 
 _GRID = 16
 """Inner parameters of an effect are asked for in multiples of so many."""
@@ -155,8 +155,8 @@ class Data(ABC):
         """
         key, react, parts = self.reactions(details)
         numerics = array_module(imu, details)
-        columns = [numerics.zeros((rows, 0))]
-        for effect in imu.all_effects().values():
+        effects, by_effect = imu.all_effects(), {}
+        for place, effect in effects.items():
             kind = type(effect)
 
             def derivatives(imu, part, numbers, kind=kind):
@@ -167,8 +167,8 @@ class Data(ABC):
             parted = [
                 stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers) for part in parts
             ]
-            columns += [-sum(parted[1:], start=parted[0])]
-        return numerics.concatenate(columns, axis=1)
+            by_effect[place] = -sum(parted[1:], start=parted[0])
+        return numerics.concatenate([numerics.zeros((rows, 0)), *free_columns(effects, by_effect)], axis=-1)
 
     def dormant_columns(
         self, imu: Imu, details: Any, grids: Mapping[type[Effect], Sequence[Mapping[str, float]]]
@@ -305,6 +305,26 @@ def _slope(kind: type[Effect], of: Callable[[Array], Array], numbers: Array) -> 
     return jax.vmap(lambda e, h: (of(numbers + h * e) - of(numbers - h * e)) / (2 * h), out_axes=1)(
         jnp.eye(len(numbers)), step
     )
+
+
+def free_columns(
+    effects: Mapping[Place, Effect], by_effect: Mapping[Place, Float[Array, "... q"]]
+) -> list[Float[Array, "... q"]]:
+    """Return the derivatives by the numbers that are free, effect by effect, of those by all numbers of each.
+
+    An inner parameter that effects share is one number: what it does to each of them adds up.
+    """
+    owners, shared = inner_owners(effects), dict(by_effect)
+    for place, owner in owners.items():
+        if place != owner:
+            size = effects[place].size
+            shared[place] = by_effect[place][..., :size]
+            inner = by_effect[place][..., size:]
+            own = effects[owner].size
+            shared[owner] = array_module(inner).concatenate(
+                [shared[owner][..., :own], shared[owner][..., own:] + inner], axis=-1
+            )
+    return list(shared.values())
 
 
 def derivatives_by_numbers(kind: type[Effect], reaction: Callable[[Effect], Array], numbers: Array) -> Array:

@@ -34,6 +34,7 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
 from jaximu.ground.tracing import array_module, is_traced
+from jaximu.model.effects.base import inner_owners
 from jaximu.model.sensor import Imu
 
 __all__ = [
@@ -196,17 +197,21 @@ def informed(found: Fit, prior: Prior) -> Fit:
 
 
 def effect_numbers(imu: Imu) -> tuple[tuple[Name, ...], Float[Array, "... q"], Float[Array, "... q"]]:
-    """Return the names, values and typical sizes of the numbers of units' effects, effect by effect."""
-    numerics = array_module(imu)
+    """Return the names, values and typical sizes of the free numbers of units' effects, effect by effect.
+
+    An inner parameter that effects share is a number of the one that it belongs to.
+    """
+    numerics, effects = array_module(imu), imu.all_effects()
+    owners = inner_owners(effects)
     names, values, sizes = [], [numerics.zeros((*np.shape(imu.accelerometer.bias)[:-1], 0))], []
-    for (owner, place), effect in imu.all_effects().items():
+    for (owner, place), effect in effects.items():
         gain = imu.triads().get(owner, imu.accelerometer).gain
         scale = numerics.mean(numerics.linalg.norm(gain, axis=-1), axis=-1, keepdims=True)
         typical = effect.typical_sizes(scale).coefficients
         names += [Name(owner, "coefficients", (k,), place) for k in range(effect.size)]
         values.append(effect.coefficients)
         sizes.append(numerics.broadcast_to(typical, np.shape(effect.coefficients)))
-        for inner in effect.inner:
+        for inner in effect.inner if owners[owner, place] == (owner, place) else ():
             value = numerics.asarray(getattr(effect, inner))[..., None]
             names.append(Name(owner, inner, (), place))
             values.append(value)
@@ -217,17 +222,21 @@ def effect_numbers(imu: Imu) -> tuple[tuple[Name, ...], Float[Array, "... q"], F
 
 def _with_numbers(imu: Imu, values: Float[Array, "... q"]) -> Imu:
     """Return units with their effects' numbers; an inner parameter moves by a factor of two at most, in its range."""
-    numerics, effects, first = array_module(imu, values), [], 0
-    for effect in imu.all_effects().values():
-        inner = {}
-        for place, (name, each) in enumerate(effect.inner.items()):
+    numerics, effects, first = array_module(imu, values), imu.all_effects(), 0
+    owners, coefficients, inner = inner_owners(effects), {}, {}
+    for at, effect in effects.items():
+        coefficients[at] = values[..., first : first + effect.size]
+        first += effect.size
+        if owners[at] != at:
+            continue
+        inner[at] = {}
+        for name, each in effect.inner.items():
             old = numerics.asarray(getattr(effect, name))
-            change = values[..., first + effect.size + place] - old
+            change = values[..., first] - old
             moved = numerics.clip(old + numerics.clip(change, -0.5 * old, old), each.low, each.high)
-            inner[name] = numerics.where(change == 0, old, moved)  # one that is held may lie outside
-        effects.append(type(effect)(values[..., first : first + effect.size], **inner))
-        first += effect.size + len(effect.inner)
-    return imu.with_effects(*effects)
+            inner[at][name] = numerics.where(change == 0, old, moved)  # one that is held may lie outside
+            first += 1
+    return imu.with_effects(*(type(each)(coefficients[at], **inner[owners[at]]) for at, each in effects.items()))
 
 
 @dataclass(frozen=True)

@@ -120,14 +120,13 @@ class Recorded(eqx.Module):
     """What a recording says of the samples of accelerometer and gyroscope without a unit.
 
     known: of each triad its stamps and temperatures. real (n,): the accelerometer's samples that are no padding.
-    together: whether both have the same stamps. window: samples over which vibration is measured, none where none
-    stands out.
+    window: samples over which vibration is measured. shaken: whether it stands out; None where nobody needs to know.
     """
 
     known: dict[str, Stimulus]
     real: Bool[Array, "... n"]
-    together: bool = eqx.field(static=True)
-    window: int = eqx.field(static=True)
+    window: Int[Array, " ..."]
+    shaken: Bool[Array, " ..."] | None = None
 
     @classmethod
     def of(cls, recording: Recording) -> Recorded:
@@ -140,14 +139,17 @@ class Recorded(eqx.Module):
                 celsius = np.interp(time, recording.temperature.time, recording.temperature.values[:, 0])
                 slope = smoothed_slope(time, celsius, TEMPERATURE_WINDOW)
                 known[name] = replace(known[name], temperature=celsius, temperature_rate=slope)
-        together = np.array_equal(accelerometer.time, gyroscope.time)
-        window = max(4, accelerometer.samples(_VIBRATION_WINDOW))
-        recorded = cls(known, np.ones(len(accelerometer), bool), together, window)
+        window = np.int64(max(4, accelerometer.samples(_VIBRATION_WINDOW)))
+        recorded = cls(known, np.ones(len(accelerometer), bool), window)  # pyright: ignore[reportArgumentType]
         if len(accelerometer) >= 4 * window:
-            power = recorded._vibration(accelerometer.si())
+            power = recorded.vibration(accelerometer.si())
             if np.median(power) > 2 * np.quantile(power, _QUIETEST):
-                return recorded
-        return replace(recorded, window=0)
+                return recorded.asked_for_vibration(stands_out=True)
+        return recorded
+
+    def asked_for_vibration(self, stands_out: bool = False) -> Recorded:
+        """Return the same with vibration among what the unit went through, zero unless it stands out."""
+        return self if self.shaken is not None else replace(self, shaken=np.bool_(stands_out))
 
     def widened(self, lengths: Mapping[str, int]) -> Recorded:
         """Return the same of one unit with padding up to so many samples of each triad."""
@@ -165,14 +167,15 @@ class Recorded(eqx.Module):
         """Return what the unit went through at the samples of each triad, of force and rate at those of their own."""
         sensed, turning = self.stamps("accelerometer"), self.stamps("gyroscope")
         numerics, power, stimuli = array_module(force, self), None, {}
-        if self.window:
-            power = self._vibration(force)
-            power = (power - numerics.nanquantile(numerics.where(self.real, power, np.nan), _QUIETEST))[:, None]
+        if self.shaken is not None:
+            power = self.vibration(force)
+            quiet = numerics.nanquantile(numerics.where(self.real, power, np.nan), _QUIETEST)
+            power = (self.shaken * (power - quiet))[:, None]
         for name, known in self.known.items():
             sampled, turned, shaken = force, rate, power
-            if not self.together and name == "accelerometer":
+            if name == "accelerometer":
                 turned = _at(turning, rate, sensed)
-            elif not self.together:
+            else:
                 sampled = _at(sensed, force, turning)
                 shaken = None if power is None else _at(sensed, power, turning)
             stimuli[name] = replace(
@@ -184,12 +187,11 @@ class Recorded(eqx.Module):
             )
         return stimuli
 
-    def _vibration(self, force: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    def vibration(self, force: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Mean square of what is quicker than the window, (m/s²)²."""
-        numerics = array_module(force, self)
-        kernel, real = np.ones(self.window) / self.window, self.real[:, None]
-        smooth = numerics.stack([numerics.convolve(axis, kernel, "same") for axis in (real * force).T], axis=1)
-        return numerics.convolve(numerics.sum((real * (force - smooth)) ** 2, axis=1), kernel, "same")
+        numerics, real = array_module(force, self), self.real[:, None]
+        quick = real * (force - _window_means(real * force, self.window))
+        return _window_means(numerics.sum(quick**2, axis=1, keepdims=True), self.window)[:, 0]
 
 
 def stimuli(recording: Recording, imu: Imu) -> dict[str, Stimulus]:
@@ -204,6 +206,15 @@ def stimuli(recording: Recording, imu: Imu) -> dict[str, Stimulus]:
         for triad, signal in ((imu.accelerometer, accelerometer), (imu.gyroscope, gyroscope))
     )
     return Recorded.of(recording).stimuli(force, rate)
+
+
+def _window_means(values: Float[Array, "n k"], window: Int[Array, ""]) -> Float[Array, "n k"]:
+    """Return the mean over so many samples about each; nothing beyond both ends counts as zero."""
+    numerics = array_module(values, window)
+    sums = numerics.cumsum(numerics.pad(values, [(1, 0), (0, 0)]), axis=0)
+    stop = np.arange(len(values)) + (window + 1) // 2
+    first, last = (numerics.clip(place, 0, len(values)) for place in (stop - window, stop))
+    return (sums[last] - sums[first]) / window
 
 
 def _at(time: Float[Array, " n"], values: Float[Array, "n k"], wanted: Float[Array, " m"]) -> Float[Array, "m k"]:

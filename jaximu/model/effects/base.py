@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import secrets
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -20,8 +20,9 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSORS
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["Effect", "Extent", "Inner", "SetupEffect", "on_triad", "pair"]
+__all__ = ["Effect", "Extent", "Inner", "Place", "SetupEffect", "inner_owners", "on_triad", "pair"]
 
+Place = TypeVar("Place", bound=Hashable)
 
 _TRIADS = {
     "accel": {"input": "specific_force", "u": "f", "SI": "m/s^2", "motions": "many orientations"},
@@ -81,6 +82,7 @@ class Effect(eqx.Module):
     possible: ClassVar[float] = float("inf")  # the most that nature lets the coefficients' root sum of squares be, SI
     known: ClassVar[float] = 0.0  # of a set-up: how well (1σ) a coefficient is known beforehand; 0: not at all
     inner: ClassVar[Mapping[str, Inner]] = MappingProxyType({})
+    shares: ClassVar[str] = ""  # the plain name of another effect whose inner parameters it has, where that is there
     refers_to: ClassVar[str] = "output"  # "input": what the axes sense, before the gain; "output": what they put out
     invertible: ClassVar[bool] = True  # False: what it took away cannot be put back, and `recover` leaves it
     memory: ClassVar[int] = 0  # how many numbers it carries over the end of a path
@@ -184,6 +186,12 @@ class Effect(eqx.Module):
         In `Stimulus.memory` NaN says that there was nothing before.
         """
         raise NotImplementedError
+
+
+def inner_owners(effects: Mapping[Place, Effect]) -> dict[Place, Place]:
+    """Return of each effect the place of that whose inner parameters it has: its own, or of the one it `shares`."""
+    places = {(each.owner, each.plain): place for place, each in effects.items()}
+    return {place: places.get((each.owner, each.shares), place) for place, each in effects.items()}
 
 
 class SetupEffect(Effect):

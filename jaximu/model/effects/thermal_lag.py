@@ -75,6 +75,7 @@ class _ThermalLagSquared(_ThermalLag):
     unit = "output/K^2"
     excited_by = "up and down ramps over a wide range of temperature"
     cause = False
+    shares = "thermal_lag"
 
     def term(self, stimulus):
         return self.coefficients * self.lagged(stimulus)[..., None] ** 2
