@@ -19,7 +19,7 @@ from jaximu.data.field import white_noise
 from jaximu.estimation.fitting import Prior, fit
 from jaximu.estimation.problem import Loss, Name, without_equipment_or_effects
 from jaximu.estimation.uncertainty import station_advice
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.precision import require_float64
@@ -238,7 +238,7 @@ def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]
             for name, (_, error, unit) in measurement.errors(imu).items()}  # fmt: skip
 
 
-def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: FloatArray) -> tuple[Mounting, Mounting]:
+def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: Array) -> tuple[Mounting, Mounting]:
     """Return a unit's mounting, and the covariance (q, q) of each of its fields; zero where it was not fitted."""
     effects = imu.all_effects()
 

@@ -14,6 +14,7 @@ from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import TOLERANCE, Loss, Parameters, without_equipment
 from jaximu.ground import stored
+from jaximu.ground.array_types import Array
 from jaximu.ground.errors import one_of
 from jaximu.ground.precision import require_float64
 from jaximu.model.sensor import Imu
@@ -64,26 +65,35 @@ def _second_step(first: Fit, observations: Observations, method: str, loss: str)
     """
     turning = PosesAndTurns.of(observations, "turning", accelerometer_excess=first.excess[:, 0], method=method)
     second = fit(first.imu, turning, loss=loss)
-    excess = np.concatenate([first.excess[:, :1], second.excess[:, 1:]], axis=1)
 
-    def block(a, b):
+    def block(a, b) -> Array:
         rows, columns = a.shape[1] + b.shape[1], a.shape[2] + b.shape[2]
         out = np.zeros((len(a), rows, columns))
         out[:, : a.shape[1], : a.shape[2]], out[:, a.shape[1] :, a.shape[2] :] = a, b
         return out
 
-    def beside(field):
-        return np.concatenate([field(first), field(second)], axis=1)
+    def beside(one: Array, other: Array) -> Array:
+        return np.concatenate([one, other], axis=1)
 
+    excess = beside(first.excess[:, :1], second.excess[:, 1:])
     return Fit(
-        second.imu, (*first.names, *second.names), beside(lambda f: f.sizes), beside(lambda f: f.values),
-        _two_step_covariance(second.imu, observations, excess), beside(lambda f: f.magnitude_sensitivity),
-        beside(lambda f: f.residual), block(first.jacobian, second.jacobian), excess, first.cost + second.cost,
-        np.maximum(first.steps, second.steps), first.converged & second.converged, first.finite & second.finite,
-    )  # fmt: skip
+        imu=second.imu,
+        names=(*first.names, *second.names),
+        sizes=beside(first.sizes, second.sizes),
+        values=beside(first.values, second.values),
+        covariance=_two_step_covariance(second.imu, observations, excess),
+        magnitude_sensitivity=beside(first.magnitude_sensitivity, second.magnitude_sensitivity),
+        residual=beside(first.residual, second.residual),
+        jacobian=block(first.jacobian, second.jacobian),
+        excess=excess,
+        cost=first.cost + second.cost,
+        steps=beside(first.steps[:, None], second.steps[:, None]).max(axis=1),
+        converged=first.converged & second.converged,
+        finite=first.finite & second.finite,
+    )
 
 
-def _two_step_covariance(model: Imu, observations: Observations, excess: np.ndarray) -> np.ndarray:
+def _two_step_covariance(model: Imu, observations: Observations, excess: Array) -> Array:
     """Return the covariance (N, p, p) of both steps together, in the numbers' units."""
     like = jax.tree.map(lambda leaf: leaf[0], model)
     parameters = Parameters.select(like, without_equipment)

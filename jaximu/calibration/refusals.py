@@ -10,7 +10,7 @@ from jaximu.estimation.fitting import Fit, Prior
 from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import UNDETERMINED
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.quantities import Z95, number
 from jaximu.ground.summary import sentence
@@ -40,7 +40,7 @@ def require_excited(found: Fit, where: str, said: str, record: str) -> None:
 
 
 def require_spanning(
-    covariance: FloatArray, names: Sequence[Name], poses: int, where: str, sensor: str = "accelerometer"
+    covariance: Array, names: Sequence[Name], poses: int, where: str, sensor: str = "accelerometer"
 ) -> None:
     """Refuse what is no calibration: more than a third of the accelerometer's parameters left open.
 

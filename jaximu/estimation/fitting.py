@@ -30,7 +30,7 @@ from jaximu.estimation.data import Conditions, Data
 from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, typical_sizes, unflatten
 from jaximu.estimation.solver import MAX_STEPS, Failure, solve
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, Computed, FloatArray
 from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
 from jaximu.ground.tracing import array_module, is_traced
@@ -120,17 +120,17 @@ class Fit(eqx.Module):
 
     imu: Imu
     names: tuple[Name, ...] = eqx.field(static=True)
-    sizes: Float[Array, "... p"]
-    values: Float[Array, "... p"]
-    covariance: Float[Array, "... p p"]
-    magnitude_sensitivity: Float[Array, "... p"]
-    residual: Float[Array, "... n"]
-    jacobian: Float[Array, "... n p"]
-    excess: Float[Array, "... k"]
-    cost: Float[Array, ...]
-    steps: Int[Array, ...]
-    converged: Bool[Array, ...]
-    finite: Bool[Array, ...]
+    sizes: Float[Computed, "... p"]
+    values: Float[Computed, "... p"]
+    covariance: Float[Computed, "... p p"]
+    magnitude_sensitivity: Float[Computed, "... p"]
+    residual: Float[Computed, "... n"]
+    jacobian: Float[Computed, "... n p"]
+    excess: Float[Computed, "... k"]
+    cost: Float[Computed, ...]
+    steps: Int[Computed, ...]
+    converged: Bool[Computed, ...]
+    finite: Bool[Computed, ...]
 
     def failure(self) -> Failure:
         """Return how an unbatched fit ended."""
@@ -478,7 +478,7 @@ def fit(
     *,
     prior: Prior | None = None,
     loss: str = "linear",
-    excess: Sequence[float] | FloatArray | None = None,
+    excess: Sequence[float] | Array | None = None,
     estimate_excess: bool = True,
     most: Sequence[float] | FloatArray | None = None,
     follow: bool = False,

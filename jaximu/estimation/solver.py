@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from jaximu.estimation.problem import Problem
-from jaximu.ground.array_types import Array
+from jaximu.ground.array_types import Array, Computed
 from jaximu.ground.precision import require_float64
 
 __all__ = ["MAX_STEPS", "Failure", "Solution", "solve"]
@@ -33,13 +33,13 @@ class Solution(eqx.Module):
     `finite` where the numbers did.
     """
 
-    z: Float[Array, " p"]
-    residual: Float[Array, " n"]
-    jacobian: Float[Array, "n p"]
-    cost: Float[Array, ""]
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
-    finite: Bool[Array, ""]
+    z: Float[Computed, " p"]
+    residual: Float[Computed, " n"]
+    jacobian: Float[Computed, "n p"]
+    cost: Float[Computed, ""]
+    steps: Int[Computed, ""]
+    converged: Bool[Computed, ""]
+    finite: Bool[Computed, ""]
 
     def failure(self) -> Failure:
         """Return how an unbatched solve ended."""

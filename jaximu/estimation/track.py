@@ -140,7 +140,7 @@ class Recorded(eqx.Module):
                 slope = smoothed_slope(time, celsius, TEMPERATURE_WINDOW)
                 known[name] = replace(known[name], temperature=celsius, temperature_rate=slope)
         window = np.int64(max(4, accelerometer.samples(_VIBRATION_WINDOW)))
-        recorded = cls(known, np.ones(len(accelerometer), bool), window)  # pyright: ignore[reportArgumentType]
+        recorded = cls(known, np.ones(len(accelerometer), bool), window)
         if len(accelerometer) >= 4 * window:
             power = recorded.vibration(accelerometer.si())
             if np.median(power) > 2 * np.quantile(power, _QUIETEST):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.estimation.problem import TOLERANCE, Name
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.quantities import listed, number, size
 from jaximu.ground.units import SENSOR_UNITS
@@ -87,9 +87,9 @@ def station_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray,
 
 
 def weak_directions(
-    jacobian: FloatArray,
+    jacobian: Array,
     names: Sequence[Name],
-    sizes: FloatArray,
+    sizes: Array,
     model: Imu,
     advice: Callable[..., str] = pose_advice,
 ) -> tuple[int, tuple[WeakDirection, ...]]:
@@ -193,7 +193,7 @@ _CHANCE = 1e-3
 
 
 def allowing_for_neighbours(
-    covariance: FloatArray, sizes: FloatArray, residual: FloatArray, jacobian: FloatArray, place: NDArray[np.int64]
+    covariance: Array, sizes: Array, residual: Array, jacobian: Array, place: NDArray[np.int64]
 ) -> FloatArray | None:
     """Return a covariance (p, p) for errors of which neighbours in time are alike; None where they are not.
 

@@ -8,14 +8,16 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from typing import Any as Array
 
-__all__ = ["Array", "FloatArray"]
+    from jax import Array as Computed
+
+__all__ = ["Array", "Computed", "FloatArray"]
 
 FloatArray = NDArray[np.float64]
 
 
 def __getattr__(name: str) -> Any:
-    """Return `Array`, for which JAX is imported, to the modules that ask for it."""
-    if name != "Array":
+    """Return `Array`, and `Computed` that an editor knows, for which JAX is imported, to the modules that ask."""
+    if name not in ("Array", "Computed"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import jax
 
