@@ -157,7 +157,7 @@ def test_pictures_show_what_was_recorded(recording, calibration, tmp_path):
     loaded = jaximu.load_calibration(tmp_path / "calibration.json")
     assert str(loaded.summary()) == str(calibration.summary())
     for picture in (loaded.plot_residuals, loaded.plot_recording):
-        with pytest.raises(InputError, match="a file does not keep"):
+        with pytest.raises(InputError, match="do not keep"):
             picture()
 
 

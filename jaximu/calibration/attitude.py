@@ -13,7 +13,7 @@ import scipy
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
-from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
+from jaximu.calibration.refusals import require_determined
 from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, reference_sigmas
 from jaximu.data.field import white_noise
 from jaximu.estimation.fitting import Prior, fit
@@ -134,25 +134,17 @@ def calibrate_against_attitude(
         free = without_equipment_or_effects if unit is None else biases_and_setup
         found = fit(imu, measurement, free, prior=prior, loss=loss)
         where = recording.name
-        if bool(found.finite):
-            require_excited(found, where, f"{attitude.name} shows too few turns, which", _RECORD)
-        require_solved(found, where)
-        refuse_undetermined(found, prior)
-    before, after = (_rms(measurement, each) for each in (imu, found.imu))
+        require_determined(found, where, f"{attitude.name} shows too few turns, which", _RECORD, prior)
     likeness = _same_unit(recording, begun, found.imu)
     calibration = concluded(
         found, gravity=gravity, method="reference", loss=loss, advice=station_advice, excess_names=EXCESS_NAMES,
-        rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
+        rms=[_rms(measurement, each) for each in (imu, found.imu)], known=list(filter(of_setup, found.names)),
         data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
         notes=[*likeness, *ready.notes, *recording.notes, *begun.attitude.notes,
                *(() if noise is None else noise.notes)],
         nominal=imu.with_effects(), reading=recording.reading,
     )  # fmt: skip
-    # of the set-up's own numbers nobody asks how well they are known
-    fixed = {name for name in found.names if of_setup(name)}
-    weak = tuple(each for each in calibration.weak if not fixed.issuperset(name for name, _ in each.parameters))
-    covariance = calibration.covariance + _of_shape(calibration, measurement)
-    calibration = replace(calibration, weak=weak, covariance=covariance)
+    calibration = replace(calibration, covariance=calibration.covariance + _of_shape(calibration, measurement))
     notes = (*(each.text for each in arrangement(recording, calibration)), *calibration.notes)
     calibration = replace(calibration, notes=tuple(dict.fromkeys(notes)))
     return replace(calibration, reference=reference_summary(calibration)), measurement

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -109,7 +109,7 @@ class Calibration(Described, Document):
         return later("report.figures", "residuals_of")(self)
 
     def plot_recording(self) -> Figure:
-        """Return a figure of the recording with its poses. Raises `InputError` where a file does not keep it."""
+        """Return a figure of the recording with its poses. Raises `InputError` where it is not kept."""
         return later("report.figures", "recording_of")(self)
 
     @property
@@ -268,18 +268,27 @@ def concluded(
     method: str,
     loss: str,
     excess_names: Sequence[str],
+    rms: Sequence[Mapping[str, tuple[float, str]]],
     notes: Sequence[str],
     advice: Callable[..., str] = pose_advice,
+    known: Collection[Name] = (),
     **working: Any,
 ) -> Calibration:
-    """Return the calibration that a fit is: rank, weak directions, excess and covariance are those of its model."""
+    """Return the calibration that a fit is: rank, weak directions, excess and covariance are those of its model.
+
+    **Arguments:** `rms`: the sizes of its errors before and after. `known`: numbers of which something is known
+    beforehand; of these alone nobody asks whether the data tell them. `working`: fields of `Calibration`.
+    """
     rank, weak = weak_directions(np.asarray(found.jacobian), found.names, found.sizes, found.imu, advice)
+    weak = tuple(one for one in weak if not set(known).issuperset(name for name, _ in one.parameters))
+    before, after = rms
     excess: dict[str, float] = dict(zip(excess_names, np.asarray(found.excess).tolist(), strict=False))
     clock = clock_sigma(working.get("segmentations", ()))
     return Calibration(
         imu=jax.tree.map(np.asarray, found.imu), names=found.names,
         covariance=found.total_covariance(gravity.sigma, clock), gravity=gravity, method=method, loss=loss, rank=rank,
-        weak=weak, excess=excess, solver=found.failure().value, notes=tuple(dict.fromkeys(notes)), fit=found, **working,
+        weak=weak, rms={name: (before[name][0], *size) for name, size in after.items()}, excess=excess,
+        solver=found.failure().value, notes=tuple(dict.fromkeys(notes)), fit=found, **working,
     )  # fmt: skip
 
 

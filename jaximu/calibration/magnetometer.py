@@ -16,7 +16,7 @@ from jaximu.calibration.calibration import Calibration, concluded, effect_named,
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import Choices, calibrate_ready
-from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved
+from jaximu.calibration.refusals import relative_covariance, require_determined
 from jaximu.data.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.estimation.fitting import Fit, Prior, fit, informed
 from jaximu.estimation.problem import Name
@@ -223,8 +223,7 @@ def _calibrated(
             f"{where}: no one field explains what was recorded, and the fit did not converge. Keep iron, magnets and "
             "currents away, check the columns' unit, and record again."
         )
-    require_solved(found, where)
-    refuse_undetermined(found)
+    require_determined(found, where)
     measurement = _measured(windows, field)
     n = np.arange(len(windows))
     place = n if windows.alone else np.concatenate([n, np.repeat(n, 2), n])
@@ -239,7 +238,7 @@ def _calibrated(
     readings = (log.reading if log.recording is None else log.recording.reading for log in logs)
     own = concluded(
         found, gravity=gravity, method="magnetometer", loss="linear", excess_names=EXCESS_NAMES,
-        rms={"field_strength": (*(_spread(each, windows, known) for each in (start, found.imu)), "uT")},
+        rms=[{"field_strength": (_spread(each, windows, known), "uT")} for each in (start, found.imu)],
         data=_data(logs, windows), nominal=start, advice=field_advice,
         notes=[*(note for each in logs for note in each.notes), *notes, *said, *stretches],
         reading=next(filter(None, readings), None if base is None else base.reading),

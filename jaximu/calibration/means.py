@@ -10,7 +10,7 @@ import numpy as np
 from jaximu.calibration.calibration import Calibration, concluded, provenance
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.calibration.refusals import relative_covariance, require_solved, require_spanning
+from jaximu.calibration.refusals import require_determined
 from jaximu.data.poses import EXCESS_NAMES, PosesAndTurns, residual_rms
 from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.problem import Loss, Name, names_of, without_equipment_or_effects
@@ -62,12 +62,9 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
         )
     else:
         found = fit_hand_held(nominal, observations, method, loss)
-    if bool(found.finite):
-        require_spanning(relative_covariance(found), found.names, poses, where)
-    require_solved(found, where)
+    require_determined(found, where, poses=poses)
     if method == "accelerometer":
         found = replace(found, imu=Imu(found.imu.accelerometer, None))
-    before, after = (residual_rms(imu, observations, method == "joint") for imu in (nominal, found.imu))
     stated = {"accelerometer": means.accelerometer_sigma is not None or prior is not None}
     if method == "joint":
         stated["gyroscope"] = means.gyroscope_sigma is not None
@@ -78,14 +75,13 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     data = {key: value for key, value in provenance([recording]).items() if "rate" not in key}
     calibration = concluded(
         found, gravity=gravity, method=method, loss=loss, excess_names=EXCESS_NAMES,
-        rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
+        rms=[residual_rms(imu, observations, method == "joint") for imu in (nominal, found.imu)],
+        known=() if prior is None else prior.names,
         data=data | {"poses": poses, "turns": 0}, notes=(*recording.notes, *notes), observations=observations,
         nominal=nominal, reading=recording.reading,
     )  # fmt: skip
     known = {name: size for name, size in calibration.excess.items() if stated.get(name)}
-    held = set() if prior is None else set(map(str, prior.names))
-    weak = [one for one in calibration.weak if not held.issuperset(name for name, _ in one.parameters)]
-    return replace(calibration, excess=known, weak=tuple(weak))
+    return replace(calibration, excess=known)
 
 
 def _step(values: FloatArray) -> float:

@@ -13,12 +13,13 @@ from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, 
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.calibration.refusals import refuse_undetermined, relative_covariance, require_solved, require_spanning
+from jaximu.calibration.refusals import require_determined
 from jaximu.calibration.saturation import saturation
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import with_drift
 from jaximu.data.poses import EXCESS_NAMES, residual_rms
-from jaximu.estimation.fitting import Prior, fit
+from jaximu.estimation.data import Data
+from jaximu.estimation.fitting import Prior, fit, linearise
 from jaximu.estimation.problem import Loss
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -40,8 +41,11 @@ __all__ = [
     "calibrate_ready",
 ]
 
+_SAME = 1e-9
+"""Share by which two statements of one gravity may differ."""
 _ROUNDS = 4
 """Times that turns which lost time are looked for."""
+_RECORD = "Rest in six orientations or more, each axis up and down, and turn about each axis between rests."
 _NO_DRIFT = (
     "The intervals of the biases leave out slow drift: use the joint method with the linear loss, or add --static LOG."
 )
@@ -61,9 +65,10 @@ class Choices:
 
 
 def calibrate(
-    recordings: Recording | Sequence[Recording],
+    recordings: Recording | Data | Sequence[Recording | Data],
     gravity: Gravity = STANDARD,
     *,
+    start: Imu | None = None,
     static: Recording | NoiseModel | None = None,
     segmentation: SegmentationOptions | None = None,
     effects: Sequence[str | Effect] = (),
@@ -76,7 +81,12 @@ def calibrate(
 
     **Arguments:**
 
-    - `recordings`: one or several recordings of the same unit, in the same units and axes.
+    - `recordings`: one or several recordings of the same unit, in the same units and axes. Data of other kinds may
+      stand beside them, [`jaximu.data.RecordedStations`][] of a table or [`jaximu.data.AgainstAttitude`][] of optics:
+      one fit then knows what each of them tells. Biases are one unit's in all of them, no new power-on between, and
+      their intervals leave out slow drift without `static`.
+    - `start`: with such data, the unit where the fit starts, and the effects of their set-ups; the data sheet's values
+      if left out.
     - `gravity`: local gravity; its uncertainty goes into the scales'. Where it states a latitude, the Earth's rotation
       is in the model, its heading free (one recording, every turn between its poses usable).
     - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
@@ -96,13 +106,83 @@ def calibrate(
     beforehand; the message says what to record.
     """
     gravity = as_gravity(gravity)
-    recordings = recordings_of(recordings)
+    given = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
+    data = [one for one in given if isinstance(one, Data)]
+    by_hand = [one for one in given if not isinstance(one, Data)]
+    recordings = recordings_of(by_hand)
     choices = Choices(gravity, static, segmentation, effects, effect_sigmas, method, loss)
+    if data:
+        return _calibrated_jointly(recordings, data, choices, start, repair)
     with prepared(recordings, repair, gyroscope=method != "accelerometer") as ready:
         found, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
     told = [*(note for each in ready for note in each.notes), *(each.text for each in unusual)]
     found = replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
     return found if static is not None else _with_drift(found)
+
+
+def _calibrated_jointly(
+    recordings: Sequence[Recording], data: Sequence[Data], choices: Choices, start: Imu | None, repair: bool
+) -> Calibration:
+    """Return the calibration of one fit to several kinds of data, recordings by hand among them."""
+    require_float64()
+    if choices.method != "joint":
+        raise InputError(f"data of several kinds are fitted jointly: leave the method {choices.method!r} out.")
+    for one in data:
+        if np.shape(one.gravity):
+            raise InputError("data of several units make no calibration of one: take one unit's, or use jaximu.fit.")
+        known, stated = float(one.gravity), choices.gravity.value
+        if abs(known / stated - 1) > _SAME:
+            raise InputError(
+                f"some data were observed at a gravity of {known:.6g} m/s² and {stated:.6g} m/s² was given: state the "
+                "same, gravity=…, for all."
+            )
+    kinds, noise, parts = list(data), noise_of(choices.static), ()
+    with prepared(recordings, repair) as ready:
+        if ready:
+            parts = tuple(segment(one.recording, choices.segmentation) for one in ready)
+            kinds = [RecordedByHand(parts, observed_poses(parts, choices.gravity.value, noise=noise)), *kinds]
+    recorded = [recording for kind in kinds for recording in kind.recordings]
+    notes = [note for one in ready for note in one.notes]
+    notes += [note for recording in recorded for note in recording.notes]
+    said: tuple[str, ...] = ()
+    unit = Imu.nominal() if start is None else start
+    if start is None and recorded:
+        unit, said = nominal_imu(recorded[0])
+    fitted = [*unit.all_effects().values(), *map(effect_named, choices.effects)]
+    unit = jax.tree.map(np.asarray, unit.with_effects(*fitted))
+    prior = Prior.of_effects(unit, choices.effect_sigmas)
+    found = fit(unit, kinds, prior=prior, loss=choices.loss)
+    where = ", ".join(recording.name for recording in recorded) or "these data"
+    require_determined(found, where, "these data together", _RECORD, prior)
+    calibration = concluded(
+        found,
+        gravity=choices.gravity,
+        method="joint",
+        loss=choices.loss,
+        excess_names=_distinct([name for kind in kinds for name in kind.excess_names]),
+        rms=[_errors(kinds, imu) for imu in (unit, found.imu)],
+        notes=[*notes, *said],
+        advice=kinds[0].advice,
+        known=() if prior is None else prior.names,
+        data=provenance(recorded) if recorded else {},
+        nominal=unit,
+        reading=recorded[0].reading if recorded else None,
+    )
+    return replace(calibration, covariance=found.total_covariance(choices.gravity.sigma, clock_sigma(parts)))
+
+
+def _errors(kinds: Sequence[Data], imu: Imu) -> dict[str, tuple[float, str]]:
+    """Return the rms of each kind of residual of all data, with its unit."""
+    sizes: list[tuple[str, tuple[float, str]]] = []
+    for kind in kinds:
+        linear = linearise(imu, kind, kind.free)
+        sizes += kind.rms(imu.with_effects(), linear.details, linear.conditions).items()
+    return dict(zip(_distinct([name for name, _ in sizes]), (size for _, size in sizes), strict=True))
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Return names with a number after those that were there before."""
+    return [f"{name} {count + 1}" if (count := names[:place].count(name)) else name for place, name in enumerate(names)]
 
 
 def _with_drift(found: Calibration) -> Calibration:
@@ -185,9 +265,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     found = fit_hand_held(nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
     poses, turns = (int(np.sum(mask)) for mask in (observations.poses.mask, observations.turns.mask))
-    if bool(found.finite):  # along directions left open a fit may creep until its steps run out
-        require_spanning(relative_covariance(found), found.names, poses, where)
-    require_solved(found, where)
+    require_determined(found, where, poses=poses)
     keep_gyroscope = method != "accelerometer"
     before = residual_rms(nominal, observations, keep_gyroscope)
     sigmas, prior = dict(choices.effect_sigmas or {}), None
@@ -200,26 +278,22 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         start = jax.tree.map(np.asarray, found.imu).with_effects(*chosen)
         prior = Prior.of_effects(start, sigmas)
         found = fit(start, measurement, prior=prior, loss=loss, excess=found.excess)
-        require_solved(found, where)
-        refuse_undetermined(found, prior)
+        require_determined(found, where, prior=prior)
         observations = measurement.along(found.imu, tuple(found.imu.all_effects().values())).observations
     notes = (*(note for recording in recordings for note in recording.notes), *notes, *mixed,
              *(() if noise is None else noise.notes),
              *(note for part in segmentations for note in part.notes))  # fmt: skip
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)
-    after = residual_rms(found.imu.with_effects(), observations, keep_gyroscope)
-    calibration = concluded(
+    return concluded(
         found if keep_gyroscope else replace(found, imu=Imu(found.imu.accelerometer, None)),
         gravity=gravity, method=method, loss=loss, excess_names=EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1],
-        rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
+        rms=[before, residual_rms(found.imu.with_effects(), observations, keep_gyroscope)],
+        known=() if prior is None else prior.names,
         data=provenance(recordings) | {"poses": poses, "turns": turns} | _mean_temperature(recordings, observations),
         notes=notes, observations=observations, segmentations=segmentations, nominal=nominal,
         reading=recordings[0].reading,
     )  # fmt: skip
-    known = () if prior is None else prior.names  # of what is known beforehand nobody asks whether the data tell it
-    weak = tuple(each for each in calibration.weak if not {name for name, _ in each.parameters} <= set(known))
-    return replace(calibration, weak=weak)
 
 
 def _headings_known(segmentations: Sequence[Segmentation], observations: Observations) -> bool:

@@ -15,7 +15,24 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.quantities import Z95, number
 from jaximu.ground.summary import sentence
 
-__all__ = ["refuse_undetermined", "relative_covariance", "require_excited", "require_solved", "require_spanning"]
+__all__ = ["refuse_undetermined", "relative_covariance", "require_determined", "require_solved", "require_spanning"]
+
+
+def require_determined(
+    found: Fit, where: str, shown: str = "", record: str = "", prior: Prior | None = None, poses: int | None = None
+) -> None:
+    """Raise `NotPossibleError` for a fit that is no calibration: left open, not solved, effects not told.
+
+    **Arguments:** `shown`, `record`: what was seen and what to record, for the message; or `poses`, by hand. `prior`:
+    what is known of effects beforehand.
+    """
+    if bool(found.finite):  # along directions left open a fit may creep until its steps run out
+        if poses is not None:
+            require_spanning(relative_covariance(found), found.names, poses, where)
+        elif shown:
+            require_excited(found, where, shown, record)
+    require_solved(found, where)
+    refuse_undetermined(found, prior)
 
 
 def require_solved(found: Fit, where: str) -> None:

@@ -249,19 +249,15 @@ def calibrate_by_filter(
         names_chosen = {each.name for each in chosen}
         terms = tuple(each for each in imu.all_effects().values() if each.name in names_chosen)
         cleaned = RecordedByHand(start.segmentations, start.observations).along(imu, terms).observations
-    after = residual_rms(imu.with_effects(), cleaned)
     calibration = concluded(
         found, advice=state_advice, gravity=gravity, method="filter", loss="linear",
         excess_names=measurement.excess_names,
-        rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()}, data=start.data,
+        rms=[before, residual_rms(imu.with_effects(), cleaned)], known=known_before.names, data=start.data,
         notes=[*ready.notes, *(() if mounted is None else mounted.attitude.notes), *(each.text for each in findings),
                *start.notes, *notes, *noise.notes],
         observations=start.observations, segmentations=start.segmentations, nominal=start.nominal,
         reading=start.reading,
     )  # fmt: skip
-    beforehand = set(known_before.names)
-    weak = tuple(each for each in calibration.weak if not {name for name, _ in each.parameters} <= beforehand)
-    calibration = replace(calibration, weak=weak)
     if mounted is not None:
         smoothed = {"filter": mounted.summary["filter"]}  # as it was found first
         calibration = replace(calibration, reference=reference_summary(calibration) | smoothed)
@@ -274,7 +270,9 @@ def calibrate_by_filter(
         "noise": _scaled_noise(measurement.errors, noise, float(found.excess[0])),
         "nis": float(history.innovations.sum() / history.freedom.sum()),
         "open": [
-            each.text for each in weak if not (each.determined and {name for name, _ in each.parameters} <= of_effects)
+            each.text
+            for each in calibration.weak
+            if not (each.determined and {name for name, _ in each.parameters} <= of_effects)
         ],
     }
     return replace(calibration, filter=summary), history

@@ -12,7 +12,7 @@ import scipy
 
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
-from jaximu.calibration.refusals import refuse_undetermined, require_excited, require_solved
+from jaximu.calibration.refusals import require_determined
 from jaximu.data.observe_stations import observe_stations
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.stations import KnownStations, station_rms
@@ -165,13 +165,9 @@ def calibrate_table_ready(
     where = ", ".join(recording.name for recording in recordings)
     used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
     poses, turns = (int(np.sum(used & (np.asarray(stations.turn) == kind))) for kind in (False, True))
-    if bool(found.finite):  # along directions left open a fit may creep until its steps run out
-        seen = f"{counted(poses, 'pose')} and {counted(turns, 'turn')}"
-        require_excited(found, where, f"the reference has {seen} that can be used, which", _RECORD)
-    require_solved(found, where)
-    refuse_undetermined(found)
+    seen = f"{counted(poses, 'pose')} and {counted(turns, 'turn')}"
+    require_determined(found, where, f"the reference has {seen} that can be used, which", _RECORD)
     found = _at_rest_where_open(found, start)
-    before, after = station_rms(start, stations), station_rms(found.imu, stations)
     notes = (
         *(note for recording in recordings for note in recording.remarks),
         *(note for one in ready for note in one.notes), *(() if noise is None else noise.notes), *said,
@@ -179,7 +175,7 @@ def calibrate_table_ready(
     calibration = concluded(
         found, gravity=gravity, method="turntable", loss=loss, advice=station_advice, notes=notes,
         excess_names=EXCESS_NAMES if nominal.gyroscope is not None else EXCESS_NAMES[:1],
-        rms={name: (before[name][0], value, unit) for name, (value, unit) in after.items()},
+        rms=[station_rms(imu, stations) for imu in (start, found.imu)],
         data=provenance(recordings) | {"poses": poses, "turns": turns},
         stations=stations, nominal=nominal, reading=recordings[0].reading,
         absent=() if "accelerometer" in recordings[0].signals else ("accelerometer",),

@@ -5,12 +5,16 @@ from typing import TYPE_CHECKING
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
+    from jaximu.data.attitude import AgainstAttitude
     from jaximu.data.poses import forces_and_angles, residual_rms
+    from jaximu.data.recorded_stations import RecordedStations
     from jaximu.data.rest_blocks import Leg, RestBlocks, without_startup
     from jaximu.data.station_error import turntable_error
 
 __all__ = [
+    "AgainstAttitude",
     "Leg",
+    "RecordedStations",
     "RestBlocks",
     "forces_and_angles",
     "residual_rms",

@@ -11,14 +11,23 @@ import numpy as np
 
 from jaximu.data.drift import drift_components, mean_output_reactions
 from jaximu.data.handling import bend, handling, moved_by_hand, sway
-from jaximu.data.poses import COARSE_EXCESS, EXCESS_NAMES, Along, PosesAndTurns, pose_rows, residual_rms
+from jaximu.data.poses import (
+    COARSE_EXCESS,
+    EXCESS_NAMES,
+    NO_FIXTURE,
+    Along,
+    PosesAndTurns,
+    felt_by_hand,
+    pose_rows,
+    residual_rms,
+)
 from jaximu.data.tracks_by_hand import rest_shifts, samples_by_hand
 from jaximu.data.twin_by_hand import twin_recordings
 from jaximu.estimation.data import About, Data, Handling, Observed
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import pose_advice
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import rotation_matrix_on_host
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -41,7 +50,7 @@ class RecordedByHand(Data):
     excess_names = EXCESS_NAMES
     coarse = COARSE_EXCESS
     by_hand = True
-    no_fixture = "a hand-held recording has no set-up to compare with"
+    no_fixture = NO_FIXTURE
     advice = staticmethod(pose_advice)
 
     @cached_property
@@ -56,7 +65,7 @@ class RecordedByHand(Data):
     def about(self, imu: Imu) -> About:
         """Return the conditions about one unit, the leading axis of length one, and its effects' columns."""
         unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        along = self.along(unit, tuple(unit.all_effects().values()))
+        along = self.along(unit, felt_by_hand(unit))
         covariance = along.condensed.covariance
         columns = self.own_columns(unit, along, covariance.used.shape[1])[None]
         return About(along.condensed.conditions, covariance, columns, along)
@@ -72,6 +81,11 @@ class RecordedByHand(Data):
         return self.data.reactions(details)
 
     # --- what a diagnosis needs to know ---------------------------------------------------------------------------
+
+    @property
+    def gravity(self) -> Array:
+        """Local gravity, m/s²."""
+        return self.observations.gravity
 
     @property
     def recordings(self) -> tuple[Recording, ...]:

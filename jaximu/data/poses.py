@@ -35,6 +35,7 @@ from jaximu.data.preintegration import Turned, linear_slope
 from jaximu.data.tracks_by_hand import SamplesByHand, during_turns, pose_means, samples_by_hand, tracks_by_hand
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import Track, added, mean_outputs
@@ -63,12 +64,14 @@ from jaximu.recordings.segmentation import observed_poses, segment
 __all__ = [
     "COARSE_EXCESS",
     "EXCESS_NAMES",
+    "NO_FIXTURE",
     "RESIDUALS",
     "Condensed",
     "HandHeldConditions",
     "PosesAndTurns",
     "condense",
     "condensed",
+    "felt_by_hand",
     "forces_and_angles",
     "observe",
     "only",
@@ -79,6 +82,7 @@ __all__ = [
 ]
 
 EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
+NO_FIXTURE = "a hand-held recording has no set-up to compare with"
 COARSE_EXCESS = (1e2, 1e4, 1e2)
 """The first pass starts at the data sheet's values, percents away: weights as sharp as the noise would make it chase
 wrong minima, so they are blunted by this excess. The next pass finds the right ones."""
@@ -227,6 +231,7 @@ class PosesAndTurns(Observations, Data):
 
     excess_names = EXCESS_NAMES
     coarse = COARSE_EXCESS
+    no_fixture = NO_FIXTURE
 
     @classmethod
     def of(cls, observations: Observations, conditions: str = "all", **settings: Any) -> Self:
@@ -262,20 +267,20 @@ class PosesAndTurns(Observations, Data):
 
     def about(self, imu: Imu) -> About:
         """Return the conditions about units; raise `InputError` for effects where there are no samples."""
-        data, effects = self._by_unit(), imu.all_effects()
+        data, effects = self._by_unit(), felt_by_hand(imu)
         if not effects:
             details = condensed(imu, data, self.conditions, self.method, data.accelerometer_excess)
-            none = np.zeros((*details.covariance.used.shape, 0))
+            none = np.zeros((*details.covariance.used.shape, len(effect_numbers(imu)[0])))
             return About(details.conditions, details.covariance, none, details)
         if not self.samples:
-            names = ", ".join(effect.name for effect in effects.values())
+            names = ", ".join(effect.name for effect in effects)
             raise InputError(
                 f"{names} cannot be fitted to poses and turns alone, which hold no samples along which effects act: "
                 "observe them with samples=True, or name the effects to jaximu.calibrate."
             )
 
         def one(imu: Imu, data: Self) -> tuple[Any, ...]:
-            details = data.along(imu, tuple(imu.all_effects().values()))
+            details = data.along(imu, felt_by_hand(imu))
             evaluated = jax.tree.map(lambda leaf: leaf[0], (details.condensed.conditions, details.condensed.covariance))
             return *evaluated, data.own_columns(imu, details, len(evaluated[1].used))
 
@@ -348,6 +353,11 @@ class PosesAndTurns(Observations, Data):
 def _without_added(imu: Imu, data: PosesAndTurns, tracks: Sequence[dict[str, Track]]) -> PosesAndTurns:
     """Return data without what a unit's effects add along the tracks of each recording."""
     return data.moved([{name: -values for name, values in added(imu, track).items()} for track in tracks])
+
+
+def felt_by_hand(imu: Imu) -> tuple[Effect, ...]:
+    """Return the effects of a unit that a recording by hand feels: none of a set-up."""
+    return tuple(effect for effect in imu.all_effects().values() if effect.scope != "fixture")
 
 
 def observe(

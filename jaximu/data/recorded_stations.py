@@ -5,13 +5,14 @@ In a station the unit goes through what the set-up says, in between through what
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from jaximu.data.observe_stations import observe_stations
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.stations import KnownStations, StationConditions, station_covariances, station_rms, station_rows
 from jaximu.estimation.data import About, Data, Observed
@@ -19,11 +20,13 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import Track, added, mean_outputs, stimuli
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.model.noise import drawn_noise
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording
+from jaximu.recordings.reference import Entry, entries_of_columns
 
 __all__ = ["AtStations", "RecordedStations", "output_reaction", "station_of"]
 
@@ -50,6 +53,21 @@ class RecordedStations(Data):
 
     excess_names = EXCESS_NAMES
     coarse = KnownStations.coarse
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        references: Sequence[Entry] | None = None,
+        gravity: Gravity = STANDARD,
+        noise: NoiseModel | None = None,
+    ) -> RecordedStations:
+        """Return a recording at known poses and turns; `references`: what the set-up says, or its columns, if None.
+
+        Raises what `jaximu.data.observe_stations.observe_stations` raises.
+        """
+        entries = entries_of_columns(recording) if references is None else references
+        return cls(recording, observe_stations(recording, entries, as_gravity(gravity).value, noise)[0])
 
     def free(self, name: Name) -> bool:
         """Return whether a number is free: all are, for the body frame is the fixture's."""
@@ -78,6 +96,11 @@ class RecordedStations(Data):
             return mean_outputs(tracks, added(imu.with_effects(effect), tracks), count).reshape(-1)
 
         return f"stations {count}", of, details.tracks
+
+    @property
+    def gravity(self) -> Array:
+        """Local gravity, m/s²."""
+        return self.stations.gravity
 
     @property
     def recordings(self) -> tuple[Recording, ...]:

@@ -361,7 +361,7 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
     calibrated = concluded(
         found, gravity=calibration.gravity, method=calibration.method, loss="linear", advice=experiment.data.advice,
         excess_names=experiment.excess_names,
-        rms={name: (before[name][0], size, unit) for name, (size, unit) in after.items()},
+        rms=[before, after],
         data=calibration.data, notes=calibration.notes, segmentations=calibration.segmentations,
         nominal=calibration.nominal, reading=calibration.reading,
     )  # fmt: skip
@@ -569,9 +569,13 @@ def _examined(examination: Examination) -> Diagnosis:
             gain = on_held_out(other, base, state)
         else:
             gain = measured(experiment, base, state) if measured is not None else cross_validated(experiment, base)
-        (first_kind, *_) = [gain.best_kind(each) for each in state.effects]
-        worse = measured is not None and gain.after.rms[first_kind][0] >= gain.before.rms[first_kind][0]
-        if (gain.log_likelihood <= 0 or (worse and gain.log_likelihood < _GUESSED)) and not taken:
+        if full := _saturated(experiment, state):
+            notes.append(
+                f"with {', '.join(effect_title(entry.name) for entry in found)} the model has as many parameters as "
+                f"there are conditions of {full[0]}: it would fit anything, so nothing confirms it. Record more poses."
+            )
+            complete = False
+        elif not gain.improved(state.effects) and not taken:
             names = ", ".join(effect_title(entry.name) for entry in found)
             notes.append(
                 f"{names} would explain part of this recording but does not improve data that was not fitted "
@@ -579,12 +583,6 @@ def _examined(examination: Examination) -> Diagnosis:
                 f"log-likelihood {gain.log_likelihood:+.1f}), and was not kept."
             )
             found, state, gain, complete = [], base, None, False
-        elif full := _saturated(experiment, state):
-            notes.append(
-                f"with {', '.join(effect_title(entry.name) for entry in found)} the model has as many parameters as "
-                f"there are conditions of {full[0]}: it would fit anything, so nothing confirms it. Record more poses."
-            )
-            complete = False
     shape = None if complete else shape_of(base.evidence, level)
     learned = None if complete else learn(experiment, state if taken else base, other)
     if shape is not None and learned is not None and shape[1] > learned.gain.log_likelihood:

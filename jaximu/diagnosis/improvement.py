@@ -56,6 +56,11 @@ class Gain:
         """What the extension gains, nats."""
         return self.after.log_likelihood - self.before.log_likelihood
 
+    def improved(self, effects: Sequence[Effect]) -> bool:
+        """Return whether what was left out is more likely with the extension, and some error of it smaller."""
+        kinds = {self.best_kind(effect) for effect in effects}
+        return self.log_likelihood > 0 and any(self.after.rms[kind][0] < self.before.rms[kind][0] for kind in kinds)
+
     def errors(self, kind: str) -> str:
         """Return the rms errors of a kind of residual without and with the extension, as a person reads them."""
         return change(self.before.rms[kind][0], *self.after.rms[kind])

@@ -113,8 +113,11 @@ class Data(ABC):
 
     effects_inside: the conditions evaluate effects themselves; else `about` gives their columns. coarse: the excess to
     begin with. owners: whose effects can show. by_hand: hands moved the unit. no_fixture: why effects of a set-up
-    cannot show, empty where they can. advice: says what to record where numbers stay open.
+    cannot show, empty where they can. advice: says what to record where numbers stay open. gravity: m/s², () or of
+    units (N,).
     """
+
+    gravity: Float[Array, " ..."]
 
     effects_inside: ClassVar[bool] = False
     excess_names: tuple[str, ...] = ()
@@ -158,6 +161,9 @@ class Data(ABC):
         effects, by_effect = imu.all_effects(), {}
         for place, effect in effects.items():
             kind = type(effect)
+            if self.no_fixture and effect.scope == "fixture":
+                by_effect[place] = numerics.zeros((rows, effect.size + len(effect.inner)))
+                continue
 
             def derivatives(imu, part, numbers, kind=kind):
                 return derivatives_by_numbers(kind, lambda varied: react(varied, imu, part), numbers)

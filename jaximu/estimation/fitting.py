@@ -492,7 +492,8 @@ def fit(
     - `imu`: where the fit starts: gain and bias as the data sheet or an old calibration has them, and the effects to be
       fitted, or to be held, with their numbers.
     - `data`: what was measured; several of one unit are one problem.
-    - `free`: which numbers are free, by name. When an effect begins is held: no derivative tells it.
+    - `free`: which numbers are free, by name; what any of the data may tell, if left out. When an effect begins is
+      held: no derivative tells it.
     - `prior`: what is known beforehand. A number of which it says nothing is known to five typical sizes about its
       start, so a problem is never singular; where data speak, that counts for less than a millionth.
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
@@ -558,7 +559,8 @@ class _Passes:
     ):  # fmt: skip
         self.data, self.estimated, self.follow = data, estimated, follow
         self.prior, self.most, self.max_passes, self.blunted = prior, most, max_passes, blunted
-        self.numerics, self.how, free = numerics, how, free or data[0].free
+        self.numerics, self.how = numerics, how
+        free = free or (lambda name: any(kind.free(name) for kind in data))
         inside = data[0].effects_inside
         self.full = imu
         bare = imu if inside else imu.with_effects()

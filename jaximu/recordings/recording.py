@@ -358,7 +358,7 @@ class Recording(Described, Comparable):
         return Summary(names or "recording", (sentence(said),), table, tuple(map(sentence, self.notes)))
 
 
-def recordings_of(given: "Recording | Sequence[Recording]") -> list[Recording]:
+def recordings_of(given: "Recording | Sequence[Any]") -> list[Recording]:
     """Return one recording or several as a list. Raises InputError for anything else, saying how to read a file."""
     found = [given] if isinstance(given, Recording) else list(given) if isinstance(given, (list, tuple)) else None
     wrong = [given] if found is None else [each for each in found if not isinstance(each, Recording)]

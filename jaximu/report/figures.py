@@ -160,7 +160,9 @@ def recording_of(calibration: Calibration) -> Figure:
     """Draw what a calibration was made from, with the poses found. Raises `InputError` where it is not kept."""
     parts = calibration.segmentations
     if not parts:
-        raise InputError("this calibration holds no recording with poses: a file does not keep it; calibrate again.")
+        raise InputError(
+            "this calibration holds no recording with poses: files and fits to several kinds of data do not keep it."
+        )
     rows = 1 if parts[0].recording.gyroscope is None else 2
     figure = new_figure(2.0 + 2.0 * rows)
     grid = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
@@ -203,7 +205,9 @@ def residuals_of(calibration: Calibration) -> Figure:
     """Draw the errors of a calibration by pose and turn. Raises `InputError` where they are not kept."""
     found = evidence(calibration)
     if found is None:
-        raise InputError("this calibration holds no errors by pose: a file does not keep them; calibrate again.")
+        raise InputError(
+            "this calibration holds no errors by pose: files and fits to several kinds of data do not keep them."
+        )
     return residual_figure(found)
 
 

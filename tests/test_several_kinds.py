@@ -1,0 +1,103 @@
+"""Recordings of several kinds in one fit: each tells what the others do not, and truth stays within the intervals."""
+
+import jax
+import numpy as np
+import pytest
+from test_reference import GRAVITY, moved, reference_of, unit_of
+
+import jaximu
+from jaximu.calibration import calibrate_against_attitude
+from jaximu.data import RecordedStations
+from jaximu.model.sensor import Imu, Triad
+from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import Environment, HandHeld, Positions
+
+UNITS = 6
+EXACT = jaximu.LocalGravity(9.80665, 0.0)
+
+
+def errors(calibration, truth) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of all numbers of gain and bias (24,), and their standard deviations; zero where not fitted."""
+    off, sigmas = [], []
+    for triad, model in calibration.triads().items():
+        gain, bias = calibration.sigma(triad)
+        true = truth.triads()[triad]
+        off += [np.where(gain > 0, model.gain - true.gain, 0.0).ravel(), model.bias - true.bias]
+        sigmas += [gain.ravel(), bias]
+    return np.concatenate(off), np.concatenate(sigmas)
+
+
+def scores(calibration, truth) -> np.ndarray:
+    """Return the errors of the fitted numbers over their standard deviations."""
+    off, sigma = errors(calibration, truth)
+    return off[sigma > 0] / sigma[sigma > 0]
+
+
+@pytest.fixture(scope="module")
+def by_hand_and_on_a_table():
+    """Return for each unit its truth, and what is found by hand, on a table, and of both together."""
+    found = []
+    for seed in range(UNITS):
+        truth = jax.tree.map(np.asarray, draw_imu(seed))
+        log = simulate(truth, HandHeld(14, 2.0), consumer_noise(), rate=50.0, seed=seed)[0]
+        turned, schedule = simulate(truth, Positions(12, 4.0, 2.0), consumer_noise(), rate=50.0, seed=50 + seed)
+        table = RecordedStations.of(turned, schedule.schedule, EXACT)
+        found.append((truth, *(jaximu.calibrate(given, EXACT) for given in (log, table, [log, table]))))
+    return found
+
+
+def test_poses_and_a_table_in_one_fit(by_hand_and_on_a_table):
+    """The table fixes the frame, poses by hand sharpen the gains: no number is known less than by either alone."""
+    whole, shares = [], []
+    for truth, by_hand, table, both in by_hand_and_on_a_table:
+        whole.append(scores(both, truth))
+        sigma, of_table = errors(both, truth)[1], errors(table, truth)[1]
+        assert np.all(sigma > 0) and both.rank == 24
+        shares.append(sigma / of_table)
+        assert {"gravity_norm", "specific_force"} <= set(both.rms)
+        assert {file for file in both.rms} >= set(by_hand.rms)
+    whole = np.concatenate(whole)
+    assert np.abs(whole).max() < 4.5 and 0.8 < np.sqrt(np.mean(whole**2)) < 1.25
+    print(np.median(shares, axis=0), np.max(shares))
+    assert np.max(shares) < 1.05 and np.median(shares) < 0.9
+
+
+def test_data_alone_are_calibrated_and_wrong_ones_refused():
+    log = simulate(draw_imu(0), HandHeld(14, 2.0), consumer_noise(), rate=50.0, seed=0)[0]
+    data = jaximu.observe(log, EXACT)
+    found, fitted = jaximu.calibrate(data, EXACT), jaximu.fit(Imu.nominal(), data)
+    np.testing.assert_allclose(found.imu.accelerometer.gain, fitted.imu.accelerometer.gain, rtol=1e-12)
+    assert found.method == "joint" and found.rank == 21
+    with pytest.raises(jaximu.InputError, match=r"gravity of 9.80665 m/s² and 9.81"):
+        jaximu.calibrate(data, 9.81)
+    with pytest.raises(jaximu.InputError, match="several units"):
+        jaximu.calibrate(jaximu.stack([data, data]), EXACT)
+    with pytest.raises(jaximu.InputError, match="fitted jointly: leave the method 'two-step' out"):
+        jaximu.calibrate([log, data], EXACT, method="two-step")
+    with pytest.raises(jaximu.InputError, match="expected a recording"):
+        jaximu.calibrate([data, "log.csv"], EXACT)
+    few = jaximu.observe(simulate(draw_imu(0), HandHeld(2, 2.0), consumer_noise(), rate=50.0, seed=0)[0], EXACT)
+    with pytest.raises(jaximu.NotPossibleError, match="these data together leave"):
+        jaximu.calibrate(few, EXACT)
+
+
+def test_poses_and_optics_in_one_fit():
+    """A short motion before cameras and a few poses by hand."""
+    made = moved()
+    triads = [
+        Triad(np.array(made.truth[f"gain_{k}"]), np.array(made.truth[f"bias_{k}"]), (), quantity, unit)
+        for k, quantity, unit in (("a", "specific_force", "m/s^2"), ("g", "angular_rate", "rad/s"))
+    ]
+    truth = Imu(*triads)
+    place = Environment(gravity=GRAVITY.value)
+    log = simulate(truth, HandHeld(14, 2.0), consumer_noise(), rate=50.0, seed=7, environment=place)[0]
+    optics, measured = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
+    alone = jaximu.calibrate(log, GRAVITY)
+    both = jaximu.calibrate([log, measured], GRAVITY, start=optics.imu)
+    assert np.abs(scores(both, truth)).max() < 4.5 and 0.5 < np.sqrt(np.mean(scores(both, truth) ** 2)) < 1.6
+    sigmas = [errors(each, truth)[1] for each in (both, optics, alone)]
+    used = sigmas[0] > 0
+    gain = sigmas[0][used] / np.minimum(sigmas[1], sigmas[2])[used]
+    print(gain)
+    assert gain.max() < 1.05 and np.median(gain) < 0.95
+    assert {effect.name for effect in both.imu.setup} == {effect.name for effect in optics.imu.setup}
