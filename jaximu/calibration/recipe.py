@@ -24,7 +24,7 @@ from jaximu.estimation.problem import Loss
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
-from jaximu.mistakes import prepared
+from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
@@ -32,7 +32,7 @@ from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Observations
-from jaximu.recordings.recording import Recording, recordings_of, same_outputs
+from jaximu.recordings.recording import Recording, same_outputs
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, observed_poses, segment
 
 __all__ = [
@@ -65,7 +65,7 @@ class Choices:
 
 
 def calibrate(
-    recordings: Recording | Data | Sequence[Recording | Data],
+    recordings: Recording | Prepared | Data | Sequence[Recording | Prepared | Data],
     gravity: Gravity = STANDARD,
     *,
     start: Imu | None = None,
@@ -106,14 +106,13 @@ def calibrate(
     beforehand; the message says what to record.
     """
     gravity = as_gravity(gravity)
-    given = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
-    data = [one for one in given if isinstance(one, Data)]
-    by_hand = [one for one in given if not isinstance(one, Data)]
-    recordings = recordings_of(by_hand)
+    by_hand, data = [], []
+    for one in one_or_several(recordings, Data):
+        (data if isinstance(one, Data) else by_hand).append(one)
     choices = Choices(gravity, static, segmentation, effects, effect_sigmas, method, loss)
     if data:
-        return _calibrated_jointly(recordings, data, choices, start, repair)
-    with prepared(recordings, repair, gyroscope=method != "accelerometer") as ready:
+        return _calibrated_jointly(by_hand, data, choices, start, repair)
+    with prepared(by_hand, repair, gyroscope=method != "accelerometer") as ready:
         found, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
     told = [*(note for each in ready for note in each.notes), *(each.text for each in unusual)]
     found = replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
@@ -121,7 +120,7 @@ def calibrate(
 
 
 def _calibrated_jointly(
-    recordings: Sequence[Recording], data: Sequence[Data], choices: Choices, start: Imu | None, repair: bool
+    recordings: Sequence[Recording | Prepared], data: Sequence[Data], choices: Choices, start: Imu | None, repair: bool
 ) -> Calibration:
     """Return the calibration of one fit to several kinds of data, recordings by hand among them."""
     require_float64()
@@ -144,31 +143,31 @@ def _calibrated_jointly(
     recorded = [recording for kind in kinds for recording in kind.recordings]
     notes = [note for one in ready for note in one.notes]
     notes += [note for recording in recorded for note in recording.notes]
-    said: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     unit = Imu.nominal() if start is None else start
     if start is None and recorded:
-        unit, said = nominal_imu(recorded[0])
-    fitted = [*unit.all_effects().values(), *map(effect_named, choices.effects)]
-    unit = jax.tree.map(np.asarray, unit.with_effects(*fitted))
+        unit, remarks = nominal_imu(recorded[0])
+    effects = [*unit.all_effects().values(), *map(effect_named, choices.effects)]
+    unit = jax.tree.map(np.asarray, unit.with_effects(*effects))
     prior = Prior.of_effects(unit, choices.effect_sigmas)
-    found = fit(unit, kinds, prior=prior, loss=choices.loss)
+    fitted = fit(unit, kinds, prior=prior, loss=choices.loss)
     where = ", ".join(recording.name for recording in recorded) or "these data"
-    require_determined(found, where, "these data together", _RECORD, prior)
+    require_determined(fitted, where, "these data together", _RECORD, prior)
     calibration = concluded(
-        found,
+        fitted,
         gravity=choices.gravity,
         method="joint",
         loss=choices.loss,
         excess_names=_distinct([name for kind in kinds for name in kind.excess_names]),
-        rms=[_errors(kinds, imu) for imu in (unit, found.imu)],
-        notes=[*notes, *said],
+        rms=[_errors(kinds, imu) for imu in (unit, fitted.imu)],
+        notes=[*notes, *remarks],
         advice=kinds[0].advice,
         known=() if prior is None else prior.names,
         data=provenance(recorded) if recorded else {},
         nominal=unit,
         reading=recorded[0].reading if recorded else None,
     )
-    return replace(calibration, covariance=found.total_covariance(choices.gravity.sigma, clock_sigma(parts)))
+    return replace(calibration, covariance=fitted.total_covariance(choices.gravity.sigma, clock_sigma(parts)))
 
 
 def _errors(kinds: Sequence[Data], imu: Imu) -> dict[str, tuple[float, str]]:
@@ -182,7 +181,8 @@ def _errors(kinds: Sequence[Data], imu: Imu) -> dict[str, tuple[float, str]]:
 
 def _distinct(names: Sequence[str]) -> list[str]:
     """Return names with a number after those that were there before."""
-    return [f"{name} {count + 1}" if (count := names[:place].count(name)) else name for place, name in enumerate(names)]
+    before = [names[:number].count(name) for number, name in enumerate(names)]
+    return [f"{name} {count + 1}" if count else name for name, count in zip(names, before, strict=True)]
 
 
 def _with_drift(found: Calibration) -> Calibration:

@@ -45,7 +45,7 @@ from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.noise.at_rest import fit_noise
+from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, rest_statistics
@@ -200,7 +200,7 @@ def calibrate_by_filter(
         raise InputError(f"{recording.name}: the filter needs a gyroscope beside the accelerometer, and there is none.")
     chosen = [state_effect(effect_named(each)) for each in effects]
     with prepared([recording], repair) as (ready,):
-        known = fit_noise(static) if isinstance(static, Recording) else static
+        known = noise_of(static)
         choices = Choices(gravity, known, segmentation)
         start, findings = calibrate_ready([ready.recording], choices, repair, losses=not chosen)
         rests = start.segmentations[0]

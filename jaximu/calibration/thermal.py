@@ -379,8 +379,9 @@ def change(
     effects, reference = [triad.effects[place] for place in places], triad.temperature_reference
     there, back = (steady(effects, *at, reference, force) for at in ((celsius, rate), (reference, 0.0)))
     values, slopes = (each - origin for each, origin in zip(there, back, strict=True))
-    own = effect_numbers(calibration.imu.with_effects(*effects))[0]
-    numbers = [Name(owner, name.part, name.axes, places[name.effect]) for name in own if name.effect is not None]
+    names_alone = effect_numbers(calibration.imu.with_effects(*effects))[0]
+    numbers = [Name(owner, name.part, name.axes, places[name.effect])
+               for name in names_alone if name.effect is not None]  # fmt: skip
     known = [(column, calibration.names.index(name)) for column, name in enumerate(numbers)
              if name in calibration.names]  # fmt: skip
     columns, rows = np.array(known, int).reshape(-1, 2).T

@@ -165,8 +165,8 @@ def calibrate_table_ready(
     where = ", ".join(recording.name for recording in recordings)
     used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
     poses, turns = (int(np.sum(used & (np.asarray(stations.turn) == kind))) for kind in (False, True))
-    seen = f"{counted(poses, 'pose')} and {counted(turns, 'turn')}"
-    require_determined(found, where, f"the reference has {seen} that can be used, which", _RECORD)
+    shown = f"the reference has {counted(poses, 'pose')} and {counted(turns, 'turn')} that can be used, which"
+    require_determined(found, where, shown, _RECORD)
     found = _at_rest_where_open(found, start)
     notes = (
         *(note for recording in recordings for note in recording.remarks),

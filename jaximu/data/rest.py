@@ -100,7 +100,7 @@ def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -
     """
     added, slopes, rows = np.zeros((count, 3)), {}, padded_count(count)
     placed = dict(enumerate(effects))
-    for place, effect in placed.items():
+    for key, effect in placed.items():
         kind = CATALOGUE[f"accel.{effect.plain}"]  # its term is the gyroscope's, too: half as many to compile
         numbers = np.concatenate([effect.coefficients, [float(getattr(effect, name)) for name in effect.inner]])
 
@@ -114,7 +114,7 @@ def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -
         recordings = [stored.call(means, f"rest {kind.name} {rows}", track, numbers) for track in tracks]
         value, slope = (sum(part[:count] for part in parts) for parts in zip(*recordings, strict=True))
         added = added + value
-        slopes[place] = np.asarray(slope)
+        slopes[key] = np.asarray(slope)
     return added, np.concatenate([np.zeros((count, 3, 0)), *free_columns(placed, slopes)], axis=2)
 
 

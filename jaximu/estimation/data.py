@@ -159,10 +159,10 @@ class Data(ABC):
         key, react, parts = self.reactions(details)
         numerics = array_module(imu, details)
         effects, by_effect = imu.all_effects(), {}
-        for place, effect in effects.items():
+        for at, effect in effects.items():
             kind = type(effect)
             if self.no_fixture and effect.scope == "fixture":
-                by_effect[place] = numerics.zeros((rows, effect.size + len(effect.inner)))
+                by_effect[at] = numerics.zeros((rows, effect.size + len(effect.inner)))
                 continue
 
             def derivatives(imu, part, numbers, kind=kind):
@@ -173,7 +173,7 @@ class Data(ABC):
             parted = [
                 stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers) for part in parts
             ]
-            by_effect[place] = -sum(parted[1:], start=parted[0])
+            by_effect[at] = -sum(parted[1:], start=parted[0])
         return numerics.concatenate([numerics.zeros((rows, 0)), *free_columns(effects, by_effect)], axis=-1)
 
     def dormant_columns(
@@ -321,16 +321,18 @@ def free_columns(
     An inner parameter that effects share is one number: what it does to each of them adds up.
     """
     owners, shared = inner_owners(effects), dict(by_effect)
-    for place, owner in owners.items():
-        if place != owner:
-            size = effects[place].size
-            shared[place] = by_effect[place][..., :size]
-            inner = by_effect[place][..., size:]
-            own = effects[owner].size
-            shared[owner] = array_module(inner).concatenate(
-                [shared[owner][..., :own], shared[owner][..., own:] + inner], axis=-1
-            )
+    for key, owner in owners.items():
+        if key != owner:
+            coefficients, inner = (by_effect[key][..., part] for part in _parts(effects[key]))
+            leading, common = (shared[owner][..., part] for part in _parts(effects[owner]))
+            shared[key] = coefficients
+            shared[owner] = array_module(inner).concatenate([leading, common + inner], axis=-1)
     return list(shared.values())
+
+
+def _parts(effect: Effect) -> tuple[slice, slice]:
+    """Return where an effect's coefficients are among its numbers, and where its inner parameters."""
+    return slice(effect.size), slice(effect.size, None)
 
 
 def derivatives_by_numbers(kind: type[Effect], reaction: Callable[[Effect], Array], numbers: Array) -> Array:

@@ -230,13 +230,14 @@ def _with_numbers(imu: Imu, values: Float[Array, "... q"]) -> Imu:
         if owners[at] != at:
             continue
         inner[at] = {}
-        for name, each in effect.inner.items():
+        for name, limits in effect.inner.items():
             old = numerics.asarray(getattr(effect, name))
             change = values[..., first] - old
-            moved = numerics.clip(old + numerics.clip(change, -0.5 * old, old), each.low, each.high)
+            moved = numerics.clip(old + numerics.clip(change, -0.5 * old, old), limits.low, limits.high)
             inner[at][name] = numerics.where(change == 0, old, moved)  # one that is held may lie outside
             first += 1
-    return imu.with_effects(*(type(each)(coefficients[at], **inner[owners[at]]) for at, each in effects.items()))
+    moved_to = (type(effect)(coefficients[at], **inner[owners[at]]) for at, effect in effects.items())
+    return imu.with_effects(*moved_to)
 
 
 @dataclass(frozen=True)

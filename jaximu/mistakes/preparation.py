@@ -94,12 +94,15 @@ class Prepared:
         return tuple(dict.fromkeys(each.text for each in self.findings))
 
 
-def one_or_several(given: Any) -> list[Recording | Prepared]:
-    """Return one recording or several, each of which may have been looked over, as a list; else raise `InputError`."""
+def one_or_several(given: Any, *others: type) -> list[Any]:
+    """Return one recording or several, each of which may have been looked over, as a list; else raise `InputError`.
+
+    **Arguments:** `others`: what may stand among them.
+    """
     several = list(given) if isinstance(given, (list, tuple)) else [given]
     if not several:
         raise InputError("no recording was given.")
-    return [one if isinstance(one, Prepared) else recordings_of(one)[0] for one in several]
+    return [one if isinstance(one, (Prepared, *others)) else recordings_of(one)[0] for one in several]
 
 
 def inspect(recording: Recording) -> list[Finding]:

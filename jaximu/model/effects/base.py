@@ -190,8 +190,8 @@ class Effect(eqx.Module):
 
 def inner_owners(effects: Mapping[Place, Effect]) -> dict[Place, Place]:
     """Return of each effect the place of that whose inner parameters it has: its own, or of the one it `shares`."""
-    places = {(each.owner, each.plain): place for place, each in effects.items()}
-    return {place: places.get((each.owner, each.shares), place) for place, each in effects.items()}
+    places = {(effect.owner, effect.plain): key for key, effect in effects.items()}
+    return {key: places.get((effect.owner, effect.shares), key) for key, effect in effects.items()}
 
 
 class SetupEffect(Effect):
