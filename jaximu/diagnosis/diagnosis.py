@@ -579,8 +579,8 @@ def _examined(examination: Examination) -> Diagnosis:
             names = ", ".join(effect_title(entry.name) for entry in found)
             notes.append(
                 f"{names} would explain part of this recording but does not improve data that was not fitted "
-                f"({gain.data}: "
-                f"log-likelihood {gain.log_likelihood:+.1f}), and was not kept."
+                f"({gain.data}: {gain.errors(gain.best_kind(state.effects[0]))}, log-likelihood "
+                f"{gain.log_likelihood:+.1f}), and was not kept."
             )
             found, state, gain, complete = [], base, None, False
     shape = None if complete else shape_of(base.evidence, level)
