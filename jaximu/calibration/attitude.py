@@ -13,6 +13,7 @@ import scipy
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
+from jaximu.calibration.recipe import errors_of
 from jaximu.calibration.refusals import require_determined
 from jaximu.data.attitude import EXCESS_NAMES, AgainstAttitude, reference_sigmas
 from jaximu.data.field import white_noise
@@ -138,7 +139,7 @@ def calibrate_against_attitude(
     likeness = _same_unit(recording, begun, found.imu)
     calibration = concluded(
         found, gravity=gravity, method="reference", loss=loss, advice=station_advice, excess_names=EXCESS_NAMES,
-        rms=[_rms(measurement, each) for each in (imu, found.imu)], known=list(filter(of_setup, found.names)),
+        rms=[errors_of([measurement], unit) for unit in (imu, found.imu)], known=list(filter(of_setup, found.names)),
         data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
         notes=[*likeness, *ready.notes, *recording.notes, *begun.attitude.notes,
                *(() if noise is None else noise.notes)],
@@ -223,11 +224,6 @@ def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect], unit:
         imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ begun.arranged))
     found = {each.name: each for each in (*setup, *imu.all_effects().values(), *effects)}
     return jax.tree.map(np.asarray, imu.with_effects(*found.values()))
-
-
-def _rms(measurement: AgainstAttitude, imu: Imu) -> dict[str, tuple[float, str]]:
-    return {name: (float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), unit)
-            for name, (_, error, unit) in measurement.errors(imu).items()}  # fmt: skip
 
 
 def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: Array) -> tuple[Mounting, Mounting]:

@@ -39,6 +39,7 @@ __all__ = [
     "Choices",
     "calibrate",
     "calibrate_ready",
+    "errors_of",
 ]
 
 _SAME = 1e-9
@@ -159,7 +160,7 @@ def _calibrated_jointly(
         method="joint",
         loss=choices.loss,
         excess_names=_distinct([name for kind in kinds for name in kind.excess_names]),
-        rms=[_errors(kinds, imu) for imu in (unit, fitted.imu)],
+        rms=[errors_of(kinds, imu) for imu in (unit, fitted.imu)],
         notes=[*notes, *remarks],
         advice=kinds[0].advice,
         known=() if prior is None else prior.names,
@@ -170,7 +171,7 @@ def _calibrated_jointly(
     return replace(calibration, covariance=fitted.total_covariance(choices.gravity.sigma, clock_sigma(parts)))
 
 
-def _errors(kinds: Sequence[Data], imu: Imu) -> dict[str, tuple[float, str]]:
+def errors_of(kinds: Sequence[Data], imu: Imu) -> dict[str, tuple[float, str]]:
     """Return the rms of each kind of residual of all data, with its unit."""
     sizes: list[tuple[str, tuple[float, str]]] = []
     for kind in kinds:

@@ -54,7 +54,8 @@ _FEWEST = 12
 _STEADY = ("bias_ramp", "temperature")
 """Effects that change as slowly as drift does."""
 _GUESSED = 10.0
-"""Nats that effects which explain a part of a misfit must add to a smooth term, having been chosen on the same data."""
+"""Nats that effects must gain, having been chosen on the same data: those that explain a part of a misfit, beyond a
+smooth term, and those with which no error of what was left out is smaller."""
 _NOT_ASKED = "the noise was taken from this recording itself: it needs a recording at rest (--static) to compare with"
 
 _INSTANTS = Finding(
@@ -501,121 +502,189 @@ def _averaged(remade: Callable[[NoiseModel], Experiment]) -> Callable[[NoiseMode
 
 
 def _examined(examination: Examination) -> Diagnosis:
-    calibration, noise, level = examination.calibration, examination.noise, examination.level
-    remade, held, taken = examination.remade, examination.held, examination.taken
-    drifting, naming, measured = examination.drifting, examination.naming, examination.measured
-    findings, notes = list(examination.findings), list(examination.notes)
-    noises: list[NoiseFinding] = []
-    asked, again, swaying = not (drifting or examination.trusted), remade, []
-    if drifting:
+    course = _with_noise_put_right(examination)
+    course.extend()
+    course.confirm()
+    course.describe()
+    return course.diagnosis()
+
+
+def _with_noise_put_right(examination: Examination) -> _Course:
+    """Ask the noise first, for a wrong model of it makes false effects, and what hands and drift add."""
+    noise, level, notes = examination.noise, examination.level, list(examination.notes)
+    if examination.drifting:
         experiment, noise, base, first = _with_hands(examination, noise)
         assert experiment.drift is not None
-        notes += experiment.drift.notes
-    else:
-        experiment = remade(noise)
-        if asked:  # a wrong noise model makes false effects: it is put right first
-            noises, right = quick_noise(experiment, noise, level)
-            swaying = experiment.data.sway(experiment.start, noise) if noises else []
-            if noises:
-                examination, noise = replace(examination, noise=right), right
-            noises = [] if swaying else noises  # it is the hand's, and not the unit's
-        experiment, base = examination.first
-        first = select(base.evidence, level)
-    if experiment.data.by_hand and asked and not first.explained:  # what hands do is in the samples
+        return _Course(examination, experiment, noise, base, first, [*notes, *experiment.drift.notes], [], [])
+    noises, swaying, again = [], [], examination.remade
+    if not examination.trusted:
+        experiment = examination.remade(noise)
+        noises, right = quick_noise(experiment, noise, level)
+        swaying = experiment.data.sway(experiment.start, noise) if noises else []
+        if noises:
+            examination, noise = replace(examination, noise=right), right
+        noises = [] if swaying else noises  # it is the hand's, and not the unit's
+    experiment, base = examination.first
+    first = select(base.evidence, level)
+    if experiment.data.by_hand and not (examination.trusted or first.explained):  # what hands do is in the samples
         experiment, noise, base, first = _with_hands(examination, noise, (base, first))
         notes += experiment.drift.notes if experiment.drift is not None else []
-        again = partial(_moved, remade, experiment.drift)
-    if naming and asked and not first.explained:
-        slow, noise, said = slow_noise(experiment, base, first, noise, again, level)
-        notes += [said] if said else []
+        again = partial(_moved, examination.remade, experiment.drift)
+    if examination.naming and not (examination.trusted or first.explained):
+        slow, noise, remark = slow_noise(experiment, base, first, noise, again, level)
+        notes += [remark] if remark else []
         if slow is not None:
             noises.append(slow)
             experiment = again(noise)
             base = experiment.fit()
             first = select(base.evidence, level)
-    findings += experiment.moved_by_hand() or swaying
-    strange = [] if experiment.drift is None else experiment.drift.implausible
-    other = None if held is None else held(noise)
-    if held is not None and other is not None and experiment.drift is not None:
-        details = other.linearise(calibration.imu).details
-        hands = hands_of(other.data, details, other.used, calibration.imu, noise, experiment.drift)
-        other = _moved(held, hands, noise)
-    extension = Extension([], base, experiment, base, True, [])
-    if naming:
-        extension = extend(experiment, base, first, level, taken)
-    taken = taken if extension.found else ()
-    if other is not None and not taken:
-        extension, said = settled(extension, other)
-        notes += said
-    found, state, base = extension.found, extension.state, extension.base
-    complete = extension.complete
-    if extension.beside:
-        names = ", ".join(effect_title(entry.name) for entry in found)
-        notes.append(f"{names} looks like the cause and is not all of it: beyond it {extension.beside}.")
-    if strange and not found:  # what an effect leaves to second order was in the drift, too, until it was fitted
-        complete = False
-        notes += strange
-    experiment = extension.experiment
-    findings += extension.findings
-    gain = None
-    if found:
-        device = any(effect.scope == "device" for effect in state.effects)
-        if other is not None and not device:
-            notes.append(
-                "the effects found belong to this recording and not to the unit, so the held-out one cannot confirm "
-                "them: their gain was measured on parts of this recording left out."
-            )
-        if other is not None and device:
-            gain = on_held_out(other, base, state)
+    return _Course(examination, experiment, noise, base, first, notes, noises, swaying)
+
+
+@dataclass
+class _Course:
+    """An examination on its way: `experiment` with the noise put right, `base`, its fit, and what stands out there.
+
+    notes: for the user, so far. noises: what is wrong with the noise. swaying: that hands turn the unit in its poses,
+    which looks like noise. chosen: whether effects that another selection has chosen are in the model. The others as in
+    `Diagnosis`.
+    """
+
+    examination: Examination
+    experiment: Experiment
+    noise: NoiseModel
+    base: State
+    first: Selection
+    notes: list[str]
+    noises: list[NoiseFinding]
+    swaying: list[Finding]
+    chosen: bool = False
+    gain: Gain | None = None
+    learned: LearnedTerm | None = None
+    shape: str | None = None
+
+    def __post_init__(self):
+        self.extension = Extension([], self.base, self.experiment, self.base, True, [])
+
+    @cached_property
+    def other(self) -> Experiment | None:
+        """Another recording of the unit, where there is one, with what hands added to it."""
+        held, drift, imu = self.examination.held, self.experiment.drift, self.examination.calibration.imu
+        other = None if held is None else held(self.noise)
+        if held is None or other is None or drift is None:
+            return other
+        hands = hands_of(other.data, other.linearise(imu).details, other.used, imu, self.noise, drift)
+        return _moved(held, hands, self.noise)
+
+    def extend(self) -> None:
+        """Take causes into the model; another recording chooses among those that this one cannot tell apart."""
+        taken = self.examination.taken
+        if self.examination.naming:
+            self.extension = extend(self.experiment, self.base, self.first, self.examination.level, taken)
+        self.chosen = bool(taken and self.extension.found)
+        if self.other is not None and not self.chosen:
+            self.extension, remarks = settled(self.extension, self.other)
+            self.notes += remarks
+        if self.extension.beside:
+            beyond = self.extension.beside
+            self.notes.append(f"{self._names()} looks like the cause and is not all of it: beyond it {beyond}.")
+        strange = [] if self.experiment.drift is None else self.experiment.drift.implausible
+        if strange and not self.extension.found:  # what an effect leaves to second order was in the drift until then
+            self._settle(complete=False)
+            self.notes += strange
+
+    def confirm(self) -> None:
+        """Measure the gain on what was not fitted; what gains nothing is not kept."""
+        experiment, base, state = self.extension.experiment, self.extension.base, self.extension.state
+        if not self.extension.found:
+            return
+        measured = self.examination.measured
+        if self.other is not None and any(effect.scope == "device" for effect in state.effects):
+            gain = on_held_out(self.other, base, state)
         else:
             gain = measured(experiment, base, state) if measured is not None else cross_validated(experiment, base)
+            if self.other is not None:
+                self.notes.append(
+                    "the effects found belong to this recording and not to the unit, so the held-out one cannot "
+                    "confirm them: their gain was measured on parts of this recording left out."
+                )
+        self.gain = gain
         if full := _saturated(experiment, state):
-            notes.append(
-                f"with {', '.join(effect_title(entry.name) for entry in found)} the model has as many parameters as "
-                f"there are conditions of {full[0]}: it would fit anything, so nothing confirms it. Record more poses."
+            self._settle(complete=False)
+            self.notes.append(
+                f"with {self._names()} the model has as many parameters as there are conditions of {full[0]}: it would "
+                "fit anything, so nothing confirms it. Record more poses."
             )
-            complete = False
-        elif not gain.improved(state.effects) and not taken:
-            names = ", ".join(effect_title(entry.name) for entry in found)
-            notes.append(
-                f"{names} would explain part of this recording but does not improve data that was not fitted "
-                f"({gain.data}: {gain.errors(gain.best_kind(state.effects[0]))}, log-likelihood "
-                f"{gain.log_likelihood:+.1f}), and was not kept."
+        # where no error is smaller, the likelihood must say it beyond the nat that each number may gain by chance
+        least = 0.0 if gain.smaller(state.effects) else _GUESSED + sum(effect.size for effect in state.effects)
+        if gain.log_likelihood <= least and not (full or self.chosen):
+            errors = gain.errors(gain.best_kind(state.effects[0]))
+            self.notes.append(
+                f"{self._names()} would explain part of this recording but does not improve data that was not fitted "
+                f"({gain.data}: {errors}, log-likelihood {gain.log_likelihood:+.1f}), and was not kept."
             )
-            found, state, gain, complete = [], base, None, False
-    shape = None if complete else shape_of(base.evidence, level)
-    learned = None if complete else learn(experiment, state if taken else base, other)
-    if shape is not None and learned is not None and shape[1] > learned.gain.log_likelihood:
-        learned = None  # it would only imitate the shape
-    if learned is not None and found and not taken:
-        beside = learn(experiment, state, other)
-        predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
-        inputs = {CATALOGUE[entry.name].curved() for entry in found} - {""}
-        one_curve = beside is not None and beside.effect.curved() in inputs  # and not two of the same input
-        if predicted > learned.log_likelihood + _GUESSED and not one_curve:
-            learned = beside
-        else:  # what was named in part was a guess at the same misfit
-            found, gain = [], None
-    state = state if learned is None else learned.state
-    words = None if shape is None or learned is not None else shape[0].words
-    named = tuple(_named(experiment, state, entry, gain) for entry in found)
-    notes += [each.impossible() for each in named if each.impossible()]
-    strongest = min((each.p_value for each in named), default=1.0)
-    effects = (
-        *(each for each in noises if each.p_value < strongest), *named,
-        *(each for each in noises if each.p_value >= strongest),
-    )  # fmt: skip
-    verdict = "unexplained" if not complete else ("effects" if effects else "adequate")
-    p_value = min([first.p_value, *(each.p_value for each in noises)])
-    told = {each.text.casefold().rstrip(".") for each in findings}
-    notes = [each for each in dict.fromkeys(notes) if each.casefold().rstrip(".") not in told]
-    blind = base.blind | ({} if asked else dict.fromkeys(NOISE_NAMES, _NOT_ASKED))
-    blind |= dict.fromkeys(("noise.white", "noise.correlated"), _SWAYING) if swaying else {}
-    return Diagnosis(
-        verdict, effects, tuple(findings), p_value, first.scores.unit, base.limits,
-        dict(sorted(blind.items())), checks_of(base, experiment), _suggestion(verdict, named, noises, learned, words),
-        tuple(notes), calibration, experiment, noise, base, state, gain, learned, shape=words,
-    )  # fmt: skip
+            self._settle(found=[], state=base, complete=False)
+
+    def describe(self) -> None:
+        """Say on what depends that which no cause explains: a shape in words, or a smooth term."""
+        experiment, base, state = self.extension.experiment, self.extension.base, self.extension.state
+        if self.extension.complete:
+            return
+        shape = shape_of(base.evidence, self.examination.level)
+        learned = learn(experiment, state if self.chosen else base, self.other)
+        if shape is not None and learned is not None and shape[1] > learned.gain.log_likelihood:
+            learned = None  # it would only imitate the shape
+        if learned is not None and self.extension.found and not self.chosen:
+            beside = learn(experiment, state, self.other)
+            predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
+            inputs = {CATALOGUE[entry.name].curved() for entry in self.extension.found} - {""}
+            one_curve = beside is not None and beside.effect.curved() in inputs  # and not two of the same input
+            if predicted > learned.log_likelihood + _GUESSED and not one_curve:
+                learned = beside
+            else:  # what was named in part was a guess at the same misfit
+                self._settle(found=[])
+        if learned is not None:
+            self._settle(state=learned.state)
+        elif shape is not None:
+            self.shape = shape[0].words
+        self.learned = learned
+
+    def _names(self) -> str:
+        return ", ".join(effect_title(entry.name) for entry in self.extension.found)
+
+    def _settle(self, **changes: Any) -> None:
+        """Change what was taken into the model; where that is nothing any more, nothing is gained."""
+        self.extension = replace(self.extension, **changes)
+        self.gain = self.gain if self.extension.found else None
+
+    def diagnosis(self) -> Diagnosis:
+        """Return the diagnosis, causes strongest first."""
+        examination, extension, noises = self.examination, self.extension, self.noises
+        moved = self.experiment.moved_by_hand() or self.swaying
+        findings = [*examination.findings, *moved, *extension.findings]
+        named = tuple(_named(extension.experiment, extension.state, entry, self.gain) for entry in extension.found)
+        notes = [*self.notes, *(cause.impossible() for cause in named if cause.impossible())]
+        strongest = min((cause.p_value for cause in named), default=1.0)
+        effects = (
+            *(noise for noise in noises if noise.p_value < strongest), *named,
+            *(noise for noise in noises if noise.p_value >= strongest),
+        )  # fmt: skip
+        verdict = "unexplained" if not extension.complete else ("effects" if effects else "adequate")
+        texts = {finding.text.casefold().rstrip(".") for finding in findings}
+        blind = dict(extension.base.blind)
+        if examination.drifting or examination.trusted:
+            blind |= dict.fromkeys(NOISE_NAMES, _NOT_ASKED)
+        if self.swaying:
+            blind |= dict.fromkeys(("noise.white", "noise.correlated"), _SWAYING)
+        return Diagnosis(
+            verdict, effects, tuple(findings), min([self.first.p_value, *(noise.p_value for noise in noises)]),
+            self.first.scores.unit, extension.base.limits, dict(sorted(blind.items())),
+            checks_of(extension.base, extension.experiment),
+            _suggestion(verdict, named, noises, self.learned, self.shape),
+            tuple(note for note in dict.fromkeys(notes) if note.casefold().rstrip(".") not in texts),
+            examination.calibration, extension.experiment, self.noise, extension.base, extension.state, self.gain,
+            self.learned, shape=self.shape,
+        )  # fmt: skip
 
 
 def _with_hands(

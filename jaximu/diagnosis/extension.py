@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -76,7 +76,7 @@ def extend(
     if causes and not selection.explained:
         blocks = base.evidence.blocks
         found = [_named(blocks, cause) for cause in causes]
-        state = experiment.fit([e for e in taken if e.name in {entry.name for entry in found}], base.imu)
+        state = experiment.fit(_those_found(taken, found), base.imu)
         selection = select(state.evidence, level / 100)
     chosen = len(found)
     guessed = False  # a cause was taken in that did not explain the misfit
@@ -116,13 +116,18 @@ def extend(
         complete = False  # a curve of one input that is in no catalogue, imitated by two that are
         strongest = max(found[chosen:], key=lambda entry: entry.statistic)
         found = [*found[:chosen], strongest]
-        state = experiment.fit([e for e in state.effects if e.name in {entry.name for entry in found}], base.imu)
+        state = experiment.fit(_those_found(state.effects, found), base.imu)
     if guessed and len(found) > 1 and any(entry.weak for entry in found):
         # Combinations of weak effects imitate what is outside the catalogue: only what is strong may keep its name.
         complete = False
         found = [entry for k, entry in enumerate(found) if k < chosen or not entry.weak]
-        state = experiment.fit([e for e in state.effects if e.name in {entry.name for entry in found}], base.imu)
+        state = experiment.fit(_those_found(state.effects, found), base.imu)
     return Extension(found, state, experiment, base, complete, poses, beside)
+
+
+def _those_found(effects: Iterable[Effect], found: Sequence[Found]) -> list[Effect]:
+    names = {entry.name for entry in found}
+    return [effect for effect in effects if effect.name in names]
 
 
 def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str]]:

@@ -56,10 +56,10 @@ class Gain:
         """What the extension gains, nats."""
         return self.after.log_likelihood - self.before.log_likelihood
 
-    def improved(self, effects: Sequence[Effect]) -> bool:
-        """Return whether what was left out is more likely with the extension, and some error of it smaller."""
+    def smaller(self, effects: Sequence[Effect]) -> bool:
+        """Return whether some error of what was left out is smaller with the extension."""
         kinds = {self.best_kind(effect) for effect in effects}
-        return self.log_likelihood > 0 and any(self.after.rms[kind][0] < self.before.rms[kind][0] for kind in kinds)
+        return any(self.after.rms[kind][0] < self.before.rms[kind][0] for kind in kinds)
 
     def errors(self, kind: str) -> str:
         """Return the rms errors of a kind of residual without and with the extension, as a person reads them."""
