@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import attitude_motion
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
@@ -12,6 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording
 from jaximu.calibration import calibrate_against_attitude, load_calibration
 from jaximu.cli.app import main
+from jaximu.estimation.fitting import effect_numbers
+from jaximu.model.effects import CATALOGUE
 from jaximu.recordings import write_recording
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.readers import holds_attitude, read_attitude
@@ -65,6 +68,27 @@ def test_truth_lies_within_the_intervals(found):
     assert found.sigma("gyroscope")[0].max() < 1e-3 and not found.reference["open"]
     before, after, unit = found.rms["rotation"]
     assert after < 0.4 * before and unit == "deg/s"
+
+
+def test_an_inner_parameter_that_effects_share_is_one_number():
+    """A lag and its square: their time constant's column is the sum of both, whichever comes first."""
+    made = moved()
+    time = unit_of(made).gyroscope.time
+    warm = replace(unit_of(made), temperature=Signal(time, 25.0 + 5.0 * np.sin(time / 5.0)[:, None], "degC"))
+    found, against = calibrate_against_attitude(warm, reference_of(made), GRAVITY)
+    lags = [CATALOGUE[name].make(1e-3, time_constant=5.0) for name in ("gyro.thermal_lag", "gyro.thermal_lag_squared")]
+
+    def columns(*effects):
+        imu = found.imu.with_effects(*found.imu.all_effects().values(), *effects)
+        lifted = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], imu)
+        names, whole = effect_numbers(imu)[0], against.about(lifted).columns[0]
+        assert whole.shape[1] == len(names)
+        return {(name.part, name.axes): whole[:, k] for k, name in enumerate(names) if name.part == "time_constant"}
+
+    (alone,), (square,) = (list(columns(lag).values()) for lag in lags)
+    for order in (lags, lags[::-1]):
+        (together,) = columns(*order).values()
+        np.testing.assert_allclose(together, alone + square, atol=0.02 * np.abs(alone).max())
 
 
 def test_a_unit_beside_the_tracked_point():

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from jaximu.data.preintegration import linear_slope, preintegrate_samples, white_covariance
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.data import About, Conditions, Data, Observed
+from jaximu.estimation.data import About, Conditions, Data, Observed, free_columns
 from jaximu.estimation.problem import Parameters
 from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import Track, added, stimuli
@@ -453,6 +453,7 @@ class AgainstAttitude(Data):
         conditions, spread, duration, leaning, columns, reactions = stored.call(
             compute, description, single, parameters, data, around, samples, noise
         )
+        columns = free_columns(single.all_effects(), columns)
         conditions = jax.tree.map(lambda leaf: leaf[None], conditions)
         covariance = self._covariance(conditions, spread, duration, leaning, white)
         details = AttitudeDetails(duration, reactions, self, single)

@@ -98,9 +98,8 @@ def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -
 
     In output units; numbers are in the order of `effect_numbers`.
     """
-    added, slopes, rows = np.zeros((count, 3)), {}, padded_count(count)
-    placed = dict(enumerate(effects))
-    for key, effect in placed.items():
+    added, slopes, rows = np.zeros((count, 3)), [np.zeros((count, 3, 0))], padded_count(count)
+    for effect in effects:
         kind = CATALOGUE[f"accel.{effect.plain}"]  # its term is the gyroscope's, too: half as many to compile
         numbers = np.concatenate([effect.coefficients, [float(getattr(effect, name)) for name in effect.inner]])
 
@@ -114,8 +113,8 @@ def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -
         recordings = [stored.call(means, f"rest {kind.name} {rows}", track, numbers) for track in tracks]
         value, slope = (sum(part[:count] for part in parts) for parts in zip(*recordings, strict=True))
         added = added + value
-        slopes[key] = np.asarray(slope)
-    return added, np.concatenate([np.zeros((count, 3, 0)), *free_columns(placed, slopes)], axis=2)
+        slopes.append(np.asarray(slope))
+    return added, free_columns(dict(enumerate(effects)), np.concatenate(slopes, axis=2))
 
 
 def padded_count(count: int) -> int:

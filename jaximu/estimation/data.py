@@ -158,11 +158,11 @@ class Data(ABC):
         """
         key, react, parts = self.reactions(details)
         numerics = array_module(imu, details)
-        effects, by_effect = imu.all_effects(), {}
-        for at, effect in effects.items():
+        effects, columns = imu.all_effects(), [numerics.zeros((rows, 0))]
+        for effect in effects.values():
             kind = type(effect)
             if self.no_fixture and effect.scope == "fixture":
-                by_effect[at] = numerics.zeros((rows, effect.size + len(effect.inner)))
+                columns.append(numerics.zeros((rows, effect.size + len(effect.inner))))
                 continue
 
             def derivatives(imu, part, numbers, kind=kind):
@@ -173,8 +173,8 @@ class Data(ABC):
             parted = [
                 stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers) for part in parts
             ]
-            by_effect[at] = -sum(parted[1:], start=parted[0])
-        return numerics.concatenate([numerics.zeros((rows, 0)), *free_columns(effects, by_effect)], axis=-1)
+            columns.append(-sum(parted[1:], start=parted[0]))
+        return free_columns(effects, numerics.concatenate(columns, axis=1))
 
     def dormant_columns(
         self, imu: Imu, details: Any, grids: Mapping[type[Effect], Sequence[Mapping[str, float]]]
@@ -313,26 +313,21 @@ def _slope(kind: type[Effect], of: Callable[[Array], Array], numbers: Array) -> 
     )
 
 
-def free_columns(
-    effects: Mapping[Place, Effect], by_effect: Mapping[Place, Float[Array, "... q"]]
-) -> list[Float[Array, "... q"]]:
+def free_columns(effects: Mapping[Place, Effect], columns: Float[Array, "... q"]) -> Float[Array, "... p"]:
     """Return the derivatives by the numbers that are free, effect by effect, of those by all numbers of each.
 
     An inner parameter that effects share is one number: what it does to each of them adds up.
     """
-    owners, shared = inner_owners(effects), dict(by_effect)
-    for key, owner in owners.items():
-        if key != owner:
-            coefficients, inner = (by_effect[key][..., part] for part in _parts(effects[key]))
-            leading, common = (shared[owner][..., part] for part in _parts(effects[owner]))
-            shared[key] = coefficients
-            shared[owner] = array_module(inner).concatenate([leading, common + inner], axis=-1)
-    return list(shared.values())
-
-
-def _parts(effect: Effect) -> tuple[slice, slice]:
-    """Return where an effect's coefficients are among its numbers, and where its inner parameters."""
-    return slice(effect.size), slice(effect.size, None)
+    owners = inner_owners(effects)
+    numbers = [
+        (at, owners[at] if name in effect.inner else at, name)
+        for at, effect in effects.items()
+        for name in (*range(effect.size), *effect.inner)
+    ]
+    free = [(owner, name) for at, owner, name in numbers if owner == at]
+    if len(free) == len(numbers):
+        return columns
+    return columns @ np.array([[(owner, name) == one for one in free] for _, owner, name in numbers], float)
 
 
 def derivatives_by_numbers(kind: type[Effect], reaction: Callable[[Effect], Array], numbers: Array) -> Array:
