@@ -83,7 +83,7 @@ def calibrate(
     **Arguments:**
 
     - `recordings`: one or several recordings of the same unit, in the same units and axes. Data of other kinds may
-      stand beside them, [`jaximu.data.RecordedStations`][] of a table or [`jaximu.data.AgainstAttitude`][] of optics:
+      stand beside them, `jaximu.data.RecordedStations` of a table or `jaximu.data.AgainstAttitude` of optics:
       one fit then knows what each of them tells. Biases are one unit's in all of them, no new power-on between, and
       their intervals leave out slow drift without `static`.
     - `start`: with such data, the unit where the fit starts, and the effects of their set-ups; the data sheet's values
