@@ -479,6 +479,12 @@ def _parameters_of(calibration: Calibration) -> ParameterTable:
     return ParameterTable([parameter(*each) for each in zip(calibration.names, sigmas, strict=True)])
 
 
+def _error_words(name: str) -> str:
+    """Return what a kind of residual is called; of several kinds of data it may have a number."""
+    kind, _, number = name.partition(" ")
+    return f"{_ERRORS[kind]} {number}".strip()
+
+
 def _summary_of(calibration: Calibration) -> Summary:
     """Return the errors before and after, whether the fit is to be trusted, the parameters, and what is open."""
     data = calibration.data
@@ -488,10 +494,10 @@ def _summary_of(calibration: Calibration) -> Summary:
     verdict = []
     for name, (before, after, unit) in calibration.rms.items():
         verdict.append(
-            f"{_ERRORS[name]}: {size(before, unit)} before calibration (rms); after it none by construction, for there "
-            "are as many parameters as conditions: no degrees of freedom are left to check it by."
+            f"{_error_words(name)}: {size(before, unit)} before calibration (rms); after it none by construction, for "
+            "there are as many parameters as conditions: no degrees of freedom are left to check it by."
             if name in calibration.exact
-            else f"{_ERRORS[name]}: {change(before, after, unit)} (rms, before → after calibration)."
+            else f"{_error_words(name)}: {change(before, after, unit)} (rms, before → after calibration)."
         )
     count, undetermined = len(calibration.names), sum(not each.determined for each in calibration.weak)
     if undetermined:

@@ -142,7 +142,7 @@ def _calibrated_jointly(
             parts = tuple(segment(one.recording, choices.segmentation) for one in ready)
             kinds = [RecordedByHand(parts, observed_poses(parts, choices.gravity.value, noise=noise)), *kinds]
     recorded = [recording for kind in kinds for recording in kind.recordings]
-    notes = [note for one in ready for note in one.notes]
+    notes = [*(note for one in ready for note in one.notes), *(same_outputs(recorded) if recorded else ())]
     notes += [note for recording in recorded for note in recording.notes]
     remarks: tuple[str, ...] = ()
     unit = Imu.nominal() if start is None else start
