@@ -1,5 +1,7 @@
 """Recordings of several kinds in one fit: each tells what the others do not, and truth stays within the intervals."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -8,7 +10,10 @@ from test_reference import GRAVITY, moved, reference_of, unit_of
 import jaximu
 from jaximu.calibration import calibrate_against_attitude
 from jaximu.data import RecordedStations
+from jaximu.data.observe_stations import scheme_stations
+from jaximu.data.stations import KnownStations
 from jaximu.model.sensor import Imu, Triad
+from jaximu.report.html import write_report
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import Environment, HandHeld, Positions
 
@@ -62,7 +67,7 @@ def test_poses_and_a_table_in_one_fit(by_hand_and_on_a_table):
     assert np.max(shares) < 1.05 and np.median(shares) < 0.9
 
 
-def test_data_alone_are_calibrated_and_wrong_ones_refused():
+def test_data_alone_are_calibrated_and_wrong_ones_refused(tmp_path):
     log = simulate(draw_imu(0), HandHeld(14, 2.0), consumer_noise(), rate=50.0, seed=0)[0]
     data = jaximu.observe(log, EXACT)
     found, fitted = jaximu.calibrate(data, EXACT), jaximu.fit(Imu.nominal(), data)
@@ -76,6 +81,23 @@ def test_data_alone_are_calibrated_and_wrong_ones_refused():
         jaximu.calibrate([log, data], EXACT, method="two-step")
     with pytest.raises(jaximu.InputError, match="expected a recording"):
         jaximu.calibrate([data, "log.csv"], EXACT)
+    with pytest.raises(jaximu.InputError, match="a start is for data of several kinds"):
+        jaximu.calibrate(log, EXACT, start=Imu.nominal())
+    with_field = replace(Imu.nominal(), magnetometer=Triad(np.eye(3), np.zeros(3), (), "magnetic_field", "uT"))
+    with pytest.raises(jaximu.InputError, match="has a magnetometer"):
+        jaximu.calibrate(data, EXACT, start=with_field)
+    with pytest.raises(jaximu.InputError, match="without gyroscope"):
+        jaximu.calibrate([jaximu.Recording(log.accelerometer), data], EXACT)
+    with pytest.raises(jaximu.InputError, match="KnownStations cannot be fitted"):
+        jaximu.calibrate(KnownStations(None), EXACT)
+    half = replace(log, accelerometer=replace(log.accelerometer, values=log.accelerometer.values / 9.80665, unit="g"))
+    table = RecordedStations(log, scheme_stations(Positions(6)))
+    with pytest.raises(jaximu.InputError, match="different units or scales"):
+        jaximu.calibrate([half, table], EXACT)
+    two = jaximu.calibrate([log, data], EXACT)
+    assert "Rate at rest 2" in str(two.summary())
+    with pytest.raises(jaximu.InputError, match="has no page"):
+        write_report(two, tmp_path)
     few = jaximu.observe(simulate(draw_imu(0), HandHeld(2, 2.0), consumer_noise(), rate=50.0, seed=0)[0], EXACT)
     with pytest.raises(jaximu.NotPossibleError, match="these data together leave"):
         jaximu.calibrate(few, EXACT)

@@ -89,7 +89,7 @@ def calibrate(
     - `start`: with such data, the unit where the fit starts, and the effects of their set-ups; the data sheet's values
       if left out.
     - `gravity`: local gravity; its uncertainty goes into the scales'. Where it states a latitude, the Earth's rotation
-      is in the model, its heading free (one recording, every turn between its poses usable).
+      is in the model, its heading free (one recording, every turn between its poses usable; not with other data).
     - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
       bias, which ties poses and turns together; else the poses' own scatter tells the noise, as if it were white, and
       of slow drift the uncertainty alone knows, by what this recording shows of it.
@@ -113,6 +113,8 @@ def calibrate(
     choices = Choices(gravity, static, segmentation, effects, effect_sigmas, method, loss)
     if data:
         return _calibrated_jointly(by_hand, data, choices, start, repair)
+    if start is not None:
+        raise InputError("a start is for data of several kinds: recordings by hand begin at the data sheet's values.")
     with prepared(by_hand, repair, gyroscope=method != "accelerometer") as ready:
         found, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
     told = [*(note for each in ready for note in each.notes), *(each.text for each in unusual)]
@@ -128,6 +130,8 @@ def _calibrated_jointly(
     if choices.method != "joint":
         raise InputError(f"data of several kinds are fitted jointly: leave the method {choices.method!r} out.")
     for one in data:
+        if not hasattr(one, "gravity"):
+            raise InputError(f"{type(one).__name__} cannot be fitted with other data: use jaximu.fit.")
         if np.shape(one.gravity):
             raise InputError("data of several units make no calibration of one: take one unit's, or use jaximu.fit.")
         known, stated = float(one.gravity), choices.gravity.value
@@ -136,20 +140,27 @@ def _calibrated_jointly(
                 f"some data were observed at a gravity of {known:.6g} m/s² and {stated:.6g} m/s² was given: state the "
                 "same, gravity=…, for all."
             )
+    if start is not None and start.magnetometer is not None:
+        raise InputError("the start has a magnetometer, of which these data tell nothing: start without it.")
+    if start is not None and start.setup and sum(not one.no_fixture for one in data) > 1:
+        raise InputError("the start has effects of a set-up, and two of the data have set-ups of their own: fit apart.")
     kinds, noise, parts = list(data), noise_of(choices.static), ()
     with prepared(recordings, repair) as ready:
         if ready:
+            if any(one.recording.gyroscope is None for one in ready):
+                raise InputError("a recording without gyroscope cannot stand beside data of other kinds.")
             parts = tuple(segment(one.recording, choices.segmentation) for one in ready)
             kinds = [RecordedByHand(parts, observed_poses(parts, choices.gravity.value, noise=noise)), *kinds]
     recorded = [recording for kind in kinds for recording in kind.recordings]
     notes = [*(note for one in ready for note in one.notes), *(same_outputs(recorded) if recorded else ())]
-    notes += [note for recording in recorded for note in recording.notes]
+    notes += [note for part in (*recorded, *parts, *([] if noise is None else [noise])) for note in part.notes]
+    notes += [] if noise is not None else [_NO_DRIFT]
     remarks: tuple[str, ...] = ()
     unit = Imu.nominal() if start is None else start
     if start is None and recorded:
         unit, remarks = nominal_imu(recorded[0])
-    effects = [*unit.all_effects().values(), *map(effect_named, choices.effects)]
-    unit = jax.tree.map(np.asarray, unit.with_effects(*effects))
+    effects = {effect.name: effect for effect in (*map(effect_named, choices.effects), *unit.all_effects().values())}
+    unit = jax.tree.map(np.asarray, unit.with_effects(*effects.values()))
     prior = Prior.of_effects(unit, choices.effect_sigmas)
     fitted = fit(unit, kinds, prior=prior, loss=choices.loss)
     where = ", ".join(recording.name for recording in recorded) or "these data"

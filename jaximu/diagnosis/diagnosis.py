@@ -609,21 +609,22 @@ class _Course:
                     "confirm them: their gain was measured on parts of this recording left out."
                 )
         self.gain = gain
-        if full := _saturated(experiment, state):
-            self._settle(complete=False)
-            self.notes.append(
-                f"with {self._names()} the model has as many parameters as there are conditions of {full[0]}: it would "
-                "fit anything, so nothing confirms it. Record more poses."
-            )
+        full = _saturated(experiment, state)
         # where no error is smaller, the likelihood must say it beyond the nat that each number may gain by chance
-        least = 0.0 if gain.smaller(state.effects) else _GUESSED + sum(effect.size for effect in state.effects)
-        if gain.log_likelihood <= least and not (full or self.chosen):
+        least = 0.0 if full or gain.smaller(state.effects) else _GUESSED + sum(effect.size for effect in state.effects)
+        if gain.log_likelihood <= least and not self.chosen:
             errors = gain.errors(gain.best_kind(state.effects[0]))
             self.notes.append(
                 f"{self._names()} would explain part of this recording but does not improve data that was not fitted "
                 f"({gain.data}: {errors}, log-likelihood {gain.log_likelihood:+.1f}), and was not kept."
             )
             self._settle(found=[], state=base, complete=False)
+        elif full:
+            self._settle(complete=False)
+            self.notes.append(
+                f"with {self._names()} the model has as many parameters as there are conditions of {full[0]}: it would "
+                "fit anything, so nothing confirms it. Record more poses."
+            )
 
     def describe(self) -> None:
         """Say on what depends that which no cause explains: a shape in words, or a smooth term."""

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaximu.calibration import Calibration
 from jaximu.ground.atomic import write_files, write_folder
+from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import probability
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures, tables, vector, words
@@ -40,6 +41,8 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str], title
     **Returns:** the path of `report.html`. Everything is drawn before anything is written, and each file is written
     whole or not at all. Raises `InputError` where the folder cannot be made or written to.
     """
+    if "poses" not in calibration.data:
+        raise InputError("a calibration of several kinds of data has no page: its summary() says what was found.")
     found, drawn = evidence(calibration), {}
     if found is not None:
         drawn["residuals"] = partial(figures.residual_figure, found)
