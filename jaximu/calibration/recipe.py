@@ -140,14 +140,10 @@ def _calibrated_jointly(
                 f"some data were observed at a gravity of {known:.6g} m/s² and {stated:.6g} m/s² was given: state the "
                 "same, gravity=…, for all."
             )
-    if start is not None and start.magnetometer is not None:
-        raise InputError("the start has a magnetometer, of which these data tell nothing: start without it.")
-    if start is not None and start.setup and sum(not one.no_fixture for one in data) > 1:
-        raise InputError("the start has effects of a set-up, and two of the data have set-ups of their own: fit apart.")
     kinds, noise, parts = list(data), noise_of(choices.static), ()
     with prepared(recordings, repair) as ready:
         if ready:
-            if any(one.recording.gyroscope is None for one in ready):
+            if any("gyroscope" not in one.recording.signals for one in ready):
                 raise InputError("a recording without gyroscope cannot stand beside data of other kinds.")
             parts = tuple(segment(one.recording, choices.segmentation) for one in ready)
             kinds = [RecordedByHand(parts, observed_poses(parts, choices.gravity.value, noise=noise)), *kinds]
@@ -159,6 +155,10 @@ def _calibrated_jointly(
     unit = Imu.nominal() if start is None else start
     if start is None and recorded:
         unit, remarks = nominal_imu(recorded[0])
+    if "magnetometer" in unit.triads():
+        raise InputError("the start has a magnetometer, which these data do not determine: start without it.")
+    if unit.setup and sum(not one.no_fixture for one in data) > 1:
+        raise InputError("the start has effects of one set-up, and two of the data have separate ones: fit them apart.")
     effects = {effect.name: effect for effect in (*map(effect_named, choices.effects), *unit.all_effects().values())}
     unit = jax.tree.map(np.asarray, unit.with_effects(*effects.values()))
     prior = Prior.of_effects(unit, choices.effect_sigmas)
