@@ -1,4 +1,4 @@
-"""What CONTRIBUTING.md shows is a whole effect: its file and its line, run as they stand, and the catalogue's tests."""
+"""What CONTRIBUTING.md says is enough: an effect of one file and one line, a kind of data of one file."""
 
 import os
 import re
@@ -7,15 +7,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from centrifuge import Centrifuge
 
+import jaximu
 from jaximu.cli import main
+from jaximu.data.stations import KnownStations
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Triad
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.readers import read_recording
+from jaximu.simulation import draw_imu
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "CONTRIBUTING.md"
@@ -101,3 +106,51 @@ def test_the_catalogue_s_tests_try_the_new_effect(page, tmp_path):
     laws = ("dormant_effect_is_absent", "is_linear_in_its_coefficients", "units_are_those_of_the_formula")
     assert failed == {f"tests/test_effects.py::test_{law}[gyro.wrong]" for law in laws}, done.stdout + done.stderr
     assert f"{len(failed)} failed, {len(chosen) - len(failed)} passed" in done.stdout
+
+
+HIDDEN = np.array([2e-4, -3e-4, 1e-4])
+
+
+def on_a_centrifuge(*effects, number=1, run=0, speeds=36):
+    """Return a unit with effects, by number, and its mean outputs at some speeds of a centrifuge, up to 3 g."""
+    random = np.random.default_rng([number, run])
+    direction, axis = (random.normal(size=(speeds, 3)) for _ in range(2))
+    speed = random.uniform(2.0, 8.0, speeds)[:, None]
+    force = 0.5 * speed**2 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    rate = speed * axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    unit = jax.tree.map(np.asarray, draw_imu(number)).with_effects(*effects)
+    outputs = [np.asarray(triad.respond(Stimulus(force, rate))) for triad in unit.triads().values()]
+    sigma = np.repeat([1e-3, 1e-4], 3)
+    output = np.concatenate(outputs, axis=1) + sigma * random.normal(size=(speeds, 6))
+    return unit, Centrifuge(output, force, rate, 10.0 * np.arange(speeds)[:, None] + np.array([0.0, 8.0]), sigma)
+
+
+def test_a_new_kind_of_data_is_one_file():
+    """A kind of data that the library knows nothing of is fitted, alone or with others, and diagnosed."""
+    truth, data = on_a_centrifuge(CATALOGUE["accel.quadratic"](HIDDEN))
+    found = jaximu.diagnose(data)
+    (named,) = found.named
+    assert found.verdict == "effects" and named.name == "accel.quadratic" and not named.rivals
+    assert np.all(np.abs(named.effect.coefficients - HIDDEN) < 4 * named.sigma)
+    assert found.gain is not None and found.gain.after.rms["force"][0] < 0.1 * found.gain.before.rms["force"][0]
+    better = found.extended_calibration()
+    off = (better.imu.accelerometer.gain - truth.accelerometer.gain) / better.sigma("accelerometer")[0]
+    assert np.abs(off).max() < 4.5 and "Error of the force" in str(better.summary())
+    assert "Gravity was taken" not in str(better.summary())  # the arm's force does not depend on it
+
+    sound, plain = on_a_centrifuge(number=2)
+    assert jaximu.diagnose(plain).verdict == "adequate"
+    both = jaximu.calibrate([plain, on_a_centrifuge(number=2, run=1, speeds=20)[1]])
+    alone = jaximu.calibrate(plain)
+    assert np.all(both.sigma("gyroscope")[0] < alone.sigma("gyroscope")[0])
+    assert np.abs((both.imu.gyroscope.gain - sound.gyroscope.gain) / both.sigma("gyroscope")[0]).max() < 4.5
+
+
+def test_what_is_not_diagnosed_says_so():
+    _, data = on_a_centrifuge()
+    with pytest.raises(jaximu.InputError, match="are for recordings, and data were given"):
+        jaximu.diagnose(data, repair=True)
+    with pytest.raises(jaximu.InputError, match="KnownStations cannot be diagnosed: give the recording"):
+        jaximu.diagnose(KnownStations(None))
+    with pytest.raises(jaximu.InputError, match=r"no effect 'accel\.quadrat'"):
+        jaximu.diagnose(data, candidates=["accel.quadrat"])

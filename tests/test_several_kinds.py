@@ -12,6 +12,7 @@ from jaximu.calibration import calibrate_against_attitude
 from jaximu.data import RecordedStations
 from jaximu.data.observe_stations import scheme_stations
 from jaximu.data.stations import KnownStations
+from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.report.html import write_report
 from jaximu.simulation import consumer_noise, draw_imu, simulate
@@ -121,3 +122,28 @@ def test_poses_and_optics_in_one_fit():
     gain = sigmas[0][used] / np.minimum(sigmas[1], sigmas[2])[used]
     assert gain.max() < 1.05 and np.median(gain) < 0.9
     assert {effect.name for effect in both.imu.setup} == {effect.name for effect in optics.imu.setup}
+
+
+def test_a_table_s_data_are_diagnosed_and_checked():
+    """As recordings are: an effect is named, an older calibration holds or not, other axes are refused."""
+    quadratic = CATALOGUE["accel.quadratic"](np.array([4e-4, -3e-4, 3e-4]))
+    truth = jax.tree.map(np.asarray, draw_imu(3))
+
+    def table(unit, seed):
+        turned, schedule = simulate(unit, Positions(24, 4.0, 2.0), consumer_noise(), rate=50.0, seed=seed)
+        return RecordedStations.of(turned, schedule.schedule, EXACT)
+
+    known = jaximu.calibrate(table(truth, 1), EXACT)
+    assert jaximu.check(known, table(truth, 2), EXACT).verdict == "valid"
+    flawed = table(truth.with_effects(quadratic), 3)
+    lacking = jaximu.check(known, flawed, EXACT)
+    assert lacking.verdict == "effect" and lacking.data["poses"] == 24
+    assert "accel.quadratic" in {name for cause in lacking.causes for name in (cause.name, *cause.rivals)}
+    found = jaximu.diagnose(flawed, EXACT, candidates=["accel.quadratic", "gyro.quadratic"])
+    assert [named.name for named in found.named] == ["accel.quadratic"]
+    gyroscope = replace(truth.gyroscope, gain=truth.gyroscope.gain * np.array([[1.003], [1.0], [1.0]]))
+    moved = jaximu.check(known, table(replace(truth, gyroscope=gyroscope), 4), EXACT)
+    assert moved.verdict == "shifted" and [str(shift.parameter) for shift in moved.moved] == ["gyroscope.gain[0,0]"]
+    log = simulate(truth, HandHeld(14, 2.0), consumer_noise(), rate=50.0, seed=5)[0]
+    with pytest.raises(jaximu.NotPossibleError, match="Check a calibration that was made in the set-up"):
+        jaximu.check(jaximu.calibrate(log, EXACT), flawed, EXACT)

@@ -482,7 +482,8 @@ def _parameters_of(calibration: Calibration) -> ParameterTable:
 def _error_words(name: str) -> str:
     """Return what a kind of residual is called; of several kinds of data it may have a number."""
     kind, _, number = name.partition(" ")
-    return f"{_ERRORS[kind]} {number}".strip()
+    words = _ERRORS.get(kind) or f"Error of the {kind.replace('_', ' ')}"
+    return f"{words} {number}".strip()
 
 
 def _summary_of(calibration: Calibration) -> Summary:
@@ -527,9 +528,13 @@ def _scatter(calibration: Calibration) -> list[str]:
 
 
 def _gravity(calibration: Calibration) -> list[str]:
-    gravity = calibration.gravity
+    gravity, triads = calibration.gravity, calibration.triads()
     share = 100 * Z95 * gravity.sigma / gravity.value
-    if "accelerometer" not in calibration.triads() or share <= 0.01:
+    if "accelerometer" not in triads or share <= 0.01:
+        return []
+    scales = [Name("accelerometer", "gain", (axis, axis)) for axis in range(3)]
+    sigmas = np.sqrt(np.diag(calibration.covariance_of(scales)))
+    if np.all(100 * Z95 * sigmas < 0.9 * share * np.diag(triads["accelerometer"].gain)):  # what was felt is not gravity
         return []
     return [
         f"Gravity was taken as {gravity.value:.5f} ± {number(Z95 * gravity.sigma, 2)} m/s² (95 %). This alone leaves "

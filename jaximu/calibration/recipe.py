@@ -47,9 +47,7 @@ _SAME = 1e-9
 _ROUNDS = 4
 """Times that turns which lost time are looked for."""
 _RECORD = "Rest in six orientations or more, each axis up and down, and turn about each axis between rests."
-_NO_DRIFT = (
-    "The intervals of the biases leave out slow drift: use the joint method with the linear loss, or add --static LOG."
-)
+_NO_DRIFT = "The intervals of the biases leave out slow drift"
 
 
 @dataclass(frozen=True)
@@ -150,7 +148,8 @@ def _calibrated_jointly(
     recorded = [recording for kind in kinds for recording in kind.recordings]
     notes = [*(note for one in ready for note in one.notes), *(same_outputs(recorded) if recorded else ())]
     notes += [note for part in (*recorded, *parts, *([] if noise is None else [noise])) for note in part.notes]
-    notes += [] if noise is not None else [_NO_DRIFT]
+    if noise is None and recorded:
+        notes.append(f"{_NO_DRIFT}, unless data were observed with a noise model.")
     remarks: tuple[str, ...] = ()
     unit = Imu.nominal() if start is None else start
     if start is None and recorded:
@@ -200,7 +199,8 @@ def _distinct(names: Sequence[str]) -> list[str]:
 def _with_drift(found: Calibration) -> Calibration:
     """Return a calibration by hand whose uncertainty knows the drift of the biases that its recordings show."""
     if found.loss != "linear" or found.method.startswith("two-step"):
-        return replace(found, notes=(*found.notes, _NO_DRIFT))
+        advice = f"{_NO_DRIFT}: use the joint method with the linear loss, or add --static LOG."
+        return replace(found, notes=(*found.notes, advice))
     assert found.fit is not None and found.observations is not None
     fit, told = with_drift(found.fit, found.observations, found.segmentations)
     covariance = fit.total_covariance(found.gravity.sigma, clock_sigma(found.segmentations))

@@ -24,7 +24,7 @@ from jaximu.data.preintegration import linear_slope, preintegrate_samples, white
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, Data, Observed, free_columns
 from jaximu.estimation.problem import Parameters
-from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
+from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import Track, added, stimuli
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -414,7 +414,7 @@ class AgainstAttitude(Data):
         covariates = {TIME: middle} | by_axis("rate", "°/s", np.where(rotations, rate, np.nan))
         covariates |= by_axis("specific force", "m/s²", np.where(rotations, np.nan, force))
         if warmth is not None:
-            covariates["temperature [°C]"] = known(warmth, warmth.values)[:, 0]
+            covariates[TEMPERATURE] = known(warmth, warmth.values)[:, 0]
         length = np.concatenate([np.where(used, np.diff(stamps), 1.0), np.ones(len(window))])
         return Rows(
             kinds=RESIDUALS,

@@ -42,14 +42,18 @@ __all__ = ["RecordedByHand"]
 
 @dataclass
 class RecordedByHand(Data):
-    """Poses and turns of one unit, and the recordings that they were cut from, along which effects act."""
+    """Poses and turns of one unit, and the recordings that they were cut from, along which effects act.
+
+    known: the unit whose effects were taken off the observations, the Earth's rotation as a rule.
+    """
 
     segmentations: tuple[Segmentation, ...]
     observations: Observations
+    known: Imu | None = None
 
     excess_names = EXCESS_NAMES
     coarse = COARSE_EXCESS
-    by_hand = True
+    by_hand = sampled = True
     no_fixture = NO_FIXTURE
     advice = staticmethod(pose_advice)
 
@@ -95,6 +99,28 @@ class RecordedByHand(Data):
     def spans(self) -> list[FloatArray]:
         """Return start and stop (k, 2), s, of the poses of each recording."""
         return [part.intervals for part in self.segmentations]
+
+    def counts(self) -> dict[str, int]:
+        """Return the numbers of poses and turns."""
+        return {name: int(np.sum(getattr(self.observations, name).mask)) for name in ("poses", "turns")}
+
+    def rate_at_rest(self) -> FloatArray:
+        """Return the gyroscope's mean output (3,) over the poses."""
+        poses = self.observations.poses
+        return np.asarray(poses.gyroscope_mean)[np.asarray(poses.mask)].mean(axis=0)
+
+    def rotations(self, imu: Imu) -> FloatArray:
+        """Return how the rotation vector of each turn (t, 3, 3, 4), rad, reacts to K⁻¹ and −K⁻¹b of the gyroscope."""
+        slope = np.asarray(self.along(imu, ()).condensed.conditions.slope)
+        return slope[0, np.asarray(self.observations.turns.mask)]
+
+    def with_noise(self, noise: NoiseModel) -> RecordedByHand:
+        """Return the poses and turns with the covariance that a noise of the samples makes."""
+        data = replace(self, observations=observed_poses(self.segmentations, float(self.gravity), noise=noise))
+        if self.known is None or not self.known.all_effects():
+            return data
+        left = data.along(self.known, tuple(self.known.all_effects().values())).observations
+        return replace(data, observations=left)
 
     def rms(self, imu: Imu, details: Along, conditions: FloatArray) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""

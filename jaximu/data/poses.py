@@ -37,7 +37,7 @@ from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
-from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
+from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import Track, added, mean_outputs
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -440,7 +440,7 @@ def pose_rows(imu: Imu, observations: Observations) -> Rows:
     unknown = np.full(len(pose), np.nan), np.full(len(turn), np.nan)
     speed = np.degrees(np.linalg.norm(gyroscope.recover_on_host(turns.output), axis=2)) * (turns.interval > 0)
     middle = (poses.start + poses.stop) / 2, (poses.stop[:-1] + poses.start[1:]) / 2
-    covariates = {TIME: placed(*middle), "temperature [°C]": placed(poses.temperature, unknown[1])}
+    covariates = {TIME: placed(*middle), TEMPERATURE: placed(poses.temperature, unknown[1])}
     forces = imu.accelerometer.recover_on_host(poses.accelerometer_mean)
     covariates |= by_axis("specific force", "m/s²", placed(forces, np.full((len(turn), 3), np.nan)))
     covariates |= {

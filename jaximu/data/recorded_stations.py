@@ -46,10 +46,11 @@ class AtStations:
 
 @dataclass
 class RecordedStations(Data):
-    """A recording of one unit whose set-up says what the unit went through."""
+    """A recording of one unit whose set-up says what the unit went through; `entries`: what it says, where known."""
 
     recording: Recording
     stations: Stations
+    entries: Sequence[Entry] = ()
 
     excess_names = EXCESS_NAMES
     coarse = KnownStations.coarse
@@ -67,7 +68,7 @@ class RecordedStations(Data):
         Raises what `jaximu.data.observe_stations.observe_stations` raises.
         """
         entries = entries_of_columns(recording) if references is None else references
-        return cls(recording, observe_stations(recording, entries, as_gravity(gravity).value, noise)[0])
+        return cls(recording, observe_stations(recording, entries, as_gravity(gravity).value, noise)[0], entries)
 
     def free(self, name: Name) -> bool:
         """Return whether a number is free: all are, for the body frame is the fixture's."""
@@ -114,6 +115,28 @@ class RecordedStations(Data):
     def rests(self) -> list[FloatArray]:
         """Return the spans of the poses alone."""
         return [_spans(self.stations, _used(self.stations) & ~np.asarray(self.stations.turn))]
+
+    @property
+    def sampled(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the noise of samples makes the covariance: the entries say what the samples are compared with."""
+        return len(self.entries) > 0
+
+    def counts(self) -> dict[str, int]:
+        """Return the numbers of poses and turns that are used."""
+        turn, used = np.asarray(self.stations.turn), _used(self.stations)
+        return {"poses": int(np.sum(used & ~turn)), "turns": int(np.sum(used & turn))}
+
+    def rate_at_rest(self) -> FloatArray | None:
+        """Return the gyroscope's mean output (3,) over the poses in which it is used, where there are some."""
+        at_rest = np.asarray(self.stations.gyroscope_used) & ~np.asarray(self.stations.turn)
+        return np.asarray(self.stations.gyroscope_mean)[at_rest].mean(axis=0) if at_rest.any() else None
+
+    def with_noise(self, noise: NoiseModel) -> RecordedStations:
+        """Return the stations with the covariance that a noise of the samples makes."""
+        if not self.sampled:
+            return self
+        stations, _ = observe_stations(self.recording, self.entries, float(self.gravity), noise)
+        return replace(self, stations=stations)
 
     def observed(self, imu: Imu, details: AtStations) -> Observed:
         """Return the stations, padding included; orientation is compared in poses."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaximu.data.station_error import turntable_error
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.data import About, Conditions, Data
-from jaximu.estimation.rows import TIME, ResidualKind, Rows, by_axis
+from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu
@@ -72,7 +72,7 @@ def station_rows(imu: Imu, stations: Stations) -> Rows:
     kind = np.repeat(np.stack([np.zeros(count, np.int64), np.where(turn, 1, 2)], axis=1), 3, axis=1).ravel()
     covariates = {TIME: np.repeat((start + stop) / 2, 6)}
     if stimulus.temperature is not None:
-        covariates["temperature [°C]"] = np.repeat(np.asarray(stimulus.temperature).mean(axis=1), 6)
+        covariates[TEMPERATURE] = np.repeat(np.asarray(stimulus.temperature).mean(axis=1), 6)
     force, rate = (
         np.repeat(np.asarray(vectors).mean(axis=1), 6, axis=0)
         for vectors in (stimulus.specific_force, stimulus.angular_rate)

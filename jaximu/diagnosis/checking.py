@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -13,12 +14,13 @@ from jaximu.calibration.calibration import provenance, require_another, require_
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.systematic import History, noise_at_rest
 from jaximu.data.by_hand import RecordedByHand
-from jaximu.data.drift import with_usual_drift
 from jaximu.diagnosis.comparison import FollowedUnit, Fresh, Old, Question, Widened, candidates, scatter_about_a_fit
 from jaximu.diagnosis.experiment import Experiment
-from jaximu.diagnosis.noise import own_noise
+from jaximu.diagnosis.noise import usual_noise
 from jaximu.diagnosis.selection import Selection, select
 from jaximu.diagnosis.validity import Cause, OutputError, Shift, Validity
+from jaximu.estimation.data import Data
+from jaximu.estimation.rows import TEMPERATURE
 from jaximu.estimation.uncertainty import describe, label
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, normal_sf
@@ -60,7 +62,7 @@ _SI = {"accelerometer": ("m/s^2", "1 g", STANDARD_GRAVITY), "gyroscope": ("rad/s
 
 def check(
     calibration: Calibration,
-    recordings: Recording | Sequence[Recording],
+    recordings: Recording | Data | Sequence[Recording],
     gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
@@ -76,8 +78,8 @@ def check(
     recording to its noise, the noise is widened, kind by kind, to what it scatters about a fresh one.
 
     **Arguments:** `recordings`, `gravity`, `static`, `segmentation` as for [`jaximu.diagnosis.diagnose`]; gravity
-    stated as it was for the old calibration is taken for the same place, whose uncertainty is common to both. `level`:
-    rate of false alarms.
+    stated as it was for the old calibration is taken for the same place, whose uncertainty is common to both.
+    Recordings may be data of another kind, such as `jaximu.data.RecordedStations`. `level`: rate of false alarms.
 
     A recording with too few poses is followed by the filter in use (`jaximu.calibration.followed_in_use`) from its
     first rest: its innovations say whether the calibration holds, and which parameters moved, as far as they tell.
@@ -88,55 +90,61 @@ def check(
     """
     require_float64()
     require_calibration(calibration)
-    gravity = as_gravity(gravity)
-    recordings = recordings_of(recordings)
-    _same_sensors(calibration, recordings)
-    require_another(calibration, [source.sha256 for recording in recordings for source in recording.sources])
-    with prepared(recordings) as ready:
-        found = _checked(calibration, [each.recording for each in ready], gravity, static, segmentation, level)
-        if found.verdict != "valid" and any(each.spoiling for each in ready):
+    gravity, noise = as_gravity(gravity), noise_of(static)
+    several = recordings.recordings if isinstance(recordings, Data) else recordings_of(recordings)
+    _same_sensors(calibration, several)
+    require_another(calibration, [source.sha256 for recording in several for source in recording.sources])
+    if isinstance(recordings, Data):
+        return _compared(calibration, Old.of(calibration, gravity, recordings.free), recordings, noise, level)
+    with prepared(several) as ready:
+        validity = _checked(calibration, [one.recording for one in ready], gravity, noise, segmentation, level)
+        if validity.verdict != "valid" and any(one.spoiling for one in ready):
             raise NotPossibleError("this recording cannot show whether the calibration is still valid.")
-    told = [note for each in ready for note in each.notes]
-    return replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
+    notes = [note for one in ready for note in one.notes]
+    return replace(validity, notes=tuple(dict.fromkeys((*notes, *validity.notes))))
 
 
 def _checked(
     calibration: Calibration,
     recordings: Sequence[Recording],
     gravity: LocalGravity,
-    static: Recording | NoiseModel | None,
+    noise: NoiseModel | None,
     segmentation: SegmentationOptions | None,
     level: float,
 ) -> Validity:
-    noise = noise_of(static)
+    """Compare with recordings that were looked over: by their poses, or by a filter where there are too few."""
     old = Old.of(calibration, gravity)
     try:
         parts = tuple(segment(recording, segmentation) for recording in recordings)
+        if len(recordings) == 1 and len(parts[0].intervals) < _FEWEST_POSES:
+            raise NotPossibleError(
+                f"{recordings[0].name} has two poses and no motion between them to check anything by."
+            )
     except NotPossibleError as error:
         return _followed(calibration, old, recordings, gravity, noise, level, error)
-    if len(recordings) == 1 and len(parts[0].intervals) < _FEWEST_POSES:
-        why = NotPossibleError(f"{recordings[0].name} has two poses and no motion between them to check anything by.")
-        return _followed(calibration, old, recordings, gravity, noise, level, why)
-    notes = [note for recording in recordings for note in recording.notes] + [n for part in parts for n in part.notes]
+    data = RecordedByHand(parts, observed_poses(parts, gravity.value, noise=noise))
+    notes = [note for source in (*recordings, *parts) for note in source.notes]
+    return _compared(calibration, old, data, noise, level, notes)
 
-    def made(known: NoiseModel) -> RecordedByHand:
-        return RecordedByHand(parts, observed_poses(parts, gravity.value, noise=known))
 
-    if noise is None:
-        own = own_noise(replace(calibration, segmentations=parts))
-        plain = Experiment(made(own), old.imu.with_effects())
-        noise = with_usual_drift(own, plain.shortest(), plain.extent().duration)
-        notes += noise.notes
-    data = made(noise)
+def _compared(
+    calibration: Calibration, old: Old, data: Data, noise: NoiseModel | None, level: float, notes: Sequence[str] = ()
+) -> Validity:
+    """Compare what the old calibration predicts of data with what was measured."""
+    notes, name = list(notes), data.recordings[0].name
     experiment = Experiment(data, old.imu.with_effects())
-    old = old.rested(data.observations)
-    notes += _temperatures(calibration, old, data)
+    if noise is None and data.sampled:
+        usual = usual_noise(experiment)
+        notes += usual.notes
+        experiment = replace(experiment, data=data.with_noise(usual))
+    old = old.rested(data.rate_at_rest())
+    notes += _temperatures(calibration, old, experiment)
     conditions = experiment.predict(old.imu)[0]
-    _same_unit(experiment, conditions, recordings[0].name)
+    _same_unit(experiment, conditions, name)
 
     scatter = np.ones(len(experiment.real.kinds))
     fresh = Fresh.fit(old, experiment, scatter)
-    _same_gains(old, fresh, recordings[0].name)
+    _same_gains(old, fresh, name)
     enough = len(conditions) - len(old.names) >= _FEWEST and bool(fresh.known(old).all())
     others = candidates(old, experiment) if enough else []
     question = Question.ask(old, Widened(experiment, scatter).predict(old.imu), others)
@@ -147,26 +155,28 @@ def _checked(
         selection = select(question.evidence, level)
     known = fresh.known(old)
     causes = tuple(
-        each
-        for each in _causes(question, selection, old)  # of what cannot be compared none is named
-        if each.scope != "parameter" or known[[old.names.index(name) for name in each.parameters]].any()
+        cause
+        for cause in _causes(question, selection, old)  # of what cannot be compared none is named
+        if cause.scope != "parameter" or known[[old.names.index(name) for name in cause.parameters]].any()
     )
     chosen = [question.candidates[cause.block] for cause in selection.causes] if selection.complete else []
-    given = [each.columns for each in chosen if each.scope != "parameter"]
-    if given or scatter.max() > 1:
-        fresh = Fresh.fit(old, experiment, scatter, given, fresh.imu)
+    explained = [candidate.columns for candidate in chosen if candidate.scope != "parameter"]
+    if explained or scatter.max() > 1:
+        fresh = Fresh.fit(old, experiment, scatter, explained, fresh.imu)
     if not fresh.converged and fresh.known(old).all():
         notes.append("the new calibration did not converge: differences from it may be less certain than stated.")
-    verdict = _verdict(selection, causes)
-    shifts = _shifts(old, fresh, 0.0 if verdict == "valid" else level)
-    compared = [k for k, each in enumerate(shifts) if each.tested]
-    spread = fresh.covariance_of_difference[np.ix_(compared, compared)]
-    square = float(fresh.difference[compared] @ np.linalg.solve(spread, fresh.difference[compared]))
-    unknown = [each.name for each in shifts if not each.comparable]
+    wide = {kind.name: float(value) for kind, value in zip(experiment.real.kinds, scatter, strict=True)}
+    before, after = (experiment.real.rms(errors) for errors in (conditions, fresh.conditions))
+    validity = _validity(
+        calibration, old, question, selection, fresh, causes, _verdict(selection, causes), level, experiment=experiment,
+        errors={name: (value, after[name][0], unit) for name, (value, unit) in before.items()}, scatter=wide,
+        conditions=(conditions, fresh.conditions), data=provenance(data.recordings) | data.counts(),
+    )  # fmt: skip
+    unknown = [shift.name for shift in validity.shifts if not shift.comparable]
     if unknown:
         notes.append(
-            f"the recording's poses and turns are too few or too alike to determine {len(unknown)} of {len(shifts)} "
-            f"parameters, which were not compared: {', '.join(unknown)}."
+            f"the recording's poses and turns are too few or too alike to determine {len(unknown)} of "
+            f"{len(validity.shifts)} parameters, which were not compared: {', '.join(unknown)}."
         )
     if not enough:
         notes.append(
@@ -174,26 +184,37 @@ def _checked(
             "them from "
             "parameters that moved."
         )
-    kinds = [kind.name for kind in experiment.real.kinds]
-    wide = {name: float(value) for name, value in zip(kinds, scatter, strict=True)}
     if scatter.max() > 1:
-        said = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in wide.items() if value > 1)
+        widened = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in wide.items() if value > 1)
         notes.append(
-            f"the recording scatters more than its noise about any calibration ({said} times): the noise was widened "
-            "by it. `jaximu diagnose` seeks the reason."
+            f"the recording scatters more than its noise about any calibration ({widened} times): the noise was "
+            "widened by it. `jaximu diagnose` seeks the reason."
         )
-    before, after = (experiment.real.rms(each) for each in (conditions, fresh.conditions))
-    observed = data.observations
+    errors = {} if unknown else _output_errors(old, fresh, data)
+    return replace(validity, output_errors=errors, notes=tuple(dict.fromkeys(notes)))
+
+
+def _validity(
+    calibration: Calibration,
+    old: Old,
+    question: Question,
+    selection: Selection,
+    fresh: Fresh,
+    causes: tuple[Cause, ...],
+    verdict: str,
+    level: float,
+    **about: Any,
+) -> Validity:
+    """Return the answer to a question; `about`: what else a `Validity` says."""
+    shifts = _shifts(old, fresh, 0.0 if verdict == "valid" else level)
+    compared = [k for k, shift in enumerate(shifts) if shift.tested]
+    difference, spread = fresh.difference[compared], fresh.covariance_of_difference[np.ix_(compared, compared)]
+    square = float(difference @ np.linalg.solve(spread, difference))
+    residual = question.evidence.residual
     return Validity(
-        verdict, selection.p_value, float(question.evidence.residual @ question.evidence.residual),
-        question.evidence.freedom,
-        difference=(square, len(compared), float(chi2_sf(square, len(compared))) if compared else 1.0),
-        shifts=shifts, causes=causes, output_errors={} if unknown else _output_errors(old, fresh, data),
-        errors={name: (value, after[name][0], unit) for name, (value, unit) in before.items()},
-        scatter=wide, notes=tuple(dict.fromkeys(notes)), experiment=experiment,
-        conditions=(conditions, fresh.conditions),
-        data=provenance(recordings) | {"poses": int(np.sum(observed.poses.mask)),
-                                       "turns": int(np.sum(observed.turns.mask))}, calibration=calibration,
+        verdict, selection.p_value, float(residual @ residual), question.evidence.freedom,
+        (square, len(compared), float(chi2_sf(square, len(compared))) if compared else 1.0), shifts, causes,
+        calibration=calibration, **about,
     )  # fmt: skip
 
 
@@ -226,46 +247,39 @@ def _followed(
     if np.sum(~history.rest) < 2:
         raise why
     _upright(old, recording, history, gravity)
-    followed, explained = _told(follower, old, int(np.sum(history.freedom > 0)))
+    updates = int(np.sum(history.freedom > 0))
+    followed, explained = _told(follower, old, updates)
     free = int(history.freedom.sum()) - len(followed.conditions)
     left = max(float(history.innovations.sum()) - explained, 0.0) / max(free, 1)
-    scatter = np.full(1, max(1.0, np.sqrt(left)))
-    question = Question.ask(old, followed.predict(float(scatter[0])))
+    scatter = max(1.0, float(np.sqrt(left)))
+    question = Question.ask(old, followed.predict(scatter))
     selection = select(question.evidence, level)
-    fresh = Fresh.of_linear(old, followed, float(scatter[0]))
+    fresh = Fresh.of_linear(old, followed, scatter)
     strange = left > _LARGE and chi2_sf(left * free, free) < _IMPLAUSIBLE
     causes = () if strange else _causes(question, selection, old)
     verdict = "unexplained" if strange else _verdict(selection, causes)
-    alone = {each.name: _alone(question, each) for each in causes if len(each.parameters) == 1}
-    shifts = _shifts(old, fresh, 0.0 if verdict == "valid" else level)
-    compared = [k for k, each in enumerate(shifts) if each.tested]
-    spread = fresh.covariance_of_difference[np.ix_(compared, compared)]
-    square = float(fresh.difference[compared] @ np.linalg.solve(spread, fresh.difference[compared]))
-    unknown = [each.words for each in shifts if not each.comparable]
+    validity = _validity(
+        calibration, old, question, selection, fresh, causes, verdict, level, history=history,
+        scatter={"innovations": scatter}, conditions=(followed.conditions, fresh.conditions),
+        data=provenance([recording]) | {"updates": updates},
+        alone={cause.name: _alone(question, cause) for cause in causes if len(cause.parameters) == 1},
+    )  # fmt: skip
     notes = [
         *recording.notes, *noise.notes,
         "the recording has too few poses, so a filter followed the calibrated unit through it, which measures in rests "
-        f"and where motion ends: {int(np.sum(history.freedom > 0))} updates.",
+        f"and where motion ends: {updates} updates.",
     ]  # fmt: skip
-    if unknown:
+    if unknown := [shift.words for shift in validity.shifts if not shift.comparable]:
         notes.append(
             f"not determined without poses, each by itself: {', '.join(unknown)}. Record twenty poses to compare them."
         )
     if diverged is not None and verdict != "valid":
         notes.append(diverged)
-    if verdict == "shifted" and any(len(each.parameters) == len(old.tested) for each in causes):
+    if verdict == "shifted" and any(len(cause.parameters) == len(old.tested) for cause in causes):
         notes.append("so much differs that the calibration may be another unit's.")
-    if scatter[0] > 1:
-        notes.append(f"innovations scatter {scatter[0]:.2g} times their noise: the noise was widened by it.")
-    return Validity(
-        verdict, selection.p_value, float(question.evidence.residual @ question.evidence.residual),
-        question.evidence.freedom,
-        difference=(square, len(compared), float(chi2_sf(square, len(compared))) if compared else 1.0),
-        shifts=shifts, causes=causes, output_errors={}, errors={}, scatter={"innovations": float(scatter[0])},
-        notes=tuple(dict.fromkeys(notes)), experiment=None, conditions=(followed.conditions, fresh.conditions),
-        data=provenance([recording]) | {"updates": int(np.sum(history.freedom > 0))}, calibration=calibration,
-        history=history, alone=alone,
-    )  # fmt: skip
+    if scatter > 1:
+        notes.append(f"innovations scatter {scatter:.2g} times their noise: the noise was widened by it.")
+    return replace(validity, notes=tuple(dict.fromkeys(notes)))
 
 
 def _told(follower: FilterInUse, old: Old, updates: int) -> tuple[FollowedUnit, float]:
@@ -374,15 +388,15 @@ def _same_gains(old: Old, fresh: Fresh, name: str) -> None:
             )
 
 
-def _temperatures(calibration: Calibration, old: Old, data: RecordedByHand) -> list[str]:
+def _temperatures(calibration: Calibration, old: Old, experiment: Experiment) -> list[str]:
     """Say where temperatures differ and the calibration has nothing that depends on them."""
-    before = calibration.data.get("temperature")
+    before, warmth = calibration.data.get("temperature"), experiment.real.covariates.get(TEMPERATURE)
     if before is None or any("temperature" in " ".join(effect.needs) for effect in old.imu.all_effects().values()):
         return []
-    poses = data.observations.poses
-    after = float(np.mean(np.asarray(poses.temperature)[np.asarray(poses.mask)]))
-    known = all(part.recording.temperature is not None for part in data.segmentations)
-    if not known or abs(after - before) < _WARMTH:
+    if warmth is None or any(recording.temperature is None for recording in experiment.recordings):
+        return []
+    after = float(np.mean(warmth[experiment.real.kind == 0]))
+    if abs(after - before) < _WARMTH:
         return []
     return [
         f"the calibration was made at {before:.1f} °C and this recording at {after:.1f} °C in the mean, and nothing in "
@@ -446,9 +460,9 @@ def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
     return tuple(found)
 
 
-def _output_errors(old: Old, fresh: Fresh, data: RecordedByHand) -> dict[str, OutputError]:
+def _output_errors(old: Old, fresh: Fresh, data: Data) -> dict[str, OutputError]:
     """The largest difference of the outputs in the recording, gyroscope bias apart, and of the turns' rotations."""
-    found = {}
+    errors = {}
 
     def error(value: float, slope: FloatArray, places: list[int], unit: str) -> OutputError:
         spread = slope @ fresh.covariance_of_difference[np.ix_(places, places)] @ slope.T
@@ -457,24 +471,22 @@ def _output_errors(old: Old, fresh: Fresh, data: RecordedByHand) -> dict[str, Ou
     for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
         before, after = old.imu.triads()[name], fresh.imu.triads()[name]
         inverse, places = np.linalg.inv(before.gain), old.places(name, "gain", "bias")
-        values = np.concatenate([getattr(part.recording, name).values for part in data.segmentations])
+        values = np.concatenate([recording.signals[name].values for recording in data.recordings])
         true = (values - after.bias) @ np.linalg.inv(after.gain).T
-        told = (values - (after if name == "gyroscope" else before).bias) @ inverse.T
-        size = np.linalg.norm(told - true, axis=1)
+        output = (values - (after if name == "gyroscope" else before).bias) @ inverse.T
+        size = np.linalg.norm(output - true, axis=1)
         worst = int(np.argmax(size))
         axes = [old.names[k].axes for k in places]  # (output, input) of a gain, (output,) of a bias
         columns = [inverse[:, each[0]] * np.prod([true[worst, k] for k in each[1:]]) for each in axes]
-        found[name] = error(float(size[worst]), np.stack(columns, axis=1), places, unit)
-    real = np.asarray(data.observations.turns.mask)
-    if real.any():
-        before, after = old.imu.triads()["gyroscope"], fresh.imu.triads()["gyroscope"]
-        rested = eqx.tree_at(lambda imu: imu.gyroscope.bias, old.imu.with_effects(), after.bias)
-        by = np.asarray(data.along(rested, ()).condensed.conditions.slope)[0, real]
+        errors[name] = error(float(size[worst]), np.stack(columns, axis=1), places, unit)
+    before, after = old.imu.triads()["gyroscope"], fresh.imu.triads()["gyroscope"]
+    by = data.rotations(eqx.tree_at(lambda imu: imu.gyroscope.bias, old.imu.with_effects(), after.bias))
+    if len(by):
         # how each turn's rotation vector reacts to A = K⁻¹, the bias held: c = −A b
         by = np.degrees(by[..., :3] - by[..., 3:] * np.asarray(after.bias))
         inverse = np.linalg.inv(before.gain)
         vectors = np.einsum("tijk,jk->ti", by, np.linalg.inv(after.gain) - inverse)
         worst = int(np.argmax(np.linalg.norm(vectors, axis=1)))
         slope = -np.einsum("ijk,ja,bk->iab", by[worst], inverse, inverse).reshape(3, 9)
-        found["turns"] = error(float(np.linalg.norm(vectors[worst])), slope, old.places("gyroscope", "gain"), "deg")
-    return found
+        errors["turns"] = error(float(np.linalg.norm(vectors[worst])), slope, old.places("gyroscope", "gain"), "deg")
+    return errors

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -18,10 +18,10 @@ from jaximu.estimation.fitting import Prior, effect_numbers, fit
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
 from jaximu.estimation.uncertainty import label
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
-from jaximu.recordings.observations import Observations
 
 __all__ = ["Explanation", "FollowedUnit", "Fresh", "Old", "Question", "Widened", "candidates", "scatter_about_a_fit"]
 
@@ -56,11 +56,14 @@ class Old:
     own: float
 
     @classmethod
-    def of(cls, calibration: Calibration, local: LocalGravity) -> Old:
-        """Return a calibration without what was its recording's or its set-up's, and without gravity's common error."""
+    def of(cls, calibration: Calibration, local: LocalGravity, free: Callable[[Name], bool] = without_equipment) -> Old:
+        """Return a calibration without what was its recording's or its set-up's, and without gravity's common error.
+
+        `free`: which numbers of gain and bias the data tell. Raises `NotPossibleError` where the calibration lacks one.
+        """
         imu = jax.tree.map(np.asarray, calibration.imu.transferable())
         triads, effects, bare = imu.triads(), imu.all_effects(), imu.with_effects()
-        parameters = Parameters.select(bare, without_equipment)
+        parameters = Parameters.select(bare, free)
         own, numbers, _ = effect_numbers(imu)
         names = (*parameters.names, *own)
         values = np.concatenate([flatten(bare)[list(parameters.index)], numbers])
@@ -68,6 +71,11 @@ class Old:
         places = {label(name, calibration.imu): place for place, name in enumerate(calibration.names)}
         known = [places.get(label(name, imu)) for name in names]
         there, found = [k for k, place in enumerate(known) if place is not None], [k for k in known if k is not None]
+        if calibration.names and None in known[: len(parameters.names)]:
+            raise NotPossibleError(
+                "the calibration's axes are the accelerometer's, and these data's are a set-up's, in which the unit "
+                "may sit turned. Check a calibration that was made in the set-up."
+            )
         covariance = np.zeros((len(names), len(names)))
         covariance[np.ix_(there, there)] = calibration.covariance[np.ix_(found, found)]
         of_effects = 10 * np.maximum(np.maximum(np.abs(values), np.sqrt(np.diag(covariance))), 1e-12)
@@ -104,13 +112,13 @@ class Old:
         """Return the places of a triad's gain, bias or both, without what is allowed to change."""
         return [k for k in self.tested if self.names[k].owner == owner and self.names[k].part in parts]
 
-    def rested(self, observations: Observations) -> Old:
-        """Return the calibration with the gyroscope's bias of the start as it is at rest in new observations.
+    def rested(self, bias: FloatArray | None) -> Old:
+        """Return the calibration with the gyroscope's bias (3,) of the start as it is at rest in new data, if known.
 
         Turns under a bias that is off by degrees a second are not linear in it.
         """
-        poses = observations.poses
-        bias = np.mean(np.asarray(poses.gyroscope_mean)[np.asarray(poses.mask)], axis=0)
+        if bias is None:
+            return self
         start = np.array(self.values)
         start[self.allowed] = bias
         return replace(self, imu=eqx.tree_at(lambda imu: imu.gyroscope.bias, self.imu, bias), start=start)

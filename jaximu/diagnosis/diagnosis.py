@@ -8,11 +8,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import concluded
-from jaximu.calibration.recipe import Choices, calibrate_ready
+from jaximu.calibration.recipe import Choices, calibrate, calibrate_ready
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import with_usual_drift
 from jaximu.diagnosis.checks import Check, checks_of
@@ -22,25 +23,38 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import LearnedTerm, learn, left_out_likelihood
-from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise
+from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise, usual_noise
 from jaximu.diagnosis.selection import Selection, select, shape_of
+from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, NotPossibleError, nearest
-from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.quantities import Z95, change, listed, probability, size, with_interval, with_intervals
 from jaximu.ground.summary import Block, Described, Summary, sentence
 from jaximu.mistakes import prepare, prepared
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect, register
 from jaximu.model.noise_model import NoiseModel
+from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, recordings_of
-from jaximu.recordings.segmentation import SegmentationOptions, observed_poses
+from jaximu.recordings.segmentation import SegmentationOptions
 
-__all__ = ["Diagnosis", "Examination", "Named", "diagnose", "examine", "same_device", "twin_of", "without_effects"]
+__all__ = [
+    "Diagnosis",
+    "Examination",
+    "Named",
+    "diagnose",
+    "diagnose_data",
+    "examine",
+    "recorded_by_hand",
+    "same_device",
+    "twin_of",
+    "without_effects",
+]
 
 _DOUBT = 0.01
 """Probability below which chance is no longer offered as an explanation."""
@@ -370,9 +384,10 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
 
 
 def diagnose(
-    recordings: Recording | Sequence[Recording],
+    recordings: Recording | Data | Sequence[Recording],
     gravity: Gravity = STANDARD,
     *,
+    start: Imu | None = None,
     static: Recording | NoiseModel | None = None,
     heldout: Recording | None = None,
     segmentation: SegmentationOptions | None = None,
@@ -385,7 +400,9 @@ def diagnose(
     **Arguments:** as for [`jaximu.calibrate`], and
 
     - `recordings`: several of one unit show together what one hardly does. Each has its own biases, as after another
-      power-on; effects that belong to one recording (steps, ramps) are asked of one alone.
+      power-on; effects that belong to one recording (steps, ramps) are asked of one alone. Or data of another kind,
+      such as `jaximu.data.RecordedStations`, as [`jaximu.calibrate`][] takes them.
+    - `start`: with data, as for [`jaximu.calibrate`][].
     - `gravity`: where it states a latitude, the Earth's rotation is no finding: it is taken off.
     - `static`: a recording of the unit at rest, or its `NoiseModel`. Without one the noise is taken from the poses
       themselves, which tells slow bias less surely.
@@ -403,6 +420,12 @@ def diagnose(
     """
     gravity = as_gravity(gravity)
     names = None if candidates is None else tuple(map(_candidate, candidates))
+    if isinstance(recordings, Data):
+        if heldout is not None or segmentation is not None or repair:
+            raise InputError("heldout, segmentation and repair are for recordings, and data were given.")
+        return _of_data(recordings, gravity, start, noise_of(static), names, level)
+    if start is not None:
+        raise InputError("a start is for data: recordings by hand begin at the data sheet's values.")
     recordings = recordings_of(recordings)
     if any(recording.gyroscope is None for recording in recordings):
         raise NotPossibleError(
@@ -410,25 +433,86 @@ def diagnose(
         )
     choices = Choices(gravity, segmentation=segmentation)
     with prepared(recordings, repair) as ready:
-        findings = [finding for each in ready for finding in each.findings]
-        spoiling = [finding for each in ready for finding in each.spoiling]
-        noise = noise_of(static)
-        calibration, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
+        findings = [finding for one in ready for finding in one.findings]
+        spoiling = [finding for one in ready for finding in one.spoiling]
+        calibration, unusual = calibrate_ready([one.recording for one in ready], choices, repair)
         spoiling += [finding for finding in unusual if finding.spoils]
-        notes, held = list(calibration.notes), None
-        notes += [] if names is None else [f"of all effects only these were asked for: {', '.join(names) or 'none'}."]
+        notes, held = [*calibration.notes, *_only(names)], None
         if heldout is not None:
             other, _ = calibrate_ready([prepare(heldout, repair).recording], choices, repair)
             notes += same_device(calibration, other)
-            held = partial(_experiment, other, start=calibration, candidates=names)
-        found = examine(Examination(
-            calibration, own_noise(calibration) if noise is None else noise,
-            partial(_experiment, calibration, candidates=names), held, (*findings, *unusual), tuple(notes), level,
-            drifting=noise is None, naming=not spoiling,
+            held = recorded_by_hand(other)
+        diagnosis = examine(Examination.of(
+            calibration, recorded_by_hand(calibration), noise_of(static), held, names,
+            findings=(*findings, *unusual), notes=tuple(notes), level=level, naming=not spoiling,
         ))  # fmt: skip
-    if found.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
+    if diagnosis.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
         spoiling = [finding for finding in findings if finding.partial]
-    return without_effects(found, spoiling) if spoiling else found
+    return without_effects(diagnosis, spoiling) if spoiling else diagnosis
+
+
+def _only(candidates: Sequence[str] | None) -> list[str]:
+    """Say which effects alone were asked for."""
+    if candidates is None:
+        return []
+    return [f"of all effects only these were asked for: {', '.join(candidates) or 'none'}."]
+
+
+def _of_data(
+    data: Data,
+    gravity: LocalGravity,
+    start: Imu | None,
+    noise: NoiseModel | None,
+    names: tuple[str, ...] | None,
+    level: float,
+) -> Diagnosis:
+    """Calibrate data of whatever kind, and ask them for all that the model lacks."""
+    if type(data).observed is Data.observed:
+        raise InputError(f"{type(data).__name__} cannot be diagnosed: give the recording that they were taken from.")
+    calibrated = partial(calibrate, data, gravity, start=start, static=noise)
+    calibration = calibrated()
+    notes = (*calibration.notes, *_only(names))
+    if data.sampled:
+        return examine(Examination.of(calibration, data, noise, None, names, notes, level=level))
+    noise = noise or data.white_noise(calibration.excess)
+    return diagnose_data(
+        calibration, data, noise, lambda effects: calibrated(effects=effects), names, notes=notes, level=level
+    )
+
+
+def diagnose_data(
+    calibration: Calibration,
+    data: Data,
+    noise: NoiseModel,
+    recalibrated: Callable[[Sequence[Effect]], Calibration],
+    candidates: Sequence[str] | None = None,
+    **about: Any,
+) -> Diagnosis:
+    """Ask calibrated data, of whatever kind, the noise of whose samples is not known apart from what a fit leaves.
+
+    How a set-up stands is known to what set-ups usually are, and no more: that is part of the conditions' covariance,
+    and so is what the fit says of the noise. What explains the misfit is taken out of it, and the rest is asked again.
+
+    **Arguments:** `noise`: what the samples' is shown as. `recalibrated`: returns the calibration with effects that
+    were named. `about`: fields of `Examination`.
+    """
+
+    def examined(fitted: Calibration) -> Diagnosis:
+        setup = tuple(effect for effect in fitted.imu.all_effects().values() if effect.scope == "fixture")
+        start = jax.tree.map(np.asarray, calibration.imu.with_effects())
+        excess = np.array([fitted.excess[name] for name in data.excess_names])
+        asked = None if candidates is None else tuple(candidates)
+        experiment = Experiment(data, start, None, asked, setup, excess, reference=fitted.reference)
+        return examine(Examination(calibration, noise, lambda noise: experiment, trusted=True, **about))
+
+    diagnosis = examined(calibration)
+    if not diagnosis.named:
+        return diagnosis
+    try:
+        fitted = recalibrated([named.effect for named in diagnosis.named])
+    except NotPossibleError:  # beside noise that is estimated with them they may be open: the first answer stands
+        return diagnosis
+    return examined(fitted)
 
 
 def twin_of(diagnosis: Diagnosis, seed: int = 0) -> Experiment:
@@ -460,6 +544,34 @@ class Examination:
     naming: bool = True
     taken: tuple[Effect, ...] = ()
     measured: Callable[[Experiment, State, State], Gain] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        calibration: Calibration,
+        data: Data,
+        noise: NoiseModel | None,
+        held: Data | None = None,
+        candidates: tuple[str, ...] | None = None,
+        notes: tuple[str, ...] = (),
+        **about: Any,
+    ) -> Examination:
+        """Return the examination of data whose covariance the noise of samples makes; None takes it from their rests.
+
+        Rests know nothing of what is slower. By hand the drift is estimated; else it is the usual one, and not asked.
+        """
+        start = jax.tree.map(np.asarray, calibration.imu.with_effects())
+
+        def remade(part: Data, known: NoiseModel) -> Experiment:
+            return Experiment(part.with_noise(known), start, candidates=candidates)
+
+        if noise is None:
+            plain = Experiment(data, start)
+            noise = own_noise(plain) if data.by_hand else usual_noise(plain)
+            notes = (*notes, *noise.notes)
+            about |= {"drifting": data.by_hand, "trusted": not data.by_hand}
+        other = None if held is None else partial(remade, held)
+        return cls(calibration, noise, partial(remade, data), other, notes=notes, **about)
 
     @cached_property
     def first(self) -> tuple[Experiment, State]:
@@ -757,19 +869,10 @@ def _candidate(effect: str | type[Effect]) -> str:
     return name
 
 
-def _experiment(
-    calibration: Calibration,
-    noise: NoiseModel,
-    start: Calibration | None = None,
-    candidates: tuple[str, ...] | None = None,
-) -> Experiment:
-    observations = observed_poses(calibration.segmentations, calibration.gravity.value, noise=noise)
-    known = tuple(calibration.imu.all_effects().values())
-    if known:  # the Earth's rotation, where the latitude is known
-        whole = RecordedByHand(calibration.segmentations, observations)
-        observations = whole.along(calibration.imu, known).observations
-    data = RecordedByHand(calibration.segmentations, observations)
-    return Experiment(data, (start or calibration).imu.with_effects(), candidates=candidates)
+def recorded_by_hand(calibration: Calibration) -> RecordedByHand:
+    """Return the poses and turns that a calibration was fitted to; its effects are taken off: the Earth's rotation."""
+    assert calibration.observations is not None
+    return RecordedByHand(calibration.segmentations, calibration.observations, calibration.imu)
 
 
 def same_device(first: Calibration, other: Calibration) -> list[str]:

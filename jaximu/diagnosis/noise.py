@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy
 
-from jaximu.calibration import Calibration
+from jaximu.data.drift import with_usual_drift
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import curves
@@ -26,9 +26,8 @@ from jaximu.ground.distributions import chi2_median, f_tails, normal_isf, normal
 from jaximu.ground.quantities import number, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
-from jaximu.recordings.segmentation import Segmentation
 
-__all__ = ["NOISE_NAMES", "NoiseFinding", "own_noise", "quick_noise", "slow_noise"]
+__all__ = ["NOISE_NAMES", "NoiseFinding", "own_noise", "quick_noise", "slow_noise", "usual_noise"]
 
 NOISE_NAMES = ("noise.white", "noise.correlated", "noise.bias_instability", "noise.rate_random_walk")
 _SHARE = 0.1
@@ -48,37 +47,33 @@ _BESIDE = 0.1
 _LONG = 4.0
 """Correlation time of a random walk's stand-in, in lengths of the recording."""
 
-_SHORTEST = 64
-"""Samples that a pose must hold for its spectrum to count."""
+_FEWEST, _SHORTEST = 8, 64
+"""Samples that a part at rest must exceed for its scatter to count, and hold for its spectrum to count."""
 
 
-def own_noise(calibration: Calibration) -> NoiseModel:
-    """Fit a noise model to the scatter inside the poses, which knows nothing of what is slower than a pose."""
-    found: dict[str, AxisNoise] = {}
+def own_noise(experiment: Experiment) -> NoiseModel:
+    """Fit a noise model to the scatter inside the parts at rest, which knows nothing of what is slower than a part."""
+    noise: dict[str, AxisNoise] = {}
     for name in ("accelerometer", "gyroscope"):
-        parts = [_parts(part, name) for part in calibration.segmentations]
-        segments = [values for part, _ in parts for values in part]
-        length = int(np.median([len(values) for values in segments]))
-        whole = [values[:length] for values in segments if len(values) >= max(length, _SHORTEST)]
-        rate = parts[0][1]
+        parts, rate = experiment.still_parts(name)
+        parts = [values for values in parts if len(values) > _FEWEST]
+        length = int(np.median([len(values) for values in parts]))
+        whole = [values[:length] for values in parts if len(values) >= max(length, _SHORTEST)]
         if len(whole) >= 4:
             bank = fit_bank(np.stack([values.T for values in whole]), rate)
             kept = bank.correlation_time < length / rate
-            found[name] = replace(bank, variance=bank.variance[:, kept], correlation_time=bank.correlation_time[kept])
+            triad = replace(bank, variance=bank.variance[:, kept], correlation_time=bank.correlation_time[kept])
         else:
-            scatter = np.mean([values.var(axis=0) for values in segments if len(values) > 1], axis=0)
-            found[name] = AxisNoise.of_white(scatter / rate)
+            triad = AxisNoise.of_white(np.mean([values.var(axis=0) for values in parts], axis=0) / rate)
         # output that never changes at rest is known to its steps and no better
-        steps = getattr(calibration.segmentations[0].recording, name).rounding_variance / 3
-        found[name] = replace(found[name], white=np.maximum(found[name].white, steps / rate))
-    return NoiseModel(found["accelerometer"], found["gyroscope"])
+        steps = experiment.recordings[0].signals[name].rounding_variance / 3
+        noise[name] = replace(triad, white=np.maximum(triad.white, steps / rate))
+    return NoiseModel(noise["accelerometer"], noise["gyroscope"])
 
 
-def _parts(part: Segmentation, name: str) -> tuple[list[np.ndarray], float]:
-    signal = getattr(part.recording, name)
-    values = signal.si()
-    inside = [values[(signal.time >= a) & (signal.time < b)] for a, b in part.intervals]
-    return [each for each in inside if len(each) > 8], signal.rate
+def usual_noise(experiment: Experiment) -> NoiseModel:
+    """Return the noise that the parts at rest show, and the drift that sensors usually have beyond them."""
+    return with_usual_drift(own_noise(experiment), experiment.shortest(), experiment.extent().duration)
 
 
 @dataclass(frozen=True)

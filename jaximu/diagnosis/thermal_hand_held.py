@@ -16,13 +16,11 @@ import numpy as np
 from jaximu._version import __version__
 from jaximu.calibration import Calibration, calibrate
 from jaximu.calibration.refusals import require_solved
-from jaximu.data.by_hand import RecordedByHand
-from jaximu.data.drift import with_usual_drift
 from jaximu.data.rest_blocks import LEAST_RANGE
-from jaximu.diagnosis.diagnosis import extended
+from jaximu.diagnosis.diagnosis import extended, recorded_by_hand
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import left_out_likelihood
-from jaximu.diagnosis.noise import own_noise
+from jaximu.diagnosis.noise import usual_noise
 from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -30,7 +28,7 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, recordings_of
-from jaximu.recordings.segmentation import observed_poses, segment
+from jaximu.recordings.segmentation import segment
 
 __all__ = ["HandHeldThermal", "calibrate_thermal_by_hand", "turned_by_hand"]
 
@@ -119,16 +117,9 @@ def calibrate_thermal_by_hand(
     noise = noise_of(static)
     calibration = calibrate(given, gravity)
 
-    def made(known: NoiseModel) -> Experiment:
-        observations = observed_poses(calibration.segmentations, gravity.value, noise=known)
-        data = RecordedByHand(calibration.segmentations, observations)
-        return Experiment(data, calibration.imu, candidates=ASKED)
-
-    if noise is None:
-        own = own_noise(calibration)
-        plain = made(own)
-        noise = with_usual_drift(own, plain.shortest(), plain.extent().duration)
-    experiment = made(noise)
+    experiment = Experiment(recorded_by_hand(calibration), calibration.imu.with_effects(), candidates=ASKED)
+    noise = usual_noise(experiment) if noise is None else noise
+    experiment = replace(experiment, data=experiment.data.with_noise(noise))
     base = state = experiment.fit()
     steps: list[tuple[str, float, float]] = []
     refused: set[str] = set()

@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
 
-import jax
-import numpy as np
-
+from jaximu.calibration import Calibration
 from jaximu.calibration.turntable import calibrate_table_ready
-from jaximu.data.drift import with_usual_drift
-from jaximu.data.observe_stations import observe_stations
 from jaximu.data.recorded_stations import RecordedStations
 from jaximu.diagnosis.diagnosis import Diagnosis, Examination, examine, same_device, without_effects
-from jaximu.diagnosis.experiment import Experiment
-from jaximu.diagnosis.noise import own_noise
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.mistakes import Prepared, prepare, prepared
 from jaximu.model.noise_model import NoiseModel
-from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.reference import Entry, entries_of_columns
-from jaximu.recordings.segmentation import Segmentation
 
 __all__ = ["diagnose_turntable"]
 
@@ -61,46 +51,25 @@ def _of_ready(
     repair: bool,
 ) -> Diagnosis:
     """Diagnose a recording that was looked over."""
-    recording = ready.recording
-    if recording.gyroscope is None or (heldout is not None and heldout[0].gyroscope is None):
+    if ready.recording.gyroscope is None or (heldout is not None and heldout[0].gyroscope is None):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
-
-    def made(part: Recording, entries: Sequence[Entry], imu: Imu, known: NoiseModel) -> Experiment:
-        stations, _ = observe_stations(part, entries, gravity.value, known)
-        return Experiment(RecordedStations(part, stations), jax.tree.map(np.asarray, imu))
-
-    entries = entries_of_columns(recording) if reference is None else reference
-    calibration = calibrate_table_ready([ready], [entries], gravity)
-    notes = list(calibration.notes)
-    held = None
+    calibration, data = _on_table(ready, reference, gravity)
+    notes, held = calibration.notes, None
     if heldout is not None:
-        other = prepare(heldout[0], repair)
-        stated = entries_of_columns(other.recording) if heldout[1] is None else heldout[1]
-        notes += same_device(calibration, calibrate_table_ready([other], [stated], gravity))
-        held = partial(made, other.recording, stated, calibration.imu)
-    remade = partial(made, recording, entries, calibration.imu)
-    if noise is not None:
-        return examine(
-            Examination(
-                calibration, noise, remade, held, ready.findings, tuple(notes), level, naming=not ready.spoiling
-            )
-        )
-    assert calibration.stations is not None
-    (spans,) = RecordedStations(recording, calibration.stations).rests()
-    own = own_noise(replace(calibration, segmentations=(Segmentation(recording, spans, 1.0, (), ()),)))
-    plain = remade(own)
-    usual = with_usual_drift(own, plain.shortest(), plain.extent().duration)
-    notes += usual.notes
+        other, held = _on_table(prepare(heldout[0], repair), heldout[1], gravity)
+        notes = (*notes, *same_device(calibration, other))
     return examine(
-        Examination(
-            calibration,
-            usual,
-            remade,
-            held,
-            ready.findings,
-            tuple(notes),
-            level,
-            trusted=True,
-            naming=not ready.spoiling,
+        Examination.of(
+            calibration, data, noise, held, findings=ready.findings, notes=notes, level=level, naming=not ready.spoiling
         )
     )
+
+
+def _on_table(
+    ready: Prepared, reference: Sequence[Entry] | None, gravity: LocalGravity
+) -> tuple[Calibration, RecordedStations]:
+    """Return the calibration at known poses and turns, and what it was fitted to."""
+    entries = entries_of_columns(ready.recording) if reference is None else reference
+    calibration = calibrate_table_ready([ready], [entries], gravity)
+    assert calibration.stations is not None
+    return calibration, RecordedStations(ready.recording, calibration.stations, entries)

@@ -167,14 +167,14 @@ class Validity(Described, Document):
     difference: tuple[float, int, float]
     shifts: tuple[Shift, ...]
     causes: tuple[Cause, ...]
-    output_errors: dict[str, OutputError]
-    errors: dict[str, tuple[float, float, str]]
-    scatter: dict[str, float]
-    notes: tuple[str, ...]
-    experiment: Experiment | None
     conditions: tuple[FloatArray, FloatArray]  # (n,) under the old calibration and under the fresh one
+    scatter: dict[str, float]
     data: dict[str, Any]
     calibration: Calibration
+    errors: dict[str, tuple[float, float, str]] = field(default_factory=dict)
+    output_errors: dict[str, OutputError] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    experiment: Experiment | None = None
     history: History | None = None
     alone: dict[str, tuple[float, float]] = field(default_factory=dict)
 

@@ -112,9 +112,10 @@ class Data(ABC):
     """What recordings say about a unit, or about units along a leading axis.
 
     effects_inside: the conditions evaluate effects themselves; else `about` gives their columns. coarse: the excess to
-    begin with. owners: whose effects can show. by_hand: hands moved the unit. no_fixture: why effects of a set-up
-    cannot show, empty where they can. advice: says what to record where numbers stay open. gravity: m/s², () or of
-    units (N,).
+    begin with. owners: whose effects can show. by_hand: hands moved the unit. sampled: the noise of samples makes the
+    covariance, see `with_noise`; else the data state it, and a fit estimates what goes beyond. no_fixture: why effects
+    of a set-up cannot show, empty where they can. advice: says what to record where numbers stay open. gravity: m/s²,
+    () or of units (N,).
     """
 
     gravity: Float[Array, " ..."]
@@ -124,6 +125,7 @@ class Data(ABC):
     coarse: tuple[float, ...] = ()
     owners: ClassVar[tuple[str, ...]] = ("accelerometer", "gyroscope", "setup")
     by_hand: ClassVar[bool] = False
+    sampled: ClassVar[bool] = False
     no_fixture: ClassVar[str] = ""
     advice: ClassVar[Callable[..., str]] = staticmethod(station_advice)
 
@@ -226,6 +228,26 @@ class Data(ABC):
     def rests(self) -> list[FloatArray]:
         """Return the spans (k, 2), s, of each recording in which the unit lay still."""
         return self.spans()
+
+    def counts(self) -> dict[str, int]:
+        """Return how many observations there are of each kind, as a document has them."""
+        return {}
+
+    def rate_at_rest(self) -> FloatArray | None:
+        """Return the gyroscope's mean output (3,) at rest, where it rested."""
+        return None
+
+    def rotations(self, imu: Imu) -> FloatArray:
+        """Return how the rotation vector of each turn (t, 3, 3, 4), rad, reacts to K⁻¹ and −K⁻¹b of the gyroscope."""
+        return np.zeros((0, 3, 3, 4))
+
+    def white_noise(self, excess: Mapping[str, float]) -> NoiseModel:
+        """Return the white noise of samples that a fit's excess, by name, shows; none where there are no samples."""
+        return NoiseModel(AxisNoise.of_white(0.0), AxisNoise.of_white(0.0))
+
+    def with_noise(self, noise: NoiseModel) -> Self:
+        """Return the data with the covariance that a noise of their samples makes, where samples make it."""
+        return self
 
     def extent(self) -> Extent:
         """Return what the recordings span: effects may begin between two observations."""

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["TIME", "ResidualKind", "Rows", "by_axis"]
+__all__ = ["TEMPERATURE", "TIME", "ResidualKind", "Rows", "by_axis"]
 
-TIME = "time [s]"
-"""The covariate that all conditions have."""
+TIME, TEMPERATURE = "time [s]", "temperature [°C]"
+"""The covariate that all conditions have, and the one that those with a thermometer have."""
 
 
 class ResidualKind(NamedTuple):

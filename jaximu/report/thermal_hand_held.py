@@ -12,6 +12,7 @@ import numpy as np
 from jaximu.calibration.thermal import change
 from jaximu.calibration.thermal_terms import POWERS, SCALE
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
+from jaximu.estimation.rows import TEMPERATURE
 from jaximu.ground.quantities import readable, size
 from jaximu.ground.summary import sentence
 from jaximu.ground.units import SENSOR_UNITS
@@ -110,7 +111,7 @@ def _error_figure(found: HandHeldThermal) -> Figure:
     real = found.experiment.real
     poses = real.of_kind("gravity_norm")
     temperature = np.full(len(real.spans), np.nan)
-    temperature[real.first[poses]] = real.covariates["temperature [°C]"][poses]
+    temperature[real.first[poses]] = real.covariates[TEMPERATURE][poses]
     temperature = (temperature[real.first] + temperature[real.last]) / 2
     series = [("one bias and scale for all temperatures", BEFORE, found.base)]
     series += [("with the effects", AFTER, found.state)] if found.steps else []
