@@ -48,9 +48,9 @@ def unusual_gains(imu: Imu, weak: Sequence[WeakDirection], scales: Mapping[str, 
     """Return the same of a fitted unit; `scales` (3,) by sensor: the nominal ones, `weak`: what the data leave open."""
     if gains_open(weak):
         return []
-    found = _factors("accelerometer", scales["accelerometer"], imu.accelerometer)
+    findings = _factors("accelerometer", scales["accelerometer"], imu.accelerometer)
     if imu.gyroscope is None or "gyroscope" not in scales:
-        return found
+        return findings
     scale = scales["gyroscope"]
     read = np.asarray(imu.gyroscope.gain) / scale[:, None]  # rates as read = read @ true rates
     arranged = signed_permutation(read.T).T
@@ -58,18 +58,22 @@ def unusual_gains(imu: Imu, weak: Sequence[WeakDirection], scales: Mapping[str, 
     if angle_of(rest) > _BETWEEN and np.linalg.det(read) > 0:
         arranged, rest = np.eye(3), rotation_of(read.T).T
     if not np.array_equal(arranged, np.eye(3)):
-        found.append(_axes(arranged))
+        findings.append(_axes(arranged))
     angle = np.degrees(angle_of(rest))
     if angle > np.degrees(_MOUNTED):
         axis = np.array([rest[2, 1] - rest[1, 2], rest[0, 2] - rest[2, 0], rest[1, 0] - rest[0, 1]])
         axis /= -max(float(np.linalg.norm(axis)), 1e-300)
-        shown = ", ".join(f"{each:.2f}" for each in axis)
-        found.append(Finding(
-            "setup.mounting", (),
-            f"gyroscope: it is mounted turned by {angle:.1f}° about ({shown}) against the accelerometer's axes, more "
-            "than misalignments are. The calibration includes it: what it corrects is in the accelerometer's axes.",
-        ))  # fmt: skip
-    return found + _factors("gyroscope", scale, imu.gyroscope)
+        shown = ", ".join(f"{component:.2f}" for component in axis)
+        findings.append(
+            Finding(
+                "setup.mounting",
+                (),
+                f"gyroscope: it is mounted turned by {angle:.1f}° about ({shown}) against the accelerometer's axes, "
+                "more than misalignments are. The calibration includes it: what it corrects is in the accelerometer's "
+                "axes.",
+            )
+        )
+    return findings + _factors("gyroscope", scale, imu.gyroscope)
 
 
 def _axes(arranged: FloatArray) -> Finding:
@@ -82,7 +86,7 @@ def _axes(arranged: FloatArray) -> Finding:
     rivals: list[str] = []
     if np.linalg.det(arranged) > 0:
         causes += [("accelerometer", arranged), ("accelerometer", -arranged)]
-        causes = sorted(causes, key=lambda each: _wrong(each[1]))[:2]
+        causes = sorted(causes, key=lambda cause: _wrong(cause[1]))[:2]
         rivals.append("setup.mounting")
     name, repaired = causes[0]
     option = f"{'gyro' if name == 'gyroscope' else 'accel'}={spelled_axes(repaired)}"
@@ -109,14 +113,14 @@ def _described(matrix: FloatArray) -> str:
     """Say what a map of axes puts right."""
     exchanged = [axis for axis, row in zip("xyz", np.abs(np.diag(matrix)), strict=True) if row == 0]
     negative = [axis for axis, row in zip("xyz", matrix.sum(axis=1), strict=True) if row < 0]
-    said = []
+    parts = []
     if exchanged:
-        said.append(f"its {listed(exchanged)} axes are exchanged")
+        parts.append(f"its {listed(exchanged)} axes are exchanged")
     if negative:
         one = len(negative) == 1
         which = "all three axes" if len(negative) == 3 else f"its {listed(negative)} {'axis' if one else 'axes'}"
-        said.append(f"{which} {'has' if one else 'have'} the wrong sign")
-    return ", and ".join(said)
+        parts.append(f"{which} {'has' if one else 'have'} the wrong sign")
+    return ", and ".join(parts)
 
 
 def _mapped(option: str) -> Callable[[Recording], Recording]:
@@ -127,42 +131,57 @@ def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
     """Name scales that are a whole factor off the data sheet's, or off by more than sensors are."""
     sizes = np.linalg.norm(np.asarray(triad.gain), axis=1) / scale
     option = "--accel-scale" if name == "accelerometer" else "--gyro-scale"
-    found = []
+    findings = []
     whole = np.zeros(3)
     for factor in _FACTORS:
         whole[np.abs(np.log(sizes / factor)) < _NEAR] = factor
     if whole.all() and len(set(whole)) == 1:
-        return [Finding(
-            "data.range", (),
-            f"{name}: its gain is {np.exp(np.mean(np.log(sizes))):.3g} times the nominal on all axes, as with another "
-            f"full-scale range. State the range that was set ({option}); the calibration includes it.",
-        )]  # fmt: skip
+        return [
+            Finding(
+                "data.range",
+                (),
+                f"{name}: its gain is {np.exp(np.mean(np.log(sizes))):.3g} times the nominal on all axes, as with "
+                f"another full-scale range. State the range that was set ({option}); the calibration includes it.",
+            )
+        ]
     usual = float(np.exp(np.mean(np.log(sizes))))
     if (np.abs(np.log(sizes)) > _ODD).all() and np.ptp(np.log(sizes)) < _NEAR:
-        return [Finding(
-            "data.range", (),
-            f"{name}: its gain is {usual:.3g} times the nominal on all axes, more than such sensors differ. Check "
-            f"{option}; the calibration includes it.",
-        )]  # fmt: skip
-    for place, axis in enumerate("xyz"):
-        if whole[place]:
-            found.append(Finding(
-                "data.range", (),
-                f"{name} {axis}: its gain is {sizes[place]:.3g} times the nominal, a whole factor, as with another "
-                "full-scale range or unit on this axis. The calibration includes it.",
-            ))  # fmt: skip
-        elif abs(np.log(sizes[place])) > _ODD:
-            found.append(Finding(
-                "data.range", (),
-                f"{name} {axis}: its gain is {sizes[place]:.3g} times the nominal, more than such sensors differ. "
-                f"Check {option}.",
-            ))  # fmt: skip
-    if name == "gyroscope" and not found and abs(usual - 1) > _SLOW and np.ptp(sizes) < _ALIKE:
-        found.append(Finding(
-            "data.time_scale", (),
-            f"{name}: all its axes read {100 * (usual - 1):+.2f} % of the nominal alike. A sample rate or clock that "
-            f"is {100 * abs(usual - 1):.2f} % {'slow' if usual > 1 else 'fast'} looks exactly the same: compare "
-            "the recording's length with another clock.",
-            rivals=("data.range",),
-        ))  # fmt: skip
-    return found
+        return [
+            Finding(
+                "data.range",
+                (),
+                f"{name}: its gain is {usual:.3g} times the nominal on all axes, more than such sensors differ. Check "
+                f"{option}; the calibration includes it.",
+            )
+        ]
+    for index, axis in enumerate("xyz"):
+        if whole[index]:
+            findings.append(
+                Finding(
+                    "data.range",
+                    (),
+                    f"{name} {axis}: its gain is {sizes[index]:.3g} times the nominal, a whole factor, as with another "
+                    "full-scale range or unit on this axis. The calibration includes it.",
+                )
+            )
+        elif abs(np.log(sizes[index])) > _ODD:
+            findings.append(
+                Finding(
+                    "data.range",
+                    (),
+                    f"{name} {axis}: its gain is {sizes[index]:.3g} times the nominal, more than such sensors differ. "
+                    f"Check {option}.",
+                )
+            )
+    if name == "gyroscope" and not findings and abs(usual - 1) > _SLOW and np.ptp(sizes) < _ALIKE:
+        findings.append(
+            Finding(
+                "data.time_scale",
+                (),
+                f"{name}: all its axes read {100 * (usual - 1):+.2f} % of the nominal alike. A sample rate or clock "
+                f"that is {100 * abs(usual - 1):.2f} % {'slow' if usual > 1 else 'fast'} looks exactly the same: "
+                "compare the recording's length with another clock.",
+                rivals=("data.range",),
+            )
+        )
+    return findings

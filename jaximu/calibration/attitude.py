@@ -121,11 +121,11 @@ def calibrate_against_attitude(
     noise = noise_of(static)
     with prepared([recording], repair) as (ready,):
         recording = ready.recording
-        begun = _coarse(recording, attitude.usable())
-        begun = replace(begun, attitude=_right_handed(recording, begun))
-        measurement = AgainstAttitude(recording, begun.attitude, gravity.value, noise)
-        chosen = [effect_named(each) for each in effects]
-        imu = _begin(recording, begun, chosen, unit)
+        start = _coarse(recording, attitude.usable())
+        start = replace(start, attitude=_right_handed(recording, start))
+        measurement = AgainstAttitude(recording, start.attitude, gravity.value, noise)
+        chosen = [effect_named(effect) for effect in effects]
+        imu = _begin(recording, start, chosen, unit)
         prior = Prior.of_effects(imu, effect_sigmas)
         of_setup = _of_setup(imu)
 
@@ -133,20 +133,32 @@ def calibrate_against_attitude(
             return name.part == "bias" or of_setup(name)
 
         free = without_equipment_or_effects if unit is None else biases_and_setup
-        found = fit(imu, measurement, free, prior=prior, loss=loss)
+        fitted = fit(imu, measurement, free, prior=prior, loss=loss)
         where = recording.name
-        require_determined(found, where, f"{attitude.name} shows too few turns, which", _RECORD, prior)
-    likeness = _same_unit(recording, begun, found.imu)
+        require_determined(fitted, where, f"{attitude.name} shows too few turns, which", _RECORD, prior)
+    likeness = _same_unit(recording, start, fitted.imu)
     calibration = concluded(
-        found, gravity=gravity, method="reference", loss=loss, advice=station_advice, excess_names=EXCESS_NAMES,
-        rms=[errors_of([measurement], unit) for unit in (imu, found.imu)], known=list(filter(of_setup, found.names)),
+        fitted,
+        gravity=gravity,
+        method="reference",
+        loss=loss,
+        advice=station_advice,
+        excess_names=EXCESS_NAMES,
+        rms=[errors_of([measurement], unit) for unit in (imu, fitted.imu)],
+        known=list(filter(of_setup, fitted.names)),
         data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
-        notes=[*likeness, *ready.notes, *recording.notes, *begun.attitude.notes,
-               *(() if noise is None else noise.notes)],
-        nominal=imu.with_effects(), reading=recording.reading,
-    )  # fmt: skip
+        notes=[
+            *likeness,
+            *ready.notes,
+            *recording.notes,
+            *start.attitude.notes,
+            *(() if noise is None else noise.notes),
+        ],
+        nominal=imu.with_effects(),
+        reading=recording.reading,
+    )
     calibration = replace(calibration, covariance=calibration.covariance + _of_shape(calibration, measurement))
-    notes = (*(each.text for each in arrangement(recording, calibration)), *calibration.notes)
+    notes = (*(finding.text for finding in arrangement(recording, calibration)), *calibration.notes)
     calibration = replace(calibration, notes=tuple(dict.fromkeys(notes)))
     return replace(calibration, reference=reference_summary(calibration)), measurement
 
@@ -169,21 +181,21 @@ class Mounted:
 
 def mounted_on(
     recording: Recording, attitude: Attitude, gravity: Gravity, noise: NoiseModel | None, known: Calibration
-) -> Mounted:  # fmt: skip
+) -> Mounted:
     """Return how a reference stands to a unit, as `calibrate_against_attitude` finds it, with its gains where known.
 
     Raises as that does.
     """
     unit = known.imu if known.gains_determined() else None
-    found, how = calibrate_against_attitude(recording, attitude, gravity, static=noise, unit=unit)
-    sharp_unit = found.imu.without(SetupReferenceFilter)
+    calibration, how = calibrate_against_attitude(recording, attitude, gravity, static=noise, unit=unit)
+    sharp_unit = calibration.imu.without(SetupReferenceFilter)
     effects = tuple(effect for effect in sharp_unit.all_effects().values() if isinstance(effect, MOUNTING_EFFECTS))
-    assert found.reference is not None
-    still, fast = reference_sigmas(found.excess)
-    sharp = how.unsmoothed(found.imu)
+    assert calibration.reference is not None
+    still, fast = reference_sigmas(calibration.excess)
+    sharp = how.unsmoothed(calibration.imu)
     if (velocity := sharp.velocities()) is not None:  # few windows of force show it, its samples more
         fast = max(fast, white_noise(Signal(sharp.time, velocity, "m/s")))
-    return Mounted(sharp, Mounting.of(sharp_unit), effects, (still, fast), found.reference)
+    return Mounted(sharp, Mounting.of(sharp_unit), effects, (still, fast), calibration.reference)
 
 
 _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis up and down for a while."
@@ -206,24 +218,24 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     matrix = np.asarray(imu.gyroscope.inverse())
     rate, slope = np.asarray(data.rate) @ matrix[:, :3].T + matrix[:, 3], np.asarray(data.slope) @ matrix[:, :3].T
     spread = abs(float(Mounting.of(imu).filter_variance))
-    late = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
+    delay = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
     effects = imu.all_effects()
     delayed = [isinstance(effects.get((name.owner, name.effect)), SetupReferenceDelay) for name in calibration.names]
-    return late**2 * np.diag(delayed)
+    return delay**2 * np.diag(delayed)
 
 
-def _begin(recording: Recording, begun: _Start, effects: Sequence[Effect], unit: Imu | None = None) -> Imu:
+def _begin(recording: Recording, start: _Start, effects: Sequence[Effect], unit: Imu | None = None) -> Imu:
     """Return the unit, the data sheet's if None, under the reference as it was coarsely aligned."""
-    turned = scipy.spatial.transform.Rotation.from_matrix(begun.matrix.T).as_rotvec()
-    arm = {} if begun.attitude.velocities() is None else {"lever_arm": 0.0}
+    turned = scipy.spatial.transform.Rotation.from_matrix(start.matrix.T).as_rotvec()
+    arm = {} if start.attitude.velocities() is None else {"lever_arm": 0.0}
     setup = Mounting.effects(
-        np.ptp(recording.accelerometer.time), rotation=turned, delay=begun.delay, tilt=0.0, filter_variance=0.0, **arm
+        np.ptp(recording.accelerometer.time), rotation=turned, delay=start.delay, tilt=0.0, filter_variance=0.0, **arm
     )
     imu = as_stated(recording) if unit is None else unit.transferable()
     if unit is None and imu.gyroscope is not None:
-        imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ begun.arranged))
-    found = {each.name: each for each in (*setup, *imu.all_effects().values(), *effects)}
-    return jax.tree.map(np.asarray, imu.with_effects(*found.values()))
+        imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ start.arranged))
+    by_name = {effect.name: effect for effect in (*setup, *imu.all_effects().values(), *effects)}
+    return jax.tree.map(np.asarray, imu.with_effects(*by_name.values()))
 
 
 def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: Array) -> tuple[Mounting, Mounting]:
@@ -289,24 +301,25 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
     for other in delays[1:]:  # turns at regular times, as a robot makes them, look alike but for their axes
         if plain.score > _CLEAR:
             break
-        found = _matched(recording, attitude, other)
-        delay, plain = (other, found) if found.score > plain.score + 0.02 else (delay, plain)
+        match = _matched(recording, attitude, other)
+        delay, plain = (other, match) if match.score > plain.score + 0.02 else (delay, plain)
     if plain.score > _CLEAR:
         return plain
     q = attitude.quaternion
     others = {
-        "": q, "its quaternions run from the upright frame to the body and were taken so": q * _BACK,
+        "": q,
+        "its quaternions run from the upright frame to the body and were taken so": q * _BACK,
         "its quaternions have w last and were taken so": q[:, _LAST],
-        "its quaternions have w last and run from the upright frame to the body, and were taken so":
-            q[:, _LAST] * _BACK,
-    }  # fmt: skip
+        "its quaternions have w last and run from the upright frame to the body, and were taken so": q[:, _LAST]
+        * _BACK,
+    }
     best = plain
     for text, values in others.items():
-        said = attitude.notes + ((f"{attitude.name}: {text}.",) if text else ())
-        changed = replace(attitude, quaternion=values, notes=said).usable()
+        notes = attitude.notes + ((f"{attitude.name}: {text}.",) if text else ())
+        changed = replace(attitude, quaternion=values, notes=notes).usable()
         for reading in (changed, _turned_up(changed)):
-            found = _matched(recording, reading, delay)
-            best = found if found.score > best.score + 0.02 else best
+            match = _matched(recording, reading, delay)
+            best = match if match.score > best.score + 0.02 else best
     if best.score < _CLEAR:
         best = _rearranged(recording, attitude, delay) or best
     if best.explained > _ALIKE > best.score:
@@ -329,34 +342,37 @@ def _turned_up(attitude: Attitude) -> Attitude:
     flip = np.array([1.0, -1.0, -1.0])
     note = f"{attitude.name}: its frame's z points down; its axes were taken as x, −y, −z."
     return replace(
-        attitude, quaternion=np.stack([-x, w, -z, y], axis=1), notes=(*attitude.notes, note),
+        attitude,
+        quaternion=np.stack([-x, w, -z, y], axis=1),
+        notes=(*attitude.notes, note),
         velocity=None if attitude.velocity is None else attitude.velocity * flip,
         position=None if attitude.position is None else attitude.position * flip,
-    )  # fmt: skip
+    )
 
 
-def _right_handed(recording: Recording, begun: _Start) -> Attitude:
+def _right_handed(recording: Recording, start: _Start) -> Attitude:
     """Return the reference with axes of its velocity and position turned round that run against the attitude's.
 
     Over half a second the specific force, upright, is gravity and the change of velocity; in a left-handed frame one
     axis of that has the opposite sign.
     """
-    attitude = begun.attitude
+    attitude = start.attitude
     velocity = attitude.velocities()
     if velocity is None:
         return attitude
     rows = np.arange(0, len(attitude.time), max(1, round(0.5 / attitude.period)))
-    inside = attitude.time[rows] - begun.delay
+    inside = attitude.time[rows] - start.delay
     force = Integral(recording.accelerometer, recording.accelerometer.si())
     rows = rows[(inside > force.edges[0]) & (inside < force.edges[-1])]
     inner = np.linspace(attitude.time[rows[:-1]], attitude.time[rows[1:]], 9, axis=1)
     stood = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(inner[:, 1:].ravel())
-    parts = force.over(inner[:, :-1] - begun.delay, inner[:, 1:] - begun.delay).reshape(-1, 3) @ begun.matrix
+    parts = force.over(inner[:, :-1] - start.delay, inner[:, 1:] - start.delay).reshape(-1, 3) @ start.matrix
     felt = stood.apply(parts).reshape(len(inner), -1, 3).sum(axis=1)
     gained = np.diff(velocity[rows], axis=0)
-    felt, gained = (each - each.mean(axis=0) for each in (felt, gained))
-    alike = np.sum(felt * gained, axis=0) / np.maximum(np.linalg.norm(felt, axis=0) * np.linalg.norm(gained, axis=0),
-                                                       1e-300)  # fmt: skip
+    felt, gained = (vectors - vectors.mean(axis=0) for vectors in (felt, gained))
+    alike = np.sum(felt * gained, axis=0) / np.maximum(
+        np.linalg.norm(felt, axis=0) * np.linalg.norm(gained, axis=0), 1e-300
+    )
     signs = np.where(alike < -max(_AGAINST, _CHANCE / np.sqrt(len(inner))), -1.0, 1.0)
     if (signs > 0).all():
         return attitude
@@ -365,12 +381,14 @@ def _right_handed(recording: Recording, begun: _Start) -> Attitude:
         f"{attitude.name}: its velocity or position runs against its attitude along {axes}, as in a left-handed frame; "
         "it was turned round there."
     )
-    turned = {name: None if (values := getattr(attitude, name)) is None else values * signs
-              for name in ("velocity", "position")}  # fmt: skip
+    turned = {
+        name: None if (values := getattr(attitude, name)) is None else values * signs
+        for name in ("velocity", "position")
+    }
     return replace(attitude, notes=(*attitude.notes, note), **turned)
 
 
-def _same_unit(recording: Recording, begun: _Start, imu: Imu) -> list[str]:
+def _same_unit(recording: Recording, start: _Start, imu: Imu) -> list[str]:
     """Warn of a reference that follows the gyroscope closer than the gyroscope's own noise would let another.
 
     Compared are second differences of the mean rates over a few samples, where the unit moves least: there what both
@@ -380,8 +398,8 @@ def _same_unit(recording: Recording, begun: _Start, imu: Imu) -> list[str]:
     assert gyroscope is not None
     mounting = Mounting.of(imu)
     turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation).as_matrix()
-    unit, said, time = _rates(recording, begun.attitude, float(mounting.delay))
-    unit = unit @ np.linalg.inv(begun.arranged).T
+    unit, reference, time = _rates(recording, start.attitude, float(mounting.delay))
+    unit = unit @ np.linalg.inv(start.arranged).T
     count = (len(unit) - 2) // _BLOCK
     samples = np.diff(gyroscope.si(), 3, axis=0)
     quiet = len(samples) // _LONGER
@@ -389,7 +407,7 @@ def _same_unit(recording: Recording, begun: _Start, imu: Imu) -> list[str]:
         return []
     moved, apart = (
         np.mean(np.diff(values, 2, axis=0)[: count * _BLOCK].reshape(count, -1) ** 2, axis=1)
-        for values in (unit, unit - said @ turned)
+        for values in (unit, unit - reference @ turned)
     )
     still = np.argsort(moved)[: max(_FEWEST // 2, count // 10)]
     powers = np.mean(samples[: quiet * _LONGER].reshape(quiet, -1) ** 2, axis=1)
@@ -398,7 +416,7 @@ def _same_unit(recording: Recording, begun: _Start, imu: Imu) -> list[str]:
     if ratio > _CLOSER:
         return []
     return [
-        f"{begun.attitude.name} follows the noise of the gyroscope itself ({100 * np.sqrt(ratio):.2g} % of it is left "
+        f"{start.attitude.name} follows the noise of the gyroscope itself ({100 * np.sqrt(ratio):.2g} % of it is left "
         "between the two): it seems to be computed from this very unit. Its errors are then the unit's own, and scales "
         "and biases found against it prove nothing: use an independent reference."
     ]
@@ -409,8 +427,9 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
     gyroscope = recording.gyroscope
     assert gyroscope is not None
     stride = max(1, round(4 / gyroscope.rate / attitude.period))
-    thin = replace(attitude, time=attitude.time[::stride], quaternion=attitude.quaternion[::stride], velocity=None,
-                   position=None)  # fmt: skip
+    thin = replace(
+        attitude, time=attitude.time[::stride], quaternion=attitude.quaternion[::stride], velocity=None, position=None
+    )
     stamps = thin.time - delay
     good = (stamps[:-1] > gyroscope.time[0]) & (stamps[1:] < gyroscope.time[-1])
     good &= np.diff(stamps) < 2.5 * stride * attitude.period
@@ -443,10 +462,10 @@ def _delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray,
     grid = np.arange(first, last, step)
     kernel = np.ones(max(1, round(step * gyroscope.rate))) / max(1, round(step * gyroscope.rate))
     unit = np.interp(grid, gyroscope.time, np.convolve(size, kernel, "same"), 0.0, 0.0)
-    said = np.interp(grid, stamps, speeds, 0.0, 0.0)
+    shifted = np.interp(grid, stamps, speeds, 0.0, 0.0)
     inside = [(grid >= a) & (grid <= b) for a, b in ((gyroscope.time[0], gyroscope.time[-1]), (stamps[0], stamps[-1]))]
     a, b = (
-        np.where(here, values - values[here].mean(), 0.0) for values, here in zip((unit, said), inside, strict=True)
+        np.where(here, values - values[here].mean(), 0.0) for values, here in zip((unit, shifted), inside, strict=True)
     )
 
     def against(x, y):
@@ -461,8 +480,8 @@ def _delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray,
     chosen = near if near.max() > 0.7 * score.max() else score
     peaks, _ = scipy.signal.find_peaks(chosen, _NEARLY * chosen.max(), distance=max(1, round(_SEPARATE / step)))
     best = int(np.argmax(chosen))
-    beside = sorted(peaks[np.abs(peaks - best) * step > _SEPARATE], key=lambda place: -chosen[place])
-    return [float(lags[place]) for place in (best, *beside[:_DELAYS])]
+    beside = sorted(peaks[np.abs(peaks - best) * step > _SEPARATE], key=lambda peak: -chosen[peak])
+    return [float(lags[lag]) for lag in (best, *beside[:_DELAYS])]
 
 
 def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
@@ -470,14 +489,14 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
     step = max(attitude.period, 1 / recording.accelerometer.rate) / 2
     best: _Start | None = None
     for shift in np.arange(-4, 4.5) * step:
-        unit, said, time = _rates(recording, attitude, delay + shift)
+        unit, reference, time = _rates(recording, attitude, delay + shift)
         if len(unit) < 16:
             continue
         force, up = _forces(recording, attitude, time, delay + shift)
-        turning, told = unit - unit.mean(axis=0), said - said.mean(axis=0)
+        turning, rotating = unit - unit.mean(axis=0), reference - reference.mean(axis=0)
         weight = np.sum(turning**2) / np.sum(force**2)
-        matrix = turning_best(turning.T @ told + weight * STANDARD.value * (force.T @ up))
-        explained = 1 - np.sum((turning - told @ matrix.T) ** 2) / np.sum(turning**2)
+        matrix = turning_best(turning.T @ rotating + weight * STANDARD.value * (force.T @ up))
+        explained = 1 - np.sum((turning - rotating @ matrix.T) ** 2) / np.sum(turning**2)
         upright = np.mean(np.sum(force * (up @ matrix.T), axis=1)) / np.mean(np.linalg.norm(force, axis=1))
         if best is None or explained > best.explained:
             best = _Start(attitude, float(delay + shift), matrix, float(explained), float(upright))
@@ -491,7 +510,7 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
 
 def _forces(recording: Recording, attitude: Attitude, time: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
     """Return the accelerometer's output and upwards in the reference's body, (n, 3) each, at times (n,)."""
-    force = np.stack([np.interp(time, recording.accelerometer.time, each) for each in _smooth(recording).T], 1)
+    force = np.stack([np.interp(time, recording.accelerometer.time, axis) for axis in _smooth(recording).T], 1)
     known = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay)
     return force, known.inv().apply([0.0, 0.0, 1.0])
 
@@ -504,19 +523,19 @@ def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Star
     """
     gyroscope = recording.gyroscope
     assert gyroscope is not None
-    unit, said, time = _rates(recording, attitude, delay)
+    unit, reference, time = _rates(recording, attitude, delay)
     if len(unit) < 16:
         return None
     force, up = _forces(recording, attitude, time, delay)
-    turning, told = unit - unit.mean(axis=0), said - said.mean(axis=0)
-    read = np.linalg.lstsq(told, turning, rcond=None)[0].T
-    if np.sum((turning - told @ read.T) ** 2) > (1 - _CLEAR) * np.sum(turning**2):
+    turning, rotating = unit - unit.mean(axis=0), reference - reference.mean(axis=0)
+    read = np.linalg.lstsq(rotating, turning, rcond=None)[0].T
+    if np.sum((turning - rotating @ read.T) ** 2) > (1 - _CLEAR) * np.sum(turning**2):
         return None
     mounting = turning_best(force.T @ up)
     arranged = signed_permutation((read @ mounting.T).T).T
     mapped = replace(recording, gyroscope=Signal(gyroscope.time, gyroscope.si() @ arranged, "rad/s"))
-    found = _matched(mapped, attitude, delay)
-    return replace(found, arranged=arranged) if found.score > _CLEAR else None
+    match = _matched(mapped, attitude, delay)
+    return replace(match, arranged=arranged) if match.score > _CLEAR else None
 
 
 def _smooth(recording: Recording) -> FloatArray:

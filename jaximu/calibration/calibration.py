@@ -31,8 +31,15 @@ from jaximu.recordings.segmentation import Segmentation
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["MAGNETIC", "Calibration", "concluded", "effect_named", "load_calibration", "provenance",
-           "require_calibration"]  # fmt: skip
+__all__ = [
+    "MAGNETIC",
+    "Calibration",
+    "concluded",
+    "effect_named",
+    "load_calibration",
+    "provenance",
+    "require_calibration",
+]
 
 SCHEMA = "jaximu.calibration/1"
 MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
@@ -181,24 +188,24 @@ class Calibration(Described, Document):
 
     def covariance_of(self, names: Sequence[Name]) -> FloatArray:
         """Return the covariance (k, k) of some numbers, zero where fixed by convention or not calibrated."""
-        there = [place for place, name in enumerate(names) if name in self.names]
-        rows = [self.names.index(names[place]) for place in there]
+        there = [index for index, name in enumerate(names) if name in self.names]
+        rows = [self.names.index(names[index]) for index in there]
         whole = np.zeros((len(names), len(names)))
         whole[np.ix_(there, there)] = self.covariance[np.ix_(rows, rows)]
         return whole
 
     def _effects(self, owner: str, model: Triad) -> dict[str, Any]:
         """Return the effects of a triad as the JSON document has them."""
-        found = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)).tolist(), strict=True))
+        sigmas = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)).tolist(), strict=True))
 
-        def entry(place: int, effect: Effect) -> dict[str, Any]:
-            sigma = [found.get(Name(owner, "coefficients", (i,), place)) for i in range(effect.size)]
+        def entry(position: int, effect: Effect) -> dict[str, Any]:
+            sigma = [sigmas.get(Name(owner, "coefficients", (i,), position)) for i in range(effect.size)]
             written = effect.document(model.output_unit)
-            for name, each in written["inner"].items():
-                each["sigma"] = found.get(Name(owner, name, (), place))
+            for name, entry_of_inner in written["inner"].items():
+                entry_of_inner["sigma"] = sigmas.get(Name(owner, name, (), position))
             return written | {"sigma": None if None in sigma else sigma}
 
-        return {effect.name: entry(place, effect) for place, effect in enumerate(model.effects)}
+        return {effect.name: entry(position, effect) for position, effect in enumerate(model.effects)}
 
     def document(self) -> dict[str, Any]:
         """Return the calibration as the JSON document of schema `jaximu.calibration/1`."""
@@ -262,7 +269,7 @@ class Calibration(Described, Document):
 
 
 def concluded(
-    found: Fit,
+    fitted: Fit,
     *,
     gravity: LocalGravity,
     method: str,
@@ -279,23 +286,33 @@ def concluded(
     **Arguments:** `rms`: the sizes of its errors before and after. `known`: numbers of which something is known
     beforehand; of these alone nobody asks whether the data tell them. `working`: fields of `Calibration`.
     """
-    rank, weak = weak_directions(np.asarray(found.jacobian), found.names, found.sizes, found.imu, advice)
+    rank, weak = weak_directions(np.asarray(fitted.jacobian), fitted.names, fitted.sizes, fitted.imu, advice)
     weak = tuple(one for one in weak if not set(known).issuperset(name for name, _ in one.parameters))
     before, after = rms
-    excess: dict[str, float] = dict(zip(excess_names, np.asarray(found.excess).tolist(), strict=False))
+    excess: dict[str, float] = dict(zip(excess_names, np.asarray(fitted.excess).tolist(), strict=False))
     clock = clock_sigma(working.get("segmentations", ()))
     return Calibration(
-        imu=jax.tree.map(np.asarray, found.imu), names=found.names,
-        covariance=found.total_covariance(gravity.sigma, clock), gravity=gravity, method=method, loss=loss, rank=rank,
-        weak=weak, rms={name: (before[name][0], *size) for name, size in after.items()}, excess=excess,
-        solver=found.failure().value, notes=tuple(dict.fromkeys(notes)), fit=found, **working,
-    )  # fmt: skip
+        imu=jax.tree.map(np.asarray, fitted.imu),
+        names=fitted.names,
+        covariance=fitted.total_covariance(gravity.sigma, clock),
+        gravity=gravity,
+        method=method,
+        loss=loss,
+        rank=rank,
+        weak=weak,
+        rms={name: (before[name][0], *size) for name, size in after.items()},
+        excess=excess,
+        solver=fitted.failure().value,
+        notes=tuple(dict.fromkeys(notes)),
+        fit=fitted,
+        **working,
+    )
 
 
 def clock_sigma(segmentations: Sequence[Segmentation]) -> float:
     """Return one sigma of the share by which the gyroscope's clock runs fast, the largest of all recordings."""
     gyroscopes = [part.recording.gyroscope for part in segmentations]
-    return max((0.0 if each is None else each.clock_sigma for each in gyroscopes), default=0.0)
+    return max((0.0 if gyroscope is None else gyroscope.clock_sigma for gyroscope in gyroscopes), default=0.0)
 
 
 def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:
@@ -318,24 +335,24 @@ def require_another(calibration: Calibration, sources: Iterable[str]) -> None:
         )
 
 
-def effect_named(given: str | Effect) -> Effect:
+def effect_named(effect: str | Effect) -> Effect:
     """Return an effect of the catalogue, dormant, by its name, or the effect that was given."""
-    if isinstance(given, Effect):
-        return given
+    if isinstance(effect, Effect):
+        return effect
     from jaximu.model.effects.catalogue import CATALOGUE  # a tenth of a second, which a plain calibration does not need
 
-    if given not in CATALOGUE:
+    if effect not in CATALOGUE:
         raise InputError(
-            f"unknown effect {given!r}: run `jaximu effects` for the list; jaximu.register adds one of your own."
+            f"unknown effect {effect!r}: run `jaximu effects` for the list; jaximu.register adds one of your own."
         )
-    return CATALOGUE[given].dormant()
+    return CATALOGUE[effect].dormant()
 
 
-def require_calibration(given: object) -> None:
+def require_calibration(candidate: object) -> None:
     """Raise `InputError` for what is no calibration, saying how to read one."""
-    if not isinstance(given, Calibration):
+    if not isinstance(candidate, Calibration):
         raise InputError(
-            f"expected a calibration, found a value of type {type(given).__name__}: make one with "
+            f"expected a calibration, found a value of type {type(candidate).__name__}: make one with "
             "jaximu.calibrate(recording), or read one with jaximu.load_calibration(path)."
         )
 
@@ -388,12 +405,12 @@ def _from_document(document: dict[str, Any]) -> Calibration:
     from jaximu.model.effects.catalogue import CATALOGUE
 
     def effects_of(entries: dict[str, Any]) -> tuple:
-        found = []
+        effects = []
         for name, entry in entries.items():
             kind = CATALOGUE[name]
-            inner = {key: float(each["value"]) for key, each in entry["inner"].items()}
-            found.append(kind.make(_numbers(entry["coefficients"], (kind.size,)), **inner))
-        return tuple(found)
+            inner = {key: float(parameter["value"]) for key, parameter in entry["inner"].items()}
+            effects.append(kind.make(_numbers(entry["coefficients"], (kind.size,)), **inner))
+        return tuple(effects)
 
     def triad(part: dict[str, Any], quantity: str) -> Triad:
         gain = _numbers(part["gain"], (3, 3))
@@ -461,7 +478,7 @@ def _from_document(document: dict[str, Any]) -> Calibration:
 
 def _parameters_of(calibration: Calibration) -> ParameterTable:
     """Return the free parameters in the order of the covariance, in output units."""
-    model, weak = calibration.imu, {name for each in calibration.weak for name, _ in each.parameters}
+    model, weak = calibration.imu, {name for direction in calibration.weak for name, _ in direction.parameters}
     triads, effects = model.triads(), model.all_effects()
 
     def parameter(name: Name, sigma: float) -> Parameter:
@@ -476,7 +493,7 @@ def _parameters_of(calibration: Calibration) -> ParameterTable:
         return Parameter(str(name), describe(name, model), float(value), sigma, unit, name in weak)
 
     sigmas = np.sqrt(np.diagonal(calibration.covariance)).tolist()
-    return ParameterTable([parameter(*each) for each in zip(calibration.names, sigmas, strict=True)])
+    return ParameterTable([parameter(*entry) for entry in zip(calibration.names, sigmas, strict=True)])
 
 
 def _error_words(name: str) -> str:
@@ -489,8 +506,8 @@ def _error_words(name: str) -> str:
 def _summary_of(calibration: Calibration) -> Summary:
     """Return the errors before and after, whether the fit is to be trusted, the parameters, and what is open."""
     data = calibration.data
-    files = ", ".join(Path(str(each["file"])).name for each in data.get("files", ())) or "a recording"
-    counts = [f"{data[each]} {each}" for each in ("poses", "turns", "intervals", "windows") if data.get(each)]
+    files = ", ".join(Path(str(file["file"])).name for file in data.get("files", ())) or "a recording"
+    counts = [f"{data[kind]} {kind}" for kind in ("poses", "turns", "intervals", "windows") if data.get(kind)]
     title = f"Calibration of {files}: {', '.join([*counts, f'{calibration.method} fit'])}"
     verdict = []
     for name, (before, after, unit) in calibration.rms.items():
@@ -500,7 +517,7 @@ def _summary_of(calibration: Calibration) -> Summary:
             if name in calibration.exact
             else f"{_error_words(name)}: {change(before, after, unit)} (rms, before → after calibration)."
         )
-    count, undetermined = len(calibration.names), sum(not each.determined for each in calibration.weak)
+    count, undetermined = len(calibration.names), sum(not direction.determined for direction in calibration.weak)
     if undetermined:
         what = f"{undetermined} combination{'s' * (undetermined > 1)} of the {count} parameters"
         verdict.append(f"The recording does not determine {what} (marked *).")
@@ -511,8 +528,11 @@ def _summary_of(calibration: Calibration) -> Summary:
     verdict += _scatter(calibration)
     if calibration.diagnosis:
         verdict.append(f"Diagnosis: {calibration.diagnosis['verdict']}.")
-    notes = [*_gravity(calibration), *(sentence(each.text) for each in calibration.weak),
-             *map(sentence, calibration.notes)]  # fmt: skip
+    notes = [
+        *_gravity(calibration),
+        *(sentence(direction.text) for direction in calibration.weak),
+        *map(sentence, calibration.notes),
+    ]
     return Summary(title, tuple(verdict), _parameters_of(calibration).block(), tuple(notes))
 
 

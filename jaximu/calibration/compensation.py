@@ -51,7 +51,7 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
     for name in signals:
         if calibration.triad_of(name, recording) is None:
             raise InputError(f"{recording.name} has a gyroscope, but the calibration has none for it.")
-    crossed = [each.name for each in imu.all_effects().values() if "specific_force" in each.needs]
+    crossed = [effect.name for effect in imu.all_effects().values() if "specific_force" in effect.needs]
     if "gyroscope" in signals and "accelerometer" not in signals and crossed:
         raise InputError(f"{crossed[0]} needs the specific force, and the calibration has no accelerometer.")
     changed: dict[str, Signal] = {}
@@ -60,12 +60,12 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
         time = signal.time
         key = time.tobytes()
         if key not in results:
-            outputs = {other: _at(each, time) for other, each in signals.items()}
+            outputs = {other: _at(signal, time) for other, signal in signals.items()}
             stimulus = Stimulus(time=time)
             if recording.temperature is not None:
-                kelvin = _at(recording.temperature, time)[:, 0]
-                slope = smoothed_slope(time, kelvin, TEMPERATURE_WINDOW)
-                stimulus = replace(stimulus, temperature=kelvin, temperature_rate=slope)
+                temperature = _at(recording.temperature, time)[:, 0]
+                slope = smoothed_slope(time, temperature, TEMPERATURE_WINDOW)
+                stimulus = replace(stimulus, temperature=temperature, temperature_rate=slope)
             force = outputs["accelerometer"] if "accelerometer" in outputs else np.zeros((len(time), 3))
             results[key] = _recover(imu, force, outputs.get("gyroscope"), stimulus)
         value = np.asarray(results[key][("accelerometer", "gyroscope").index(name)])
@@ -81,9 +81,10 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
         )
     left = sorted({e.name for t in calibration.triads().values() for e in t.effects if e.scope != "device"})
     notes = (
-        "compensated by a calibration", *(f"{name} was not removed: it belongs to a session" for name in left),
+        "compensated by a calibration",
+        *(f"{name} was not removed: it belongs to a session" for name in left),
         *_extrapolated(calibration, recording),
-    )  # fmt: skip
+    )
     return replace(recording, **changed, notes=(*recording.notes, *notes))
 
 
@@ -93,7 +94,7 @@ def _field(triad: Triad, recording: Recording, rate: Signal | None) -> Signal:
     assert signal is not None
     time = signal.time
     others = {"temperature": recording.temperature, "current": recording.current, "angular_rate": rate}
-    known: dict[str, Any] = {name: _at(each, time) for name, each in others.items() if each is not None}
+    known: dict[str, Any] = {name: _at(signal, time) for name, signal in others.items() if signal is not None}
     known |= {name: known[name][:, 0] for name in ("temperature", "current") if name in known}
     field = eqx.filter_jit(Triad.recover)(triad, signal.values, Stimulus(time=time, **known))
     return Signal(time, np.asarray(field), "uT")
@@ -101,10 +102,10 @@ def _field(triad: Triad, recording: Recording, rate: Signal | None) -> Signal:
 
 def _extrapolated(calibration: Calibration, recording: Recording) -> list[str]:
     """Say where the temperature leaves the range that a calibration over temperature saw."""
-    seen, signal = calibration.data.get("temperature_range"), recording.temperature
-    if seen is None or signal is None:
+    covered, signal = calibration.data.get("temperature_range"), recording.temperature
+    if covered is None or signal is None:
         return []
-    low, high = seen
+    low, high = covered
     share = float(np.mean((signal.values < low - _BEYOND) | (signal.values > high + _BEYOND)))
     if not share:
         return []

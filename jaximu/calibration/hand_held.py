@@ -47,12 +47,12 @@ def fit_hand_held(nominal: Imu, observations: Observations, method: Method = "jo
     lift = (lambda leaf: np.asarray(leaf)[None]) if single else np.asarray
     nominal, observations = jax.tree.map(lift, (nominal, observations))
     if method == "joint":
-        found = fit(nominal, PosesAndTurns.of(observations), loss=loss)
+        fitted = fit(nominal, PosesAndTurns.of(observations), loss=loss)
     else:
-        found = fit(nominal, PosesAndTurns.of(observations, "norm"), loss=loss)
+        fitted = fit(nominal, PosesAndTurns.of(observations, "norm"), loss=loss)
         if method != "accelerometer":
-            found = _second_step(found, observations, "rk4" if method.endswith("rk4") else "exponential", loss)
-    return jax.tree.map(lambda leaf: leaf[0], found) if single else found
+            fitted = _second_step(fitted, observations, "rk4" if method.endswith("rk4") else "exponential", loss)
+    return jax.tree.map(lambda leaf: leaf[0], fitted) if single else fitted
 
 
 def _second_step(first: Fit, observations: Observations, method: str, loss: str) -> Fit:
@@ -104,10 +104,10 @@ def _two_step_covariance(model: Imu, observations: Observations, excess: Array) 
     def batch(like, parameters, units):
         def lane(unit):
             reference, observations, excess = unit
-            own = eqx.tree_at(lambda p: p.reference, parameters, reference)
-            zero = jnp.zeros(len(own.index))
-            conditions, covariance, *_ = condense(own.model(like, zero), observations)
-            slope = jax.jacfwd(lambda z: conditions(own.model(like, z)))(zero)
+            of_unit = eqx.tree_at(lambda p: p.reference, parameters, reference)
+            zero = jnp.zeros(len(of_unit.index))
+            conditions, covariance, *_ = condense(of_unit.model(like, zero), observations)
+            slope = jax.jacfwd(lambda z: conditions(of_unit.model(like, z)))(zero)
 
             def step(rows, columns):
                 """How numbers react to the conditions in a step that looks at some rows only."""
@@ -127,5 +127,5 @@ def _two_step_covariance(model: Imu, observations: Observations, excess: Array) 
 
     units = (reference, observations, excess)
     size = np.asarray(parameters.size)
-    found = stored.call(batch, "two-step covariance", like, parameters, units, quick=count == 1)
-    return found * size[:, None] * size
+    covariance = stored.call(batch, "two-step covariance", like, parameters, units, quick=count == 1)
+    return covariance * size[:, None] * size

@@ -21,9 +21,13 @@ _TOLD = 0.05
 ENOUGH = 0.1
 """Share of a shape that must be left beside all others for its coefficient to be worth having."""
 _LISTED = 6  # ways of the temperature that are listed one by one
-_WORDS = {"temperature_rate": "the rate of temperature", "temperature_rate_squared": "the square of that rate",
-          "temperature_times_rate": "temperature times its rate", "thermal_lag": "a lag",
-          "thermal_hysteresis": "a hysteresis"}  # fmt: skip
+_WORDS = {
+    "temperature_rate": "the rate of temperature",
+    "temperature_rate_squared": "the square of that rate",
+    "temperature_times_rate": "temperature times its rate",
+    "thermal_lag": "a lag",
+    "thermal_hysteresis": "a hysteresis",
+}
 
 
 class Separation(NamedTuple):
@@ -69,18 +73,18 @@ def separated(shapes: ThermalShapes) -> dict[str, Separation]:
     grids: dict[str, list[ThermalTerm]] = {name: [ThermalTerm(name)] for name in RATES}
     grids |= {name: [history(name, value) for value in values] for name, values in shapes.grids.items()}
     columns = {name: [root[:, 0] * shapes.column(term)[0] for term in grid] for name, grid in grids.items()}
-    middle = {name: found[len(found) // 2] for name, found in columns.items()}
-    found = {}
+    middle = {name: options[len(options) // 2] for name, options in columns.items()}
+    separations = {}
     for name, options in columns.items():
         # a rate counts from standing still, a lag and a play, like temperature, from wherever they are
-        whole = [_length(each if name in RATES else _off(mean, each)) for each in options]
-        alone = max(_length(_off(base, each)) / size for each, size in zip(options, whole, strict=True))
-        others = np.stack([_off(base, each) for other, each in middle.items() if other != name], axis=1)
+        whole = [_length(option if name in RATES else _off(mean, option)) for option in options]
+        alone = max(_length(_off(base, option)) / size for option, size in zip(options, whole, strict=True))
+        others = np.stack([_off(base, column) for other, column in middle.items() if other != name], axis=1)
         # what rounding leaves of a shape is no shape
         others = others[:, np.linalg.norm(others, axis=0) > 1e-9 * max(map(_length, middle.values()))]
         left = _length(_off(orthonormal(others), _off(base, middle[name])))
-        found[name] = Separation(alone, left / whole[len(options) // 2], left**2)
-    return found
+        separations[name] = Separation(alone, left / whole[len(options) // 2], left**2)
+    return separations
 
 
 def _length(column: FloatArray) -> float:
@@ -95,7 +99,7 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
     """Say before any fit which thermal effects the path of temperature distinguishes from smooth functions of it."""
     parts = separated(shapes)
     legs = blocks.legs()
-    told = [*POWERS, LEARNED, *(name for name, part in parts.items() if part.alone > _TOLD)]
+    observable = [*POWERS, LEARNED, *(name for name, part in parts.items() if part.alone > _TOLD)]
     if len(legs) > _LISTED:
         low, high = blocks.range
         fast = 60 * float(np.max(np.abs(blocks.rate)))
@@ -104,8 +108,8 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
     else:
         words = [f"The temperature went {'; '.join(map(str, legs))}."]
     share = max(part.alone for part in parts.values())
-    alike = [name for name in (*RATES, *HISTORY) if name in told and parts[name].apart < ENOUGH]
-    hidden = [name for name in (*RATES, *HISTORY) if name not in told]
+    alike = [name for name in (*RATES, *HISTORY) if name in observable and parts[name].apart < ENOUGH]
+    hidden = [name for name in (*RATES, *HISTORY) if name not in observable]
     if len(hidden) == len(parts):
         words.append(
             f"Over this path the rate of temperature, a lag and a hysteresis are functions of temperature, to "
@@ -114,26 +118,30 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
             "cycle: the same range up and down, then again at another rate."
         )
     elif hidden or alike:
-        seen = [name for name in (*RATES, *HISTORY) if name not in hidden and name not in alike]
-        said = [f"This path of temperature separates {listed([_WORDS[name] for name in seen])}." if seen else ""]
+        separate = [name for name in (*RATES, *HISTORY) if name not in hidden and name not in alike]
+        sentences = [
+            f"This path of temperature separates {listed([_WORDS[name] for name in separate])}." if separate else ""
+        ]
         lacking = [_WORDS[name] for name in hidden]
-        said.append(f"It does not show {listed(lacking, 'or')} beside bias over temperature." if hidden else "")
+        sentences.append(f"It does not show {listed(lacking, 'or')} beside bias over temperature." if hidden else "")
         if alike:
             share = 100 * (1 - min(parts[name].apart for name in alike))
-            said.append(f"The other effects imitate {listed([_WORDS[name] for name in alike])} to {share:.2g} %.")
-        said.append("Record a cycle, then again at another rate, to separate them." if hidden else "")
-        words.append(" ".join(filter(None, said)))
+            sentences.append(f"The other effects imitate {listed([_WORDS[name] for name in alike])} to {share:.2g} %.")
+        sentences.append("Record a cycle, then again at another rate, to separate them." if hidden else "")
+        words.append(" ".join(filter(None, sentences)))
     else:
         words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
     base = orthonormal(np.concatenate([np.eye(blocks.levels)[blocks.level], shapes.smooth()], axis=1))
     mean = orthonormal(np.eye(blocks.levels)[blocks.level])
-    scale = max(_length(_off(base, each)) / _length(_off(mean, each)) for each in shapes.column(ThermalTerm(SCALE)))
+    scale = max(
+        _length(_off(base, column)) / _length(_off(mean, column)) for column in shapes.column(ThermalTerm(SCALE))
+    )
     if scale > _TOLD and blocks.several_poses:
-        told.append(SCALE)
+        observable.append(SCALE)
     else:
         words.append(
             "What the accelerometer shows of temperature is bias and, along gravity, scale, and across it, "
             "tilt of the mounting: in one pose they stay unresolved. Poses with each axis up and down at the same "
             "temperatures would separate them."
         )
-    return Identifiability(tuple(told), tuple(words), tuple(legs), parts)
+    return Identifiability(tuple(observable), tuple(words), tuple(legs), parts)

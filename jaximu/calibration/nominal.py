@@ -48,16 +48,16 @@ def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
     imu = as_stated(recording, factors)
     if gyroscope is None:
         return imu, ()
-    found = recording.turning
+    motion = recording.turning
     if (factors != 1).any():
-        found = turning(accelerometer.time, accelerometer.si() / factors, gyroscope.time, gyroscope.si())
-    if found is None or found.explained < _EXPLAINED or not float(np.max(found.sigma)) < _KNOWN:
+        motion = turning(accelerometer.time, accelerometer.si() / factors, gyroscope.time, gyroscope.si())
+    if motion is None or motion.explained < _EXPLAINED or not float(np.max(motion.sigma)) < _KNOWN:
         return imu, ()
-    matrix, notes = _start(found)
+    matrix, notes = _start(motion)
     if np.array_equal(matrix, np.eye(3)):
         return imu, ()
     gain = np.diag(gyroscope.nominal_scale) @ np.linalg.inv(matrix)
-    return eqx.tree_at(lambda each: each.gyroscope.gain, imu, gain), notes
+    return eqx.tree_at(lambda unit: unit.gyroscope.gain, imu, gain), notes
 
 
 def _forces(recording: Recording) -> FloatArray:
@@ -83,12 +83,12 @@ def _forces(recording: Recording) -> FloatArray:
     return np.asarray(np.where(np.abs(np.log(factors)) > _ODD, factors, 1.0), np.float64)
 
 
-def _start(found: Turning) -> tuple[FloatArray, tuple[str, ...]]:
+def _start(motion: Turning) -> tuple[FloatArray, tuple[str, ...]]:
     """Return the matrix from rates as read to true ones that a fit starts from, and what is to be said of it."""
-    arranged = signed_permutation(found.matrix)
-    rest = arranged.T @ found.matrix
+    arranged = signed_permutation(motion.matrix)
+    rest = arranged.T @ motion.matrix
     if angle_of(rotation_of(rest)) > _MOUNTED:
-        return found.matrix, ()
+        return motion.matrix, ()
     scales = np.maximum(np.diag(rest), 1e-6)
     off = np.abs(np.log(scales)) > _SAME
     if not off.any():

@@ -114,10 +114,10 @@ def calibrate(
     if start is not None:
         raise InputError("a start is for data of several kinds: recordings by hand begin at the data sheet's values.")
     with prepared(by_hand, repair, gyroscope=method != "accelerometer") as ready:
-        found, unusual = calibrate_ready([each.recording for each in ready], choices, repair)
-    told = [*(note for each in ready for note in each.notes), *(each.text for each in unusual)]
-    found = replace(found, notes=tuple(dict.fromkeys((*told, *found.notes))))
-    return found if static is not None else _with_drift(found)
+        calibration, unusual = calibrate_ready([one.recording for one in ready], choices, repair)
+    notes = [*(note for item in ready for note in item.notes), *(item.text for item in unusual)]
+    calibration = replace(calibration, notes=tuple(dict.fromkeys((*notes, *calibration.notes))))
+    return calibration if static is not None else _with_drift(calibration)
 
 
 def _calibrated_jointly(
@@ -196,15 +196,15 @@ def _distinct(names: Sequence[str]) -> list[str]:
     return [f"{name} {count + 1}" if count else name for name, count in zip(names, before, strict=True)]
 
 
-def _with_drift(found: Calibration) -> Calibration:
+def _with_drift(calibration: Calibration) -> Calibration:
     """Return a calibration by hand whose uncertainty knows the drift of the biases that its recordings show."""
-    if found.loss != "linear" or found.method.startswith("two-step"):
+    if calibration.loss != "linear" or calibration.method.startswith("two-step"):
         advice = f"{_NO_DRIFT}: use the joint method with the linear loss, or add --static LOG."
-        return replace(found, notes=(*found.notes, advice))
-    assert found.fit is not None and found.observations is not None
-    fit, told = with_drift(found.fit, found.observations, found.segmentations)
-    covariance = fit.total_covariance(found.gravity.sigma, clock_sigma(found.segmentations))
-    return replace(found, fit=fit, covariance=covariance, notes=(*found.notes, *told))
+        return replace(calibration, notes=(*calibration.notes, advice))
+    assert calibration.fit is not None and calibration.observations is not None
+    fit, sentences = with_drift(calibration.fit, calibration.observations, calibration.segmentations)
+    covariance = fit.total_covariance(calibration.gravity.sigma, clock_sigma(calibration.segmentations))
+    return replace(calibration, fit=fit, covariance=covariance, notes=(*calibration.notes, *sentences))
 
 
 def calibrate_ready(
@@ -216,36 +216,38 @@ def calibrate_ready(
     ranges; with `repair` axes are mapped. `losses`: whether lost time is looked for; turns that miss for another
     reason would be taken for it.
     """
-    found = _calibrated(recordings, choices)
-    findings = arrangement(recordings[0], found)
-    wrong = [each for each in findings if each.apply is not None]
+    calibration = _calibrated(recordings, choices)
+    findings = arrangement(recordings[0], calibration)
+    wrong = [finding for finding in findings if finding.apply is not None]
     if wrong and not repair:  # turns about wrong axes tell nothing of what was lost in them
-        return found, findings
-    for each in wrong:
-        assert each.apply is not None
-        recordings = [each.apply(recording) for recording in recordings]
+        return calibration, findings
+    for finding in wrong:
+        assert finding.apply is not None
+        recordings = [finding.apply(recording) for recording in recordings]
     if wrong:
-        findings = [replace(each, text=f"{each.text} This was repaired.") if each in wrong else each
-                    for each in findings]  # fmt: skip
-        found = _calibrated(recordings, choices)
+        findings = [
+            replace(finding, text=f"{finding.text} This was repaired.") if finding in wrong else finding
+            for finding in findings
+        ]
+        calibration = _calibrated(recordings, choices)
     if not losses:
-        return found, findings
-    found, lost = _without_losses(found, choices)
-    return found, [*lost, *findings]
+        return calibration, findings
+    calibration, lost = _without_losses(calibration, choices)
+    return calibration, [*lost, *findings]
 
 
-def _without_losses(found: Calibration, choices: Choices) -> tuple[Calibration, list[Finding]]:
+def _without_losses(calibration: Calibration, choices: Choices) -> tuple[Calibration, list[Finding]]:
     """Calibrate again without the turns that lost time, as the fit shows them, and tell it."""
-    if found.loss != "linear" or found.method != "joint" or not tells_losses(found):
-        return found, []
+    if calibration.loss != "linear" or calibration.method != "joint" or not tells_losses(calibration):
+        return calibration, []
     findings: list[Finding] = []
     for _ in range(_ROUNDS):  # a gross one moves the fit, and hides others
-        kept, more = without_lost_stretches(found)
+        kept, more = without_lost_stretches(calibration)
         if not more:
             break
         findings += more
-        found = _calibrated(kept, choices)
-    return found, [*findings, *(saturation(found) or lost_share(found))]
+        calibration = _calibrated(kept, choices)
+    return calibration, [*findings, *(saturation(calibration) or lost_share(calibration))]
 
 
 def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibration:
@@ -254,7 +256,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     mixed = same_outputs(recordings)
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
     method = choices.method if has_gyroscope else "accelerometer"
-    chosen = [effect_named(each) for each in choices.effects]
+    chosen = [effect_named(effect) for effect in choices.effects]
     if chosen and method != "joint":
         raise InputError(
             f"{chosen[0].name} is fitted jointly with gain and bias of both sensors, which needs the joint method and "
@@ -274,10 +276,10 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     noise = noise_of(static)
     observations = observed_poses(segmentations, gravity.value, noise=noise)
     nominal, notes = nominal_imu(recordings[0])
-    found = fit_hand_held(nominal, observations, method, loss)
+    fitted = fit_hand_held(nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
     poses, turns = (int(np.sum(mask)) for mask in (observations.poses.mask, observations.turns.mask))
-    require_determined(found, where, poses=poses)
+    require_determined(fitted, where, poses=poses)
     keep_gyroscope = method != "accelerometer"
     before = residual_rms(nominal, observations, keep_gyroscope)
     sigmas, prior = dict(choices.effect_sigmas or {}), None
@@ -287,25 +289,35 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
             chosen, sigmas = [*chosen, earth], sigmas | {earth.name: spread}
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
-        start = jax.tree.map(np.asarray, found.imu).with_effects(*chosen)
+        start = jax.tree.map(np.asarray, fitted.imu).with_effects(*chosen)
         prior = Prior.of_effects(start, sigmas)
-        found = fit(start, measurement, prior=prior, loss=loss, excess=found.excess)
-        require_determined(found, where, prior=prior)
-        observations = measurement.along(found.imu, tuple(found.imu.all_effects().values())).observations
-    notes = (*(note for recording in recordings for note in recording.notes), *notes, *mixed,
-             *(() if noise is None else noise.notes),
-             *(note for part in segmentations for note in part.notes))  # fmt: skip
+        fitted = fit(start, measurement, prior=prior, loss=loss, excess=fitted.excess)
+        require_determined(fitted, where, prior=prior)
+        observations = measurement.along(fitted.imu, tuple(fitted.imu.all_effects().values())).observations
+    notes = (
+        *(note for recording in recordings for note in recording.notes),
+        *notes,
+        *mixed,
+        *(() if noise is None else noise.notes),
+        *(note for part in segmentations for note in part.notes),
+    )
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)
     return concluded(
-        found if keep_gyroscope else replace(found, imu=Imu(found.imu.accelerometer, None)),
-        gravity=gravity, method=method, loss=loss, excess_names=EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1],
-        rms=[before, residual_rms(found.imu.with_effects(), observations, keep_gyroscope)],
+        fitted if keep_gyroscope else replace(fitted, imu=Imu(fitted.imu.accelerometer, None)),
+        gravity=gravity,
+        method=method,
+        loss=loss,
+        excess_names=EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1],
+        rms=[before, residual_rms(fitted.imu.with_effects(), observations, keep_gyroscope)],
         known=() if prior is None else prior.names,
         data=provenance(recordings) | {"poses": poses, "turns": turns} | _mean_temperature(recordings, observations),
-        notes=notes, observations=observations, segmentations=segmentations, nominal=nominal,
+        notes=notes,
+        observations=observations,
+        segmentations=segmentations,
+        nominal=nominal,
         reading=recordings[0].reading,
-    )  # fmt: skip
+    )
 
 
 def _headings_known(segmentations: Sequence[Segmentation], observations: Observations) -> bool:

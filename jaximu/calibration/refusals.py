@@ -19,41 +19,41 @@ __all__ = ["refuse_undetermined", "relative_covariance", "require_determined", "
 
 
 def require_determined(
-    found: Fit, where: str, shown: str = "", record: str = "", prior: Prior | None = None, poses: int | None = None
+    fitted: Fit, where: str, shown: str = "", record: str = "", prior: Prior | None = None, poses: int | None = None
 ) -> None:
     """Raise `NotPossibleError` for a fit that is no calibration: left open, not solved, effects not told.
 
     **Arguments:** `shown`, `record`: what was seen and what to record, for the message; or `poses`, by hand. `prior`:
     what is known of effects beforehand.
     """
-    if bool(found.finite):  # along directions left open a fit may creep until its steps run out
+    if bool(fitted.finite):  # along directions left open a fit may creep until its steps run out
         if poses is not None:
-            require_spanning(relative_covariance(found), found.names, poses, where)
+            require_spanning(relative_covariance(fitted), fitted.names, poses, where)
         elif shown:
-            require_excited(found, where, shown, record)
-    require_solved(found, where)
-    refuse_undetermined(found, prior)
+            require_excited(fitted, where, shown, record)
+    require_solved(fitted, where)
+    refuse_undetermined(fitted, prior)
 
 
-def require_solved(found: Fit, where: str) -> None:
+def require_solved(fitted: Fit, where: str) -> None:
     """Raise `NotPossibleError` where a fit did not end well."""
-    if found.failure() is not Failure.NONE:
-        raise NotPossibleError(f"{where}: {found.failure().value}.")
+    if fitted.failure() is not Failure.NONE:
+        raise NotPossibleError(f"{where}: {fitted.failure().value}.")
 
 
-def require_excited(found: Fit, where: str, said: str, record: str) -> None:
+def require_excited(fitted: Fit, where: str, shown: str, record: str) -> None:
     """Refuse what is no calibration: of every triad more than half of the parameters left open."""
-    covariance = relative_covariance(found)
+    covariance = relative_covariance(fitted)
     parts = []
-    for triad in found.imu.triads():
-        rows = [place for place, name in enumerate(found.names) if name.owner == triad and name.effect is None]
+    for triad in fitted.imu.triads():
+        rows = [index for index, name in enumerate(fitted.names) if name.owner == triad and name.effect is None]
         if not rows:
             continue
         left = _open_directions(covariance, rows)
         if left <= len(rows) // 2:
             return
         parts.append(f"{left} of the {triad}'s {len(rows)} parameters")
-    raise NotPossibleError(f"{where}: {said} leave {' and '.join(parts)} open. {record}")
+    raise NotPossibleError(f"{where}: {shown} leave {' and '.join(parts)} open. {record}")
 
 
 def require_spanning(
@@ -63,7 +63,7 @@ def require_spanning(
 
     covariance: (p, p) of the parameters over their typical sizes. sensor: what stands in the accelerometer's place.
     """
-    rows = [place for place, name in enumerate(names) if name.owner == "accelerometer"]
+    rows = [index for index, name in enumerate(names) if name.owner == "accelerometer"]
     open_directions = _open_directions(covariance, rows)
     if open_directions > len(rows) // 3:
         raise NotPossibleError(
@@ -73,24 +73,24 @@ def require_spanning(
         )
 
 
-def refuse_undetermined(found: Fit, prior: Prior | None = None, wholly: bool = False) -> None:
+def refuse_undetermined(fitted: Fit, prior: Prior | None = None, wholly: bool = False) -> None:
     """Raise `NotPossibleError` for a fitted effect that was not told from all else that was fitted.
 
     An effect of which a prior says something is let through; with `wholly` one of which a part is determined, too.
     """
     known = set() if prior is None else set(prior.names)
-    jacobian = np.asarray(found.jacobian)
-    for (owner, place), effect in found.imu.all_effects().items():
-        own = np.array([(name.owner, name.effect) == (owner, place) for name in found.names])
-        if not own.any() or any(name in known for name, mine in zip(found.names, own, strict=True) if mine):
+    jacobian = np.asarray(fitted.jacobian)
+    for (owner, position), effect in fitted.imu.all_effects().items():
+        members = np.array([(name.owner, name.effect) == (owner, position) for name in fitted.names])
+        if not members.any() or any(name in known for name, mine in zip(fitted.names, members, strict=True) if mine):
             continue
-        columns, others = jacobian[:, own], jacobian[:, ~own]
+        columns, others = jacobian[:, members], jacobian[:, ~members]
         left = columns - others @ np.linalg.lstsq(others, columns, rcond=1e-10)[0]
         least = np.linalg.svd(left, compute_uv=False)[0 if wholly else -1]
         if not least > 1e-6 * np.linalg.norm(columns):
             raise NotPossibleError(
                 f"{sentence(effect.title)} cannot be distinguished here from bias, scale and misalignment"
-                f"{' or from the other effects' if len(found.imu.all_effects()) > 1 else ''}. Record "
+                f"{' or from the other effects' if len(fitted.imu.all_effects()) > 1 else ''}. Record "
                 f"{effect.excited_by}."
             )
         if 1 / least > UNDETERMINED:
@@ -101,9 +101,9 @@ def refuse_undetermined(found: Fit, prior: Prior | None = None, wholly: bool = F
             )
 
 
-def relative_covariance(found: Fit) -> FloatArray:
+def relative_covariance(fitted: Fit) -> FloatArray:
     """Return the covariance (p, p) of a fit's parameters over their typical sizes."""
-    return np.asarray(found.covariance) / found.sizes[:, None] / found.sizes
+    return np.asarray(fitted.covariance) / fitted.sizes[:, None] / fitted.sizes
 
 
 def _open_directions(covariance: FloatArray, rows: Sequence[int]) -> int:

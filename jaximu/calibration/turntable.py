@@ -75,8 +75,8 @@ def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss
     def seen(name: Name) -> bool:
         return on_table(name) and (force or name.owner != "accelerometer" or name.effect is not None)
 
-    found = fit(start, KnownStations(stations), seen, loss=loss, follow=True)
-    return jax.tree.map(lambda leaf: leaf[0], found) if single else found
+    fitted = fit(start, KnownStations(stations), seen, loss=loss, follow=True)
+    return jax.tree.map(lambda leaf: leaf[0], fitted) if single else fitted
 
 
 def free_on_table(imu: Imu, free: Sequence[str] = ()) -> Callable[[Name], bool]:
@@ -121,21 +121,21 @@ def calibrate_turntable(
     recordings = recordings_of(recordings)
     mixed = same_outputs(recordings, alone=True)
     if references is None:
-        given = [entries_of_columns(recording) for recording in recordings]
+        entries = [entries_of_columns(recording) for recording in recordings]
     else:
         alone = len(references) > 0 and not isinstance(references[0], Sequence)
-        given = [references] if alone else list(references)
-    if len(given) != len(recordings):
-        raise InputError(f"{len(recordings)} recordings need as many references, found {len(given)}.")
+        entries = [references] if alone else list(references)
+    if len(entries) != len(recordings):
+        raise InputError(f"{len(recordings)} recordings need as many references, found {len(entries)}.")
     noise = noise_of(static)
     with prepared(recordings, repair) as ready:
-        calibration = calibrate_table_ready(ready, given, gravity, noise, effects, latitude, loss)  # pyright: ignore[reportArgumentType]
+        calibration = calibrate_table_ready(ready, entries, gravity, noise, effects, latitude, loss)  # pyright: ignore[reportArgumentType]
     return replace(calibration, notes=(*mixed, *calibration.notes))
 
 
 def calibrate_table_ready(
     ready: Sequence[Prepared],
-    given: Sequence[Sequence[Entry]],
+    references: Sequence[Sequence[Entry]],
     gravity: LocalGravity,
     noise: NoiseModel | None = None,
     effects: Sequence[str | Effect] = (),
@@ -144,42 +144,51 @@ def calibrate_table_ready(
 ) -> Calibration:
     """Calibrate as `calibrate_turntable` does, from recordings that [`jaximu.mistakes.prepare`][] has been over."""
     recordings = [one.recording for one in ready]
-    stations, said = observe_stations(recordings, given, gravity.value, noise)
+    stations, remarks = observe_stations(recordings, references, gravity.value, noise)
     nominal = as_stated(recordings[0])
     if recordings[0].gyroscope is None:
         nominal = Imu(nominal.accelerometer, None)
-    chosen = [effect_named(each) for each in effects]
+    chosen = [effect_named(effect) for effect in effects]
     if latitude is not None:
-        _require_headings(recordings, given)
+        _require_headings(recordings, references)
         known = GyroEarthRotation.make(earth_rate(np.radians(latitude)))
-        chosen = [*(each for each in chosen if each.name != known.name), known]
-    free = tuple(each.name for each in chosen if latitude is None or not isinstance(each, GyroEarthRotation))
-    for each in chosen:
-        if "attitude" in each.needs and stations.stimulus.attitude is None:
+        chosen = [*(effect for effect in chosen if effect.name != known.name), known]
+    free = tuple(effect.name for effect in chosen if latitude is None or not isinstance(effect, GyroEarthRotation))
+    for effect in chosen:
+        if "attitude" in effect.needs and stations.stimulus.attitude is None:
             raise NotPossibleError(
-                f"{each.name} needs to know how the unit was turned about the vertical in every pose: state headings "
+                f"{effect.name} needs to know how the unit was turned about the vertical in every pose: state headings "
                 "in the reference, or all turns between the poses."
             )
     start = jax.tree.map(np.asarray, nominal.with_effects(*chosen))
-    found = fit_turntable(start, stations, free, loss)
+    fitted = fit_turntable(start, stations, free, loss)
     where = ", ".join(recording.name for recording in recordings)
     used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
     poses, turns = (int(np.sum(used & (np.asarray(stations.turn) == kind))) for kind in (False, True))
     shown = f"the reference has {counted(poses, 'pose')} and {counted(turns, 'turn')} that can be used, which"
-    require_determined(found, where, shown, _RECORD)
-    found = _at_rest_where_open(found, start)
+    require_determined(fitted, where, shown, _RECORD)
+    fitted = _at_rest_where_open(fitted, start)
     notes = (
         *(note for recording in recordings for note in recording.remarks),
-        *(note for one in ready for note in one.notes), *(() if noise is None else noise.notes), *said,
-    )  # fmt: skip
+        *(note for one in ready for note in one.notes),
+        *(() if noise is None else noise.notes),
+        *remarks,
+    )
     calibration = concluded(
-        found, gravity=gravity, method="turntable", loss=loss, advice=station_advice, notes=notes,
+        fitted,
+        gravity=gravity,
+        method="turntable",
+        loss=loss,
+        advice=station_advice,
+        notes=notes,
         excess_names=EXCESS_NAMES if nominal.gyroscope is not None else EXCESS_NAMES[:1],
-        rms=[station_rms(imu, stations) for imu in (start, found.imu)],
+        rms=[station_rms(imu, stations) for imu in (start, fitted.imu)],
         data=provenance(recordings) | {"poses": poses, "turns": turns},
-        stations=stations, nominal=nominal, reading=recordings[0].reading,
+        stations=stations,
+        nominal=nominal,
+        reading=recordings[0].reading,
         absent=() if "accelerometer" in recordings[0].signals else ("accelerometer",),
-    )  # fmt: skip
+    )
     return replace(calibration, notes=(*calibration.notes, *_turned_as_a_whole(calibration)))
 
 
@@ -188,8 +197,13 @@ def _turned_as_a_whole(calibration: Calibration) -> list[str]:
 
     The gain's polar factor (Higham, SIAM J. Sci. Stat. Comput. 7, 1986) is the rotation that comes closest to it.
     """
-    open_gains = {name.partition(".")[0] for weak in calibration.weak if not weak.determined
-                  for name, _ in weak.parameters if ".gain[" in name}  # fmt: skip
+    open_gains = {
+        name.partition(".")[0]
+        for weak in calibration.weak
+        if not weak.determined
+        for name, _ in weak.parameters
+        if ".gain[" in name
+    }
     notes = []
     for sensor in sorted({name.owner for name in calibration.names if name.part == "gain"} - open_gains):
         gain = np.asarray(calibration.triads()[sensor].gain)
@@ -204,19 +218,19 @@ def _turned_as_a_whole(calibration: Calibration) -> list[str]:
     return notes
 
 
-def _at_rest_where_open(found: Fit, start: Imu) -> Fit:
+def _at_rest_where_open(fitted: Fit, start: Imu) -> Fit:
     """Return the fit with what the data leave open where the data sheet has it: noise had moved it about."""
-    parameters = Parameters.select(start, lambda name: name in found.names)
+    parameters = Parameters.select(start, lambda name: name in fitted.names)
     values = np.asarray(parameters.reference)[list(parameters.index)]
-    moved = (found.values - values) / found.sizes
-    _, known, right = np.linalg.svd(np.asarray(found.jacobian), full_matrices=True)
+    moved = (fitted.values - values) / fitted.sizes
+    _, known, right = np.linalg.svd(np.asarray(fitted.jacobian), full_matrices=True)
     known = np.pad(known, (0, len(right) - len(known)))
     free = right[1 / np.hypot(known, 1 / TOLERANCE) > UNDETERMINED]
     if not len(free):
-        return found
+        return fitted
     back = moved - free.T @ (free @ moved)
     model = jax.tree.map(np.asarray, parameters.model(start, jnp.asarray(back)))
-    return replace(found, imu=model, values=values + found.sizes * back)
+    return replace(fitted, imu=model, values=values + fitted.sizes * back)
 
 
 def _require_headings(recordings: Sequence[Recording], references: Sequence[Sequence[Entry]]) -> None:

@@ -37,6 +37,11 @@ def diagnose_against_attitude(
     calibration, measurement = calibrated()
     noise = known or measurement.white_noise(calibration.excess)
     return diagnose_data(
-        calibration, measurement, noise, lambda effects: calibrated(effects=effects)[0],
-        findings=tuple(inspect(recording)), notes=calibration.notes, level=level,
-    )  # fmt: skip
+        calibration,
+        measurement,
+        noise,
+        lambda effects: calibrated(effects=effects)[0],
+        findings=tuple(inspect(recording)),
+        notes=calibration.notes,
+        level=level,
+    )

@@ -168,10 +168,20 @@ def _compared(
     wide = {kind.name: float(value) for kind, value in zip(experiment.real.kinds, scatter, strict=True)}
     before, after = (experiment.real.rms(errors) for errors in (conditions, fresh.conditions))
     validity = _validity(
-        calibration, old, question, selection, fresh, causes, _verdict(selection, causes), level, experiment=experiment,
-        errors={name: (value, after[name][0], unit) for name, (value, unit) in before.items()}, scatter=wide,
-        conditions=(conditions, fresh.conditions), data=provenance(data.recordings) | data.counts(),
-    )  # fmt: skip
+        calibration,
+        old,
+        question,
+        selection,
+        fresh,
+        causes,
+        _verdict(selection, causes),
+        level,
+        experiment=experiment,
+        errors={name: (value, after[name][0], unit) for name, (value, unit) in before.items()},
+        scatter=wide,
+        conditions=(conditions, fresh.conditions),
+        data=provenance(data.recordings) | data.counts(),
+    )
     unknown = [shift.name for shift in validity.shifts if not shift.comparable]
     if unknown:
         notes.append(
@@ -212,16 +222,27 @@ def _validity(
     square = float(difference @ np.linalg.solve(spread, difference))
     residual = question.evidence.residual
     return Validity(
-        verdict, selection.p_value, float(residual @ residual), question.evidence.freedom,
-        (square, len(compared), float(chi2_sf(square, len(compared))) if compared else 1.0), shifts, causes,
-        calibration=calibration, **about,
-    )  # fmt: skip
+        verdict,
+        selection.p_value,
+        float(residual @ residual),
+        question.evidence.freedom,
+        (square, len(compared), float(chi2_sf(square, len(compared))) if compared else 1.0),
+        shifts,
+        causes,
+        calibration=calibration,
+        **about,
+    )
 
 
 def _followed(
-    calibration: Calibration, old: Old, recordings: Sequence[Recording], gravity: LocalGravity,
-    noise: NoiseModel | None, level: float, why: NotPossibleError,
-) -> Validity:  # fmt: skip
+    calibration: Calibration,
+    old: Old,
+    recordings: Sequence[Recording],
+    gravity: LocalGravity,
+    noise: NoiseModel | None,
+    level: float,
+    why: NotPossibleError,
+) -> Validity:
     """Return the answer of a filter in use, for a recording in which no poses are found because of `why`."""
     if len(recordings) > 1:
         raise why
@@ -240,9 +261,12 @@ def _followed(
     covariance[np.ix_(known, known)] = old.covariance[np.ix_(places, places)]
     covariance += _ROUNDING * np.diag(np.diagonal(covariance))  # it stays positive definite without gravity's share
     follower = FilterInUse(
-        replace(calibration, covariance=covariance), noise, recording.gyroscope.rate, there,
+        replace(calibration, covariance=covariance),
+        noise,
+        recording.gyroscope.rate,
+        there,
         changing={"gyroscope": POWER_ON["gyroscope"]},
-    )  # fmt: skip
+    )
     history, diverged = follow(follower, recording)
     if np.sum(~history.rest) < 2:
         raise why
@@ -259,16 +283,26 @@ def _followed(
     causes = () if strange else _causes(question, selection, old)
     verdict = "unexplained" if strange else _verdict(selection, causes)
     validity = _validity(
-        calibration, old, question, selection, fresh, causes, verdict, level, history=history,
-        scatter={"innovations": scatter}, conditions=(followed.conditions, fresh.conditions),
+        calibration,
+        old,
+        question,
+        selection,
+        fresh,
+        causes,
+        verdict,
+        level,
+        history=history,
+        scatter={"innovations": scatter},
+        conditions=(followed.conditions, fresh.conditions),
         data=provenance([recording]) | {"updates": updates},
         alone={cause.name: _alone(question, cause) for cause in causes if len(cause.parameters) == 1},
-    )  # fmt: skip
+    )
     notes = [
-        *recording.notes, *noise.notes,
+        *recording.notes,
+        *noise.notes,
         "the recording has too few poses, so a filter followed the calibrated unit through it, which measures in rests "
         f"and where motion ends: {updates} updates.",
-    ]  # fmt: skip
+    ]
     if unknown := [shift.words for shift in validity.shifts if not shift.comparable]:
         notes.append(
             f"not determined without poses, each by itself: {', '.join(unknown)}. Record twenty poses to compare them."
@@ -295,18 +329,18 @@ def _told(follower: FilterInUse, old: Old, updates: int) -> tuple[FollowedUnit, 
     pull = information @ follower.change
     kept = [k for k, name in enumerate(names) if name.effect is None and name in old.names]
     beside = [k for k in range(len(pull)) if k not in kept]
-    own = information[np.ix_(kept, kept)] - prior[np.ix_(kept, kept)]
+    alone = information[np.ix_(kept, kept)] - prior[np.ix_(kept, kept)]
     across = information[np.ix_(kept, beside)]
     away = np.linalg.solve(information[np.ix_(beside, beside)], np.column_stack([across.T, pull[beside]]))
-    own, pull = own - across @ away[:, :-1], pull[kept] - across @ away[:, -1]
+    alone, pull = alone - across @ away[:, :-1], pull[kept] - across @ away[:, -1]
     places = [old.names.index(names[k]) for k in kept]
     size = old.sizes[places]
-    values, vectors = np.linalg.eigh(own * size[:, None] * size)
-    told = values > max(_TOLD * np.max(np.diagonal(prior)[kept] * size**2), updates * _BY_NOISE)
-    lengths = np.sqrt(values[told])
+    values, vectors = np.linalg.eigh(alone * size[:, None] * size)
+    determined = values > max(_TOLD * np.max(np.diagonal(prior)[kept] * size**2), updates * _BY_NOISE)
+    lengths = np.sqrt(values[determined])
     columns = np.zeros((len(lengths), len(old.names)))
-    columns[:, places] = lengths[:, None] * vectors[:, told].T / size
-    conditions = -(vectors[:, told].T @ (pull * size)) / lengths
+    columns[:, places] = lengths[:, None] * vectors[:, determined].T / size
+    conditions = -(vectors[:, determined].T @ (pull * size)) / lengths
     spread = np.eye(len(lengths)) + columns @ _beforehand(follower, old, kept, places) @ columns.T
     return FollowedUnit(conditions, columns), float(conditions @ np.linalg.solve(spread, conditions))
 
@@ -321,18 +355,19 @@ def _beforehand(follower: FilterInUse, old: Old, kept: list[int], places: list[i
 
 def _alone(question: Question, cause: Cause) -> tuple[float, float]:
     """Return how far the single parameter of a cause moved if it alone did, and the sigma of that."""
-    (place,) = (k for k, each in enumerate(question.candidates) if each.block.name == cause.name)
-    size, evidence = float(question.evidence.blocks[place].sizes[0]), question.evidence
-    sigma = 1 / np.sqrt(float(evidence.information(place)[0, 0]))
-    return size * float(evidence.coefficients([place])[0]), float(size * sigma)
+    (index,) = (k for k, candidate in enumerate(question.candidates) if candidate.block.name == cause.name)
+    size, evidence = float(question.evidence.blocks[index].sizes[0]), question.evidence
+    sigma = 1 / np.sqrt(float(evidence.information(index)[0, 0]))
+    return size * float(evidence.coefficients([index])[0]), float(size * sigma)
 
 
 def _upright(old: Old, recording: Recording, history: History, gravity: LocalGravity) -> None:
     """Raise `InputError` where gravity is far off in rests, which no calibration's age makes."""
     signal = recording.accelerometer
     force = np.asarray(old.imu.with_effects().accelerometer.recover(signal.values))
-    size = np.linalg.norm(np.stack([np.interp(history.time[history.rest] - INTERVAL / 2, signal.time, axis)
-                                    for axis in force.T]), axis=0)  # fmt: skip
+    size = np.linalg.norm(
+        np.stack([np.interp(history.time[history.rest] - INTERVAL / 2, signal.time, axis) for axis in force.T]), axis=0
+    )
     off = float(np.median(np.abs(size - gravity.value)))
     if off > _FAR_OFF[0]:
         raise InputError(
@@ -377,14 +412,14 @@ def _same_unit(experiment: Experiment, conditions: FloatArray, name: str) -> Non
 
 
 def _same_gains(old: Old, fresh: Fresh, name: str) -> None:
-    for place, each in enumerate(old.names):
-        if each.part != "gain":
+    for index, parameter in enumerate(old.names):
+        if parameter.part != "gain":
             continue
-        scale, shift = old.scales[place], abs(fresh.difference[place])
-        if shift > _OTHER_UNIT * scale and shift > 5 * np.sqrt(fresh.covariance_of_difference[place, place]):
+        scale, shift = old.scales[index], abs(fresh.difference[index])
+        if shift > _OTHER_UNIT * scale and shift > 5 * np.sqrt(fresh.covariance_of_difference[index, index]):
             raise InputError(
-                f"{name}: the {each.owner}'s gain differs from the calibration's by {100 * shift / scale:.2g} % "
-                f"({each}): is it the same unit, in the same units and axes?"
+                f"{name}: the {parameter.owner}'s gain differs from the calibration's by {100 * shift / scale:.2g} % "
+                f"({parameter}): is it the same unit, in the same units and axes?"
             )
 
 
@@ -410,18 +445,28 @@ def _causes(question: Question, selection: Selection, old: Old) -> tuple[Cause, 
         return ()
     taken = [question.candidates[cause.block] for cause in selection.causes]
     numbers = question.evidence.coefficients([cause.block for cause in selection.causes])
-    parts = np.split(numbers, np.cumsum([len(each.block.sizes) for each in taken])[:-1])
-    found = []
-    for cause, each, part in zip(selection.causes, taken, parts, strict=True):
-        block, others = each.block, [question.candidates[k] for k in cause.rivals]
-        rivals = {k.block.name for k in others if not each.scope == k.scope == "parameter"} - {block.name}
-        unit = old.units[each.places[0]] if len(each.places) == 1 else ""
+    parts = np.split(numbers, np.cumsum([len(candidate.block.sizes) for candidate in taken])[:-1])
+    causes = []
+    for cause, candidate, part in zip(selection.causes, taken, parts, strict=True):
+        block, others = candidate.block, [question.candidates[k] for k in cause.rivals]
+        rivals = {k.block.name for k in others if not candidate.scope == k.scope == "parameter"} - {block.name}
+        unit = old.units[candidate.places[0]] if len(candidate.places) == 1 else ""
         if block.name in CATALOGUE:
             kind = CATALOGUE[block.name]
             unit = kind.coefficient_unit(old.imu.triads().get(kind.owner, old.imu.accelerometer).output_unit)
-        found.append(Cause(block.name, each.scope, tuple(old.names[k] for k in each.places), tuple(sorted(rivals)),
-                           cause.p_value, part * block.sizes, dict(block.inner), unit))  # fmt: skip
-    return tuple(found)
+        causes.append(
+            Cause(
+                block.name,
+                candidate.scope,
+                tuple(old.names[k] for k in candidate.places),
+                tuple(sorted(rivals)),
+                cause.p_value,
+                part * block.sizes,
+                dict(block.inner),
+                unit,
+            )
+        )
+    return tuple(causes)
 
 
 def _verdict(selection: Selection, causes: Sequence[Cause]) -> str:
@@ -442,22 +487,34 @@ def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
     difference, sigma = fresh.difference, np.sqrt(np.diag(fresh.covariance_of_difference))
     comparable = fresh.known(old)
     raw = 2 * normal_sf(np.abs(difference) / sigma)
-    asked = [k for k in np.argsort(raw) if comparable[k] and k not in old.allowed]
+    tested = [k for k in np.argsort(raw) if comparable[k] and k not in old.allowed]
     p_value = np.ones(len(raw))
-    p_value[asked] = np.maximum.accumulate(np.minimum(raw[asked] * np.arange(len(asked), 0, -1), 1.0))
-    found = []
+    p_value[tested] = np.maximum.accumulate(np.minimum(raw[tested] * np.arange(len(tested), 0, -1), 1.0))
+    shifts = []
     for k, name in enumerate(old.names):
         gain = name.part == "gain"
         unit, at, size = _SI[name.owner]
         factor = float((size if gain else 1.0) / old.scales[k]) if name.effect is None else None
-        found.append(Shift(
-            label(name, old.imu), describe(name, old.imu), name, float(old.values[k]), float(difference[k]),
-            float(sigma[k]), old.units[k],
-            None if factor is None else factor * float(difference[k]),
-            None if factor is None else factor * float(sigma[k]), "" if factor is None else unit, at if gain else "",
-            float(p_value[k]), bool(p_value[k] < level), bool(comparable[k]), k in old.allowed,
-        ))  # fmt: skip
-    return tuple(found)
+        shifts.append(
+            Shift(
+                label(name, old.imu),
+                describe(name, old.imu),
+                name,
+                float(old.values[k]),
+                float(difference[k]),
+                float(sigma[k]),
+                old.units[k],
+                None if factor is None else factor * float(difference[k]),
+                None if factor is None else factor * float(sigma[k]),
+                "" if factor is None else unit,
+                at if gain else "",
+                float(p_value[k]),
+                bool(p_value[k] < level),
+                bool(comparable[k]),
+                k in old.allowed,
+            )
+        )
+    return tuple(shifts)
 
 
 def _output_errors(old: Old, fresh: Fresh, data: Data) -> dict[str, OutputError]:
@@ -477,7 +534,7 @@ def _output_errors(old: Old, fresh: Fresh, data: Data) -> dict[str, OutputError]
         size = np.linalg.norm(output - true, axis=1)
         worst = int(np.argmax(size))
         axes = [old.names[k].axes for k in places]  # (output, input) of a gain, (output,) of a bias
-        columns = [inverse[:, each[0]] * np.prod([true[worst, k] for k in each[1:]]) for each in axes]
+        columns = [inverse[:, entry[0]] * np.prod([true[worst, k] for k in entry[1:]]) for entry in axes]
         errors[name] = error(float(size[worst]), np.stack(columns, axis=1), places, unit)
     before, after = old.imu.triads()["gyroscope"], fresh.imu.triads()["gyroscope"]
     by = data.rotations(eqx.tree_at(lambda imu: imu.gyroscope.bias, old.imu.with_effects(), after.bias))

@@ -40,14 +40,17 @@ class Check:
     def document(self) -> dict[str, Any]:
         """Return the check as `diagnosis.json` has it."""
         return {
-            "name": self.name, "statistic": self.statistic, "p_value": self.p_value, "adjusted": self.adjusted,
+            "name": self.name,
+            "statistic": self.statistic,
+            "p_value": self.p_value,
+            "adjusted": self.adjusted,
             "text": self.text,
-        }  # fmt: skip
+        }
 
 
 def checks_of(state: State, experiment: Experiment) -> tuple[Check, ...]:
     """Return all checks of a fit: by kind of residual, by what it may depend on, distribution, odd against even."""
-    found = [*_by_kind(state, experiment)]
+    checks = [*_by_kind(state, experiment)]
     scores = state.evidence.scores()
     generic: dict[str, list[int]] = {}
     for k, block in enumerate(state.evidence.blocks):
@@ -58,20 +61,20 @@ def checks_of(state: State, experiment: Experiment) -> tuple[Check, ...]:
         ratio = float(scores.statistic[best] / scores.freedom[best])
         p_value = float(-np.expm1(len(blocks) * np.log1p(-min(scores.p_value[best], 1 - 1e-16))))  # Šidák
         text = f"{state.evidence.blocks[best].words}: χ²/dof {ratio:.2f} with {scores.freedom[best]} degrees of freedom"
-        found.append(Check(name, ratio, p_value, text))
+        checks.append(Check(name, ratio, p_value, text))
     statistic, freedom, p_value = scores.outside
     if freedom:
         text = f"what no candidate can explain: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom"
-        found.append(Check("outside the catalogue", statistic / freedom, p_value, text))
+        checks.append(Check("outside the catalogue", statistic / freedom, p_value, text))
     if experiment.data.by_hand:
-        found += _dependences(state, experiment)
-    found += [_distribution(state), _odd_even(state, experiment)]
-    order = sorted(range(len(found)), key=lambda k: found[k].p_value)
+        checks += _dependences(state, experiment)
+    checks += [_distribution(state), _odd_even(state, experiment)]
+    order = sorted(range(len(checks)), key=lambda k: checks[k].p_value)
     largest = 0.0
-    for place, k in enumerate(order):
-        largest = max(largest, min((len(order) - place) * found[k].p_value, 1.0))
-        found[k] = replace(found[k], adjusted=largest)
-    return tuple(found)
+    for rank, k in enumerate(order):
+        largest = max(largest, min((len(order) - rank) * checks[k].p_value, 1.0))
+        checks[k] = replace(checks[k], adjusted=largest)
+    return tuple(checks)
 
 
 def _by_kind(state: State, experiment: Experiment) -> list[Check]:
@@ -81,20 +84,26 @@ def _by_kind(state: State, experiment: Experiment) -> list[Check]:
     residual = root @ evidence.residual
     basis = np.linalg.svd(evidence.jacobian, full_matrices=False)[0]
     left = root @ (np.eye(len(residual)) - basis @ basis.T) @ root.T
-    found = []
-    for place, kind in enumerate(experiment.real.kinds):
+    checks = []
+    for index, kind in enumerate(experiment.real.kinds):
         plain = kind.name.replace("_", " ")
         name, words = _KINDS.get(kind.name, (plain, plain))
-        rows = experiment.real.kind == place
+        rows = experiment.real.kind == index
         if not rows.any():
             continue
         values, vectors = np.linalg.eigh(left[np.ix_(rows, rows)])
         keep = values > 1e-9 * values[-1]
         along = vectors[:, keep].T @ residual[rows] / np.sqrt(values[keep])
         statistic, freedom = float(along @ along), int(keep.sum())
-        found.append(Check(name, statistic / freedom, float(chi2_sf(statistic, freedom)),
-                           f"{words}: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom"))  # fmt: skip
-    return found
+        checks.append(
+            Check(
+                name,
+                statistic / freedom,
+                float(chi2_sf(statistic, freedom)),
+                f"{words}: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom",
+            )
+        )
+    return checks
 
 
 def _dependences(state: State, experiment: Experiment) -> list[Check]:
@@ -130,23 +139,23 @@ def _dependences(state: State, experiment: Experiment) -> list[Check]:
 
     axes = np.zeros((len(kinds), 3))
     axes[kinds == 2] = np.tile(np.eye(3), (int(np.sum(kinds == 2)) // 3, 1))
-    asked = [name for name in real.covariates if not (steady and name.startswith("temperature"))]
-    for name in asked:
+    covariates = [name for name in real.covariates if not (steady and name.startswith("temperature"))]
+    for name in covariates:
         degree = 4 if name.startswith("specific force") else 3  # bias and scale take the first two degrees of force
         add(0, name, degree, np.ones((len(kinds), 1)))
         add(2, name, degree, axes)
-    for name in asked:
+    for name in covariates:
         add(1, name, 2, jacobian[:, scales])
     evidence = Evidence(state.evidence.residual, state.evidence.jacobian, blocks)
     scores = evidence.scores()
-    found = []
+    checks = []
     for block, scaled, freedom in zip(blocks, scores.statistic, scores.freedom, strict=True):
         if freedom:
             statistic = float(scaled) * scores.unit**2
             text = f"{block.name}: χ²/dof {statistic / freedom:.2f} with {freedom} degrees of freedom"
             p_value = float(chi2_sf(statistic, freedom))
-            found.append(Check(block.name, statistic / int(freedom), p_value, text))
-    return found
+            checks.append(Check(block.name, statistic / int(freedom), p_value, text))
+    return checks
 
 
 def _distribution(state: State) -> Check:
@@ -170,8 +179,8 @@ def _odd_even(state: State, experiment: Experiment) -> Check:
     alone = first == experiment.real.last  # a turn may join an odd and an even pose
     parity = np.zeros(len(kinds), np.int64)
     for kind in np.unique(kinds[alone]):
-        own = alone & (kinds == kind)
-        parity[own] = np.unique(first[own], return_inverse=True)[1] % 2
+        members = alone & (kinds == kind)
+        parity[members] = np.unique(first[members], return_inverse=True)[1] % 2
     even = alone & (parity == 0)
 
     def misfit(rows) -> tuple[float, int]:

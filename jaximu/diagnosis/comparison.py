@@ -64,20 +64,20 @@ class Old:
         imu = jax.tree.map(np.asarray, calibration.imu.transferable())
         triads, effects, bare = imu.triads(), imu.all_effects(), imu.with_effects()
         parameters = Parameters.select(bare, free)
-        own, numbers, _ = effect_numbers(imu)
-        names = (*parameters.names, *own)
+        effect_names, numbers, _ = effect_numbers(imu)
+        names = (*parameters.names, *effect_names)
         values = np.concatenate([flatten(bare)[list(parameters.index)], numbers])
         # what the calibration lost of its effects has moved the others: they are found by what they are shown as
-        places = {label(name, calibration.imu): place for place, name in enumerate(calibration.names)}
+        places = {label(name, calibration.imu): index for index, name in enumerate(calibration.names)}
         known = [places.get(label(name, imu)) for name in names]
-        there, found = [k for k, place in enumerate(known) if place is not None], [k for k in known if k is not None]
+        there, columns = [k for k, index in enumerate(known) if index is not None], [k for k in known if k is not None]
         if calibration.names and None in known[: len(parameters.names)]:
             raise NotPossibleError(
                 "the calibration's axes are the accelerometer's, and these data's are a set-up's, in which the unit "
                 "may sit turned. Check a calibration that was made in the set-up."
             )
         covariance = np.zeros((len(names), len(names)))
-        covariance[np.ix_(there, there)] = calibration.covariance[np.ix_(found, found)]
+        covariance[np.ix_(there, there)] = calibration.covariance[np.ix_(columns, columns)]
         of_effects = 10 * np.maximum(np.maximum(np.abs(values), np.sqrt(np.diag(covariance))), 1e-12)
         sizes = np.concatenate([np.asarray(parameters.size), of_effects[len(parameters.names) :]])
         scales, units = np.ones(len(names)), []
@@ -165,12 +165,12 @@ class Widened(Data):
 
     def about(self, imu: Imu) -> About:
         """Return the recording about the unit."""
-        found, real = self.experiment.about(imu), np.ix_(self.used, self.used)
-        covariance = jax.tree.map(lambda leaf: leaf[0], found.covariance).dense()
+        evaluated, real = self.experiment.about(imu), np.ix_(self.used, self.used)
+        covariance = jax.tree.map(lambda leaf: leaf[0], evaluated.covariance).dense()
         measured = np.array(covariance.measured)
         measured[real] = self.widen(measured[real])
         covariance = replace(covariance, measured=measured)
-        return replace(found, covariance=jax.tree.map(lambda leaf: leaf[None], covariance))
+        return replace(evaluated, covariance=jax.tree.map(lambda leaf: leaf[None], covariance))
 
     def predict(self, imu: Imu) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the conditions (n,) of a unit with its effects, their columns (n, p) and covariance (n, n)."""
@@ -197,24 +197,33 @@ class Fresh:
 
     @classmethod
     def fit(
-        cls, old: Old, experiment: Experiment, scatter: FloatArray, causes: Sequence[FloatArray] = (),
+        cls,
+        old: Old,
+        experiment: Experiment,
+        scatter: FloatArray,
+        causes: Sequence[FloatArray] = (),
         begin: Imu | None = None,
-    ) -> Fresh:  # fmt: skip
+    ) -> Fresh:
         """Fit all parameters, known beforehand about the old ones, in a recording with `causes`; begin at a unit."""
         measurement = Widened(experiment, scatter, causes)
         prior = Prior(old.names, old.start, np.diag(1 / (TOLERANCE * old.sizes)))
-        found = fit(
-            old.imu if begin is None else begin, measurement, experiment.free, prior=prior,
-            excess=np.zeros(len(measurement.coarse)), estimate_excess=False, max_passes=_PASSES,
-        )  # fmt: skip
-        imu, spread = jax.tree.map(np.asarray, found.imu), np.asarray(found.covariance)
+        fitted = fit(
+            old.imu if begin is None else begin,
+            measurement,
+            experiment.free,
+            prior=prior,
+            excess=np.zeros(len(measurement.coarse)),
+            estimate_excess=False,
+            max_passes=_PASSES,
+        )
+        imu, spread = jax.tree.map(np.asarray, fitted.imu), np.asarray(fitted.covariance)
         conditions, columns, covariance = measurement.predict(imu)
         # the share that is no cause's, of the conditions and of their covariance
         share = np.eye(len(conditions)) - measurement.causes @ np.linalg.solve(covariance, measurement.causes).T
         left = share @ (covariance - columns @ spread @ columns.T) @ share.T
         new = spread + old.own**2 * old.gravity[:, None] * old.gravity
-        difference = np.asarray(found.values) - old.values
-        return cls(imu, difference, new, new + old.covariance, share @ conditions, left, bool(found.converged))
+        difference = np.asarray(fitted.values) - old.values
+        return cls(imu, difference, new, new + old.covariance, share @ conditions, left, bool(fitted.converged))
 
     @classmethod
     def of_linear(cls, old: Old, followed: FollowedUnit, scatter: float) -> Fresh:
@@ -241,12 +250,12 @@ def scatter_about_a_fit(old: Old, experiment: Experiment, fresh: Fresh) -> Float
     scatter = np.ones(len(experiment.real.kinds))
     for number in range(4):
         fresh = fresh if number == 0 else Fresh.fit(old, experiment, scatter, begin=fresh.imu)
-        for place in np.unique(experiment.real.kind):
-            rows = experiment.real.kind == place
+        for kind in np.unique(experiment.real.kind):
+            rows = experiment.real.kind == kind
             values, vectors = np.linalg.eigh(fresh.left[np.ix_(rows, rows)])
             keep = values > 1e-6 * values[-1]
             along = vectors[:, keep].T @ fresh.conditions[rows] / np.sqrt(values[keep])
-            scatter[place] = max(1.0, scatter[place] * np.sqrt(float(along @ along) / keep.sum()))
+            scatter[kind] = max(1.0, scatter[kind] * np.sqrt(float(along @ along) / keep.sum()))
     return scatter
 
 
@@ -272,10 +281,12 @@ def candidates(old: Old, experiment: Experiment) -> list[Explanation]:
     state = experiment.fit(tuple(old.imu.all_effects().values()), old.imu.with_effects())
     root = np.linalg.inv(state.weights)
     return [
-        Explanation(replace(block, columns=root @ block.columns),
-                  CATALOGUE[block.name].scope if block.kind == "effect" else block.kind)
+        Explanation(
+            replace(block, columns=root @ block.columns),
+            CATALOGUE[block.name].scope if block.kind == "effect" else block.kind,
+        )
         for block in state.evidence.blocks
-    ]  # fmt: skip
+    ]
 
 
 @dataclass(frozen=True)
@@ -303,24 +314,32 @@ class Question:
         conditions, columns, whole = predicted
         tested = old.tested
         whole = whole + columns[:, tested] @ old.covariance[np.ix_(tested, tested)] @ columns[:, tested].T
-        reach = columns @ old.gravity
-        whole += old.own**2 * reach[:, None] * reach
+        by_gravity = columns @ old.gravity
+        whole += old.own**2 * by_gravity[:, None] * by_gravity
         weights = np.linalg.inv(np.linalg.cholesky(whole))
         bias = columns[:, old.allowed]
 
         def evidence(of: Sequence[Explanation]) -> Evidence:
-            blocks = [replace(each.block, columns=weights @ each.block.columns) for each in of]
+            blocks = [replace(explanation.block, columns=weights @ explanation.block.columns) for explanation in of]
             return Evidence(weights @ conditions, weights @ bias, blocks)
 
-        found = [Explanation(EffectBlock(name, -columns[:, places] * old.sizes[places], old.sizes[places]), "parameter",
-                           tuple(places)) for name, places in _groups(old)]  # fmt: skip
+        explanations = [
+            Explanation(
+                EffectBlock(name, -columns[:, places] * old.sizes[places], old.sizes[places]),
+                "parameter",
+                tuple(places),
+            )
+            for name, places in _groups(old)
+        ]
         if old.shared > 0:  # unless the place was another one
             sigma = np.sqrt(2) * old.shared  # between two places
-            gravity = Explanation(EffectBlock("setup.gravity", sigma * reach[:, None], np.full(1, sigma)), "fixture")
+            gravity = Explanation(
+                EffectBlock("setup.gravity", sigma * by_gravity[:, None], np.full(1, sigma)), "fixture"
+            )
             if abs(evidence([gravity]).coefficients([0])[0]) < 3:
-                found.append(gravity)
-        found += others
-        return cls(evidence(found), tuple(found))
+                explanations.append(gravity)
+        explanations += others
+        return cls(evidence(explanations), tuple(explanations))
 
 
 def _groups(old: Old) -> list[tuple[str, list[int]]]:

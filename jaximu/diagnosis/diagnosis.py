@@ -73,10 +73,11 @@ smooth term, and those with which no error of what was left out is smaller."""
 _NOT_ASKED = "the noise was taken from this recording itself: it needs a recording at rest (--static) to compare with"
 
 _INSTANTS = Finding(
-    "data.sampling", (),
+    "data.sampling",
+    (),
     "The gyroscope's samples are rates at instants and not means over the sample interval, as a log thinned without a "
     "filter has them. Turns were integrated accordingly. Log at the sensor's own rate, or let it filter.",
-)  # fmt: skip
+)
 _SWAYING = "the unit moved in its poses, which looks like noise: put it down, or hold it against something solid"
 
 
@@ -119,9 +120,9 @@ class Named:
                 with_intervals(values, self.sigma, self.unit), values, self.sigma, strict=True
             )
         ]
-        for name, each in self.effect.inner.items():
+        for name, parameter in self.effect.inner.items():
             value, sigma = float(getattr(self.effect, name)), self.inner_sigma.get(name)
-            text = size(value, each.unit, 4) if sigma is None else with_interval(value, sigma, each.unit)
+            text = size(value, parameter.unit, 4) if sigma is None else with_interval(value, sigma, parameter.unit)
             texts.append(f"{name.replace('_', ' ')} {text}")
         return texts
 
@@ -139,8 +140,8 @@ class Named:
 
     def sentence(self) -> str:
         """Return what it adds, for the headline."""
-        begun = self.effect.since()
-        since = "" if begun is None else f", from {begun:.4g} s on"
+        start = self.effect.since()
+        since = "" if start is None else f", from {start:.4g} s on"
         return f"{self.effect.title}, up to {self.size()}{since}"
 
     def size(self) -> str:
@@ -150,8 +151,12 @@ class Named:
     def document(self) -> dict[str, Any]:
         """Return the effect as `diagnosis.json` has it."""
         inner = {
-            name: {"value": float(getattr(self.effect, name)), "sigma": self.inner_sigma.get(name), "unit": each.unit}
-            for name, each in self.effect.inner.items()
+            name: {
+                "value": float(getattr(self.effect, name)),
+                "sigma": self.inner_sigma.get(name),
+                "unit": parameter.unit,
+            }
+            for name, parameter in self.effect.inner.items()
         }
         return {
             "name": self.name,
@@ -236,41 +241,51 @@ class Diagnosis(Described, Document):
     @property
     def named(self) -> tuple[Named, ...]:
         """The effects that are terms of the model."""
-        return tuple(each for each in self.effects if isinstance(each, Named))
+        return tuple(effect for effect in self.effects if isinstance(effect, Named))
 
     @property
     def files(self) -> str:
         """The names of the files that were diagnosed."""
-        files = [Path(str(each["file"])).name for each in self.calibration.data.get("files", ())]
+        files = [Path(str(file["file"])).name for file in self.calibration.data.get("files", ())]
         return ", ".join(files) or "a recording"
 
     def summary(self) -> Summary:
         """Return the verdict, the effects with their size and evidence, and what to do next."""
         rows = [
-            (effect_title(each.name), each.size() if isinstance(each, Named) else "", f"p {probability(each.p_value)}",
-             ", ".join(map(effect_title, each.rivals)) or "—", "weak" if each.weak else "") for each in self.effects
-        ]  # fmt: skip
+            (
+                effect_title(effect.name),
+                effect.size() if isinstance(effect, Named) else "",
+                f"p {probability(effect.p_value)}",
+                ", ".join(map(effect_title, effect.rivals)) or "—",
+                "weak" if effect.weak else "",
+            )
+            for effect in self.effects
+        ]
         headers = ("effect", "adds up to", "evidence", "not told apart from", "")
-        notes = [each.text for each in self.preflight] + ([f"Next: {self.suggestion}"] if self.suggestion else [])
+        notes = [finding.text for finding in self.preflight] + ([f"Next: {self.suggestion}"] if self.suggestion else [])
         return Summary(
-            f"Diagnosis of {self.files}: {self.verdict}", (self.headline(),),
-            Block(headers, tuple(rows)) if rows else None, tuple(map(sentence, (*notes, *self.notes))),
-        )  # fmt: skip
+            f"Diagnosis of {self.files}: {self.verdict}",
+            (self.headline(),),
+            Block(headers, tuple(rows)) if rows else None,
+            tuple(map(sentence, (*notes, *self.notes))),
+        )
 
     def document(self) -> dict[str, Any]:
         """Return the diagnosis as the JSON document of schema `jaximu.diagnosis/1`."""
         return {
             "schema": SCHEMA,
             "verdict": self.verdict,
-            "effects": [each.document() for each in self.effects],
-            "preflight": [each.document() for each in self.preflight],
+            "effects": [effect.document() for effect in self.effects],
+            "preflight": [finding.document() for finding in self.preflight],
             "detection_limits": {
                 name: {"value": value, "unit": unit} for name, (value, unit) in self.detection_limits.items()
             },
             "not_observable": self.not_observable,
-            "checks": [each.document() for each in self.checks],
+            "checks": [check.document() for check in self.checks],
             "suggestion": self.suggestion,
-            "next": [{"record": each.text, "power": each.powers, "power_now": each.before} for each in self.options],
+            "next": [
+                {"record": option.text, "power": option.powers, "power_now": option.before} for option in self.options
+            ],
             "p_value": self.p_value,
             "noise_scale": self.unit,
             "notes": list(self.notes),
@@ -282,19 +297,19 @@ class Diagnosis(Described, Document):
 
     def extended_calibration(self) -> Calibration:
         """Return the calibration with the effects that were found: it is used and saved like any other."""
-        found = {
+        diagnosis = {
             "verdict": self.verdict,
-            "effects": [each.name for each in self.effects],
+            "effects": [effect.name for effect in self.effects],
             "learned": None if self.learned is None else self.learned.effect.name,
             "p_value": self.p_value,
             "suggestion": self.suggestion,
         }
-        return replace(extended(self.calibration, self.experiment, self.extended), diagnosis=found)
+        return replace(extended(self.calibration, self.experiment, self.extended), diagnosis=diagnosis)
 
     def headline(self) -> str:
         """Return the one sentence a person wants first."""
         if self.verdict == "adequate":
-            beside = min(self.checks, key=lambda each: each.adjusted, default=None)
+            beside = min(self.checks, key=lambda check: check.adjusted, default=None)
             if beside is not None and beside.adjusted < _DOUBT:
                 return (
                     f"No effect shows (p {probability(self.p_value)}), but the noise is not all that was assumed: "
@@ -312,12 +327,16 @@ class Diagnosis(Described, Document):
                 "The model fits: bias, scale and misalignment explain this recording to its noise "
                 f"(p {probability(self.p_value)})."
             )
-        standing = [each for each in self.preflight if each.spoils or (each.partial and self.verdict == "unexplained")]
+        standing = [
+            finding
+            for finding in self.preflight
+            if finding.spoils or (finding.partial and self.verdict == "unexplained")
+        ]
         if standing:
             return f"No effect can be named from this recording. {standing[0].text}"
-        causes = "; ".join(self._named_words(each) for each in self.effects)
+        causes = "; ".join(self._named_words(effect) for effect in self.effects)
         if self.verdict != "unexplained":
-            sure = "Probably" if all(each.weak for each in self.effects) else "Found"
+            sure = "Probably" if all(effect.weak for effect in self.effects) else "Found"
             return f"{sure} {causes}.{self._gained()}"
         text = "The model does not fit, and no known effect explains why."
         if self.p_value > _DOUBT:
@@ -345,11 +364,11 @@ class Diagnosis(Described, Document):
         return f" Modelling {'them' if many else 'it'} cuts {data} {little}from {cut}."
 
     @staticmethod
-    def _named_words(each: Named | NoiseFinding) -> str:
-        if not each.rivals:
-            return each.sentence()
-        rivals = " or ".join(map(effect_title, each.rivals))
-        return f"{each.sentence()}, or {rivals} (this recording cannot tell them apart)"
+    def _named_words(effect: Named | NoiseFinding) -> str:
+        if not effect.rivals:
+            return effect.sentence()
+        rivals = " or ".join(map(effect_title, effect.rivals))
+        return f"{effect.sentence()}, or {rivals} (this recording cannot tell them apart)"
 
 
 def extended(calibration: Calibration, experiment: Experiment, state: State) -> Calibration:
@@ -365,21 +384,33 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
         if state.prior is None
         else {name for name in state.names if name.effect is not None} - set(state.prior.names)
     )
-    found = fit(state.model, experiment, lambda name: experiment.free(name) and name not in held, prior=state.prior,
-                excess=np.zeros(len(experiment.coarse)))  # fmt: skip
-    linear = experiment.linearise(found.imu)
-    after = experiment.rms(found.imu.with_effects(), linear)
+    fitted = fit(
+        state.model,
+        experiment,
+        lambda name: experiment.free(name) and name not in held,
+        prior=state.prior,
+        excess=np.zeros(len(experiment.coarse)),
+    )
+    linear = experiment.linearise(fitted.imu)
+    after = experiment.rms(fitted.imu.with_effects(), linear)
     known = {name: (size, unit) for name, (size, _, unit) in calibration.rms.items() if name in after}
     before = (
         known if len(known) == len(after) else experiment.rms(experiment.start, experiment.linearise(experiment.start))
     )
     calibrated = concluded(
-        found, gravity=calibration.gravity, method=calibration.method, loss="linear", advice=experiment.data.advice,
+        fitted,
+        gravity=calibration.gravity,
+        method=calibration.method,
+        loss="linear",
+        advice=experiment.data.advice,
         excess_names=experiment.excess_names,
         rms=[before, after],
-        data=calibration.data, notes=calibration.notes, segmentations=calibration.segmentations,
-        nominal=calibration.nominal, reading=calibration.reading,
-    )  # fmt: skip
+        data=calibration.data,
+        notes=calibration.notes,
+        segmentations=calibration.segmentations,
+        nominal=calibration.nominal,
+        reading=calibration.reading,
+    )
     return replace(calibrated, reference=experiment.reference)
 
 
@@ -442,10 +473,19 @@ def diagnose(
             other, _ = calibrate_ready([prepare(heldout, repair).recording], choices, repair)
             notes += same_device(calibration, other)
             held = recorded_by_hand(other)
-        diagnosis = examine(Examination.of(
-            calibration, recorded_by_hand(calibration), noise_of(static), held, names,
-            findings=(*findings, *unusual), notes=tuple(notes), level=level, naming=not spoiling,
-        ))  # fmt: skip
+        diagnosis = examine(
+            Examination.of(
+                calibration,
+                recorded_by_hand(calibration),
+                noise_of(static),
+                held,
+                names,
+                findings=(*findings, *unusual),
+                notes=tuple(notes),
+                level=level,
+                naming=not spoiling,
+            )
+        )
     if diagnosis.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
         spoiling = [finding for finding in findings if finding.partial]
     return without_effects(diagnosis, spoiling) if spoiling else diagnosis
@@ -501,8 +541,8 @@ def diagnose_data(
         setup = tuple(effect for effect in fitted.imu.all_effects().values() if effect.scope == "fixture")
         start = jax.tree.map(np.asarray, calibration.imu.with_effects())
         excess = np.array([fitted.excess[name] for name in data.excess_names])
-        asked = None if candidates is None else tuple(candidates)
-        experiment = Experiment(data, start, None, asked, setup, excess, reference=fitted.reference)
+        names = None if candidates is None else tuple(candidates)
+        experiment = Experiment(data, start, None, names, setup, excess, reference=fitted.reference)
         return examine(Examination(calibration, noise, lambda noise: experiment, trusted=True, **about))
 
     diagnosis = examined(calibration)
@@ -594,19 +634,23 @@ def examine(examination: Examination) -> Diagnosis:
 
     Raises `NotPossibleError` where too little is left to ask anything.
     """
-    found = _examined(examination)
-    coarse = any(each.name == "data.sampling" for each in found.preflight)
-    if not examination.naming or (found.verdict != "unexplained" and found.p_value >= examination.level and not coarse):
-        return found
+    diagnosis = _examined(examination)
+    coarse = any(finding.name == "data.sampling" for finding in diagnosis.preflight)
+    if not examination.naming or (
+        diagnosis.verdict != "unexplained" and diagnosis.p_value >= examination.level and not coarse
+    ):
+        return diagnosis
     # the samples themselves may do what looks like effects, or like turns that are too quick
     experiment, state = examination.first
     if experiment.instants(state):
         examination = replace(
-            examination, remade=_averaged(examination.remade), findings=(*examination.findings, _INSTANTS),
+            examination,
+            remade=_averaged(examination.remade),
+            findings=(*examination.findings, _INSTANTS),
             held=None if examination.held is None else _averaged(examination.held),
-        )  # fmt: skip
+        )
         return _examined(examination)
-    return found
+    return diagnosis
 
 
 def _averaged(remade: Callable[[NoiseModel], Experiment]) -> Callable[[NoiseModel], Experiment]:
@@ -628,7 +672,7 @@ def _with_noise_put_right(examination: Examination) -> _Course:
         experiment, noise, base, first = _with_hands(examination, noise)
         assert experiment.drift is not None
         return _Course(examination, experiment, noise, base, first, [*notes, *experiment.drift.notes], [], [])
-    noises, swaying, again = [], [], examination.remade
+    noises, swaying, remade = [], [], examination.remade
     if not examination.trusted:
         experiment = examination.remade(noise)
         noises, right = quick_noise(experiment, noise, level)
@@ -641,13 +685,13 @@ def _with_noise_put_right(examination: Examination) -> _Course:
     if experiment.data.by_hand and not (examination.trusted or first.explained):  # what hands do is in the samples
         experiment, noise, base, first = _with_hands(examination, noise, (base, first))
         notes += experiment.drift.notes if experiment.drift is not None else []
-        again = partial(_moved, examination.remade, experiment.drift)
+        remade = partial(_moved, examination.remade, experiment.drift)
     if examination.naming and not (examination.trusted or first.explained):
-        slow, noise, remark = slow_noise(experiment, base, first, noise, again, level)
+        slow, noise, remark = slow_noise(experiment, base, first, noise, remade, level)
         notes += [remark] if remark else []
         if slow is not None:
             noises.append(slow)
-            experiment = again(noise)
+            experiment = remade(noise)
             base = experiment.fit()
             first = select(base.evidence, level)
     return _Course(examination, experiment, noise, base, first, notes, noises, swaying)
@@ -779,9 +823,10 @@ class _Course:
         notes = [*self.notes, *(cause.impossible() for cause in named if cause.impossible())]
         strongest = min((cause.p_value for cause in named), default=1.0)
         effects = (
-            *(noise for noise in noises if noise.p_value < strongest), *named,
+            *(noise for noise in noises if noise.p_value < strongest),
+            *named,
             *(noise for noise in noises if noise.p_value >= strongest),
-        )  # fmt: skip
+        )
         verdict = "unexplained" if not extension.complete else ("effects" if effects else "adequate")
         texts = {finding.text.casefold().rstrip(".") for finding in findings}
         blind = dict(extension.base.blind)
@@ -790,14 +835,25 @@ class _Course:
         if self.swaying:
             blind |= dict.fromkeys(("noise.white", "noise.correlated"), _SWAYING)
         return Diagnosis(
-            verdict, effects, tuple(findings), min([self.first.p_value, *(noise.p_value for noise in noises)]),
-            self.first.scores.unit, extension.base.limits, dict(sorted(blind.items())),
+            verdict,
+            effects,
+            tuple(findings),
+            min([self.first.p_value, *(noise.p_value for noise in noises)]),
+            self.first.scores.unit,
+            extension.base.limits,
+            dict(sorted(blind.items())),
             checks_of(extension.base, extension.experiment),
             _suggestion(verdict, named, noises, self.learned, self.shape),
             tuple(note for note in dict.fromkeys(notes) if note.casefold().rstrip(".") not in texts),
-            examination.calibration, extension.experiment, self.noise, extension.base, extension.state, self.gain,
-            self.learned, shape=self.shape,
-        )  # fmt: skip
+            examination.calibration,
+            extension.experiment,
+            self.noise,
+            extension.base,
+            extension.state,
+            self.gain,
+            self.learned,
+            shape=self.shape,
+        )
 
 
 def _with_hands(
@@ -846,18 +902,24 @@ def _require_freedom(base: State, calibration: Calibration) -> None:
         )
 
 
-def without_effects(found: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis:
+def without_effects(diagnosis: Diagnosis, spoiling: Sequence[Finding]) -> Diagnosis:
     """Return the diagnosis of a recording with mistakes that stand: what they imitate is not named."""
-    options = list(dict.fromkeys(each.repair for each in spoiling if each.repair and each.spoils))
-    names = ", ".join(dict.fromkeys(effect_title(each.name) for each in spoiling))
-    if options and all(each.repair for each in spoiling):
+    options = list(dict.fromkeys(finding.repair for finding in spoiling if finding.repair and finding.spoils))
+    names = ", ".join(dict.fromkeys(effect_title(finding.name) for finding in spoiling))
+    if options and all(finding.repair for finding in spoiling):
         suggestion = f"Repair the recording first: run again with {' '.join(options)} ({names})."
     elif options:
         suggestion = f"Run again with {' '.join(options)}, and record again what that cannot repair ({names})."
     else:
         suggestion = f"Correct the recording, or record again: {names} cannot be repaired afterwards."
     return replace(
-        found, verdict="unexplained", effects=(), extended=found.base, gain=None, learned=None, suggestion=suggestion
+        diagnosis,
+        verdict="unexplained",
+        effects=(),
+        extended=diagnosis.base,
+        gain=None,
+        learned=None,
+        suggestion=suggestion,
     )
 
 
@@ -879,7 +941,7 @@ def same_device(first: Calibration, other: Calibration) -> list[str]:
     """Say where the held-out recording's gains are too far off to be the same unit's."""
     notes = []
     for name, triad in first.triads().items():
-        gains = [np.asarray(each) for each in (triad.gain, other.triads()[name].gain)]
+        gains = [np.asarray(gain) for gain in (triad.gain, other.triads()[name].gain)]
         jump = float(np.max(np.abs(gains[0] - gains[1])) / np.mean(np.linalg.norm(gains[0], axis=1)))
         if jump > _OTHER_UNIT:
             notes.append(
@@ -898,10 +960,10 @@ def _saturated(experiment: Experiment, state: State) -> list[str]:
 
 
 def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None) -> Named:
-    (effect,) = (each for each in state.effects if each.name == entry.name)
+    (effect,) = (fitted for fitted in state.effects if fitted.name == entry.name)
     sigma = np.sqrt(np.maximum(np.diag(state.covariance), 0.0))
     places = state.places(entry.name)
-    inner = {name: float(sigma[place]) for name in effect.inner for place in state.places(entry.name, name)}
+    inner = {name: float(sigma[index]) for name in effect.inner for index in state.places(entry.name, name)}
     triads, largest = state.imu.triads(), experiment.largest(state, effect)
     owner = effect.owner if effect.owner in triads else "accelerometer"
     if effect.scope == "fixture" and gain is not None and gain.best_kind(effect) != next(iter(gain.before.rms)):
@@ -913,9 +975,18 @@ def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None
         f"{entry.times:.1f} times its detection limit"
     )
     return Named(
-        effect, entry.rivals, entry.p_value, entry.weak, sigma[places], {k: v for k, v in inner.items() if v > 0},
-        effect.coefficient_unit(triads[owner].output_unit), owner, largest[owner], evidence, gain,
-    )  # fmt: skip
+        effect,
+        entry.rivals,
+        entry.p_value,
+        entry.weak,
+        sigma[places],
+        {k: v for k, v in inner.items() if v > 0},
+        effect.coefficient_unit(triads[owner].output_unit),
+        owner,
+        largest[owner],
+        evidence,
+        gain,
+    )
 
 
 def _suggestion(
@@ -925,13 +996,13 @@ def _suggestion(
     learned: LearnedTerm | None,
     shape: str | None,
 ) -> str:
-    tied = [each for each in effects if each.rivals]
+    tied = [effect for effect in effects if effect.rivals]
     if tied:
         kinds = [CATALOGUE[name] for name in (tied[0].name, *tied[0].rivals) if name in CATALOGUE]
         wanted = "; ".join(dict.fromkeys(f"{kind.english}: {kind.excited_by}" for kind in kinds))
         rivals = " or ".join(map(effect_title, tied[0].rivals))
         return f"To distinguish {tied[0].effect.title} from {rivals}, record what excites one alone ({wanted})."
-    weak = [each for each in effects if each.weak]
+    weak = [effect for effect in effects if effect.weak]
     if weak:
         return (
             f"{sentence(weak[0].effect.title)} is below twice its detection limit: record again with more of what "

@@ -129,14 +129,14 @@ class Evidence:
 
     def information(self, block: int) -> FloatArray:
         """Return AᵀA (q, q) of a block, the base projected off: coefficients in units of the block's sizes."""
-        place = self.place(block)
-        return self._gram[place, place]
+        columns = self.place(block)
+        return self._gram[columns, columns]
 
     def observable(self, block: int) -> bool:
         """Whether the base parameters leave anything of the block that the recording reacts to."""
-        place = self.place(block)
-        reach = np.max(self._reach[place], initial=0.0)
-        return bool(reach > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > _BLIND * reach)
+        columns = self.place(block)
+        largest = np.max(self._reach[columns], initial=0.0)
+        return bool(largest > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > _BLIND * largest)
 
     def limit(self, blocks: Sequence[int]) -> float:
         """Return the detection limit of an effect that is asked at several places of a grid, in its own unit.
@@ -151,32 +151,32 @@ class Evidence:
     @cached_property
     def _groups(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]]:
         """Blocks of as many columns each: blocks (b,), columns (b, q), AᵀA (b, q, q)."""
-        found, size = [], np.diff(self._edges)
+        groups, size = [], np.diff(self._edges)
         for q in np.unique(size):
             blocks = np.flatnonzero(size == q)
             columns = self._edges[blocks, None] + np.arange(q)
-            found.append((blocks, columns, self._gram[columns[:, :, None], columns[:, None, :]]))
-        return found
+            groups.append((blocks, columns, self._gram[columns[:, :, None], columns[:, None, :]]))
+        return groups
 
-    def scores(self, given: Sequence[int] = ()) -> Scores:
-        """Return every block's score, those `given` taken into the model beforehand."""
-        inside = self.span(given)
+    def scores(self, known: Sequence[int] = ()) -> Scores:
+        """Return every block's score, those `known` taken into the model beforehand."""
+        inside = self.span(known)
         root, _ = _roots(self._gram[np.ix_(inside, inside)][None], self._reach[inside][None])
         across = self._gram[:, inside] @ root[0]
         product = self._product - across @ (root[0].T @ self._product[inside])
-        outside = self._outside(given)
+        outside = self._outside(known)
         unit = float(_guard(np.array(outside[0]), outside[1]))
         statistic = np.zeros(len(self.blocks))
         ranks = np.zeros(len(self.blocks), np.int64)
         p_value = np.ones(len(self.blocks))
         for blocks, columns, gram in self._groups:
             shared = across[columns]
-            found, ranks[blocks] = _quadratic(
+            quadratic, ranks[blocks] = _quadratic(
                 gram - shared @ shared.transpose(0, 2, 1), product[columns], self._reach[columns]
             )
-            statistic[blocks] = found / unit**2
-        asked = ranks > 0
-        p_value[asked] = chi2_sf(statistic[asked], ranks[asked])
+            statistic[blocks] = quadratic / unit**2
+        testable = ranks > 0
+        p_value[testable] = chi2_sf(statistic[testable], ranks[testable])
         return Scores(statistic, ranks, p_value, outside, unit)
 
     @cached_property
@@ -194,17 +194,17 @@ class Evidence:
     def _off_span(self, values: FloatArray) -> FloatArray:
         return values - self._spanned @ (self._spanned.T @ values)
 
-    def _outside(self, given: Sequence[int]) -> tuple[float, int, float]:
+    def _outside(self, known: Sequence[int]) -> tuple[float, int, float]:
         """The misfit outside the span of all blocks but those at a position, unless given."""
         rest = self._off_span(self.residual)
-        inside = self.span(k for k in given if self.blocks[k].position)
+        inside = self.span(k for k in known if self.blocks[k].position)
         columns = self._off_span(self.columns[:, inside])
         statistic, rank = _quadratic((columns.T @ columns)[None], (columns.T @ rest)[None], self._reach[inside][None])
         left = self.freedom - self._spanned.shape[1] - int(rank[0])
         if left < 1:
             return 0.0, 0, 1.0
-        found = max(float(rest @ rest) - float(statistic[0]), 0.0)
-        return found, left, float(chi2_sf(found, left))
+        outside = max(float(rest @ rest) - float(statistic[0]), 0.0)
+        return outside, left, float(chi2_sf(outside, left))
 
     @cached_property
     def null(self) -> FloatArray:
@@ -223,17 +223,17 @@ class Evidence:
         for _, columns, gram in self._groups:
             root, rank = _roots(gram, self._reach[columns])
             statistic = np.sum((root.transpose(0, 2, 1) @ product[columns]) ** 2, axis=1) / guard**2
-            for each in np.unique(rank[rank > 0]):
-                best = statistic[rank == each].max(axis=0)
-                np.minimum(smallest, chi2_sf(best, each), out=smallest)
+            for freedom in np.unique(rank[rank > 0]):
+                best = statistic[rank == freedom].max(axis=0)
+                np.minimum(smallest, chi2_sf(best, freedom), out=smallest)
         return np.sort(smallest)
 
     def strongest(self, blocks: Sequence[EffectBlock]) -> tuple[float, EffectBlock]:
         """Return of other blocks the one that stands out most, and the probability that one does so by chance."""
         other = Evidence(self.residual, self.jacobian, blocks, self._noise)
         p_value = other.scores().p_value
-        place = int(np.argmin(p_value))
-        return other.family_wise(float(p_value[place])), other.blocks[place]
+        best = int(np.argmin(p_value))
+        return other.family_wise(float(p_value[best])), other.blocks[best]
 
     def without(self, columns: FloatArray) -> Evidence:
         """Return the same questions with more base parameters (n, k): one for every condition that is left out.
@@ -283,32 +283,32 @@ def _guard(outside: FloatArray, freedom: int) -> FloatArray:
     return np.sqrt(np.maximum(1.0, outside / freedom)) if freedom >= _ENOUGH else np.ones_like(outside)
 
 
-def _safe(reach: FloatArray) -> FloatArray:
+def _safe(lengths: FloatArray) -> FloatArray:
     """Return lengths (..., q) to divide by: what is nothing beside the others of a block is rounding."""
-    least = _NOTHING * np.max(reach, axis=-1, keepdims=True, initial=0.0)
-    return np.where(least > 0, np.maximum(reach, least), 1.0)
+    least = _NOTHING * np.max(lengths, axis=-1, keepdims=True, initial=0.0)
+    return np.where(least > 0, np.maximum(lengths, least), 1.0)
 
 
-def _scaled(gram: FloatArray, reach: FloatArray) -> FloatArray:
-    scale = _safe(reach)
+def _scaled(gram: FloatArray, lengths: FloatArray) -> FloatArray:
+    scale = _safe(lengths)
     return gram / scale[..., :, None] / scale[..., None, :]
 
 
-def _roots(gram: FloatArray, reach: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+def _roots(gram: FloatArray, lengths: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """Return R (b, q, q) with R Rᵀ the pseudo-inverse of each Gram matrix, and the ranks (b,).
 
     What is left of a direction counts if it is more than a share of the column's whole reach: the rest is rounding, and
     what the estimated path is uncertain by.
     """
-    values, vectors = np.linalg.eigh(_scaled(gram, reach))
+    values, vectors = np.linalg.eigh(_scaled(gram, lengths))
     keep = values > _BLIND**2
     root = vectors / np.sqrt(np.where(keep, values, 1.0))[..., None, :] * keep[..., None, :]
-    return root / _safe(reach)[..., :, None], keep.sum(axis=-1)
+    return root / _safe(lengths)[..., :, None], keep.sum(axis=-1)
 
 
-def _quadratic(gram: FloatArray, product: FloatArray, reach: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+def _quadratic(gram: FloatArray, product: FloatArray, lengths: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """Return bᵀ G⁺ b (b,) and the ranks."""
-    root, rank = _roots(gram, reach)
+    root, rank = _roots(gram, lengths)
     return np.sum(np.einsum("bqr,bq->br", root, product) ** 2, axis=1), rank
 
 
@@ -321,20 +321,20 @@ def _power(freedom: int, level: float) -> tuple[FloatArray, FloatArray]:
 
 
 def detection_limit(
-    information: FloatArray, reach: FloatArray | None = None, places: int = 1, level: float = LIMIT_LEVEL
+    information: FloatArray, lengths: FloatArray | None = None, places: int = 1, level: float = LIMIT_LEVEL
 ) -> float:
     """Return the size of a coefficient vector (q,) of random direction that its own test finds with 90 % power.
 
     `information` (places·q, places·q): AᵀA of the effect's whitened columns with the base projected off, at every place
     of its grid, place by place. The effect is at any of them, each as likely, which the test does not know: it takes
-    the best of all. `reach` (places·q,): the columns' lengths before that, against which what is left counts or is
+    the best of all. `lengths` (places·q,): the columns' lengths before that, against which what is left counts or is
     rounding. `level`: the p-value that one place must reach. Infinite where too little of the effect is seen.
     """
     if places > 1:
-        return _grid_limit(information, np.sqrt(np.diag(information)) if reach is None else reach, places, level)
+        return _grid_limit(information, np.sqrt(np.diag(information)) if lengths is None else lengths, places, level)
     q = len(information)
     values = np.linalg.eigvalsh(information)
-    whole = values[-1] if reach is None else float(np.max(np.square(reach), initial=0.0))
+    whole = values[-1] if lengths is None else float(np.max(np.square(lengths), initial=0.0))
     rank = int(np.sum(values > _BLIND**2 * max(whole, 0.0)))
     if values[-1] <= 0 or not rank:
         return float("inf")
@@ -356,18 +356,18 @@ def detection_limit(
     return float(np.exp((low + high) / 2))
 
 
-def _grid_limit(gram: FloatArray, reach: FloatArray, places: int, level: float) -> float:
+def _grid_limit(gram: FloatArray, lengths: FloatArray, places: int, level: float) -> float:
     """Draw noise n, a place and a direction, and take the size s from which on |n + s v|² passes any place's bound."""
-    random, own = np.random.default_rng(7), np.arange(len(gram)).reshape(places, -1)
-    root, rank = _roots(gram[own[:, :, None], own[:, None, :]], reach[own])
+    random, columns = np.random.default_rng(7), np.arange(len(gram)).reshape(places, -1)
+    root, rank = _roots(gram[columns[:, :, None], columns[:, None, :]], lengths[columns])
     bound = np.where(rank > 0, chi2_isf(level, np.maximum(rank, 1)), np.inf)
     values, vectors = np.linalg.eigh(gram)
     # the symmetric root: the signs of eigenvectors, which are anybody's, do not change the draws
     noise = random.standard_normal((_DRAWN, len(gram))) @ (vectors * np.sqrt(np.maximum(values, 0.0)) @ vectors.T)
-    direction = random.standard_normal((_DRAWN, own.shape[1]))
+    direction = random.standard_normal((_DRAWN, columns.shape[1]))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    signal = np.concatenate([direction[k::places] @ gram[own[k]] for k in range(places)])
-    n, v = (np.einsum("dkq,kqr->dkr", each.reshape(_DRAWN, *own.shape), root) for each in (noise, signal))
+    signal = np.concatenate([direction[k::places] @ gram[columns[k]] for k in range(places)])
+    n, v = (np.einsum("dkq,kqr->dkr", drawn.reshape(_DRAWN, *columns.shape), root) for drawn in (noise, signal))
     lacking, across, strength = bound - np.sum(n**2, axis=2), np.sum(n * v, axis=2), np.sum(v**2, axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         needed = (np.sqrt(across**2 + strength * lacking) - across) / strength

@@ -70,30 +70,30 @@ def extend(
 
     `taken`: effects that another selection has chosen; they are in the model from the start, and stay.
     """
-    found: list[Found] = []
+    entries: list[Found] = []
     state, poses = base, []
     causes = causes_of(base.evidence, [effect.name for effect in taken]) if selection.causes or taken else []
     if causes and not selection.explained:
         blocks = base.evidence.blocks
-        found = [_named(blocks, cause) for cause in causes]
-        state = experiment.fit(_those_found(taken, found), base.imu)
+        entries = [_named(blocks, cause) for cause in causes]
+        state = experiment.fit(_those_found(taken, entries), base.imu)
         selection = select(state.evidence, level / 100)
-    chosen = len(found)
+    chosen = len(entries)
     guessed = False  # a cause was taken in that did not explain the misfit
     while selection.causes:
         guessed |= not selection.complete
-        if len(found) - chosen + len(poses) + len(selection.causes) > _MOST:
+        if len(entries) - chosen + len(poses) + len(selection.causes) > _MOST:
             break
         effects, blocks = list(state.effects), state.evidence.blocks
         coefficients = state.evidence.start([cause.block for cause in selection.causes])
         edges = np.cumsum([0, *(len(blocks[cause.block].sizes) for cause in selection.causes)])
-        bumped, before = [], len(found)
+        bumped, before = [], len(entries)
         for cause, a, b in zip(selection.causes, edges[:-1], edges[1:], strict=True):
             block = blocks[cause.block]
             if block.kind == "data":
                 bumped.append(int(block.inner["pose"]))
                 continue
-            found.append(_named(blocks, cause))
+            entries.append(_named(blocks, cause))
             effects.append(CATALOGUE[block.name].make(coefficients[a:b] * block.sizes, **block.inner))
         for pose in bumped:
             poses.append(_bumped(experiment, pose))
@@ -103,30 +103,30 @@ def extend(
         try:
             state = experiment.fit(effects, state.imu) if effects else base
         except NotPossibleError:  # what looks like these effects to first order is none of them
-            state, found = experiment.fit(state.effects, base.imu) if bumped else state, found[:before]
+            state, entries = experiment.fit(state.effects, base.imu) if bumped else state, entries[:before]
             break
         # what is found once all was explained is mostly chance, or a shape that the refit did not quite meet
         selection = select(state.evidence, level if guessed else level / 100)
     complete = selection.complete and not selection.causes
-    p_value, beside = experiment.beside(state) if complete and found else (1.0, "")
+    p_value, beside = experiment.beside(state) if complete and entries else (1.0, "")
     imitated = p_value < level * BESIDE  # by something that the causes look like, and that no catalogue has
     complete, beside = complete and not imitated, beside if imitated else ""
-    own = causes_of(base.evidence, [entry.name for entry in found[chosen:]])
-    if any(one_curve(base.evidence, a.block, b.block) for a, b in combinations(own, 2)):
+    chosen_causes = causes_of(base.evidence, [entry.name for entry in entries[chosen:]])
+    if any(one_curve(base.evidence, a.block, b.block) for a, b in combinations(chosen_causes, 2)):
         complete = False  # a curve of one input that is in no catalogue, imitated by two that are
-        strongest = max(found[chosen:], key=lambda entry: entry.statistic)
-        found = [*found[:chosen], strongest]
-        state = experiment.fit(_those_found(state.effects, found), base.imu)
-    if guessed and len(found) > 1 and any(entry.weak for entry in found):
+        strongest = max(entries[chosen:], key=lambda entry: entry.statistic)
+        entries = [*entries[:chosen], strongest]
+        state = experiment.fit(_those_found(state.effects, entries), base.imu)
+    if guessed and len(entries) > 1 and any(entry.weak for entry in entries):
         # Combinations of weak effects imitate what is outside the catalogue: only what is strong may keep its name.
         complete = False
-        found = [entry for k, entry in enumerate(found) if k < chosen or not entry.weak]
-        state = experiment.fit(_those_found(state.effects, found), base.imu)
-    return Extension(found, state, experiment, base, complete, poses, beside)
+        entries = [entry for k, entry in enumerate(entries) if k < chosen or not entry.weak]
+        state = experiment.fit(_those_found(state.effects, entries), base.imu)
+    return Extension(entries, state, experiment, base, complete, poses, beside)
 
 
-def _those_found(effects: Iterable[Effect], found: Sequence[Found]) -> list[Effect]:
-    names = {entry.name for entry in found}
+def _those_found(effects: Iterable[Effect], entries: Sequence[Found]) -> list[Effect]:
+    names = {entry.name for entry in entries}
     return [effect for effect in effects if effect.name in names]
 
 
@@ -136,9 +136,9 @@ def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str
     Each rival takes its cause's place in a fit. Effects of the unit that predict the other recording worse than the
     best of them, or than none, are no rivals any more; those of a session may be gone or still there: they stay.
     """
-    evidence, state, found, notes = extension.base.evidence, extension.state, list(extension.found), []
-    for place, entry in enumerate(extension.found):
-        others = [each.name for each in found if each is not entry]
+    evidence, state, entries, notes = extension.base.evidence, extension.state, list(extension.found), []
+    for index, entry in enumerate(extension.found):
+        others = [other.name for other in entries if other is not entry]
         causes = {
             name: cause for name in entry.rivals if name in CATALOGUE and (cause := _beside(evidence, name, others))
         }
@@ -166,15 +166,15 @@ def settled(extension: Extension, held: Experiment) -> tuple[Extension, list[str
             _, name = max((gains.get(name, 0.0), name) for name in kept)
             chosen, state = _named(evidence.blocks, causes[name]), states[name]
         stay = {*kept, *(name for name in entry.rivals if name not in causes)} - {chosen.name}
-        found[place] = replace(chosen, rivals=tuple(sorted(stay)))
+        entries[index] = replace(chosen, rivals=tuple(sorted(stay)))
         notes.append(f"the held-out recording speaks against {' and '.join(map(effect_title, dropped))}.")
-    return replace(extension, found=found, state=state), notes
+    return replace(extension, found=entries, state=state), notes
 
 
 def _beside(evidence: Evidence, name: str, others: Sequence[str]) -> SelectedCause | None:
     """Return an effect as a cause beside others, if it can be told from them."""
     causes = causes_of(evidence, [*others, name])
-    return next((each for each in causes if evidence.blocks[each.block].name == name), None)
+    return next((cause for cause in causes if evidence.blocks[cause.block].name == name), None)
 
 
 def _fitted(extension: Extension, state: State, name: str, cause: SelectedCause) -> State:
@@ -192,6 +192,6 @@ def _named(blocks: Sequence[EffectBlock], cause: SelectedCause) -> Found:
     return Found(name, rivals, cause.p_value, cause.statistic, cause.freedom)
 
 
-def _bumped(experiment: Experiment, place: int) -> Finding:
-    text = f"{experiment.real.describe(place)} does not fit the others: bumped, or not still. It was left out."
+def _bumped(experiment: Experiment, observation: int) -> Finding:
+    text = f"{experiment.real.describe(observation)} does not fit the others: bumped, or not still. It was left out."
     return Finding("data.bumped_pose", (), text)

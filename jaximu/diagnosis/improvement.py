@@ -98,7 +98,7 @@ def _predict(held: Experiment, state: State) -> Prediction:
 
 def _biases(names: Sequence[Name], triad: str) -> list[int]:
     """Return the places of a triad's bias."""
-    return [place for place, name in enumerate(names) if (name.owner, name.part) == (triad, "bias")]
+    return [index for index, name in enumerate(names) if (name.owner, name.part) == (triad, "bias")]
 
 
 def _rested(held: Experiment, imu: Imu) -> Imu:
@@ -141,25 +141,27 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
         if not rows.any() or np.sum(~rows) <= evidence.jacobian.shape[1]:
             continue
         models = {"before": [(1.0, ())], "after": _models(evidence.without(base.weights[:, rows]))}
-        parts = {key: [_left_out(base, blocks, rows) for _, blocks in each] for key, each in models.items()}
-        blind = [null_space(part.directions.T) for each in parts.values() for part, _ in each if part.blind]
-        told = null_space(np.concatenate(blind, axis=1).T, rcond=1e-6) if blind else np.eye(rows.sum())
-        count_out += told.shape[1]
-        for key, each in parts.items():
+        parts = {key: [_left_out(base, blocks, rows) for _, blocks in options] for key, options in models.items()}
+        blind = [null_space(part.directions.T) for options in parts.values() for part, _ in options if part.blind]
+        determined = null_space(np.concatenate(blind, axis=1).T, rcond=1e-6) if blind else np.eye(rows.sum())
+        count_out += determined.shape[1]
+        for key, options in parts.items():
             weight = np.array([share for share, _ in models[key]])
-            estimate = np.tensordot(weight, [part.errors for part, _ in each], 1)
+            estimate = np.tensordot(weight, [part.errors for part, _ in options], 1)
             spread = sum(
                 share * (part.covariance + np.outer(part.errors - estimate, part.errors - estimate))
-                for share, (part, _) in zip(weight, each, strict=True)
+                for share, (part, _) in zip(weight, options, strict=True)
             )
-            part_squared, part_likelihood = _likelihood(told.T @ estimate, told.T @ np.asarray(spread) @ told)
+            part_squared, part_likelihood = _likelihood(
+                determined.T @ estimate, determined.T @ np.asarray(spread) @ determined
+            )
             # a turn between two folds is left out twice; its later error is kept
-            rest = (root @ np.tensordot(weight, [residual for _, residual in each], 1))[rows]
-            errors[key][rows] = rest - (estimate - told @ (told.T @ estimate))
+            rest = (root @ np.tensordot(weight, [residual for _, residual in options], 1))[rows]
+            errors[key][rows] = rest - (estimate - determined @ (determined.T @ estimate))
             squared[key] += part_squared
             likelihood[key] += part_likelihood
-    found = {key: Prediction(real.rms(errors[key]), squared[key], count_out, likelihood[key]) for key in errors}
-    return Gain(found["before"], found["after"], f"{_FOLDS} parts left out in turn")
+    predictions = {key: Prediction(real.rms(errors[key]), squared[key], count_out, likelihood[key]) for key in errors}
+    return Gain(predictions["before"], predictions["after"], f"{_FOLDS} parts left out in turn")
 
 
 def _models(evidence: Evidence) -> list[tuple[float, tuple[int, ...]]]:
@@ -172,14 +174,19 @@ def _models(evidence: Evidence) -> list[tuple[float, tuple[int, ...]]]:
     for cause in causes:
         statistic = evidence.scores([k for k in causes if k != cause]).statistic
         name = evidence.blocks[cause].name
-        options.append([
-            (float(np.exp((statistic[k] - statistic[cause]) / 2)), k)
-            for k, block in enumerate(evidence.blocks)
-            if block.name == name and statistic[k] > statistic[cause] - _SIMILAR
-        ])  # fmt: skip
-    found = [(float(np.prod([w for w, _ in each])), tuple(k for _, k in each)) for each in itertools.product(*options)]
-    total = sum(weight for weight, _ in found)
-    return [(weight / total, blocks) for weight, blocks in found]
+        options.append(
+            [
+                (float(np.exp((statistic[k] - statistic[cause]) / 2)), k)
+                for k, block in enumerate(evidence.blocks)
+                if block.name == name and statistic[k] > statistic[cause] - _SIMILAR
+            ]
+        )
+    models = [
+        (float(np.prod([w for w, _ in combination])), tuple(k for _, k in combination))
+        for combination in itertools.product(*options)
+    ]
+    total = sum(weight for weight, _ in models)
+    return [(weight / total, blocks) for weight, blocks in models]
 
 
 def _left_out(base: State, blocks: Sequence[int], rows: NDArray[np.bool_]) -> tuple[LeftOut, FloatArray]:

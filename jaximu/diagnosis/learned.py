@@ -109,24 +109,24 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
     best: tuple[float, Curve, float, Any] | None = None
     for effect, columns, root in curves(experiment, state):
         for strength in _STRENGTHS / max(np.linalg.eigvalsh(columns.T @ columns)[-1], 1e-300):
-            found = _left_out(state, columns, strength, folds)
-            gained = found[0] - base[0]
+            left = _left_out(state, columns, strength, folds)
+            gained = left[0] - base[0]
             if best is None or gained > best[0]:
-                best = gained, effect, strength, (found, root)
+                best = gained, effect, strength, (left, root)
     if best is None or best[0] < _PAYS:
         return None
-    _, effect, strength, (found, root) = best
+    _, effect, strength, (left, root) = best
     try:
         fitted = _fitted(experiment, state, effect, root * np.sqrt(strength))
     except NotPossibleError:  # a curve that leads a fit to nothing explains nothing
         return None
-    told = [_prediction(experiment, each) for each in (base, found)]
-    gain = Gain(told[0], told[1], f"{len(folds)} parts left out in turn")
+    predictions = [_prediction(experiment, parts) for parts in (base, left)]
+    gain = Gain(predictions[0], predictions[1], f"{len(folds)} parts left out in turn")
     if held is not None and effect.scope == "device":
         gain = on_held_out(held, state, fitted)
         if gain.log_likelihood <= 0:
             return None
-    return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, found[0])
+    return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, left[0])
 
 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:
@@ -142,9 +142,9 @@ def left_out(experiment: Experiment, before: State, after: State) -> Gain:
     nothing = np.zeros((len(after.conditions), 0))
     folds = _folds(experiment)
     # a part that one of the two cannot predict at all is no comparison
-    folds = [fold for fold in folds if all(_left_out(each, nothing, 1.0, [fold])[2] for each in (before, after))]
-    found = [_prediction(experiment, _left_out(each, nothing, 1.0, folds)) for each in (before, after)]
-    return Gain(found[0], found[1], f"{len(folds)} parts left out in turn")
+    folds = [fold for fold in folds if all(_left_out(state, nothing, 1.0, [fold])[2] for state in (before, after))]
+    predictions = [_prediction(experiment, _left_out(state, nothing, 1.0, folds)) for state in (before, after)]
+    return Gain(predictions[0], predictions[1], f"{len(folds)} parts left out in turn")
 
 
 def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatArray, FloatArray]]:
@@ -173,7 +173,7 @@ def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatA
 def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve | None:
     """Return the dormant curve over what its covariate was in what is compared; None where it stood still."""
     name = kind.owner
-    typical = {name: each.typical for name, each in kind.inner.items()}
+    typical = {name: parameter.typical for name, parameter in kind.inner.items()}
     values = []
     for track in (tracks[name] for tracks in experiment.data.tracks(state.linear.details)):
         rows = track.inside()
@@ -182,7 +182,7 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
         true = jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], track.stimulus)
         true = replace(true, time_reference=state.imu.triads()[name].time_reference)
         values.append(np.asarray(kind(np.zeros(kind.size), **typical).covariate(true)))
-    low, high = min(float(each.min()) for each in values), max(float(each.max()) for each in values)
+    low, high = min(float(part.min()) for part in values), max(float(part.max()) for part in values)
     if high - low <= 1e-6 * max(abs(low), abs(high)):
         return None
     effect = kind.dormant(**kind.spanning(low, high))
@@ -215,8 +215,8 @@ def _left_out(state: State, columns: FloatArray, strength: float, folds) -> tupl
     return -0.5 * (count * np.log(2 * np.pi * unit) + log_size + squared / unit), squared / unit, count, errors
 
 
-def _prediction(experiment: Experiment, found: tuple[float, float, int, FloatArray]) -> Prediction:
-    likelihood, squared, count, errors = found
+def _prediction(experiment: Experiment, left: tuple[float, float, int, FloatArray]) -> Prediction:
+    likelihood, squared, count, errors = left
     return Prediction(experiment.real.rms(errors), squared, count, likelihood)
 
 
@@ -224,8 +224,8 @@ def _fitted(experiment: Experiment, state: State, effect: Curve, spread: FloatAr
     """Fit all parameters and the curve, its coefficients (q,) a priori of the standard deviations `spread`."""
     effects = (*state.effects, effect)
     owned = state.imu.with_effects(*effects).all_effects()
-    ((owner, place),) = (key for key, each in owned.items() if each.name == effect.name)
-    names = tuple(Name(owner, "coefficients", (k,), place) for k in range(effect.size))
+    ((owner, index),) = (key for key, fitted in owned.items() if fitted.name == effect.name)
+    names = tuple(Name(owner, "coefficients", (k,), index) for k in range(effect.size))
     return experiment.fit(effects, state.imu, Prior(names, np.zeros(effect.size), np.diag(1 / spread)))
 
 
@@ -243,9 +243,9 @@ def _curve(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
     x = np.linspace(low, high, _POINTS)
     shapes = np.asarray(effect.shapes(x))
     places = state.places(effect.name)
-    own = state.covariance[np.ix_(places, places)]
+    known = state.covariance[np.ix_(places, places)]
     count = shapes.shape[1]
     y = shapes @ np.asarray(effect.coefficients).reshape(3, count).T / scale
-    blocks = [own[a : a + count, a : a + count] for a in range(0, 3 * count, count)]
+    blocks = [known[a : a + count, a : a + count] for a in range(0, 3 * count, count)]
     sigma = np.sqrt(np.stack([np.einsum("xk,kl,xl->x", shapes, block, shapes) for block in blocks], axis=1))
     return x, y, 1.96 * sigma / scale

@@ -70,10 +70,16 @@ class MagneticCause:
     def document(self) -> dict[str, Any]:
         """Return the cause as `calibration.json` has it under `diagnosis`."""
         return {
-            "name": self.effect.name, "indistinguishable_from": list(self.rivals), "p_value": self.p_value,
-            "improvement": {"heldout_rms_before": self.before, "heldout_rms_after": self.after, "unit": "uT",
-                            "heldout_loglik": self.gain},
-        } | self.effect.document("uT")  # fmt: skip
+            "name": self.effect.name,
+            "indistinguishable_from": list(self.rivals),
+            "p_value": self.p_value,
+            "improvement": {
+                "heldout_rms_before": self.before,
+                "heldout_rms_after": self.after,
+                "unit": "uT",
+                "heldout_loglik": self.gain,
+            },
+        } | self.effect.document("uT")
 
 
 @dataclass(frozen=True)
@@ -87,9 +93,11 @@ class MagneticDiagnosis:
     def document(self) -> dict[str, Any]:
         """Return the diagnosis as `calibration.json` has it."""
         return {
-            "verdict": "effects" if self.causes else "adequate", "effects": [each.document() for each in self.causes],
-            "p_value": self.p_value, "not_observable": self.not_asked,
-        }  # fmt: skip
+            "verdict": "effects" if self.causes else "adequate",
+            "effects": [each.document() for each in self.causes],
+            "p_value": self.p_value,
+            "not_observable": self.not_asked,
+        }
 
 
 def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) -> MagneticDiagnosis:
@@ -186,10 +194,15 @@ class MagneticShift:
     def document(self) -> dict[str, Any]:
         """Return the comparison as `calibration.json` has it under `check`."""
         return {
-            "verdict": "valid" if self.holds else "moved", "statistic": self.statistic, "freedom": self.freedom,
-            "p_value": self.p_value, "hard_iron_shift": self.iron.tolist(), "sigma": self.iron_sigma.tolist(),
-            "heading_off": self.heading, "unit": "uT",
-        }  # fmt: skip
+            "verdict": "valid" if self.holds else "moved",
+            "statistic": self.statistic,
+            "freedom": self.freedom,
+            "p_value": self.p_value,
+            "hard_iron_shift": self.iron.tolist(),
+            "sigma": self.iron_sigma.tolist(),
+            "heading_off": self.heading,
+            "unit": "uT",
+        }
 
 
 def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
@@ -227,9 +240,13 @@ def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
     iron = [k for k, name in enumerate(names) if name.part == "bias"]
     scale = float(np.mean(np.linalg.norm(gains[0], axis=1)))
     return MagneticShift(
-        statistic, len(left), float(chi2_sf(statistic, len(left))), shift[iron] / scale,
-        np.sqrt(np.diagonal(spread))[iron] / scale, _heading_off(triads, new.magnetic or {}),
-    )  # fmt: skip
+        statistic,
+        len(left),
+        float(chi2_sf(statistic, len(left))),
+        shift[iron] / scale,
+        np.sqrt(np.diagonal(spread))[iron] / scale,
+        _heading_off(triads, new.magnetic or {}),
+    )
 
 
 def _heading_off(triads, magnetic: dict[str, Any]) -> float | None:
@@ -239,8 +256,9 @@ def _heading_off(triads, magnetic: dict[str, Any]) -> float | None:
         return None
     dip, strength = np.radians(field["dip"]["value"]), field["strength"]["value"]
     angle = np.radians(np.arange(0.0, 360.0, 15.0))
-    body = strength * np.stack([-np.cos(dip) * np.sin(angle), np.cos(dip) * np.cos(angle),
-                                np.full(len(angle), -np.sin(dip))], axis=1)  # fmt: skip
+    body = strength * np.stack(
+        [-np.cos(dip) * np.sin(angle), np.cos(dip) * np.cos(angle), np.full(len(angle), -np.sin(dip))], axis=1
+    )
     old, new = triads
     output = body @ np.asarray(new.gain).T + np.asarray(new.bias)
     seen = np.linalg.solve(np.asarray(old.gain), (output - np.asarray(old.bias)).T).T
@@ -251,8 +269,11 @@ def _heading_off(triads, magnetic: dict[str, Any]) -> float | None:
 def _askable(windows: FieldWindows, triad) -> tuple[list[type[Effect]], dict[str, str]]:
     """Return the effects of a magnetometer that can be asked, and why others cannot."""
     stimulus, fitted = windows.samples.track.stimulus, {effect.name for effect in triad.effects}
-    inputs = {"temperature": (stimulus.temperature, _LEAST_WARMING), "current": (stimulus.current, _LEAST_CURRENT),
-              "angular_rate": (stimulus.angular_rate, 0.0)}  # fmt: skip
+    inputs = {
+        "temperature": (stimulus.temperature, _LEAST_WARMING),
+        "current": (stimulus.current, _LEAST_CURRENT),
+        "angular_rate": (stimulus.angular_rate, 0.0),
+    }
     asked, refused = [], {}
     for kind in CATALOGUE.values():
         if kind.owner != "magnetometer" or kind.name in fitted:

@@ -100,9 +100,9 @@ class NoiseFinding:
 
     def sentence(self) -> str:
         """Return what is found, for the headline."""
-        place = int(np.argmax(np.abs(np.log(self.factor))))
-        triad, _, axis = self.axes[place].rpartition(" ")
-        times = number(self.factor[place])
+        worst = int(np.argmax(np.abs(np.log(self.factor))))
+        triad, _, axis = self.axes[worst].rpartition(" ")
+        times = number(self.factor[worst])
         return f"{effect_title(self.name)}: the noise of the {triad}'s {axis} axis is {times} times what the model says"
 
     def numbers(self) -> list[str]:
@@ -146,10 +146,10 @@ def quick_noise(experiment: Experiment, noise: NoiseModel, level: float) -> tupl
             continue
         (low, few, usual_low), (high, many, usual_high) = counts
         means = known.duration / _WIDTH if known.duration else np.inf
-        told = [1 / (1 / few + 4 / means), 1 / (1 / many + 4 / 3 / means)]  # the model, too, is known so well only
+        variances = [1 / (1 / few + 4 / means), 1 / (1 / many + 4 / 3 / means)]  # the model, too, is known so well only
         wrong = {}
         for name, ratio, usual, freedom in (
-            ("noise.correlated", (low / few) / (high / many), usual_low / usual_high, (told[0], told[1])),
+            ("noise.correlated", (low / few) / (high / many), usual_low / usual_high, (variances[0], variances[1])),
             ("noise.white", high / many, usual_high, (many, means * 3 / 4)),
         ):
             p_value = np.minimum(2 * np.minimum(*f_tails(ratio, *freedom)), 1.0)
@@ -165,19 +165,19 @@ def quick_noise(experiment: Experiment, noise: NoiseModel, level: float) -> tupl
             changed[triad] = _with_own(known, parts, rate, length)
         elif wrong["noise.white"]:
             changed[triad] = _scaled(known, high / many, length)
-    found = []
+    findings = []
     for name, entries in rows.items():
         hit = [float(p) for *_, p, off in entries if off]
         if hit:
             axes, factor, sigma, *_ = zip(*entries, strict=True)
             what = "means over 1/8 s" if name == "noise.white" else "what is slower than half a second"
             text = f"{what} in the still parts against the noise model, {len(hit)} of {len(axes)} axes off"
-            found.append(
+            findings.append(
                 NoiseFinding(name, axes, np.array(factor), np.array(sigma), min(hit), _weak(min(hit), alpha), text)
             )
     accelerometer = changed["accelerometer"]
     assert accelerometer is not None
-    return found, replace(noise, accelerometer=accelerometer, gyroscope=changed["gyroscope"])
+    return findings, replace(noise, accelerometer=accelerometer, gyroscope=changed["gyroscope"])
 
 
 def slow_noise(
@@ -212,7 +212,7 @@ def slow_noise(
             tried.append((gained, name, p_value, strength, spread, unit, added))
     if not tried:
         return None, noise, ""
-    tried.sort(key=lambda each: -each[0])
+    tried.sort(key=lambda entry: -entry[0])
     gained, name, p_value, strength, spread, unit, added = tried[0]
     evidence = state.evidence
     rival = _criterion(evidence, selection) if selection.complete else -np.inf
@@ -228,24 +228,24 @@ def slow_noise(
     if left.family_wise(left.scores().smallest) < _BESIDE * level:
         return None, noise, ""
     if gained < rival + _TIE:
-        said = (
+        text = (
             f"a {name.partition('.')[2].replace('_', ' ')} of the gyroscope's bias beyond the recording at rest would "
             "explain what was found about as well: repeat the recording."
         )
-        return None, noise, said
+        return None, noise, text
     corrected = _joined(known, replace(unit, variance=strength * unit.variance))
     tau = experiment.extent().duration / 4
     before, extra = known.allan_variance([tau])[0], strength * unit.allan_variance([tau])[0]
     factor = np.sqrt((before + extra) / before)
     sigma = 0.5 * spread * extra / before / factor
     axes = tuple(f"gyroscope {axis}" for axis in "xyz")
-    rivals = tuple(each[1] for each in tried[1:] if each[0] > gained - _TIE)
+    rivals = tuple(entry[1] for entry in tried[1:] if entry[0] > gained - _TIE)
     text = (
         f"the bias at rest and over the turns drifts more than the recording at rest showed: log-likelihood "
         f"{(gained + np.log(evidence.freedom)) / 2:+.1f}, p {p_value:.2g}"
     )
-    found = NoiseFinding(name, axes, factor, sigma, p_value, _weak(p_value, alpha), text, rivals)
-    return found, replace(noise, gyroscope=corrected), ""
+    finding = NoiseFinding(name, axes, factor, sigma, p_value, _weak(p_value, alpha), text, rivals)
+    return finding, replace(noise, gyroscope=corrected), ""
 
 
 def _otherwise(experiment: Experiment, state: State) -> Iterator[FloatArray]:
@@ -294,8 +294,8 @@ def _bands(parts: list[FloatArray], rate: float, known: AxisNoise):
         squares = (basis.T @ whitening[axis] @ np.stack(pieces)[..., axis].T) ** 2
         sums[:, :, axis] = squares[:few].sum(axis=0), squares[few:].sum(axis=0)
     return [
-        (each.sum(axis=0), freedom * len(pieces), np.median(each, axis=0) / chi2_median(freedom))
-        for each, freedom in zip(sums, (few, count - _TREND - few), strict=True)
+        (part.sum(axis=0), freedom * len(pieces), np.median(part, axis=0) / chi2_median(freedom))
+        for part, freedom in zip(sums, (few, count - _TREND - few), strict=True)
     ]
 
 
@@ -309,13 +309,15 @@ def _scaled(known: AxisNoise, ratio: FloatArray, length: float) -> AxisNoise:
 def _with_own(known: AxisNoise, parts: list[FloatArray], rate: float, length: float) -> AxisNoise:
     """Return the noise with what is quicker than `length` (s) taken from the still parts."""
     samples = round(length * rate)
-    own = fit_bank(np.stack([part[:samples].T for part in parts if len(part) >= samples]), rate)
-    quick, slow = own.correlation_time < length, known.correlation_time >= length
+    bank = fit_bank(np.stack([part[:samples].T for part in parts if len(part) >= samples]), rate)
+    quick, slow = bank.correlation_time < length, known.correlation_time >= length
     return AxisNoise(
-        own.white, own.quantisation,
-        np.concatenate([own.variance[:, quick], known.variance[:, slow]], axis=1),
-        np.concatenate([own.correlation_time[quick], known.correlation_time[slow]]), known.duration,
-    )  # fmt: skip
+        bank.white,
+        bank.quantisation,
+        np.concatenate([bank.variance[:, quick], known.variance[:, slow]], axis=1),
+        np.concatenate([bank.correlation_time[quick], known.correlation_time[slow]]),
+        known.duration,
+    )
 
 
 def _slow_units(known: AxisNoise, duration: float) -> dict[str, AxisNoise]:
@@ -388,13 +390,16 @@ def quadratic_tail(value: float, sizes: FloatArray) -> float:
 def _criterion(evidence: Evidence, selection: Selection) -> float:
     """Return S − q ln(dof) of the causes selected, and −2 ln of the number of places for one of many."""
     blocks = [cause.block for cause in selection.causes]
-    statistic = float(
-        evidence.residual @ evidence.columns[:, evidence.span(blocks)] @ evidence.coefficients(blocks)
-    ) / selection.scores.unit**2  # fmt: skip
+    statistic = (
+        float(evidence.residual @ evidence.columns[:, evidence.span(blocks)] @ evidence.coefficients(blocks))
+        / selection.scores.unit**2
+    )
     places = [
         sum(other.name == evidence.blocks[k].name for other in evidence.blocks) if evidence.blocks[k].position else 1
         for k in blocks
     ]
-    numbers = sum(len(evidence.blocks[k].sizes) + (not evidence.blocks[k].position) * len(evidence.blocks[k].inner)
-                  for k in blocks)  # fmt: skip
+    numbers = sum(
+        len(evidence.blocks[k].sizes) + (not evidence.blocks[k].position) * len(evidence.blocks[k].inner)
+        for k in blocks
+    )
     return statistic - numbers * float(np.log(evidence.freedom)) - 2 * float(np.sum(np.log(places)))

@@ -92,9 +92,9 @@ def select(evidence: Evidence, level: float = LEVEL) -> Selection:
         together = {pair: value for pair, value in pairs.items() if value > top - _TIE}
         causes = []
         for one, other in ((first, second), (second, first)):
-            given = evidence.scores([other])
+            beside = evidence.scores([other])
             rivals = {k for pair in together if other in pair for k in pair} - {one, other}
-            causes.append(_cause(evidence, [one, *sorted(rivals)], given))
+            causes.append(_cause(evidence, [one, *sorted(rivals)], beside))
         return Selection(tuple(sorted(causes, key=lambda cause: -cause.statistic)), True, p_value, scores)
     # what lies outside all spans may be the only thing that stands out: then nothing deserves a name
     named = [k for k in close if evidence.blocks[k].kind == "effect"]
@@ -130,12 +130,12 @@ def causes_of(evidence: Evidence, names: Sequence[str]) -> list[SelectedCause]:
             places = [k for k, block in enumerate(evidence.blocks) if block.name == name and scores.freedom[k]]
             if places:
                 best[name] = max(places, key=lambda k: scores.statistic[k])
-    found = []
+    causes = []
     for name, block in best.items():
         scores = evidence.scores([other for key, other in best.items() if key != name])
         rivals = [k for k in _leaders(evidence, scores) if evidence.blocks[k].name not in best]
-        found.append(_cause(evidence, [block, *rivals], scores))
-    return sorted(found, key=lambda cause: -cause.statistic)
+        causes.append(_cause(evidence, [block, *rivals], scores))
+    return sorted(causes, key=lambda cause: -cause.statistic)
 
 
 def _second_order(evidence: Evidence, scores: Scores, block: int) -> bool:
@@ -147,10 +147,10 @@ def _second_order(evidence: Evidence, scores: Scores, block: int) -> bool:
 
 def criterion(evidence: Evidence, scores: Scores, block: int) -> float:
     """Return S − (q + inner) ln(dof), and −2 ln of the number of places for one of many."""
-    each = evidence.blocks[block]
-    places = sum(other.name == each.name for other in evidence.blocks) if each.position else 1
-    inner = 0 if each.position else len(each.inner)
-    doubt = _DEFECT if each.kind == "data" else 0.0
+    candidate = evidence.blocks[block]
+    places = sum(other.name == candidate.name for other in evidence.blocks) if candidate.position else 1
+    inner = 0 if candidate.position else len(candidate.inner)
+    doubt = _DEFECT if candidate.kind == "data" else 0.0
     return float(
         scores.statistic[block]
         - (scores.freedom[block] + inner) * np.log(evidence.freedom)
@@ -174,8 +174,8 @@ def _cause(evidence: Evidence, explaining: Sequence[int], scores: Scores) -> Sel
     first = explaining[0]
     top = criterion(evidence, scores, first)
     rivals = tuple(k for k in explaining[1:] if criterion(evidence, scores, k) > top - _TIE)
-    asked = sum(block.name == evidence.blocks[first].name for block in evidence.blocks)
-    p_value = float(-np.expm1(asked * np.log1p(-min(scores.p_value[first], 1 - 1e-16))))  # Šidák over its grid
+    places = sum(block.name == evidence.blocks[first].name for block in evidence.blocks)
+    p_value = float(-np.expm1(places * np.log1p(-min(scores.p_value[first], 1 - 1e-16))))  # Šidák over its grid
     return SelectedCause(first, rivals, float(scores.statistic[first]), int(scores.freedom[first]), p_value)
 
 
@@ -196,24 +196,24 @@ def _taken(evidence: Evidence, one: int, other: int) -> float:
 def _pairs(evidence: Evidence, first: Sequence[int], explain: Callable[..., bool]) -> dict[tuple[int, int], float]:
     """Return the pairs that explain the misfit, with their criterion; the likeliest are tried, best first."""
     alone = evidence.scores()
-    given = {one: evidence.scores([one]) for one in first}
+    beside = {one: evidence.scores([one]) for one in first}
     ranked: dict[tuple[int, int], float] = {}
     for one in first:
-        for other in _leaders(evidence, given[one]):
-            if evidence.blocks[one].name != evidence.blocks[other].name and given[one].times(other) > _SEPARATE:
+        for other in _leaders(evidence, beside[one]):
+            if evidence.blocks[one].name != evidence.blocks[other].name and beside[one].times(other) > _SEPARATE:
                 pair = (min(one, other), max(one, other))
-                ranked[pair] = criterion(evidence, alone, one) + criterion(evidence, given[one], other)
+                ranked[pair] = criterion(evidence, alone, one) + criterion(evidence, beside[one], other)
 
     def stands(one: int, other: int) -> bool:
         names = [evidence.blocks[k].name for k in (one, other)]
         separate = len({name.partition(".")[0] for name in names}) == 2 and abs(_taken(evidence, one, other)) < _SHARED
         return evidence.scores([one]).times(other) > (_SEPARATE if separate else _STRONG)
 
-    found: dict[tuple[int, int], float] = {}
+    pairs: dict[tuple[int, int], float] = {}
     for pair in sorted(ranked, key=lambda pair: -ranked[pair])[:_TRIED]:
-        if found and ranked[pair] < max(found.values()) - _TIE:
+        if pairs and ranked[pair] < max(pairs.values()) - _TIE:
             break
         one, other = pair
         if explain(*pair) and stands(one, other) and stands(other, one) and not one_curve(evidence, one, other):
-            found[pair] = ranked[pair]
-    return found
+            pairs[pair] = ranked[pair]
+    return pairs

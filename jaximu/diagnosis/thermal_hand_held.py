@@ -66,16 +66,19 @@ class HandHeldThermal(Document):
             "schema": SCHEMA,
             "kind": "hand-held",
             "temperature_range": list(self.range),
-            "effects": [{"name": name, "statistic": statistic, "heldout_loglik": gain}
-                        for name, statistic, gain in self.steps],
+            "effects": [
+                {"name": name, "statistic": statistic, "heldout_loglik": gain} for name, statistic, gain in self.steps
+            ],
             "detection_limits": {name: {"value": value, "unit": unit} for name, (value, unit) in self.limits.items()},
             "undetermined": self.undetermined,
-            "rms": {name: {"before": before, "after": after, "unit": unit}
-                    for name, (before, after, unit) in self.calibration.rms.items()},
+            "rms": {
+                name: {"before": before, "after": after, "unit": unit}
+                for name, (before, after, unit) in self.calibration.rms.items()
+            },
             "notes": list(self.notes),
             "calibration": self.calibration.document(),
             "software": self.software,
-        }  # fmt: skip
+        }
 
 
 def turned_by_hand(recording: Recording) -> bool:
@@ -144,9 +147,16 @@ def calibrate_thermal_by_hand(
     notes = tuple(dict.fromkeys((*calibration.notes, *noise.notes)))
     data = found.data | {"temperature_range": [low, high]}
     return HandHeldThermal(
-        replace(found, data=data, notes=notes), base, state, experiment, (low, high), tuple(steps), state.limits,
-        state.blind, notes,
-    )  # fmt: skip
+        replace(found, data=data, notes=notes),
+        base,
+        state,
+        experiment,
+        (low, high),
+        tuple(steps),
+        state.limits,
+        state.blind,
+        notes,
+    )
 
 
 def _next(state: State, refused: set[str]) -> str | None:

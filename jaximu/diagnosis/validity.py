@@ -82,14 +82,24 @@ class Shift:
 
     def document(self) -> dict[str, Any]:
         """Return the shift as `check.json` has it."""
-        si = None if self.in_si is None else {
-            "value": self.in_si, "sigma": self.sigma_in_si, "unit": self.si_unit, "at": self.at
-        }  # fmt: skip
+        si = (
+            None
+            if self.in_si is None
+            else {"value": self.in_si, "sigma": self.sigma_in_si, "unit": self.si_unit, "at": self.at}
+        )
         return {
-            "name": self.name, "old": self.old, "new": self.old + self.difference, "shift": self.difference,
-            "sigma": self.sigma, "unit": self.unit, "z": self.z, "si": si,
-            "p_value": self.p_value if self.tested else None, "moved": self.moved, "allowed": self.allowed,
-        }  # fmt: skip
+            "name": self.name,
+            "old": self.old,
+            "new": self.old + self.difference,
+            "shift": self.difference,
+            "sigma": self.sigma,
+            "unit": self.unit,
+            "z": self.z,
+            "si": si,
+            "p_value": self.p_value if self.tested else None,
+            "moved": self.moved,
+            "allowed": self.allowed,
+        }
 
 
 @dataclass(frozen=True)
@@ -120,20 +130,25 @@ class Cause:
     def sentence(self) -> str:
         """The cause, and what its scope means."""
         meaning = {
-            "parameter": "", "device": "an effect of the unit that the calibration lacks",
+            "parameter": "",
+            "device": "an effect of the unit that the calibration lacks",
             "session": "belongs to this recording",
             "fixture": "gravity is another here, or all scales of the accelerometer changed alike",
             "data": "a pose that was bumped",
-        }[self.scope]  # fmt: skip
+        }[self.scope]
         return f"{self.title}: {meaning}" if meaning else f"{self.title} moved"
 
     def document(self) -> dict[str, Any]:
         """Return the cause as `check.json` has it."""
         return {
-            "name": self.name, "scope": self.scope, "indistinguishable_from": list(self.rivals),
-            "p_value": self.p_value, "coefficients": self.coefficients.tolist(), "inner": self.inner,
+            "name": self.name,
+            "scope": self.scope,
+            "indistinguishable_from": list(self.rivals),
+            "p_value": self.p_value,
+            "coefficients": self.coefficients.tolist(),
+            "inner": self.inner,
             "unit": self.unit,
-        }  # fmt: skip
+        }
 
 
 @dataclass(frozen=True)
@@ -181,11 +196,11 @@ class Validity(Described, Document):
     @property
     def moved(self) -> tuple[Shift, ...]:
         """Parameters that moved, most significant first."""
-        return tuple(sorted((each for each in self.shifts if each.moved), key=lambda each: -abs(each.z)))
+        return tuple(sorted((shift for shift in self.shifts if shift.moved), key=lambda shift: -abs(shift.z)))
 
     def bias_words(self) -> str:
         """Say how far the gyroscope's bias is off, which is no fault of the calibration."""
-        shift = np.array([each.in_si for each in self.shifts if each.allowed], float)
+        shift = np.array([moved.in_si for moved in self.shifts if moved.allowed], float)
         return (
             f"gyroscope bias: {size(float(np.linalg.norm(shift)), 'rad/s', 2)} off the calibration's; it changes "
             "at power-on; re-zero it at rest."
@@ -193,7 +208,7 @@ class Validity(Described, Document):
 
     def summary(self) -> Summary:
         """Return the verdict, the parameters that moved, and notes."""
-        rows = [(each.words, each.amount, f"{abs(each.z):.1f}") for each in self.moved]
+        rows = [(shift.words, shift.amount, f"{abs(shift.z):.1f}") for shift in self.moved]
         table = Block(("parameter", "moved by (± 95 %)", "in standard deviations"), tuple(rows)) if rows else None
         where = Path(str(self.data.get("file", "a recording"))).name
         return Summary(f"Check against {where}: {self.verdict}", (self.headline(),), table, self.notes)
@@ -213,7 +228,7 @@ class Validity(Described, Document):
                 f"The calibration does not predict this recording ({ratio}), and no change of its parameters would: "
                 "diagnose the recording to see why."
             )
-        causes = ", ".join(each.title for each in self.causes if each.scope != "parameter")
+        causes = ", ".join(cause.title for cause in self.causes if cause.scope != "parameter")
         if self.verdict == "session":
             return (
                 f"The calibration still holds; what it does not predict ({ratio}) belongs to this recording: {causes}."
@@ -224,8 +239,10 @@ class Validity(Described, Document):
                 f"The unit shows what the calibration lacks ({ratio}): {causes}; {what}. Diagnose a recording and keep "
                 "the extended calibration."
             )
-        words = [_shift_words(each) for each in self.moved[:3]]
-        words = words or [f"{each.title} moved{self._alone(each)}" for each in self.causes if each.scope == "parameter"]
+        words = [_shift_words(shift) for shift in self.moved[:3]]
+        words = words or [
+            f"{cause.title} moved{self._alone(cause)}" for cause in self.causes if cause.scope == "parameter"
+        ]
         if not words:
             few = "poses and turns are" if self.history is None else "rests and motion are"
             return (
@@ -258,14 +275,15 @@ class Validity(Described, Document):
             "sentence": self.headline(),
             "p_value": self.p_value,
             "prediction": {
-                "chi_squared": self.chi_squared, "degrees_of_freedom": self.freedom,
+                "chi_squared": self.chi_squared,
+                "degrees_of_freedom": self.freedom,
                 "p_value": float(chi2_sf(self.chi_squared, self.freedom)),
             },
             "difference": {"chi_squared": statistic, "degrees_of_freedom": freedom, "p_value": p_value},
-            "parameters": [each.document() for each in self.shifts if each.comparable],
-            "not_comparable": [each.name for each in self.shifts if not each.comparable],
-            "causes": [each.document() for each in self.causes],
-            "output_error": {name: asdict(each) for name, each in self.output_errors.items()},
+            "parameters": [shift.document() for shift in self.shifts if shift.comparable],
+            "not_comparable": [shift.name for shift in self.shifts if not shift.comparable],
+            "causes": [cause.document() for cause in self.causes],
+            "output_error": {name: asdict(error) for name, error in self.output_errors.items()},
             "errors": {
                 name: {"old": old, "fresh": fresh, "unit": unit} for name, (old, fresh, unit) in self.errors.items()
             },
@@ -277,7 +295,7 @@ class Validity(Described, Document):
             "calibration": self.calibration.data,
             "data": self.data,
             "software": SOFTWARE,
-        }  # fmt: skip
+        }
 
 
 def _shift_words(shift: Shift) -> str:
