@@ -17,18 +17,20 @@ from jaximu.data.poses import (
     NO_FIXTURE,
     Along,
     PosesAndTurns,
+    as_observations,
     felt_by_hand,
     pose_rows,
     residual_rms,
 )
 from jaximu.data.tracks_by_hand import rest_shifts, samples_by_hand
 from jaximu.data.twin_by_hand import twin_recordings
-from jaximu.estimation.data import About, Data, Handling, Observed
+from jaximu.estimation.data import About, Handling, Observed, OfOneUnit
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import rotation_matrix_on_host
+from jaximu.ground.tracing import first
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
@@ -41,7 +43,7 @@ __all__ = ["RecordedByHand"]
 
 
 @dataclass
-class RecordedByHand(Data):
+class RecordedByHand(OfOneUnit):
     """Poses and turns of one unit, and the recordings that they were cut from, along which effects act."""
 
     segmentations: tuple[Segmentation, ...]
@@ -62,19 +64,16 @@ class RecordedByHand(Data):
         """Return what each condition is: norms of poses, two components of turns, three of means at rest."""
         return pose_rows(imu, self.observations)
 
-    def about(self, imu: Imu) -> About:
-        """Return the conditions about one unit, the leading axis of length one, and its effects' columns."""
-        unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        along = self.along(unit, felt_by_hand(unit))
-        covariance = along.condensed.covariance
-        columns = self.own_columns(unit, along, covariance.used.shape[1])[None]
-        return About(along.condensed.conditions, covariance, columns, along)
+    def about_one(self, imu: Imu) -> About:
+        """Return the conditions about the unit, and its effects' columns."""
+        along = self.along(imu, felt_by_hand(imu))
+        conditions, covariance = first((along.condensed.conditions, along.condensed.covariance))
+        return About(conditions, covariance, self.own_columns(imu, along, len(covariance.used)), along)
 
     def along(self, imu: Imu, effects: tuple[Effect, ...]) -> Along:
         """Return the recordings about a unit with effects: the tracks, and the observations without what they add."""
         along = jax.tree.map(np.asarray, self.data.along(imu, effects))
-        left = along.observations
-        return along._replace(observations=Observations(left.poses, left.turns, left.gravity, left.slow))
+        return along._replace(observations=as_observations(along.observations))
 
     def reactions(self, details: Along):
         """Return how norms, directions and means at rest react to effects, recording by recording."""
@@ -177,8 +176,8 @@ def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
     """Return the level frame's axes in the body's (poses, 9) in each pose, padding included, as tracks have them."""
     axes = np.zeros((poses, 9))
     for track in (pair["gyroscope"] for pair in tracks):
-        pose, first = np.unique(np.asarray(track.observation), return_index=True)
+        pose, row = np.unique(np.asarray(track.observation), return_index=True)
         inside = pose < poses
-        attitude = np.asarray(track.stimulus.attitude)[first[inside]]
+        attitude = np.asarray(track.stimulus.attitude)[row[inside]]
         axes[pose[inside]] = rotation_matrix_on_host(attitude).reshape(-1, 9)
     return axes

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from jaximu.data.observe_stations import observe_stations
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.stations import KnownStations, StationConditions, station_covariances, station_rms, station_rows
-from jaximu.estimation.data import About, Data, Observed
+from jaximu.estimation.data import About, Observed, OfOneUnit
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
-from jaximu.estimation.track import Track, added, mean_outputs, stimuli
+from jaximu.estimation.track import TRIADS, Track, added, mean_outputs, stimuli
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.tracing import first, lifted
 from jaximu.model.noise import drawn_noise
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
@@ -45,7 +47,7 @@ class AtStations:
 
 
 @dataclass
-class RecordedStations(Data):
+class RecordedStations(OfOneUnit):
     """A recording of one unit whose set-up says what the unit went through."""
 
     recording: Recording
@@ -77,16 +79,14 @@ class RecordedStations(Data):
         """Return what each condition is."""
         return station_rows(imu, self.stations)
 
-    def about(self, imu: Imu) -> About:
-        """Return the errors of the mean outputs of one unit, the leading axis, and its effects' columns."""
-        unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        path, stations = _path(self.recording, self.stations, unit), self.stations
-        if unit.all_effects():
-            stations = self._without_outputs(self._means(path, added(unit, path)))
+    def about_one(self, imu: Imu) -> About:
+        """Return the errors of the mean outputs of the unit, and its effects' columns."""
+        path, stations = _path(self.recording, self.stations, imu), self.stations
+        if imu.all_effects():
+            stations = self._without_outputs(self._means(path, added(imu, path)))
         details = AtStations(path, stations)
-        lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], stations)
-        columns = self.own_columns(unit, details, 6 * len(stations.turn))
-        return About(StationConditions(lifted), station_covariances(lifted), columns[None], details)
+        columns = self.own_columns(imu, details, 6 * len(stations.turn))
+        return About(StationConditions(stations), first(station_covariances(lifted(stations))), columns, details)
 
     def reactions(self, details: AtStations):
         """Return how the mean outputs react to effects."""
@@ -177,10 +177,9 @@ def output_reaction(triad: str, shape: FloatArray, used: NDArray[np.bool_]) -> F
 
     **Arguments:** `shape`: (o, k) of each axis alike; `used` (o,): observations in which the triad counts.
     """
-    first = 0 if triad == "accelerometer" else 3
     columns = np.zeros((len(shape), 6, shape.shape[1], 3))
     for axis in range(3):
-        columns[used, first + axis, :, axis] = shape[used]
+        columns[used, 3 * TRIADS.index(triad) + axis, :, axis] = shape[used]
     return columns.reshape(6 * len(shape), -1)
 
 
@@ -219,12 +218,9 @@ def _path(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track
         nearest = np.clip(np.searchsorted((nodes.time[1:] + nodes.time[:-1]) / 2, signal.time), 0, len(nodes.time) - 1)
         motion = {field: np.array(getattr(known, field)) for field in ("specific_force", "angular_rate")}
         for field, values in motion.items():
-            stated = getattr(nodes, field)
-            for axis in range(3):
-                values[inside, axis] = np.interp(signal.time[inside], nodes.time, stated[:, axis])
+            values[inside] = interpolated(nodes.time, getattr(nodes, field), signal.time[inside])
         pose = inside & ~np.asarray(stations.turn)[np.minimum(station, count - 1)]
-        first = np.asarray(stations.stimulus.specific_force)[:, 0]
-        motion["specific_force"][pose] = first[station[pose]]
+        motion["specific_force"][pose] = np.asarray(stations.stimulus.specific_force)[station[pose], 0]
         motion["angular_rate"][pose] = 0.0
         acceleration = np.gradient(motion["angular_rate"], signal.time, axis=0)
         acceleration[pose] = 0.0

@@ -168,11 +168,11 @@ def station_covariances(stations: Stations) -> Covariance:
 
 @dataclass(frozen=True)
 class StationErrors:
-    """Errors of one kind, by station: `name`, `unit`, `place` (n,) of the stations, `error` and `sigma` (3, n)."""
+    """Errors of one kind, by station: `name`, `unit`, index `station` (n,), `error` and `sigma` (3, n)."""
 
     name: str
     unit: str
-    place: np.ndarray
+    station: np.ndarray
     error: np.ndarray
     sigma: np.ndarray
 
@@ -190,13 +190,15 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
     degrees = np.degrees(np.asarray(stations.stop) - np.asarray(stations.start))
     kinds = [("specific_force", "m/s^2", np.asarray(stations.accelerometer_used), slice(3), 1.0)]
     if len(scale) > 1:
-        kinds += [("rate_at_rest", "rad/s", gyroscope & ~turn, slice(3, 6), 1.0),
-                  ("turn_angle", "deg", gyroscope & turn, slice(3, 6), degrees)]  # fmt: skip
+        kinds += [
+            ("rate_at_rest", "rad/s", gyroscope & ~turn, slice(3, 6), 1.0),
+            ("turn_angle", "deg", gyroscope & turn, slice(3, 6), degrees),
+        ]
     errors = []
     for name, unit, used, rows, factor in kinds:
-        per = factor / scale[rows.start is not None]
-        place = np.flatnonzero(used)
-        errors.append(StationErrors(name, unit, place, (error[rows] * per)[:, place], (sigma[rows] * per)[:, place]))
+        station, per = np.flatnonzero(used), factor / scale[rows.start is not None]
+        values = ((part[rows] * per)[:, station] for part in (error, sigma))
+        errors.append(StationErrors(name, unit, station, *values))
     return errors
 
 
@@ -205,5 +207,5 @@ def station_rms(imu: Imu, stations: Stations) -> dict[str, tuple[float, str]]:
     return {
         kind.name: (float(np.sqrt(np.mean(np.sum(kind.error**2, axis=0)))), kind.unit)
         for kind in station_errors(imu, stations, np.zeros(len(KnownStations.coarse)))
-        if len(kind.place)
+        if len(kind.station)
     }

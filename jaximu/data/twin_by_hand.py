@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from jaximu.data.poses import PosesAndTurns
+from jaximu.data.twin_signal import twin_signal
 from jaximu.estimation.track import Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.rotation import rotation_matrix_on_host
-from jaximu.model.noise import drawn_noise
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
@@ -62,10 +62,8 @@ def twin_recordings(
         first += len(part.intervals)
         changed = {}
         for order, ((name, triad), values) in enumerate(zip(imu.triads().items(), (force, rate), strict=True)):
-            signal = signals[name]
-            drawn = drawn_noise(getattr(noise, name), len(signal), signal.rate, [seed, number, order])
-            outputs = values @ np.asarray(triad.gain).T + np.asarray(triad.bias) + drawn * signal.nominal_scale
-            changed[name] = replace(signal, values=outputs + (shift if name == "gyroscope" else 0.0))
+            twin = twin_signal(signals[name], triad, values, getattr(noise, name), [seed, number, order])
+            changed[name] = replace(twin, values=twin.values + (shift if name == "gyroscope" else 0.0))
         made.append(replace(part.recording, **changed, notes=()))
     return made
 
