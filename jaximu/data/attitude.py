@@ -360,10 +360,10 @@ class AgainstAttitude(OfOneUnit):
     def _places(self, imu: Imu) -> NDArray[np.int64]:
         """Samples (T, S) of each interval, with some more on either side for the delay to move."""
         data = self.intervals
-        stamps = Mounting.of(imu).on_log(np.asarray(data.stamp))
+        stamps = Mounting.of(imu).on_log(data.stamp)
         first = np.searchsorted(data.until, stamps[:-1]) - _MARGIN
         longest = np.searchsorted(data.until, stamps[1:]) - first + _MARGIN
-        size = -(-longest[np.asarray(data.used)].max() // _SAMPLES) * _SAMPLES
+        size = -(-longest[data.used].max() // _SAMPLES) * _SAMPLES
         return np.clip(first[:, None] + np.arange(size), 0, len(data.until) - 1)
 
     def unsmoothed(self, imu: Imu) -> Attitude:
@@ -403,7 +403,7 @@ class AgainstAttitude(OfOneUnit):
     def rows(self, imu: Imu) -> Rows:
         """Return what each condition is: three of each rotation, then three of each window's mean force."""
         data, group = self.intervals, self.group
-        stamps, used = np.asarray(data.stamp), np.asarray(data.used)
+        stamps, used = data.stamp, data.used
         ends = stamps[::group]
         window = np.arange(len(ends) - 1)
         observation = np.repeat(np.concatenate([np.repeat(window, group), window]), 3)
@@ -475,7 +475,7 @@ class AgainstAttitude(OfOneUnit):
 
     def spans(self) -> list[FloatArray]:
         """Return start and stop (k, 2), s, of the windows of the specific force."""
-        ends = np.asarray(self.intervals.stamp)[:: self.group]
+        ends = self.intervals.stamp[:: self.group]
         return [np.stack([ends[:-1], ends[1:]], axis=1)]
 
     def rests(self) -> list[FloatArray]:
@@ -484,18 +484,15 @@ class AgainstAttitude(OfOneUnit):
 
     def observed(self, imu: Imu, details: AttitudeDetails) -> Observed:
         """Return the samples, along which shapes act: slow changes, and what depends on orientation."""
-        (tracks,), stamps = details.tracks, np.asarray(self.intervals.stamp)
+        (tracks,), stamps = details.tracks, self.intervals.stamp
         stimulus, windows = tracks["gyroscope"].stimulus, len(details.duration) // self.group
         force = np.asarray(stimulus.specific_force)
 
         def react(triad: str, shape: FloatArray) -> FloatArray:
-            columns = []
-            for axis in np.eye(3):
-                along = axis[:, None] * shape[:, None, :]
-                none = np.zeros_like(along)
-                both = (along, none) if triad == "accelerometer" else (none, along)
-                columns.append(np.asarray(details.reactions.react(*both, windows)))
-            return np.concatenate(columns, axis=1)
+            along = np.einsum("ij,mk->mijk", np.eye(3), shape).reshape(len(shape), 3, -1)
+            none = np.zeros_like(along)
+            both = (along, none) if triad == "accelerometer" else (none, along)
+            return np.asarray(details.reactions.react(*both, windows))
 
         share = (np.asarray(stimulus.time) - stamps[0]) / np.ptp(stamps)
         return Observed(react, share, up=force / np.linalg.norm(force, axis=1, keepdims=True))
@@ -558,7 +555,7 @@ class AgainstAttitude(OfOneUnit):
         values = np.asarray(conditions(imu.with_effects()))
         turn, window = conditions.turn, conditions.window
         rate = values[: 3 * len(turn)].reshape(-1, 3)[turn] / about.details.duration[turn, None]
-        stamps = np.asarray(self.intervals.stamp)
+        stamps = self.intervals.stamp
         middle = (stamps[1:] + stamps[:-1]) / 2
         forces = values[3 * len(turn) :].reshape(-1, 3)[window]
         return {

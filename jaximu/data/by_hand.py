@@ -55,6 +55,9 @@ class RecordedByHand(OfOneUnit):
     no_fixture = NO_FIXTURE
     advice = staticmethod(pose_advice)
 
+    def __post_init__(self):
+        self.observations = jax.tree.map(np.asarray, self.observations)
+
     @cached_property
     def data(self) -> PosesAndTurns:
         """The poses and turns with the samples along which effects act."""
@@ -101,15 +104,11 @@ class RecordedByHand(OfOneUnit):
 
     def without(self, observation: int) -> RecordedByHand:
         """Return the recordings with a pose, and the turns to and from it, left out."""
-        poses, turns = np.array(self.observations.poses.mask), np.array(self.observations.turns.mask)
-        poses[observation] = False
-        turns[max(observation - 1, 0) : observation + 1] = False
-        observations = replace(
-            self.observations,
-            poses=replace(self.observations.poses, mask=poses),
-            turns=replace(self.observations.turns, mask=turns),
-        )
-        return replace(self, observations=observations)
+        poses, turns = self.observations.poses, self.observations.turns
+        pose, turn = np.arange(len(poses.mask)), np.arange(len(turns.mask))
+        poses = replace(poses, mask=poses.mask & (pose != observation))
+        turns = replace(turns, mask=turns.mask & (turn != observation) & (turn != observation - 1))
+        return replace(self, observations=replace(self.observations, poses=poses, turns=turns))
 
     def observed(self, imu: Imu, details: Along) -> Observed:
         """Return the real poses; what is off in a gyroscope's pose is off by the mean of its neighbours in a turn."""
@@ -122,7 +121,7 @@ class RecordedByHand(OfOneUnit):
             columns = np.einsum(equation, (by_force if triad == "accelerometer" else by_rate)[:, real], shape)
             return columns.reshape(len(columns), -1)
 
-        time = ((np.asarray(poses.start) + np.asarray(poses.stop)) / 2)[real]
+        time = ((poses.start + poses.stop) / 2)[real]
         force = imu.accelerometer.recover_on_host(poses.accelerometer_mean)
         return Observed(
             react,
@@ -154,12 +153,12 @@ class RecordedByHand(OfOneUnit):
     def averaged(self) -> RecordedByHand:
         """Return the recordings with samples of instants turned into means over their intervals."""
         turns = self.observations.turns
-        changed = replace(turns, output=np.asarray(turns.output) + bend(turns))
+        changed = replace(turns, output=turns.output + bend(turns))
         return replace(self, observations=replace(self.observations, turns=changed))
 
     def change_by_averaging(self, details: Along) -> FloatArray:
         """Return how the conditions (n,) change by that."""
-        turns = np.einsum("tasi,tsi->ta", np.asarray(details.reaction.turn), -bend(self.observations.turns)).ravel()
+        turns = np.einsum("tasi,tsi->ta", details.reaction.turn, -bend(self.observations.turns)).ravel()
         count = len(self.observations.poses.mask)
         return np.concatenate([np.zeros(count), turns, np.zeros(3 * count)])
 
@@ -176,7 +175,7 @@ def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
     """Return the level frame's axes in the body's (poses, 9) in each pose, padding included, as tracks have them."""
     axes = np.zeros((poses, 9))
     for track in (pair["gyroscope"] for pair in tracks):
-        pose, row = np.unique(np.asarray(track.observation), return_index=True)
+        pose, row = np.unique(track.observation, return_index=True)
         inside = pose < poses
         attitude = np.asarray(track.stimulus.attitude)[row[inside]]
         axes[pose[inside]] = rotation_matrix_on_host(attitude).reshape(-1, 9)

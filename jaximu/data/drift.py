@@ -13,6 +13,7 @@ import numpy as np
 
 from jaximu.data.poses import condensed, with_gyroscope
 from jaximu.data.poses_covariance import Sensitivities
+from jaximu.data.rest_blocks import RATIO, correlation_times
 from jaximu.estimation.fitting import Fit, unwhitened
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.estimation.track import TRIADS
@@ -55,7 +56,6 @@ _LONGEST = 4.0
 """Correlation time of a random walk's stand-in, in lengths of the recording."""
 _SLOWEST = 16.0
 """Correlation time of the slowest part of flicker noise: what is slower still changes a recording by a hundredth."""
-_RATIO = 4.0
 _STEPS, _STILL, _FARTHEST = 60, 3e-3, 3.0
 """Steps of a size's logarithm: how many at most, what ends them, and the longest."""
 
@@ -67,15 +67,14 @@ def slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str, 
     times stand r apart, from `shortest` (s) on; a random walk is one slow process with the growth 2σ²/τ.
     """
     white = known.covariance([0.0], [1.0])[:, 0]
-    octaves = 1 + int(np.ceil(np.log(max(_SLOWEST * duration / shortest, 1.0)) / np.log(_RATIO)))
-    times = np.asarray(shortest * _RATIO ** np.arange(octaves), np.float64)
+    times = correlation_times(shortest, max(_SLOWEST * duration, shortest))
     longest = np.array([_LONGEST * duration])
 
     def of(times: FloatArray, variance: FloatArray) -> AxisNoise:
         return AxisNoise(np.zeros(3), np.zeros(3), white * variance, np.asarray(times, np.float64))
 
     return {
-        "bias instability": of(times, np.full(octaves, np.log(_RATIO) / np.pi)),
+        "bias instability": of(times, np.full(len(times), np.log(RATIO) / np.pi)),
         "random walk": of(longest, longest / (2 * duration)),
     }
 
@@ -168,11 +167,11 @@ def _beforehand(priors: Sequence[tuple[float, float]]) -> tuple[FloatArray, Floa
 def _noise_of_scatter(observations: Observations, recording: Recording) -> NoiseModel:
     """Return white noise as the scatter in the poses tells it."""
     poses = observations.poses
-    real = np.asarray(poses.mask)
-    duration = (np.asarray(poses.stop) - np.asarray(poses.start))[real]
+    real = poses.mask
+    duration = (poses.stop - poses.start)[real]
 
     def white(signal: Signal, covariance) -> AxisNoise:
-        scatter = np.diagonal(np.asarray(covariance)[real], axis1=1, axis2=2) / np.square(signal.nominal_scale)
+        scatter = np.diagonal(covariance[real], axis1=1, axis2=2) / np.square(signal.nominal_scale)
         return AxisNoise.of_white(np.mean(scatter * duration[:, None], axis=0))
 
     gyroscope = recording.gyroscope
@@ -197,7 +196,7 @@ def drift_components(
     """
     poses = observations.poses
     real = np.flatnonzero(poses.mask)
-    start, stop = np.asarray(poses.start)[real], np.asarray(poses.stop)[real]
+    start, stop = poses.start[real], poses.stop[real]
     counts = [len(part.intervals) for part in segmentations]
     which = np.repeat(np.arange(len(counts)), counts)
     duration = max(float(part.intervals[-1, 1] - part.intervals[0, 0]) for part in segmentations)
@@ -265,7 +264,7 @@ def restricted_likelihood(
         sizes = np.exp(log_size)
         projector, volume = _projector(bare + np.tensordot(sizes, components, 1), jacobian)
         off = log_size - mean
-        return float(-0.5 * (residual @ projector @ residual + volume + known @ off**2)), projector, np.asarray(sizes)
+        return float(-0.5 * (residual @ projector @ residual + volume + known @ off**2)), projector, sizes
 
     log_size = mean.copy()
     best, projector, sizes = at(log_size)

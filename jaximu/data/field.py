@@ -193,7 +193,7 @@ class FieldWindows:
 
     def field(self, imu: Imu) -> FloatArray:
         """Return the field (n, 3), µT, that a unit's magnetometer makes of each window, in its body frame there."""
-        return np.einsum("nijk,jk->ni", self.along(imu).slope, np.asarray(imu.triads()["magnetometer"].inverse()))
+        return np.einsum("nijk,jk->ni", self.along(imu).slope, imu.triads()["magnetometer"].inverse())
 
     def added(self, imu: Imu) -> FloatArray:
         """Return what the effects of a unit's magnetometer add to each sample's output (n, S, 3), output units."""
@@ -441,7 +441,7 @@ class MagneticField(OfOneUnit):
         rows, kinds = (n, slice(1)) if windows.alone else (4 * n, slice(None))
         used, places = used[:rows], places[:, kinds]
         values = values[:, kinds] * used[places][..., None]
-        inverse = np.linalg.inv(np.asarray(imu.triads()["magnetometer"].gain))
+        inverse = np.linalg.inv(imu.triads()["magnetometer"].gain)
         shaken = BlockFactor(places, values * (windows.noise / np.sqrt(windows.count))[:, None, None] @ inverse)  # pyright: ignore
         turned = _UNITS[1] * (1 + _TURN_SHARE / _UNITS[1] * windows.angle) * length
         sizes = np.concatenate([np.full(n, _UNITS[0]), np.repeat(turned, 2), _UNITS[2] + windows.off])[:rows] * used

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaximu.estimation.data import Handling
+from jaximu.estimation.problem import axis_scales
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu, Triad
@@ -49,19 +50,19 @@ def handling(
     tilts, sigma = _tilts(segmentations, imu, noise.accelerometer)
     tilting[: len(tilts)], spread[: len(tilts)] = np.linalg.norm(tilts, axis=1), sigma
     excess = np.maximum(tilting**2 - 2 * np.where(np.isfinite(spread), spread, 0.0) ** 2, 0.0)
-    off = excess / 2 * ((np.asarray(poses.stop) - np.asarray(poses.start)) / 2) ** 2
+    off = excess / 2 * ((poses.stop - poses.start) / 2) ** 2
     gyroscope = imu.triads()["gyroscope"]
     assert noise.gyroscope is not None
-    scale = np.linalg.norm(np.asarray(gyroscope.gain), axis=1)
+    scale = axis_scales(gyroscope)
     rest = (excess / 2)[:, None] * scale**2
     moving = np.concatenate([np.zeros(count), np.repeat(off[:-1] + off[1:], 2), rest.ravel()])
 
     turned = missed_by_sampling(turns, gyroscope, np.asarray(running))
-    interval = np.asarray(turns.interval)
+    interval = turns.interval
     white = float(np.mean(noise.gyroscope.split(_SHORT)[0]))
     known = white * np.sum(interval, axis=1)
     missed = np.sum(turned**2, axis=1) - 3 * known
-    missed = np.where(np.asarray(turns.mask), np.maximum(missed, 0.0), 0.0)
+    missed = np.where(turns.mask, np.maximum(missed, 0.0), 0.0)
     sampling = np.concatenate([np.zeros(count), np.repeat(missed / 3, 2), np.zeros(3 * count)])
     return Handling(moving, sampling, np.sqrt(excess), spread, np.sqrt(missed), np.sqrt(known))
 
@@ -104,7 +105,7 @@ def bend(turns: Turns) -> FloatArray:
     The mean over an interval h is the rate in its middle and h²/24 of its second derivative, which over a turn about a
     moving axis does not vanish.
     """
-    output, inside = np.asarray(turns.output), np.asarray(turns.interval) > 0
+    output, inside = turns.output, turns.interval > 0
     bent = np.zeros(output.shape)
     bent[:, 1:-1] = (output[:, 2:] - 2 * output[:, 1:-1] + output[:, :-2]) * inside[:, 2:, None] / 24
     return bent
@@ -116,11 +117,11 @@ def moved_by_hand(
     """Return the poses that move, and the turns that are too quick; `undersampling`: share of what samples miss."""
     findings = []
     poses = observations.poses
-    start, stop = np.asarray(poses.start), np.asarray(poses.stop)
-    variance = np.asarray(poses.gyroscope_covariance).diagonal(axis1=1, axis2=2)
-    scale = np.linalg.norm(np.asarray(imu.triads()["gyroscope"].gain), axis=1)
+    start, stop = poses.start, poses.stop
+    variance = poses.gyroscope_covariance.diagonal(axis1=1, axis2=2)
+    scale = axis_scales(imu.triads()["gyroscope"])
     noise = np.sqrt(np.mean(variance / scale**2, axis=1))
-    moving = np.flatnonzero(np.asarray(poses.mask) & (hands.tilting > _SURE * hands.noise) & (hands.tilting > noise))
+    moving = np.flatnonzero(poses.mask & (hands.tilting > _SURE * hands.noise) & (hands.tilting > noise))
     if len(moving):
         worst = moving[np.argmax(hands.tilting[moving])]
         times = [part.recording.accelerometer.time for part in segmentations for _ in part.intervals]
@@ -133,7 +134,7 @@ def moved_by_hand(
                 "them count for less. Put the unit down, or hold it against something solid.",
             )
         )
-    real = np.asarray(observations.turns.mask)
+    real = observations.turns.mask
     expected, known = undersampling * hands.missed / np.sqrt(3), hands.turned
     coarse = real & (expected > 2 * known)
     if undersampling < 1 and np.sum(coarse) > _MANY * np.sum(real):
@@ -189,7 +190,7 @@ def missed_by_sampling(turns: Turns, gyroscope: Triad, running: FloatArray) -> F
     Where sampling is dense enough it is noise. running: the turns' rotations (T, S, 4) after each sample.
     """
     rates = gyroscope.recover_on_host(turns.output)
-    interval = np.asarray(turns.interval)
+    interval = turns.interval
     sign = np.where(np.arange(interval.shape[1]) % 2 == 0, 1.0, -1.0)
     axis = running[..., 1:]
     across = 2 * np.cross(axis, rates)

@@ -494,7 +494,7 @@ def carried(
 def first_field(intervals: MotionIntervals, imu: Imu) -> FloatArray:
     """Return the magnetic field (3,) in the level frame, µT, as the first rest in which it is measured has it."""
     (sighting,) = (sighting for sighting in intervals.sightings if isinstance(sighting, FieldSeen))
-    at = int(np.argmax(np.asarray(sighting.measured) > 0))
+    at = int(np.argmax(sighting.measured > 0))
     part = jax.tree.map(lambda leaf: np.asarray(leaf)[at], intervals)
     before = part.time.shape[-1] - part.length.shape[-1]
     mean = part.length @ part.accelerometer[before:] / part.length.sum()
@@ -502,7 +502,7 @@ def first_field(intervals: MotionIntervals, imu: Imu) -> FloatArray:
     for other in part.sightings:
         if other.absolute and other.measured > 0:
             attitude = other.placed(attitude, Mounting.of(imu))
-    return np.asarray(rotate(attitude, np.asarray(sighting.value)[at]))
+    return np.asarray(rotate(attitude, sighting.value[at]))
 
 
 def sees_earth(errors: Disturbances) -> Bool[Array, ""]:
@@ -536,9 +536,8 @@ def longest_rest(errors: Disturbances) -> float:
     Over T the mean of a process with variance σ² and correlation time τ differs from its end by 2σ²T/3τ, in variance;
     white noise of density N² by N²/T.
     """
-    white, variance = np.asarray(errors.rest), np.asarray(errors.variance)
-    squared = 1.5 * _SHARE * np.asarray(errors.correlation_time)[:, None] * white / variance
-    return float(np.sqrt(squared.min(initial=np.inf)))
+    squared = 1.5 * _SHARE * errors.correlation_time[:, None] * errors.rest / errors.variance
+    return float(np.sqrt(np.min(squared, initial=np.inf)))
 
 
 @dataclass(frozen=True)
@@ -795,8 +794,8 @@ class IntervalsOfMotion(OfOneUnit):
         each kind of sighting (three).
         """
         intervals = self.intervals
-        sighted = [3 * (np.asarray(sighting.measured) > 0) for sighting in intervals.sightings]
-        inner = 6 * np.asarray(intervals.rest) + 3 * np.asarray(intervals.arrival)
+        sighted = [3 * (sighting.measured > 0) for sighting in intervals.sightings]
+        inner = 6 * intervals.rest + 3 * intervals.arrival
         return np.stack([inner, *sighted], axis=1).astype(float)
 
     def filtered(self, imu: Imu) -> Filtered:
@@ -804,7 +803,7 @@ class IntervalsOfMotion(OfOneUnit):
         means = self._means(imu)
         if self.path is None:
             self.path = stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity)
-            self.anchor = np.asarray(self.path.attitude)[1:]
+            self.anchor = self.path.attitude[1:]
         states, absolute = self.errors.states, self._absolute
         for number in range(_ROUNDS):
             rows = self._rows(means)
@@ -832,7 +831,7 @@ class IntervalsOfMotion(OfOneUnit):
 
     def _means(self, imu: Imu) -> _Means:
         """Return the intervals without their samples; nothing is integrated in a rest."""
-        rest = np.asarray(self.intervals.rest) > 0
+        rest = self.intervals.rest > 0
         merged = None
         for kind, chosen in ((_of_motion, ~rest), (_of_rest, rest)):
             rows = np.flatnonzero(chosen)

@@ -18,6 +18,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from jaximu.estimation.problem import axis_scales
 from jaximu.estimation.track import TRIADS
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
@@ -240,7 +241,7 @@ def scheme_stations(
     stimulus = _stimulus(entries, begin, course, float(motion.gravity))
     stimulus = replace(stimulus, time=time, temperature=np.interp(time, motion.temperature_time, motion.temperature))
     turn = np.array([entry.kind == "turn" for entry in entries])
-    scale = [np.linalg.norm(np.asarray(triad.gain), axis=1) for triad in imu.triads().values()]
+    scale = [axis_scales(triad) for triad in imu.triads().values()]
     known = [noise.accelerometer, noise.gyroscope][: len(scale)]
     if known[-1] is None:
         raise NotPossibleError("the noise model has no gyroscope, but the unit has one: record both at rest.")

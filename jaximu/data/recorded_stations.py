@@ -56,6 +56,9 @@ class RecordedStations(OfOneUnit):
     excess_names = EXCESS_NAMES
     coarse = KnownStations.coarse
 
+    def __post_init__(self):
+        self.stations = jax.tree.map(np.asarray, self.stations)
+
     @classmethod
     def of(
         cls,
@@ -113,16 +116,13 @@ class RecordedStations(OfOneUnit):
 
     def rests(self) -> list[FloatArray]:
         """Return the spans of the poses alone."""
-        return [_spans(self.stations, _used(self.stations) & ~np.asarray(self.stations.turn))]
+        return [_spans(self.stations, _used(self.stations) & ~self.stations.turn)]
 
     def observed(self, imu: Imu, details: AtStations) -> Observed:
         """Return the stations, padding included; orientation is compared in poses."""
-        stations, turn = self.stations, np.asarray(self.stations.turn)
-        used = {
-            "accelerometer": np.asarray(stations.accelerometer_used),
-            "gyroscope": np.asarray(stations.gyroscope_used),
-        }
-        middle, real = (np.asarray(stations.start) + np.asarray(stations.stop)) / 2, _used(stations)
+        stations, turn = self.stations, self.stations.turn
+        used = {"accelerometer": stations.accelerometer_used, "gyroscope": stations.gyroscope_used}
+        middle, real = (stations.start + stations.stop) / 2, _used(stations)
         force = np.asarray(stations.stimulus.specific_force).mean(axis=1)
         return Observed(
             lambda triad, shape: output_reaction(triad, shape, used[triad]),
@@ -136,7 +136,7 @@ class RecordedStations(OfOneUnit):
     def without(self, observation: int) -> RecordedStations:
         """Return the recording with a station left out."""
         stations, kept = self.stations, np.arange(len(self.stations.turn)) != observation
-        used = {name: np.asarray(getattr(stations, name)) & kept for name in ("accelerometer_used", "gyroscope_used")}
+        used = {name: getattr(stations, name) & kept for name in ("accelerometer_used", "gyroscope_used")}
         return replace(self, stations=replace(stations, **used))
 
     def rms(self, imu: Imu, details: AtStations, conditions: FloatArray) -> dict[str, tuple[float, str]]:
@@ -163,8 +163,8 @@ class RecordedStations(OfOneUnit):
         force, rate = np.split(outputs.reshape(-1, 6), 2, axis=1)
         return replace(
             self.stations,
-            accelerometer_mean=np.asarray(self.stations.accelerometer_mean) - force,
-            gyroscope_mean=np.asarray(self.stations.gyroscope_mean) - rate,
+            accelerometer_mean=self.stations.accelerometer_mean - force,
+            gyroscope_mean=self.stations.gyroscope_mean - rate,
         )
 
     def _means(self, path: dict[str, Track], outputs: Mapping[str, Array | FloatArray]) -> FloatArray:
@@ -184,23 +184,23 @@ def output_reaction(triad: str, shape: FloatArray, used: NDArray[np.bool_]) -> F
 
 
 def _used(stations: Stations) -> NDArray[np.bool_]:
-    return np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
+    return stations.accelerometer_used | stations.gyroscope_used
 
 
 def _spans(stations: Stations, chosen: NDArray[np.bool_]) -> FloatArray:
-    return np.stack([np.asarray(stations.start)[chosen], np.asarray(stations.stop)[chosen]], axis=1)
+    return np.stack([stations.start[chosen], stations.stop[chosen]], axis=1)
 
 
 def _in_order(stations: Stations) -> NDArray[np.int64]:
     """Return the places of the stations that are used, in the order of time."""
     real = np.flatnonzero(_used(stations))
-    return real[np.argsort(np.asarray(stations.start)[real])]
+    return real[np.argsort(stations.start[real])]
 
 
 def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:
     """Return the station (n,) that each stamp lies in, S where in none."""
     order = _in_order(stations)
-    start, stop = np.asarray(stations.start)[order], np.asarray(stations.stop)[order]
+    start, stop = stations.start[order], stations.stop[order]
     latest = np.maximum(np.searchsorted(start, time, side="right") - 1, 0)
     inside = (time >= start[latest]) & (time < stop[latest])
     return np.where(inside, order[latest], len(stations.turn))
@@ -209,7 +209,7 @@ def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:
 def _path(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track]:
     """Return the stimulus at every sample: in a station as the set-up says, in between as `imu` measured it."""
     count, order = len(stations.turn), _in_order(stations)
-    nodes = jax.tree.map(lambda leaf: np.asarray(leaf)[order].reshape(-1, *np.shape(leaf)[2:]), stations.stimulus)
+    nodes = jax.tree.map(lambda leaf: leaf[order].reshape(-1, *np.shape(leaf)[2:]), stations.stimulus)
     tracks = {}
     for name, known in stimuli(recording, imu).items():
         signal = recording.signals[name]
@@ -219,7 +219,7 @@ def _path(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track
         motion = {field: np.array(getattr(known, field)) for field in ("specific_force", "angular_rate")}
         for field, values in motion.items():
             values[inside] = interpolated(nodes.time, getattr(nodes, field), signal.time[inside])
-        pose = inside & ~np.asarray(stations.turn)[np.minimum(station, count - 1)]
+        pose = inside & ~stations.turn[np.minimum(station, count - 1)]
         motion["specific_force"][pose] = np.asarray(stations.stimulus.specific_force)[station[pose], 0]
         motion["angular_rate"][pose] = 0.0
         acceleration = np.gradient(motion["angular_rate"], signal.time, axis=0)

@@ -23,9 +23,11 @@ from jaximu.recordings.recording import Recording, Signal, recordings_of, same_o
 __all__ = [
     "LEAST_RANGE",
     "RATE_BANDWIDTH",
+    "RATIO",
     "WAYS",
     "Leg",
     "RestBlocks",
+    "correlation_times",
     "folds_of",
     "joined",
     "rest_blocks",
@@ -39,6 +41,8 @@ RATE_BANDWIDTH = 0.578 / TEMPERATURE_WINDOW
 3 (sin x − x cos x) / x³ with x = π f window."""
 WAYS = 4
 """Ways of the temperature from which on they are left out whole."""
+RATIO = 4.0
+"""Of neighbouring correlation times of the processes that make flicker noise."""
 _FOLDS = 8  # parts that are left out in turn, at most
 _MOST_BLOCKS = 600
 _FEWEST_BLOCKS = 30
@@ -507,6 +511,12 @@ def _startup(signal: Signal) -> int:
     return end
 
 
+def correlation_times(shortest: float, longest: float) -> FloatArray:
+    """Return the correlation times (s) of Gauss–Markov processes that together are flicker noise, `RATIO` apart."""
+    count = 1 + int(np.ceil(np.log(longest / shortest) / np.log(RATIO)))
+    return np.asarray(shortest * RATIO ** np.arange(count), np.float64)
+
+
 def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     """Fit white noise, flicker and a random walk to what smooth functions of temperature leave of the blocks.
 
@@ -515,8 +525,7 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     """
     shortest = blocks.duration
     longest = 4 * max(blocks.spans)
-    members = 1 + int(np.ceil(np.log(longest / shortest) / np.log(4.0)))
-    times = np.asarray(shortest * 4.0 ** np.arange(members), np.float64)
+    times = correlation_times(shortest, longest)
     indicator = np.eye(blocks.levels)[blocks.level]
     taken = np.concatenate([indicator, smooth / np.maximum(np.linalg.norm(smooth, axis=0), 1e-300)], axis=1)
     null = scipy.linalg.null_space(taken.T, rcond=1e-9)
@@ -546,7 +555,7 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     for name, fits in tried.items():
         cost, white, variance = (np.stack(values) for values in zip(*fits, strict=True))
         best = np.argmin(cost, axis=0), np.arange(3)
-        usual = _FLICKER**2 * white[best] * shortest * np.log(4.0) / np.pi
+        usual = _FLICKER**2 * white[best] * shortest * np.log(RATIO) / np.pi
         slowly = np.maximum(variance[best], usual[:, None])
         noise[name] = AxisNoise(white[best] * shortest, nothing, slowly, times, longest / 4)
     return NoiseModel(noise["accelerometer"], noise.get("gyroscope"))

@@ -32,8 +32,7 @@ from jaximu.recordings.recording import Recording
 
 __all__ = ["Resting", "RestingConditions"]
 
-_LEVEL = (1.0, 0.1)  # m/s² and rad/s: how far a rest may lie from another, as good as free
-_SMOOTH = (1.0, 0.1)  # m/s² and rad/s: the same of a smooth function of temperature
+_FREE = (1.0, 0.1)  # m/s² and rad/s: how far a rest, or a smooth function of temperature, may lie off, as good as free
 _IN_POSES = ("accel.scale_temperature", "accel.misalignment_temperature")
 _PLACES = 40  # at which a step is sought
 _RESIDUALS = (
@@ -216,7 +215,7 @@ class Resting(OfOneUnit):
         curved = self.curves @ self.curves.T if self.smooth else 0.0
         for triad, name in enumerate(TRIADS):
             noise = blocks.covariance(getattr(self.noise, name))
-            covariance = noise + _LEVEL[triad] ** 2 * same + _SMOOTH[triad] ** 2 * curved
+            covariance = noise + _FREE[triad] ** 2 * (same + curved)
             for axis in range(3):
                 column = 3 * triad + axis
                 whole[:, column, :, column] = covariance[axis] * self._scale[column] ** 2

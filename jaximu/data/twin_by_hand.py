@@ -56,8 +56,8 @@ def twin_recordings(
         )
         up = {int(k): force[row] / gravity for k, row in zip(*np.unique(pose, return_index=True), strict=True)}
         for k in range(first, first + len(part.intervals) - 1):
-            if np.asarray(turns.mask)[k]:
-                inside = np.asarray(samples.sample)[k][np.asarray(turns.interval)[k] > 0]
+            if turns.mask[k]:
+                inside = samples.sample[k][turns.interval[k] > 0]
                 rate[inside] += _correction(attitude[inside], up[k + 1], float(np.sum(turns.interval[k])))
         first += len(part.intervals)
         changed = {}
