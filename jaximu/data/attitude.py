@@ -254,7 +254,6 @@ def evaluated(
     total = jnp.sum(duration.reshape(windows, group), axis=1)
     complete = jnp.all(data.used.reshape(windows, group), axis=1) & (total > 0)
     safe = jnp.where(complete, total, 1.0)
-
     share = upright * (jnp.repeat(complete / safe, group) * data.used)[:, None, None]
 
     def by_window(parts):

@@ -263,20 +263,7 @@ def windows_of(
     index = np.minimum(edges[:-1, None] + np.arange(count.max()), stops[:, None] - 1)
     weight = (np.arange(count.max()) < count[:, None]) / count[:, None]
     centre = (time[edges[:-1]] + time[stops - 1]) / 2
-    if gyroscope is None:
-        turned = np.broadcast_to(np.eye(3), (*index.shape, 3, 3))
-        carried, angle = np.broadcast_to(np.eye(3), (len(centre), 3, 3)), np.zeros(len(centre))
-        swept = np.zeros((len(centre), 3, 3))
-    else:
-        attitude, turned_until = _carried(gyroscope)
-        middle = attitude(centre)
-        frames = attitude(time[index.ravel()]).as_matrix().reshape(*index.shape, 3, 3)
-        turned = np.einsum("nji,nsjk->nsik", middle.as_matrix(), frames)
-        step = middle[:-1].inv() * middle[1:]
-        carried = np.concatenate([step.as_matrix(), np.eye(3)[None]])
-        angle = np.append(step.magnitude(), 0.0)
-        swept = np.zeros((len(centre), 3, 3))
-        swept[:-1] = middle[:-1].inv().as_matrix() @ np.diff(turned_until(centre), axis=0)
+    turned, carried, swept, angle = _frames(gyroscope, centre, time[index])
     with_one = np.concatenate([values[index], np.ones((*index.shape, 1))], axis=2)
     slope = np.einsum("ns,nsij,nsk->nijk", weight, turned, with_one)
     up, off = np.zeros((len(centre), 3)), np.ones(len(centre))
@@ -290,13 +277,13 @@ def windows_of(
     warm, flow = (known[name][..., 0] if name in known else None for name in ("temperature", "current"))
     stimulus = Stimulus(time=time[index], temperature=warm, current=flow, angular_rate=known.get("gyroscope"))  # pyright: ignore
     window = np.where(weight > 0, np.arange(len(count))[:, None], len(count))
-    samples = FieldSamples(values[index], np.array(turned), Track(stimulus, window))
+    samples = FieldSamples(values[index], turned, Track(stimulus, window))
     everywhere = np.ones(len(centre), bool)
     following = np.append(everywhere[1:], False)
     return FieldWindows(
         (weight[:, :, None] * values[index]).sum(axis=1),
         slope,
-        np.array(carried),
+        carried,
         swept,
         up,
         off,
@@ -311,6 +298,29 @@ def windows_of(
         samples,
         np.zeros((12, 12)) if vertical is None else vertical,
     )
+
+
+def _frames(
+    gyroscope: Signal | None, centre: FloatArray, times: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return how windows stand, by the gyroscope: none of them turns without one.
+
+    Rotations (n, S, 3, 3) from the samples' frames at `times` to the windows' at their `centre`, then (n, 3, 3) from
+    the next window's to each one's, how that turns with the rate (s), and by how much it turns (n,), rad.
+    """
+    count = len(centre)
+    turned, carried = (np.array(np.broadcast_to(np.eye(3), (*size, 3, 3))) for size in (times.shape, (count,)))
+    swept, angle = np.zeros((count, 3, 3)), np.zeros(count)
+    if gyroscope is not None:
+        attitude, turned_until = _carried(gyroscope)
+        middle = attitude(centre)
+        back = middle.inv()
+        frames = attitude(times.ravel()).as_matrix().reshape(turned.shape)
+        turned = np.einsum("nij,nsjk->nsik", back.as_matrix(), frames)
+        step = back[:-1] * middle[1:]
+        carried[:-1], angle[:-1] = step.as_matrix(), step.magnitude()
+        swept[:-1] = back[:-1].as_matrix() @ np.diff(turned_until(centre), axis=0)
+    return turned, carried, swept, angle
 
 
 def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> NDArray[np.int64]:

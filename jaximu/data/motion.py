@@ -384,19 +384,24 @@ def _rows(
     )
     beginning = carrying._replace(before=0.0, after=jnp.concatenate([by_end, none], axis=1), shared=0.0, right=-miss)
     process = jax.tree.map(partial(jnp.where, (part.restart > 0) & (part.real > 0)), beginning, carrying)
-    duration = jnp.where(part.real > 0, means.duration, 1.0)
-    kept = jnp.exp(-duration / errors.correlation_time)
-    variance = errors.variance * -jnp.expm1(-2 * duration / errors.correlation_time)[:, None]
-    white = 1 / jnp.sqrt(variance).reshape(-1)
-    wander = WhiteRows(
-        jnp.pad(jnp.diag(-white * jnp.repeat(kept, 6)), ((0, 0), (6, 0))),
-        jnp.pad(jnp.diag(white), ((0, 0), (6, 0))),
-        jnp.zeros((drifts, by_number.shape[1] + 1)),
-        jnp.zeros(drifts),
-    )
+    wander = _wandering(jnp.where(part.real > 0, means.duration, 1.0), errors, by_number.shape[1] + 1)
     rows = [process, wander, _measured(means, part, errors, gravity, after, size)]
     rows += [_sighted(means, part, sighting, errors, gravity, after, size) for sighting in part.sightings]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *rows)
+
+
+def _wandering(duration: Array, errors: Disturbances, numbers: int) -> WhiteRows:
+    """Return the rows of the drift, which dies away and is driven by noise over an interval."""
+    drifts = errors.variance.size
+    kept = jnp.exp(-duration / errors.correlation_time)
+    variance = errors.variance * -jnp.expm1(-2 * duration / errors.correlation_time)[:, None]
+    white = 1 / jnp.sqrt(variance).reshape(-1)
+    return WhiteRows(
+        jnp.pad(jnp.diag(-white * jnp.repeat(kept, 6)), ((0, 0), (6, 0))),
+        jnp.pad(jnp.diag(white), ((0, 0), (6, 0))),
+        jnp.zeros((drifts, numbers)),
+        jnp.zeros(drifts),
+    )
 
 
 def _measured(
@@ -646,40 +651,40 @@ def cut(
     around = np.clip(around, 0, np.minimum(end + beyond, len(time))[:, None] - 1)
     rest_follows = np.append(rest[1:], False)
     arrival = ~rest & ~restart & rest_follows
-
-    def padded(values, mode: Any = "constant"):
-        """Return values of intervals up to a bucket's number: zeros, or with mode "edge" the last one again."""
-        missing = [(0, _bucket(count, 64) - count), *[(0, 0)] * (np.ndim(values) - 1)]
-        return np.pad(np.asarray(values, float), missing, mode=mode)
-
-    sightings, ends = [], padded(edges[end])
+    sightings, ends = [], _padded(edges[end])
     if field is not None:
         final = rest & ~rest_follows  # intervals that end a rest, in the order of rests
         value, known = np.zeros((count, 3)), np.zeros(count)
         value[final], known[final] = _mean_field(field, time[resting[:, 0]], time[resting[:, 1] - 1])
-        sightings.append(FieldSeen(ends, ends, padded(known), padded(value)))
+        sightings.append(FieldSeen(ends, ends, _padded(known), _padded(value)))
     if attitude is not None:  # in a rest any stamp will do; in motion one in the last sample
         latest = np.searchsorted(marks, edges[end], side="right") - 1
         since = np.where(rest, edges[begin], edges[end - 1])
         measured = (latest >= 0) & (marks[latest] > since) & ~arrival & ~restart
-        at = padded(attitude.time[latest]), ends, padded(measured)
-        sightings.append(AttitudeSeen(*at, padded(attitude.quaternion[latest], "edge")))
+        at = _padded(attitude.time[latest]), ends, _padded(measured)
+        sightings.append(AttitudeSeen(*at, _padded(attitude.quaternion[latest], "edge")))
         if (velocity := attitude.velocities()) is not None:
-            sightings.append(VelocitySeen(*at, padded(velocity[latest])))
+            sightings.append(VelocitySeen(*at, _padded(velocity[latest])))
     at_samples = around[:, beyond:]
     intervals = MotionIntervals(
-        padded(force[around], "edge"),
-        padded(gyroscope.values[around], "edge"),
-        padded(np.where(inside, np.diff(edges)[at_samples], 0.0)),
-        padded(time[around]),
-        padded(rest),
-        padded(arrival),
-        padded(restart),
-        padded((lost[at_samples] * inside).sum(axis=1)),
-        padded(np.ones(count)),
+        _padded(force[around], "edge"),
+        _padded(gyroscope.values[around], "edge"),
+        _padded(np.where(inside, np.diff(edges)[at_samples], 0.0)),
+        _padded(time[around]),
+        _padded(rest),
+        _padded(arrival),
+        _padded(restart),
+        _padded((lost[at_samples] * inside).sum(axis=1)),
+        _padded(np.ones(count)),
         tuple(sightings),
     )  # pyright: ignore[reportArgumentType]
     return intervals, notes
+
+
+def _padded(values, mode: Any = "constant") -> FloatArray:
+    """Return values of intervals up to a bucket's number: zeros, or with mode "edge" the last one again."""
+    missing = [(0, _bucket(len(values), 64) - len(values)), *[(0, 0)] * (np.ndim(values) - 1)]
+    return np.pad(np.asarray(values, float), missing, mode=mode)
 
 
 def _mean_field(field: Signal, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:

@@ -8,6 +8,7 @@ and turns that are too quick to be followed by integration still count. NumPy, h
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray
@@ -55,13 +56,7 @@ def shared_stations(
         stimulus = Stimulus(force, rate, angular_acceleration=0 * rate, time=span)
         weight = np.full(span.shape, 0.5)
     else:
-        edges = np.concatenate([[2 * time[0] - time[1]], time, [2 * time[-1] - time[-2]]])
-        edges = (edges[1:] + edges[:-1]) / 2
-        begin = np.searchsorted(edges, start, side="right") - 1 - _MARGIN
-        nodes = int(np.ceil(np.max(stop - start) * gyroscope.rate - 1e-6)) + 2 * _MARGIN + 1
-        index = np.clip(begin, 0, len(time) - nodes)[:, None] + np.arange(nodes)
-        held = np.minimum(edges[index + 1], stop[:, None]) - np.maximum(edges[index], start[:, None])
-        held = np.maximum(held, 0.0)
+        index, held = _held(time, span, gyroscope.rate)
         weight = held / held.sum(axis=1, keepdims=True)
         turning = np.gradient(rate, time, axis=0)
         stimulus = Stimulus(force[index], rate[index], angular_acceleration=turning[index], time=time[index])
@@ -85,3 +80,14 @@ def shared_stations(
         used,
         np.asarray(gravity),
     )  # pyright: ignore
+
+
+def _held(time: FloatArray, span: FloatArray, rate: float) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return which samples lie in each span, some beside it included, and how long each holds in it (S, Q), s."""
+    edges = np.concatenate([[2 * time[0] - time[1]], time, [2 * time[-1] - time[-2]]])
+    edges = (edges[1:] + edges[:-1]) / 2
+    begin = np.searchsorted(edges, span[:, 0], side="right") - 1 - _MARGIN
+    nodes = int(np.ceil(np.max(np.diff(span)) * rate - 1e-6)) + 2 * _MARGIN + 1
+    index = np.clip(begin, 0, len(time) - nodes)[:, None] + np.arange(nodes)
+    held = np.minimum(edges[index + 1], span[:, 1:]) - np.maximum(edges[index], span[:, :1])
+    return index, np.maximum(held, 0.0)

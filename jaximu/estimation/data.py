@@ -52,7 +52,7 @@ class Conditions(eqx.Module):
 
     def at_magnitude(self, magnitude: Float[Array, ""]) -> Self:
         """Return the same with another magnitude."""
-        return eqx.tree_at(lambda conditions: conditions.magnitude, self, magnitude)  # pyright: ignore[reportAttributeAccessIssue]
+        return replace(self, magnitude=magnitude)  # pyright: ignore[reportCallIssue]
 
 
 @dataclass(frozen=True)

@@ -388,7 +388,7 @@ class _Unit(NamedTuple):
 
         def of_magnitude(magnitude):
             moved = tuple(kind.at_magnitude(magnitude) for kind in self.conditions)
-            return eqx.tree_at(lambda p: p.conditions, problem, moved).objective(z)[0]
+            return replace(problem, conditions=moved).objective(z)[0]
 
         magnitude = self.conditions[0].magnitude  # pyright: ignore[reportAttributeAccessIssue]
         slope = jax.jvp(of_magnitude, (magnitude,), (jnp.ones_like(magnitude),))[1]
@@ -454,8 +454,7 @@ def _run(
     def batch(like, parameters, references, sizes, units):
         def lane(item):
             reference, size, unit = item
-            placed = eqx.tree_at(lambda p: (p.reference, p.size), parameters, (reference, size))
-            return one(how, like, placed, unit)
+            return one(how, like, replace(parameters, reference=reference, size=size), unit)
 
         lanes = None if jax.default_backend() == "cpu" else count
         return jax.lax.map(lane, (references, sizes, units), batch_size=lanes)
