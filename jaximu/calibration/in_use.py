@@ -22,6 +22,7 @@ from jaximu.calibration.systematic import (
     places_of,
     seen_from_outside,
 )
+from jaximu.data.gravity_direction import level
 from jaximu.data.motion import (
     FARTHEST_UNSEEN,
     LONGEST_MOTION,
@@ -31,7 +32,6 @@ from jaximu.data.motion import (
     carried,
     first_knowledge,
     interval_rows,
-    level,
     turned,
 )
 from jaximu.data.sightings import AttitudeSeen, FieldSeen, Sighting, VelocitySeen

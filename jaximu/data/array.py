@@ -8,9 +8,8 @@ the units' own conditions. With them the conditions are as many as there are mea
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,10 +19,11 @@ from jaximu.data.gravity_direction import across, unit_vectors
 from jaximu.data.poses import EXCESS_NAMES, HandHeldConditions, condense
 from jaximu.data.poses_covariance import turn_noise
 from jaximu.estimation.covariance import Covariance, mean_root
-from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.data import About, Conditions, OfOneUnit
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix
+from jaximu.ground.tracing import first
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
@@ -37,10 +37,10 @@ IN_COMMON = "turns, in common"
 class SharedConditions(Conditions):
     """Conditions of U units: each one's own, then gravity's direction and the turns about it against the first's.
 
-    own: stacked. basis: two directions across gravity in each pose, in the first unit's axes.
+    separate: stacked. basis: two directions across gravity in each pose, in the first unit's axes.
     """
 
-    own: HandHeldConditions
+    separate: HandHeldConditions
     basis: Float[Array, "P 2 3"]
     magnitude: Float[Array, ""]
 
@@ -48,21 +48,22 @@ class SharedConditions(Conditions):
         """Return each unit's conditions, directions (rad), two a pose and other unit, and turns (rad), one each."""
         assert isinstance(imu, Board)
         units = _stacked(imu)
-        own = self.own.at_magnitude(jnp.broadcast_to(self.magnitude, self.own.magnitude.shape))
-        alone = jax.vmap(lambda conditions, unit: conditions(unit))(own, units)
-        up = unit_vectors(jax.vmap(HandHeldConditions.forces)(own, units))
-        turned = jax.vmap(HandHeldConditions.rotations)(own, units)
+        separate = self.separate.at_magnitude(jnp.broadcast_to(self.magnitude, self.separate.magnitude.shape))
+        alone = jax.vmap(lambda conditions, unit: conditions(unit))(separate, units)
+        up = unit_vectors(jax.vmap(HandHeldConditions.forces)(separate, units))
+        turned = jax.vmap(HandHeldConditions.rotations)(separate, units)
         mounted = exponential(_mountings(imu))[:, None]
         poses, turns = up.shape[1], turned.shape[1]
-        said = rotate(jnp.broadcast_to(mounted, (*up[1:].shape[:2], 4)), up[1:])
-        leaning = jax.vmap(lambda other: across(self.basis, other - up[0]))(said)
+        others_up = rotate(jnp.broadcast_to(mounted, (*up[1:].shape[:2], 4)), up[1:])
+        leaning = jax.vmap(lambda other: across(self.basis, other - up[0]))(others_up)
         mounted = jnp.broadcast_to(mounted, turned[1:].shape)
-        there = multiply(multiply(mounted, turned[1:]), conjugate(mounted))
-        first = jnp.broadcast_to(conjugate(turned[0]), there.shape)
-        twisted = jnp.sum(logarithm(multiply(first, there)) * up[0, 1:], axis=-1)
-        pose, turn = (self.own.pose[1:] & self.own.pose[0]), (self.own.turn[1:] & self.own.turn[0])
-        leaning = jnp.where(pose[..., None], leaning, 0.0).reshape(len(said) * poses * 2)
-        return jnp.concatenate([alone.reshape(-1), leaning, jnp.where(turn, twisted, 0.0).reshape(len(said) * turns)])
+        others_turned = multiply(multiply(mounted, turned[1:]), conjugate(mounted))
+        first_back = jnp.broadcast_to(conjugate(turned[0]), others_turned.shape)
+        twisted = jnp.sum(logarithm(multiply(first_back, others_turned)) * up[0, 1:], axis=-1)
+        pose, turn = (mask[1:] & mask[0] for mask in (self.separate.pose, self.separate.turn))
+        leaning = jnp.where(pose[..., None], leaning, 0.0).reshape(len(leaning) * poses * 2)
+        twisted = jnp.where(turn, twisted, 0.0).reshape(len(twisted) * turns)
+        return jnp.concatenate([alone.reshape(-1), leaning, twisted])
 
 
 def _stacked(board: Board) -> Imu:
@@ -76,7 +77,7 @@ def _mountings(board: Board) -> Float[Array, "U-1 3"]:
 
 
 @dataclass
-class UnitsOnOneBody(Data):
+class UnitsOnOneBody(OfOneUnit):
     """Observations of U units along a leading axis, cut at the same rests.
 
     Components of the excess: those of poses and turns, as many times each unit's own noise, alike for all units; and
@@ -89,12 +90,10 @@ class UnitsOnOneBody(Data):
     excess_names = (*EXCESS_NAMES, IN_COMMON)
     coarse = (0.0,) * 4
 
-    def about(self, imu: Imu) -> About:
-        """Return the conditions about one board, the leading axis of length one."""
-        board = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
-        found = stored.call(_about, "units on one body", board, self.observations)
-        conditions, covariance = jax.tree.map(lambda leaf: leaf[None], found)
-        return About(conditions, covariance, np.zeros((*covariance.used.shape, 0)))
+    def about_one(self, imu: Imu) -> About:
+        """Return the conditions about one board."""
+        conditions, covariance = stored.call(_about, "units on one body", imu, self.observations)
+        return About(conditions, covariance, np.zeros((len(covariance.used), 0)))
 
 
 def _about(board: Board, observations: Observations) -> tuple[SharedConditions, Covariance]:
@@ -104,33 +103,38 @@ def _about(board: Board, observations: Observations) -> tuple[SharedConditions, 
         conditions, covariance, whole, _ = condense(*unit)
         return conditions, covariance.used, covariance.group, turn_noise(unit[0].gyroscope, unit[1].turns, whole)
 
-    own, used, group, noise = jax.lax.map(lane, (_stacked(board), observations))
-    up = unit_vectors(own.forces(jax.tree.map(lambda leaf: leaf[0], _stacked(board)))[0])
+    separate, used, group, noise = jax.lax.map(lane, (_stacked(board), observations))
+    up = unit_vectors(separate.forces(first(_stacked(board)))[0])
     basis = jnp.linalg.svd(up[:, None, :])[2][:, 1:, :]
-    conditions = SharedConditions(own, basis, observations.gravity[0])
+    conditions = SharedConditions(separate, basis, observations.gravity[0])
     poses, turns = observations.poses, observations.turns
     units, count, steps = (*poses.mask.shape, turns.mask.shape[1])
-    pose, turn = poses.mask[1:] & poses.mask[0], turns.mask[1:] & turns.mask[0]
+    pose, turn = (mask[1:] & mask[0] for mask in (poses.mask, turns.mask))
     used = jnp.concatenate([used.reshape(-1), jnp.repeat(pose.reshape(-1), 2), turn.reshape(-1)]).astype(float)
     group = jnp.concatenate([group.reshape(-1), jnp.zeros(2 * pose.size, int), jnp.ones(turn.size, int)])
 
     def moved(change):
         means, rests, last = change
-        turned = multiply(own.rotation, exponential(last))
-        outputs = own.accelerometer_mean + means, own.gyroscope_mean + rests, turned
-        changed = eqx.tree_at(lambda c: (c.accelerometer_mean, c.gyroscope_mean, c.rotation), own, outputs)
-        return eqx.tree_at(lambda each: each.own, conditions, changed)(board)
+        changed = replace(
+            separate,
+            accelerometer_mean=separate.accelerometer_mean + means,
+            gyroscope_mean=separate.gyroscope_mean + rests,
+            rotation=multiply(separate.rotation, exponential(last)),
+        )
+        return replace(conditions, separate=changed)(board)
 
     none = jnp.zeros((units, count, 3)), jnp.zeros((units, count, 3)), jnp.zeros((units, steps, 3))
-    means, rests, last = (used[:, None, None, None] * each for each in jax.jacfwd(moved)(none))
-    spreads = (poses.accelerometer_covariance, noise, poses.gyroscope_covariance)
-    reactions, masks = (means, last, rests), (poses.mask, turns.mask, poses.mask)
-    measured = sum(jnp.einsum("nupi,upij,mupj->nm", each, spread * mask[..., None, None], each)
-                   for each, spread, mask in zip(reactions, spreads, masks, strict=True))  # fmt: skip
-    factors = []
-    for each, spread, mask in zip(reactions, spreads, masks, strict=True):
-        roots = jax.vmap(mean_root)(spread, mask)
-        factors.append(jnp.einsum("nupi,uij->nupj", each, roots).reshape(len(used), -1))
+    means, rests, last = (used[:, None, None, None] * slopes for slopes in jax.jacfwd(moved)(none))
+    measured, factors = 0.0, []
+    for reaction, covariance, mask in (
+        (means, poses.accelerometer_covariance, poses.mask),
+        (last, noise, turns.mask),
+        (rests, poses.gyroscope_covariance, poses.mask),
+    ):
+        real = covariance * mask[..., None, None]
+        measured += jnp.einsum("nupi,upij,mupj->nm", reaction, real, reaction)
+        roots = jax.vmap(mean_root)(covariance, mask)
+        factors.append(jnp.einsum("nupi,uij->nupj", reaction, roots).reshape(len(used), -1))
     back = jnp.concatenate([jnp.eye(3)[None], rotation_matrix(exponential(_mountings(board))).swapaxes(1, 2)])
     together = jnp.einsum("nuti,uij,jk->ntk", last, back, mean_root(noise[0], turns.mask[0]))
     return conditions, Covariance(measured, (*factors, together.reshape(len(used), -1)), used, group)

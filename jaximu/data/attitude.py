@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,12 +23,13 @@ from numpy.typing import NDArray
 
 from jaximu.data.preintegration import linear_slope, preintegrate_samples, white_covariance
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.data import About, Conditions, Data, Observed, free_columns
+from jaximu.estimation.data import About, Conditions, Observed, OfOneUnit, free_columns
 from jaximu.estimation.problem import Parameters
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
-from jaximu.estimation.track import Track, added, stimuli
+from jaximu.estimation.track import TRIADS, Track, added, stimuli
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.rotation import (
     conjugate,
     exponential,
@@ -45,7 +47,8 @@ from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
-from jaximu.recordings.recording import Recording, Signal, smoothed_slope
+from jaximu.recordings.recording import Recording, smoothed_slope
+from jaximu.recordings.reference import Integral
 
 __all__ = [
     "EXCESS_NAMES",
@@ -66,7 +69,6 @@ RESIDUALS = (
     ResidualKind("specific_force", "specific force against gravity", "m/s^2", 3),
     ResidualKind("rotation", "rate against the reference", "rad/s", 3),
 )
-_TRIADS = ("accelerometer", "gyroscope")
 _KNOWN = 0.03
 """Share of `_UNITS` that white noise has at the least, where no recording at rest tells it."""
 INTERVALS = 192
@@ -104,8 +106,7 @@ class AttitudeConditions(Conditions):
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of the rotations (rad) and of the mean forces (m/s²)."""
-        assert imu.gyroscope is not None
-        change = imu.gyroscope.inverse() - self.linear
+        change = imu.triads()["gyroscope"].inverse() - self.linear
         moved = jnp.einsum("tijk,jk->ti", self.slope, change)
         error = logarithm(multiply(conjugate(self.target), multiply(self.rotation, exponential(moved))))
         force = jnp.einsum("wijk,jk->wi", self.force, imu.accelerometer.inverse()) - self.gain
@@ -124,9 +125,7 @@ class Reactions(eqx.Module):
     reaction: Float[Array, "T S 6 6"]
     sample: Int[Array, "T S"]
 
-    def react(
-        self, force: Float[Array, "m 3 k"], rate: Float[Array, "m 3 k"], windows: int
-    ) -> Float[Array, "n k"]:  # fmt: skip
+    def react(self, force: Float[Array, "m 3 k"], rate: Float[Array, "m 3 k"], windows: int) -> Float[Array, "n k"]:
         """Return how the conditions react to additions to the specific force and to the rate at every sample."""
         both = jnp.einsum("tsij,tsjk->tik", self.reaction, jnp.concatenate([rate, force], axis=1)[self.sample])
         turned, pushed = both[:, :3], both[:, 3:]
@@ -150,7 +149,7 @@ class AttitudeDetails:
     def tracks(self) -> list[dict[str, Track]]:
         """What the unit went through at the gyroscope's samples, the accelerometer's included: one observation."""
         stimulus = self.measurement.around(self.imu)
-        return [dict.fromkeys(_TRIADS, Track.padded(stimulus, np.zeros(len(np.asarray(stimulus.time)), np.int64), 1))]
+        return [dict.fromkeys(TRIADS, Track.padded(stimulus, np.zeros(len(np.asarray(stimulus.time)), np.int64), 1))]
 
 
 class Intervals(eqx.Module):
@@ -176,20 +175,14 @@ class Intervals(eqx.Module):
 
 def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Array, "k 4"]:
     """Return the rotations by which the unit stands behind what a smoothed reference says, at times of the log."""
-    assert imu.gyroscope is not None
-    time, matrix = (data.since + data.until) / 2, imu.gyroscope.inverse()[:, :3]
-    acceleration, jerk = (
-        jnp.stack([jnp.interp(stamps, time, axis) for axis in slope.T], axis=-1) @ matrix.T
-        for slope in (data.slope, data.curve)
-    )
+    time, matrix = (data.since + data.until) / 2, imu.triads()["gyroscope"].inverse()[:, :3]
+    acceleration, jerk = (interpolated(time, slope, stamps) @ matrix.T for slope in (data.slope, data.curve))
     return exponential(behind(Mounting.of(imu).filter_variance, acceleration, jerk))
 
 
 def reference_sigmas(excess: Mapping[str, float]) -> tuple[float, float]:
     """Return the noise of a reference's attitude (rad) and velocity (m/s), each axis, from a fit's excess by name."""
-    attitude, velocity = (
-        _UNITS[component] * float(np.sqrt(excess[EXCESS_NAMES[component]])) for component in (1, 4)
-    )  # fmt: skip
+    attitude, velocity = (_UNITS[k] * float(np.sqrt(excess[EXCESS_NAMES[k]])) for k in (1, 4))
     return attitude, velocity
 
 
@@ -207,11 +200,14 @@ def _added(imu: Imu, data: Intervals, around: Stimulus | None) -> tuple[Array, A
         turning = bare.gyroscope.recover(data.rate - rate)  # pyright: ignore[reportOptionalMemberAccess]
         inner = (turning[2:] - turning[:-2]) / (time[2:] - time[:-2])[:, None]
         stimulus = replace(
-            around, specific_force=bare.accelerometer.recover(data.force - force), angular_rate=turning, time=time,
+            around,
+            specific_force=bare.accelerometer.recover(data.force - force),
+            angular_rate=turning,
+            time=time,
             angular_acceleration=jnp.concatenate([inner[:1], inner, inner[-1:]]),
-        )  # fmt: skip
-        outputs = added(unit, dict.fromkeys(_TRIADS, Track(stimulus, jnp.zeros(len(time), int))))
-        force, rate = (outputs[name] for name in _TRIADS)
+        )
+        outputs = added(unit, dict.fromkeys(TRIADS, Track(stimulus, jnp.zeros(len(time), int))))
+        force, rate = (outputs[name] for name in TRIADS)
     return force, rate
 
 
@@ -221,9 +217,13 @@ def _recorded(imu: Imu) -> tuple[Effect, ...]:
 
 
 def evaluated(
-    imu: Imu, data: Intervals, around: Stimulus | None, samples: Int[Array, "T S"], noise: Float[Array, "3 3"],
+    imu: Imu,
+    data: Intervals,
+    around: Stimulus | None,
+    samples: Int[Array, "T S"],
+    noise: Float[Array, "3 3"],
     group: int,
-):  # fmt: skip
+):
     """Return the conditions about a unit, rotations' white noise (T, 3, 3), times (T,), and reactions.
 
     Reactions: of a window's mean force to the rotation vector by which the reference stands wrong at an interval's
@@ -233,15 +233,14 @@ def evaluated(
     some beside it; `noise`: density of the gyroscope's, output² s; `group`: intervals to a window of the force.
     """
     bare = imu.with_effects()
-    assert bare.gyroscope is not None
-    mounting = Mounting.of(imu)
+    gyroscope, mounting = bare.triads()["gyroscope"], Mounting.of(imu)
     force, rate = _added(imu, data, around)
     stamps = mounting.on_log(data.stamp)
     held = jnp.minimum(data.until[samples], stamps[1:, None]) - jnp.maximum(data.since[samples], stamps[:-1, None])
     held = jnp.maximum(held, 0.0) / (1 + mounting.clock_scale)  # of the reference's time, in which rates are meant
     turning, sensed = (data.rate - rate)[samples], (data.force - force)[samples]
-    whole = preintegrate_samples(bare.gyroscope.recover(turning), bare.accelerometer.recover(sensed), held)
-    inverse = bare.gyroscope.inverse()[:, :3]
+    whole = preintegrate_samples(gyroscope.recover(turning), bare.accelerometer.recover(sensed), held)
+    inverse = gyroscope.inverse()[:, :3]
     spread = white_covariance(whole.reaction[..., :3, :3], inverse @ noise @ inverse.T, held)
     true = multiply(multiply(data.attitude, mounting.turned), _smoothed(imu, data, stamps))
     before, after = true[:-1], true[1:]
@@ -255,7 +254,6 @@ def evaluated(
     total = jnp.sum(duration.reshape(windows, group), axis=1)
     complete = jnp.all(data.used.reshape(windows, group), axis=1) & (total > 0)
     safe = jnp.where(complete, total, 1.0)
-
     share = upright * (jnp.repeat(complete / safe, group) * data.used)[:, None, None]
 
     def by_window(parts):
@@ -263,9 +261,17 @@ def evaluated(
 
     gained = rotate(mounting.tilted, jnp.sum(data.velocity.reshape(windows, group, 3), axis=1))
     conditions = AttitudeConditions(
-        whole.rotation, target, turn_slope, bare.gyroscope.inverse(), by_window(slope), by_window(swung),
-        gained / safe[:, None] - by_window(sculled), data.used, complete, data.gravity,
-    )  # fmt: skip
+        whole.rotation,
+        target,
+        turn_slope,
+        gyroscope.inverse(),
+        by_window(slope),
+        by_window(swung),
+        gained / safe[:, None] - by_window(sculled),
+        data.used,
+        complete,
+        data.gravity,
+    )
     leaning = share @ jnp.cross(jnp.eye(3), whole.velocity[:, None]).swapaxes(1, 2)
     turned = whole.reaction[..., :3, :] * data.used[:, None, None, None]
     reaction = jnp.concatenate([turned, share[:, None] @ whole.reaction[..., 3:6, :]], axis=-2)
@@ -284,7 +290,7 @@ def shared_ends(back: Float[Array, "T 3 3"]) -> Float[Array, "3*T 3*(T+1)"]:
 
 
 @dataclass(frozen=True)
-class AgainstAttitude(Data):
+class AgainstAttitude(OfOneUnit):
     """One recording of a unit against a measured attitude, whose zero of time is the recording's (`offset`, s, later).
 
     noise: of the unit at rest, where known. left_out: windows of the force that do not count, with their rotations.
@@ -304,39 +310,41 @@ class AgainstAttitude(Data):
     @cached_property
     def intervals(self) -> Intervals:
         """What was recorded, the reference thinned to some two hundred intervals."""
-        recording, attitude = self.recording, self.attitude
-        gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
-        assert gyroscope is not None
-        middle, period = (gyroscope.time[1:] + gyroscope.time[:-1]) / 2, 1 / gyroscope.rate
-        edges = np.concatenate([[gyroscope.time[0] - period / 2], middle, [gyroscope.time[-1] + period / 2]])
-        force = np.stack([np.interp(gyroscope.time, accelerometer.time, axis) for axis in accelerometer.values.T], 1)
+        attitude, (accelerometer, gyroscope) = self.attitude, map(self.recording.signals.__getitem__, TRIADS)
+        time, edges = gyroscope.time, Integral(gyroscope, gyroscope.values).edges
         stamps = attitude.time + self.offset
         knots, group = self._knots
         count = len(knots) - 1
         size = -(-count // (_WINDOWS * group)) * _WINDOWS * group
-        gaps = np.concatenate([[0], np.cumsum(np.diff(gyroscope.time) > 2.5 * period)])
-        holes = np.concatenate([[0], np.cumsum((np.diff(attitude.time) > 2.5 * attitude.period)
-                                               | np.isnan(attitude.turned()).any(axis=1))])  # fmt: skip
-        at = np.interp(stamps[knots], gyroscope.time, gaps)
-        used = (np.diff(at) == 0) & (np.diff(holes[knots]) == 0)
+        gaps = np.concatenate([[0], np.cumsum(np.diff(time) > 2.5 / gyroscope.rate)])
+        missing = (np.diff(attitude.time) > 2.5 * attitude.period) | np.isnan(attitude.turned()).any(axis=1)
+        holes = np.concatenate([[0], np.cumsum(missing)])
+        used = (np.diff(np.interp(stamps[knots], time, gaps)) == 0) & (np.diff(holes[knots]) == 0)
         used &= ~np.isin(np.arange(count) // group, self.left_out)
         velocity = attitude.velocities()
         gained = np.zeros((size, 3))
         if velocity is not None:
             gained[:count] = np.diff(velocity[knots], axis=0)
-        last = np.full(size + 1 - len(knots), knots[-1])
-        places = np.concatenate([knots, last])
-        slope, curve = _slopes(gyroscope.time, gyroscope.values)
+        knots = np.pad(knots, (0, size - count), mode="edge")
+        slope, curve = _slopes(time, gyroscope.values)
         return Intervals(
-            gyroscope.values, slope, curve, force, edges[:-1], edges[1:], stamps[places],
-            attitude.quaternion[places], gained, np.pad(used, (0, size - count)), np.float64(self.gravity),
-        )  # pyright: ignore # fmt: skip
+            gyroscope.values,
+            slope,
+            curve,
+            interpolated(accelerometer.time, accelerometer.values, time),
+            edges[:-1],
+            edges[1:],
+            stamps[knots],
+            attitude.quaternion[knots],
+            gained,
+            np.pad(used, (0, size - count)),
+            np.float64(self.gravity),
+        )  # pyright: ignore
 
     @cached_property
     def _knots(self) -> tuple[NDArray[np.int64], int]:
         """Rows of the reference between which the intervals lie, and how many intervals make a window of the force."""
-        gyroscope, attitude = self.recording.gyroscope, self.attitude
-        assert gyroscope is not None
+        gyroscope, attitude = self.recording.signals["gyroscope"], self.attitude
         margin, stamps = 3 / gyroscope.rate, attitude.time + self.offset
         rows = np.flatnonzero((stamps > gyroscope.time[0] + margin) & (stamps < gyroscope.time[-1] - margin))
         stride = max(1, int(np.ceil(len(rows) / INTERVALS)), int(np.ceil(4 / gyroscope.rate / attitude.period)))
@@ -351,10 +359,10 @@ class AgainstAttitude(Data):
     def _places(self, imu: Imu) -> NDArray[np.int64]:
         """Samples (T, S) of each interval, with some more on either side for the delay to move."""
         data = self.intervals
-        stamps = Mounting.of(imu).on_log(np.asarray(data.stamp))
+        stamps = Mounting.of(imu).on_log(data.stamp)
         first = np.searchsorted(data.until, stamps[:-1]) - _MARGIN
         longest = np.searchsorted(data.until, stamps[1:]) - first + _MARGIN
-        size = -(-longest[np.asarray(data.used)].max() // _SAMPLES) * _SAMPLES
+        size = -(-longest[data.used].max() // _SAMPLES) * _SAMPLES
         return np.clip(first[:, None] + np.arange(size), 0, len(data.until) - 1)
 
     def unsmoothed(self, imu: Imu) -> Attitude:
@@ -366,22 +374,19 @@ class AgainstAttitude(Data):
 
     def densities(self) -> tuple[FloatArray, float]:
         """White noise of the gyroscope (3, 3), output² s, and of the accelerometer, (m/s²)² s."""
-        gyroscope = self.recording.gyroscope
-        assert gyroscope is not None
         if self.noise is None or self.noise.gyroscope is None:
             white, force = np.full(3, (_KNOWN * _UNITS[0]) ** 2), (_KNOWN * _UNITS[3]) ** 2
         else:
             white, force = self.noise.gyroscope.split(0.25)[0], float(self.noise.accelerometer.split(0.25)[0].mean())
-        return np.diag(white * gyroscope.nominal_scale**2), force
+        return np.diag(white * self.recording.signals["gyroscope"].nominal_scale ** 2), force
 
     def white_noise(self, excess: Mapping[str, float]) -> NoiseModel:
         """Return the white noise of accelerometer and gyroscope that a fit shows, which is all that motion shows."""
         rate, force = self.densities()
-        gyroscope = self.recording.gyroscope
-        assert gyroscope is not None
+        rate = np.diag(rate) / self.recording.signals["gyroscope"].nominal_scale ** 2
         return NoiseModel(
             AxisNoise.of_white(force + excess["accelerometer"] * _UNITS[3] ** 2),
-            AxisNoise.of_white(np.diag(rate) / gyroscope.nominal_scale**2 + excess["gyroscope"] * _UNITS[0] ** 2),
+            AxisNoise.of_white(rate + excess["gyroscope"] * _UNITS[0] ** 2),
         )
 
     def around(self, imu: Imu) -> Stimulus:
@@ -397,24 +402,18 @@ class AgainstAttitude(Data):
     def rows(self, imu: Imu) -> Rows:
         """Return what each condition is: three of each rotation, then three of each window's mean force."""
         data, group = self.intervals, self.group
-        stamps, used = np.asarray(data.stamp), np.asarray(data.used)
+        stamps, used = data.stamp, data.used
         ends = stamps[::group]
         window = np.arange(len(ends) - 1)
         observation = np.repeat(np.concatenate([np.repeat(window, group), window]), 3)
         middle = np.concatenate([(stamps[1:] + stamps[:-1]) / 2, (ends[1:] + ends[:-1]) / 2])
         rotations = (np.arange(len(middle)) < len(used))[:, None]
-
-        def known(signal: Signal, values: FloatArray) -> FloatArray:
-            return np.stack([np.interp(middle, signal.time, column) for column in values.T], axis=1)
-
-        gyroscope, accelerometer = self.recording.gyroscope, self.recording.accelerometer
-        warmth = self.recording.temperature
-        assert gyroscope is not None
-        rate, force = known(gyroscope, np.degrees(gyroscope.si())), known(accelerometer, accelerometer.si())
-        covariates = {TIME: middle} | by_axis("rate", "°/s", np.where(rotations, rate, np.nan))
+        signals = self.recording.signals
+        force, rate = (interpolated(signals[name].time, signals[name].si(), middle) for name in TRIADS)
+        covariates = {TIME: middle} | by_axis("rate", "°/s", np.where(rotations, np.degrees(rate), np.nan))
         covariates |= by_axis("specific force", "m/s²", np.where(rotations, np.nan, force))
-        if warmth is not None:
-            covariates[TEMPERATURE] = known(warmth, warmth.values)[:, 0]
+        if warmth := signals.get("temperature"):
+            covariates[TEMPERATURE] = np.interp(middle, warmth.time, warmth.values[:, 0])
         length = np.concatenate([np.where(used, np.diff(stamps), 1.0), np.ones(len(window))])
         return Rows(
             kinds=RESIDUALS,
@@ -428,36 +427,31 @@ class AgainstAttitude(Data):
             observation="motion",
         )
 
-    def about(self, imu: Imu) -> About:
+    def about_one(self, imu: Imu) -> About:
         """Return the conditions about the unit, their covariance, and columns of effects, of the set-up's included."""
-        single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
-        data, group = self.intervals, self.group
-        samples = self._places(single)
+        group, samples = self.group, self._places(imu)
         noise, white = self.densities()
-        parameters = Parameters.select(single, lambda name: name.effect is not None)
+        parameters = Parameters.select(imu, lambda name: name.effect is not None)
+        touched = _recorded(imu) or any(triad.effects for triad in imu.triads().values())
+        around = self.around(imu) if touched else None
 
-        touched = single.accelerometer.effects or single.gyroscope.effects or _recorded(single)
-        around = self.around(single) if touched else None
-
-        def compute(single, parameters, data, around, samples, noise):
-            conditions, spread, duration, leaning, reactions = evaluated(single, data, around, samples, noise, group)
+        def compute(imu, parameters, data, around, samples, noise):
+            conditions, spread, duration, leaning, reactions = evaluated(imu, data, around, samples, noise, group)
 
             def of(z):
-                varied = evaluated(parameters.model(single, z), data, around, samples, noise, group)[0]
-                return varied(single.with_effects())
+                varied = evaluated(parameters.model(imu, z), data, around, samples, noise, group)[0]
+                return varied(imu.with_effects())
 
             columns = jax.jacfwd(of)(jnp.zeros(len(parameters.index))) / parameters.size
-            return conditions, spread, duration, leaning, columns, reactions
+            return conditions, spread, duration, leaning, reactions, columns
 
-        description = f"against attitude {group} {' '.join(effect.name for effect in single.all_effects().values())}"
-        conditions, spread, duration, leaning, columns, reactions = stored.call(
-            compute, description, single, parameters, data, around, samples, noise
+        description = f"against attitude {group} {' '.join(effect.name for effect in imu.all_effects().values())}"
+        conditions, spread, duration, leaning, reactions, columns = stored.call(
+            compute, description, imu, parameters, self.intervals, around, samples, noise
         )
-        columns = free_columns(single.all_effects(), columns)
-        conditions = jax.tree.map(lambda leaf: leaf[None], conditions)
         covariance = self._covariance(conditions, spread, duration, leaning, white)
-        details = AttitudeDetails(duration, reactions, self, single)
-        return About(conditions, covariance, columns[None], details=details)
+        details = AttitudeDetails(duration, reactions, self, imu)
+        return About(conditions, covariance, free_columns(imu.all_effects(), columns), details=details)
 
     def reactions(self, details: AttitudeDetails):
         """Return how rotations and mean forces react to effects of a unit that stands as the reference says."""
@@ -466,7 +460,7 @@ class AgainstAttitude(Data):
         def of(effect, imu, part):
             tracks, reactions = part
             outputs, triads = added(imu.with_effects(effect), tracks), imu.triads()
-            force, rate = ((outputs[name] @ inverse_matrix(triads[name].gain).T)[..., None] for name in _TRIADS)
+            force, rate = ((outputs[name] @ inverse_matrix(triads[name].gain).T)[..., None] for name in TRIADS)
             return reactions.react(force, rate, windows)[:, 0]
 
         return f"against attitude {windows}", of, [(tracks, details.reactions) for tracks in details.tracks]
@@ -480,7 +474,7 @@ class AgainstAttitude(Data):
 
     def spans(self) -> list[FloatArray]:
         """Return start and stop (k, 2), s, of the windows of the specific force."""
-        ends = np.asarray(self.intervals.stamp)[:: self.group]
+        ends = self.intervals.stamp[:: self.group]
         return [np.stack([ends[:-1], ends[1:]], axis=1)]
 
     def rests(self) -> list[FloatArray]:
@@ -489,18 +483,15 @@ class AgainstAttitude(Data):
 
     def observed(self, imu: Imu, details: AttitudeDetails) -> Observed:
         """Return the samples, along which shapes act: slow changes, and what depends on orientation."""
-        (tracks,), stamps = details.tracks, np.asarray(self.intervals.stamp)
+        (tracks,), stamps = details.tracks, self.intervals.stamp
         stimulus, windows = tracks["gyroscope"].stimulus, len(details.duration) // self.group
         force = np.asarray(stimulus.specific_force)
 
         def react(triad: str, shape: FloatArray) -> FloatArray:
-            columns = []
-            for axis in np.eye(3):
-                along = axis[:, None] * shape[:, None, :]
-                none = np.zeros_like(along)
-                both = (along, none) if triad == "accelerometer" else (none, along)
-                columns.append(np.asarray(details.reactions.react(*both, windows)))
-            return np.concatenate(columns, axis=1)
+            along = np.einsum("ij,mk->mijk", np.eye(3), shape).reshape(len(shape), 3, -1)
+            none = np.zeros_like(along)
+            both = (along, none) if triad == "accelerometer" else (none, along)
+            return np.asarray(details.reactions.react(*both, windows))
 
         share = (np.asarray(stimulus.time) - stamps[0]) / np.ptp(stamps)
         return Observed(react, share, up=force / np.linalg.norm(force, axis=1, keepdims=True))
@@ -521,7 +512,7 @@ class AgainstAttitude(Data):
 
         Neighbouring intervals share an end, and where the reference stands wrong there the force of the window leans.
         """
-        turn, window = (np.asarray(leaf)[0] for leaf in (conditions.turn, conditions.window))
+        turn, window = conditions.turn, conditions.window
         turns, windows = len(turn), len(window)
         total = duration.reshape(windows, -1).sum(axis=1)
         total = np.where(window, total, 1.0)
@@ -538,7 +529,7 @@ class AgainstAttitude(Data):
             whole[rows.ravel()] = factor
             return (whole.T * used).T
 
-        back = rotation_matrix_on_host(np.asarray(conditions.target)[0]).swapaxes(1, 2)
+        back = rotation_matrix_on_host(conditions.target).swapaxes(1, 2)
         ends = np.zeros((n, 3 * (turns + 1)))
         ends[rows.ravel()] = shared_ends(back)
         for interval in range(turns):
@@ -547,21 +538,23 @@ class AgainstAttitude(Data):
         walk = np.kron(np.tril(np.ones((turns, turns))) * step * duration[:, None], np.eye(3))
         changes = np.kron((np.eye(windows + 1)[1:] - np.eye(windows + 1)[:-1]) / total[:, None], np.eye(3))
         factors = (
-            placed(rows, np.repeat(step, 3)) * _UNITS[0], (ends.T * used).T * _UNITS[1],
-            placed(rows, walk) * _UNITS[2], placed(later, np.repeat(total**-0.5, 3)) * _UNITS[3],
-            placed(later, changes) * _UNITS[4],
-        )  # fmt: skip
-        kind = np.repeat([0, 3], [3 * turns, 3 * windows])
-        return Covariance(measured[None], tuple(factor[None] for factor in factors), used[None], kind[None])
+            placed(rows, np.repeat(step, 3)),
+            (ends.T * used).T,
+            placed(rows, walk),
+            placed(later, np.repeat(total**-0.5, 3)),
+            placed(later, changes),
+        )
+        factors = tuple(factor * unit for factor, unit in zip(factors, _UNITS, strict=True))
+        return Covariance(measured, factors, used, np.repeat([0, 3], [3 * turns, 3 * windows]))
 
     def errors(self, imu: Imu) -> dict[str, tuple[FloatArray, FloatArray, str]]:
         """Return times (k,), errors (k, 3) and unit of the rotations, over their time, and of the mean forces."""
-        about = self.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], imu))
-        conditions = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.conditions)
+        about = self.about_one(imu)
+        conditions: Any = about.conditions
         values = np.asarray(conditions(imu.with_effects()))
         turn, window = conditions.turn, conditions.window
         rate = values[: 3 * len(turn)].reshape(-1, 3)[turn] / about.details.duration[turn, None]
-        stamps = np.asarray(self.intervals.stamp)
+        stamps = self.intervals.stamp
         middle = (stamps[1:] + stamps[:-1]) / 2
         forces = values[3 * len(turn) :].reshape(-1, 3)[window]
         return {

@@ -17,18 +17,20 @@ from jaximu.data.poses import (
     NO_FIXTURE,
     Along,
     PosesAndTurns,
+    as_observations,
     felt_by_hand,
     pose_rows,
     residual_rms,
 )
 from jaximu.data.tracks_by_hand import rest_shifts, samples_by_hand
 from jaximu.data.twin_by_hand import twin_recordings
-from jaximu.estimation.data import About, Data, Handling, Observed
+from jaximu.estimation.data import About, Handling, Observed, OfOneUnit
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import rotation_matrix_on_host
+from jaximu.ground.tracing import first
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
@@ -41,7 +43,7 @@ __all__ = ["RecordedByHand"]
 
 
 @dataclass
-class RecordedByHand(Data):
+class RecordedByHand(OfOneUnit):
     """Poses and turns of one unit, and the recordings that they were cut from, along which effects act.
 
     known: the unit whose effects were taken off the observations, the Earth's rotation as a rule.
@@ -57,6 +59,9 @@ class RecordedByHand(Data):
     no_fixture = NO_FIXTURE
     advice = staticmethod(pose_advice)
 
+    def __post_init__(self):
+        self.observations = jax.tree.map(np.asarray, self.observations)
+
     @cached_property
     def data(self) -> PosesAndTurns:
         """The poses and turns with the samples along which effects act."""
@@ -66,19 +71,16 @@ class RecordedByHand(Data):
         """Return what each condition is: norms of poses, two components of turns, three of means at rest."""
         return pose_rows(imu, self.observations)
 
-    def about(self, imu: Imu) -> About:
-        """Return the conditions about one unit, the leading axis of length one, and its effects' columns."""
-        unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        along = self.along(unit, felt_by_hand(unit))
-        covariance = along.condensed.covariance
-        columns = self.own_columns(unit, along, covariance.used.shape[1])[None]
-        return About(along.condensed.conditions, covariance, columns, along)
+    def about_one(self, imu: Imu) -> About:
+        """Return the conditions about the unit, and its effects' columns."""
+        along = self.along(imu, felt_by_hand(imu))
+        conditions, covariance = first((along.condensed.conditions, along.condensed.covariance))
+        return About(conditions, covariance, self.own_columns(imu, along, len(covariance.used)), along)
 
     def along(self, imu: Imu, effects: tuple[Effect, ...]) -> Along:
         """Return the recordings about a unit with effects: the tracks, and the observations without what they add."""
         along = jax.tree.map(np.asarray, self.data.along(imu, effects))
-        left = along.observations
-        return along._replace(observations=Observations(left.poses, left.turns, left.gravity, left.slow))
+        return along._replace(observations=as_observations(along.observations))
 
     def reactions(self, details: Along):
         """Return how norms, directions and means at rest react to effects, recording by recording."""
@@ -128,15 +130,11 @@ class RecordedByHand(Data):
 
     def without(self, observation: int) -> RecordedByHand:
         """Return the recordings with a pose, and the turns to and from it, left out."""
-        poses, turns = np.array(self.observations.poses.mask), np.array(self.observations.turns.mask)
-        poses[observation] = False
-        turns[max(observation - 1, 0) : observation + 1] = False
-        observations = replace(
-            self.observations,
-            poses=replace(self.observations.poses, mask=poses),
-            turns=replace(self.observations.turns, mask=turns),
-        )
-        return replace(self, observations=observations)
+        poses, turns = self.observations.poses, self.observations.turns
+        pose, turn = np.arange(len(poses.mask)), np.arange(len(turns.mask))
+        poses = replace(poses, mask=poses.mask & (pose != observation))
+        turns = replace(turns, mask=turns.mask & (turn != observation) & (turn != observation - 1))
+        return replace(self, observations=replace(self.observations, poses=poses, turns=turns))
 
     def observed(self, imu: Imu, details: Along) -> Observed:
         """Return the real poses; what is off in a gyroscope's pose is off by the mean of its neighbours in a turn."""
@@ -149,7 +147,7 @@ class RecordedByHand(Data):
             columns = np.einsum(equation, (by_force if triad == "accelerometer" else by_rate)[:, real], shape)
             return columns.reshape(len(columns), -1)
 
-        time = ((np.asarray(poses.start) + np.asarray(poses.stop)) / 2)[real]
+        time = ((poses.start + poses.stop) / 2)[real]
         force = imu.accelerometer.recover_on_host(poses.accelerometer_mean)
         return Observed(
             react,
@@ -181,12 +179,12 @@ class RecordedByHand(Data):
     def averaged(self) -> RecordedByHand:
         """Return the recordings with samples of instants turned into means over their intervals."""
         turns = self.observations.turns
-        changed = replace(turns, output=np.asarray(turns.output) + bend(turns))
+        changed = replace(turns, output=turns.output + bend(turns))
         return replace(self, observations=replace(self.observations, turns=changed))
 
     def change_by_averaging(self, details: Along) -> FloatArray:
         """Return how the conditions (n,) change by that."""
-        turns = np.einsum("tasi,tsi->ta", np.asarray(details.reaction.turn), -bend(self.observations.turns)).ravel()
+        turns = np.einsum("tasi,tsi->ta", details.reaction.turn, -bend(self.observations.turns)).ravel()
         count = len(self.observations.poses.mask)
         return np.concatenate([np.zeros(count), turns, np.zeros(3 * count)])
 
@@ -203,8 +201,8 @@ def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
     """Return the level frame's axes in the body's (poses, 9) in each pose, padding included, as tracks have them."""
     axes = np.zeros((poses, 9))
     for track in (pair["gyroscope"] for pair in tracks):
-        pose, first = np.unique(np.asarray(track.observation), return_index=True)
+        pose, row = np.unique(track.observation, return_index=True)
         inside = pose < poses
-        attitude = np.asarray(track.stimulus.attitude)[first[inside]]
+        attitude = np.asarray(track.stimulus.attitude)[row[inside]]
         axes[pose[inside]] = rotation_matrix_on_host(attitude).reshape(-1, 9)
     return axes

@@ -9,16 +9,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import jax
 import numpy as np
 
-from jaximu.data.poses import condensed
+from jaximu.data.poses import condensed, with_gyroscope
 from jaximu.data.poses_covariance import Sensitivities
+from jaximu.data.rest_blocks import RATIO, correlation_times
 from jaximu.estimation.fitting import Fit, unwhitened
+from jaximu.estimation.leave_out import orthonormal
+from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
+from jaximu.ground.tracing import first, lifted
 from jaximu.model.noise_model import AxisNoise, NoiseModel
-from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation
@@ -28,7 +30,6 @@ __all__ = [
     "drift_components",
     "drift_text",
     "mean_output_reactions",
-    "orthonormal_basis",
     "power_on_text",
     "restricted_likelihood",
     "slow_units",
@@ -55,7 +56,6 @@ _LONGEST = 4.0
 """Correlation time of a random walk's stand-in, in lengths of the recording."""
 _SLOWEST = 16.0
 """Correlation time of the slowest part of flicker noise: what is slower still changes a recording by a hundredth."""
-_RATIO = 4.0
 _STEPS, _STILL, _FARTHEST = 60, 3e-3, 3.0
 """Steps of a size's logarithm: how many at most, what ends them, and the longest."""
 
@@ -67,15 +67,14 @@ def slow_units(known: AxisNoise, shortest: float, duration: float) -> dict[str, 
     times stand r apart, from `shortest` (s) on; a random walk is one slow process with the growth 2σ²/τ.
     """
     white = known.covariance([0.0], [1.0])[:, 0]
-    octaves = 1 + int(np.ceil(np.log(max(_SLOWEST * duration / shortest, 1.0)) / np.log(_RATIO)))
-    times = np.asarray(shortest * _RATIO ** np.arange(octaves), np.float64)
+    times = correlation_times(shortest, max(_SLOWEST * duration, shortest))
     longest = np.array([_LONGEST * duration])
 
     def of(times: FloatArray, variance: FloatArray) -> AxisNoise:
         return AxisNoise(np.zeros(3), np.zeros(3), white * variance, np.asarray(times, np.float64))
 
     return {
-        "bias instability": of(times, np.full(octaves, np.log(_RATIO) / np.pi)),
+        "bias instability": of(times, np.full(len(times), np.log(RATIO) / np.pi)),
         "random walk": of(longest, longest / (2 * duration)),
     }
 
@@ -88,16 +87,14 @@ def _power_on(known: AxisNoise) -> AxisNoise:
 def with_noise(noise: NoiseModel, triad: str, more: AxisNoise) -> NoiseModel:
     """Return a noise model with further slow noise of a triad."""
     known = getattr(noise, triad)
-    joined = replace(
-        known, variance=np.concatenate([known.variance, more.variance], axis=1),
-        correlation_time=np.concatenate([known.correlation_time, more.correlation_time]),
-    )  # fmt: skip
-    return replace(noise, **{triad: joined})
+    variance = np.concatenate([known.variance, more.variance], axis=1)
+    times = np.concatenate([known.correlation_time, more.correlation_time])
+    return replace(noise, **{triad: replace(known, variance=variance, correlation_time=times)})
 
 
 def with_usual_drift(noise: NoiseModel, shortest: float, duration: float) -> NoiseModel:
     """Return a noise model with the drift that is usual of MEMS sensors, slower than `shortest` (s)."""
-    for triad in ("accelerometer", "gyroscope"):
+    for triad in TRIADS:
         known = getattr(noise, triad)
         for name, unit in slow_units(known, shortest, duration).items() if known is not None else ():
             noise = with_noise(noise, triad, replace(unit, variance=USUAL_DRIFT[name][0] ** 2 * unit.variance))
@@ -106,62 +103,59 @@ def with_usual_drift(noise: NoiseModel, shortest: float, duration: float) -> Noi
 
 def drift_text(sizes: Mapping[str, float]) -> str:
     """Say how biases drift; `sizes`: standard deviations by name, relative to white noise over a second."""
-    told = [f"{name} {each:.2g}" for name, each in sizes.items() if name.endswith("bias instability")]
+    instabilities = [f"{name} {size:.2g}" for name, size in sizes.items() if name.endswith("bias instability")]
     return (
         "Noise and bias drift were estimated from this recording (relative to white noise over a second: "
-        f"{', '.join(told)}). A recording at rest (--static LOG) would determine them better."
+        f"{', '.join(instabilities)}). A recording at rest (--static LOG) would determine them better."
     )
 
 
 def power_on_text(units: Mapping[str, AxisNoise], sizes: Mapping[str, float]) -> list[str]:
     """Say how a bias changes from recording to recording, where it does; `sizes` of the drifts `units`, by name."""
-    found = []
-    for name, unit in units.items():
-        triad, _, kind = name.partition(" ")
-        if kind == _POWER_ON:
-            spread = size(sizes[name] * float(np.sqrt(np.mean(unit.variance))), "m/s^2", 2)
-            found.append(
-                f"Between the recordings the {triad}'s bias changes by about {spread} (standard deviation), as it does "
-                "when the power is switched on; the calibration has that of the first."
-            )
-    return found
+    changes = {
+        name.removesuffix(_POWER_ON): size(sizes[name] * float(np.sqrt(np.mean(unit.variance))), "m/s^2", 2)
+        for name, unit in units.items()
+        if name.endswith(_POWER_ON)
+    }
+    return [
+        f"Between the recordings the {triad.strip()}'s bias changes by about {change} (standard deviation), as it does "
+        "when the power is switched on; the calibration has that of the first."
+        for triad, change in changes.items()
+    ]
 
 
 def with_drift(
-    found: Fit, observations: Observations, segmentations: Sequence[Segmentation]
+    fitted: Fit, observations: Observations, segmentations: Sequence[Segmentation]
 ) -> tuple[Fit, tuple[str, ...]]:
     """Return a fit of one unit whose covariance knows how the biases drift, and what was estimated, in sentences.
 
     The fit's weights know white noise and the excess alone. Its estimate is linear in the conditions to first order,
     T = N⁻¹JᵀW, so its covariance changes by T ΔC Tᵀ, ΔC what the conditions' covariance changes by once drift and
-    excess are estimated together. `found`: of a linear loss, to poses and turns or to poses alone; `observations`: with
-    what its effects add taken off.
+    excess are estimated together. `fitted`: of a linear loss, to poses and turns or to poses alone; `observations`:
+    with what its effects add taken off.
     """
-    model = found.imu
-    rows = "all" if model.gyroscope is not None else "norm"
-    full = model if model.gyroscope is not None else Imu(model.accelerometer, Imu.nominal().gyroscope)
-    unit, measured = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))
-    about = condensed(unit, measured, rows)
+    rows = "all" if "gyroscope" in fitted.imu.triads() else "norm"
+    about = condensed(*lifted((with_gyroscope(fitted.imu).with_effects(), observations)), rows)
     assert about.reaction is not None
-    chain = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)
-    residual, jacobian = unwhitened(found, chain)
+    chain = first(about.covariance)
+    residual, jacobian = unwhitened(fitted, chain)
     covariance = chain.dense()
     used = covariance.used > 0
     bare = covariance.measured[np.ix_(used, used)]
     present = [k for k in range(len(covariance.factors)) if np.any(covariance.group[used] == k)]
     excess = [covariance.component(k)[np.ix_(used, used)] for k in present]
-    fitted = bare + np.einsum("k,kij->ij", np.asarray(found.excess)[present], np.stack(excess))
+    weighted = bare + np.einsum("k,kij->ij", np.asarray(fitted.excess)[present], np.stack(excess))
     noise = _noise_of_scatter(observations, segmentations[0].recording)
     drifts, components = drift_components(noise, observations, segmentations, about.reaction)
     priors = [_USUAL_EXCESS] * len(excess) + [USUAL_DRIFT[name.partition(" ")[2]] for name in drifts]
     components = np.concatenate([np.stack(excess), components[:, used][:, :, used]])
     log_size, _ = restricted_likelihood(residual[used], jacobian[used], bare, components, *_beforehand(priors))
-    changed = bare + np.einsum("k,kij->ij", np.exp(log_size), components) - fitted
-    sizes = np.asarray(found.sizes)
-    react = np.asarray(found.covariance) / sizes @ np.linalg.solve(fitted, jacobian[used]).T
-    told = dict(zip(drifts, np.exp(log_size[len(excess) :] / 2), strict=True))
-    total = np.asarray(found.covariance) + react @ changed @ react.T
-    return replace(found, covariance=total), (drift_text(told), *power_on_text(drifts, told))
+    changed = bare + np.einsum("k,kij->ij", np.exp(log_size), components) - weighted
+    sizes = np.asarray(fitted.sizes)
+    react = np.asarray(fitted.covariance) / sizes @ np.linalg.solve(weighted, jacobian[used]).T
+    drift_sizes = dict(zip(drifts, np.exp(log_size[len(excess) :] / 2), strict=True))
+    total = np.asarray(fitted.covariance) + react @ changed @ react.T
+    return replace(fitted, covariance=total), (drift_text(drift_sizes), *power_on_text(drifts, drift_sizes))
 
 
 def _beforehand(priors: Sequence[tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
@@ -173,11 +167,11 @@ def _beforehand(priors: Sequence[tuple[float, float]]) -> tuple[FloatArray, Floa
 def _noise_of_scatter(observations: Observations, recording: Recording) -> NoiseModel:
     """Return white noise as the scatter in the poses tells it."""
     poses = observations.poses
-    real = np.asarray(poses.mask)
-    duration = (np.asarray(poses.stop) - np.asarray(poses.start))[real]
+    real = poses.mask
+    duration = (poses.stop - poses.start)[real]
 
     def white(signal: Signal, covariance) -> AxisNoise:
-        scatter = np.diagonal(np.asarray(covariance)[real], axis1=1, axis2=2) / np.square(signal.nominal_scale)
+        scatter = np.diagonal(covariance[real], axis1=1, axis2=2) / np.square(signal.nominal_scale)
         return AxisNoise.of_white(np.mean(scatter * duration[:, None], axis=0))
 
     gyroscope = recording.gyroscope
@@ -188,9 +182,12 @@ def _noise_of_scatter(observations: Observations, recording: Recording) -> Noise
 
 
 def drift_components(
-    noise: NoiseModel, observations: Observations, segmentations: Sequence[Segmentation], reaction: Sensitivities,
+    noise: NoiseModel,
+    observations: Observations,
+    segmentations: Sequence[Segmentation],
+    reaction: Sensitivities,
     within: bool = True,
-) -> tuple[dict[str, AxisNoise], FloatArray]:  # fmt: skip
+) -> tuple[dict[str, AxisNoise], FloatArray]:
     """Return drifts by name, at a size of one, and the covariance (k, n, n) of all conditions that each adds.
 
     Sizes are relative to what `noise` does in a second. Between recordings nothing is carried over, and of several the
@@ -199,23 +196,24 @@ def drift_components(
     """
     poses = observations.poses
     real = np.flatnonzero(poses.mask)
-    start, stop = np.asarray(poses.start)[real], np.asarray(poses.stop)[real]
+    start, stop = poses.start[real], poses.stop[real]
     counts = [len(part.intervals) for part in segmentations]
     which = np.repeat(np.arange(len(counts)), counts)
     duration = max(float(part.intervals[-1, 1] - part.intervals[0, 0]) for part in segmentations)
-    reaches = mean_output_reactions(reaction)
-    units, found = {}, [np.zeros((0, *[len(reaches[0])] * 2))]
-    for triad, reach in zip(("accelerometer", "gyroscope"), reaches, strict=True):
-        known, signal = getattr(noise, triad), getattr(segmentations[0].recording, triad)
-        own = slow_units(known, float(np.median(stop - start)), duration) if known and within else {}
+    reactions = mean_output_reactions(reaction)
+    units, covariances = {}, [np.zeros((0, *[len(reactions[0])] * 2))]
+    for triad, output_reaction in zip(TRIADS, reactions, strict=True):
+        known, by_output = getattr(noise, triad), output_reaction[:, real]
+        drifts = slow_units(known, float(np.median(stop - start)), duration) if known and within else {}
         if known and len(segmentations) > 1 and triad == "accelerometer":
-            own[_POWER_ON] = _power_on(known)
-        for kind, unit in own.items():
-            slow = np.square(signal.nominal_scale)[:, None, None] * unit.covariance(start, stop)
+            drifts[_POWER_ON] = _power_on(known)
+        for kind, unit in drifts.items():
+            scale = segmentations[0].recording.signals[triad].nominal_scale
+            slow = np.square(scale)[:, None, None] * unit.covariance(start, stop)
             slow *= which[:, None] == which
             units[f"{triad} {kind}"] = unit
-            found.append(np.einsum("npi,ipq,mqi->nm", reach[:, real], slow, reach[:, real], optimize=True)[None])
-    return units, np.concatenate(found)
+            covariances.append(np.einsum("npi,ipq,mqi->nm", by_output, slow, by_output, optimize=True)[None])
+    return units, np.concatenate(covariances)
 
 
 def mean_output_reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArray]:
@@ -223,8 +221,7 @@ def mean_output_reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArr
 
     A gyroscope's output that is off in a pose is taken to be off by the mean of its neighbours in the turn between.
     """
-    norm, after, before, turn = (np.asarray(each) for each in
-                                 (reaction.norm, reaction.after, reaction.before, reaction.turn))  # fmt: skip
+    norm, after, before, turn = map(np.asarray, (reaction.norm, reaction.after, reaction.before, reaction.turn))
     poses = len(norm)
     conditions = poses + 2 * (poses - 1) + 3 * poses
     by_force, by_rate = np.zeros((conditions, poses, 3)), np.zeros((conditions, poses, 3))
@@ -242,9 +239,13 @@ def mean_output_reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArr
 
 
 def restricted_likelihood(
-    residual: FloatArray, jacobian: FloatArray, bare: FloatArray, components: FloatArray, mean: FloatArray,
+    residual: FloatArray,
+    jacobian: FloatArray,
+    bare: FloatArray,
+    components: FloatArray,
+    mean: FloatArray,
     spread: FloatArray,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray]:
     """Return the log sizes (k,) that are likeliest a posteriori, and their covariance (k, k).
 
     Of residual (n,) with derivatives (n, p) by what is fitted beside, covariance `bare` (n, n) and `components`
@@ -255,7 +256,7 @@ def restricted_likelihood(
     way ½ rᵀPV_iPV_jPr serves as the information, which takes no product of matrices (Gilmour, Thompson and Cullis,
     Biometrics 51, 1995); a step that does not lead higher is shortened.
     """
-    jacobian = orthonormal_basis(jacobian)
+    jacobian = orthonormal(jacobian)
     known = 1 / spread**2
 
     def at(log_size: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -263,7 +264,7 @@ def restricted_likelihood(
         sizes = np.exp(log_size)
         projector, volume = _projector(bare + np.tensordot(sizes, components, 1), jacobian)
         off = log_size - mean
-        return float(-0.5 * (residual @ projector @ residual + volume + known @ off**2)), projector, np.asarray(sizes)
+        return float(-0.5 * (residual @ projector @ residual + volume + known @ off**2)), projector, sizes
 
     log_size = mean.copy()
     best, projector, sizes = at(log_size)
@@ -296,9 +297,3 @@ def _projector(covariance: FloatArray, jacobian: FloatArray) -> tuple[FloatArray
     volume = 2 * float(np.sum(np.log(np.diagonal(root))) + np.sum(np.log(np.diagonal(inner))))
     across = np.linalg.solve(inner, basis.T @ white)
     return white.T @ white - across.T @ across, volume
-
-
-def orthonormal_basis(columns: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (n, r) of what columns (n, q) span, whatever their lengths."""
-    u, s, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
-    return np.asarray(u[:, s > 1e-9 * s[0]], np.float64)

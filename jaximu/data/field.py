@@ -23,16 +23,18 @@ from numpy.typing import NDArray
 
 from jaximu.data.preintegration import turned_by_rates
 from jaximu.estimation.covariance import BlockFactor, Covariance
-from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.data import About, Conditions, OfOneUnit
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.estimation.track import Track, added
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.rotation import exponential, inverse_matrix, rotate
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.reference import Integral
 
 __all__ = ["EXCESS_NAMES", "FieldConditions", "FieldSamples", "FieldWindows", "MagneticField", "windows_of"]
 
@@ -81,8 +83,7 @@ class FieldConditions(Conditions):
 
     def field(self, imu: Imu) -> Float[Array, "n 3"]:
         """Return the field (µT) of each window in its own body frame."""
-        assert imu.magnetometer is not None
-        return jnp.einsum("nijk,jk->ni", self.slope, imu.magnetometer.inverse())
+        return jnp.einsum("nijk,jk->ni", self.slope, imu.triads()["magnetometer"].inverse())
 
     def __call__(self, imu: Imu) -> Float[Array, " 4*n"]:
         """Return the errors of the strength, of both components across the field, and of the sine of its dip."""
@@ -118,8 +119,7 @@ class FieldSamples(eqx.Module):
     @partial(stored.compiled, quick=True)
     def added(self, imu: Imu) -> Float[Array, "n S 3"]:
         """Return what the effects of a unit's magnetometer add to its output (output units)."""
-        assert imu.magnetometer is not None
-        field = imu.magnetometer.recover(self.output, self.track.stimulus)
+        field = imu.triads()["magnetometer"].recover(self.output, self.track.stimulus)
         stimulus = replace(self.track.stimulus, magnetic_field=field)
         return added(imu, {"magnetometer": replace(self.track, stimulus=stimulus)})["magnetometer"]
 
@@ -143,9 +143,11 @@ class FieldSamples(eqx.Module):
         tracks = [part.track.renumbered(numbers) for part, numbers in zip(parts, renumberings, strict=True)]
         observation = together([track.observation - total for track in tracks]) + total  # padding is of none
         stimuli = [vars(track.stimulus) for track in tracks]
-        known = [name for name in ("time", "temperature", "current", "angular_rate")
-                 if all(stimulus[name] is not None for stimulus in stimuli)]  # fmt: skip
-        inputs: dict[str, Any] = {name: together([stimulus[name] for stimulus in stimuli]) for name in known}
+        inputs: dict[str, Any] = {
+            name: together([stimulus[name] for stimulus in stimuli])
+            for name in ("time", "temperature", "current", "angular_rate")
+            if all(stimulus[name] is not None for stimulus in stimuli)
+        }
         output, turned = (together([vars(part)[name] for part in parts]) for name in ("output", "turned"))
         return cls(output, turned, Track(Stimulus(**inputs), observation))
 
@@ -191,18 +193,16 @@ class FieldWindows:
 
     def field(self, imu: Imu) -> FloatArray:
         """Return the field (n, 3), µT, that a unit's magnetometer makes of each window, in its body frame there."""
-        assert imu.magnetometer is not None
-        return np.einsum("nijk,jk->ni", self.along(imu).slope, np.asarray(imu.magnetometer.inverse()))
+        return np.einsum("nijk,jk->ni", self.along(imu).slope, imu.triads()["magnetometer"].inverse())
 
     def added(self, imu: Imu) -> FloatArray:
         """Return what the effects of a unit's magnetometer add to each sample's output (n, S, 3), output units."""
-        if imu.magnetometer is None or not imu.magnetometer.effects:
-            return np.zeros_like(self.samples.output)
-        return np.asarray(self.samples.added(imu))
+        affected = imu.triads()["magnetometer"].effects
+        return np.asarray(self.samples.added(imu)) if affected else np.zeros_like(self.samples.output)
 
     def along(self, imu: Imu) -> FieldWindows:
         """Return the same with what a unit's effects add taken off the samples."""
-        if imu.magnetometer is None or not imu.magnetometer.effects:
+        if not imu.triads()["magnetometer"].effects:
             return self
         slope = np.array(self.slope)
         slope[..., :3] -= np.asarray(self.samples.mean_added(imu))
@@ -263,51 +263,64 @@ def windows_of(
     index = np.minimum(edges[:-1, None] + np.arange(count.max()), stops[:, None] - 1)
     weight = (np.arange(count.max()) < count[:, None]) / count[:, None]
     centre = (time[edges[:-1]] + time[stops - 1]) / 2
-    if gyroscope is None:
-        turned = np.broadcast_to(np.eye(3), (*index.shape, 3, 3))
-        carried, angle = np.broadcast_to(np.eye(3), (len(centre), 3, 3)), np.zeros(len(centre))
-        swept = np.zeros((len(centre), 3, 3))
-    else:
-        attitude, turned_until = _carried(gyroscope)
-        middle = attitude(centre)
-        frames = attitude(time[index.ravel()]).as_matrix().reshape(*index.shape, 3, 3)
-        turned = np.einsum("nji,nsjk->nsik", middle.as_matrix(), frames)
-        step = middle[:-1].inv() * middle[1:]
-        carried = np.concatenate([step.as_matrix(), np.eye(3)[None]])
-        angle = np.append(step.magnitude(), 0.0)
-        swept = np.zeros((len(centre), 3, 3))
-        swept[:-1] = middle[:-1].inv().as_matrix() @ np.diff(turned_until(centre), axis=0)
+    turned, carried, swept, angle = _frames(gyroscope, centre, time[index])
     with_one = np.concatenate([values[index], np.ones((*index.shape, 1))], axis=2)
     slope = np.einsum("ns,nsij,nsk->nijk", weight, turned, with_one)
     up, off = np.zeros((len(centre), 3)), np.ones(len(centre))
     if motion is not None:
         force = motion.accelerometer
-        at = np.stack([np.interp(time[index.ravel()], force.time, axis) for axis in force.values.T], 1)
-        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, at.reshape(*index.shape, 3))
+        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, interpolated(force.time, force.values, time[index]))
         length = np.linalg.norm(mean, axis=1)
         up, off = mean / length[:, None], np.abs(length / STANDARD_GRAVITY - 1)
-    at = time[index]
-
-    def known(other: Signal | None) -> FloatArray | None:
-        if other is None:
-            return None
-        return np.stack([np.interp(at, other.time, axis) for axis in other.values.T], axis=-1)
-
-    warm, flow = (None, None) if motion is None else (known(motion.temperature), known(motion.current))
-    stimulus = Stimulus(
-        time=at, temperature=None if warm is None else warm[..., 0], current=None if flow is None else flow[..., 0],
-        angular_rate=known(gyroscope),
-    )  # pyright: ignore # fmt: skip
+    known = {} if motion is None else motion.signals
+    known = {name: interpolated(part.time, part.values, time[index]) for name, part in known.items()}
+    warm, flow = (known[name][..., 0] if name in known else None for name in ("temperature", "current"))
+    stimulus = Stimulus(time=time[index], temperature=warm, current=flow, angular_rate=known.get("gyroscope"))  # pyright: ignore
     window = np.where(weight > 0, np.arange(len(count))[:, None], len(count))
-    samples = FieldSamples(values[index], np.array(turned), Track(stimulus, window))
+    samples = FieldSamples(values[index], turned, Track(stimulus, window))
     everywhere = np.ones(len(centre), bool)
     following = np.append(everywhere[1:], False)
     return FieldWindows(
-        (weight[:, :, None] * values[index]).sum(axis=1), slope, np.array(carried), swept, up, off, angle,
-        np.stack([time[edges[:-1]], time[edges[1:] - 1]], axis=1), count.astype(float), everywhere,
-        following if gyroscope is not None else ~everywhere, everywhere if motion is not None else ~everywhere,
-        white_noise(signal), origin, samples, np.zeros((12, 12)) if vertical is None else vertical,
-    )  # fmt: skip
+        (weight[:, :, None] * values[index]).sum(axis=1),
+        slope,
+        carried,
+        swept,
+        up,
+        off,
+        angle,
+        np.stack([time[edges[:-1]], time[edges[1:] - 1]], axis=1),
+        count.astype(float),
+        everywhere,
+        following if gyroscope is not None else ~everywhere,
+        everywhere if motion is not None else ~everywhere,
+        white_noise(signal),
+        origin,
+        samples,
+        np.zeros((12, 12)) if vertical is None else vertical,
+    )
+
+
+def _frames(
+    gyroscope: Signal | None, centre: FloatArray, times: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return how windows stand, by the gyroscope: none of them turns without one.
+
+    Rotations (n, S, 3, 3) from the samples' frames at `times` to the windows' at their `centre`, then (n, 3, 3) from
+    the next window's to each one's, how that turns with the rate (s), and by how much it turns (n,), rad.
+    """
+    count = len(centre)
+    turned, carried = (np.array(np.broadcast_to(np.eye(3), (*size, 3, 3))) for size in (times.shape, (count,)))
+    swept, angle = np.zeros((count, 3, 3)), np.zeros(count)
+    if gyroscope is not None:
+        attitude, turned_until = _carried(gyroscope)
+        middle = attitude(centre)
+        back = middle.inv()
+        frames = attitude(times.ravel()).as_matrix().reshape(turned.shape)
+        turned = np.einsum("nij,nsjk->nsik", back.as_matrix(), frames)
+        step = back[:-1] * middle[1:]
+        carried[:-1], angle[:-1] = step.as_matrix(), step.magnitude()
+        swept[:-1] = back[:-1].as_matrix() @ np.diff(turned_until(centre), axis=0)
+    return turned, carried, swept, angle
 
 
 def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> NDArray[np.int64]:
@@ -327,9 +340,7 @@ def _carried(gyroscope: Signal):
 
     Both against the frame in which the recording began.
     """
-    middle, half = (gyroscope.time[1:] + gyroscope.time[:-1]) / 2, 0.5 / gyroscope.rate
-    edges = np.concatenate([[gyroscope.time[0] - half], middle, [gyroscope.time[-1] + half]])
-    count = len(gyroscope)
+    edges, count = Integral(gyroscope, gyroscope.values).edges, len(gyroscope)
     padding = (0, (1 << count.bit_length()) - count)  # few shapes are compiled
     rates, held = np.pad(gyroscope.values, (padding, (0, 0))), np.pad(np.diff(edges), padding)
     running, sweep = (leaf[:count] for leaf in stored.call(turned_by_rates, "carried attitude", rates, held))
@@ -347,7 +358,7 @@ class _At(eqx.Module):
 
 
 @dataclass(frozen=True)
-class MagneticField(Data):
+class MagneticField(OfOneUnit):
     """A unit's magnetometer in a field of the same strength (µT) and direction at all times.
 
     dip: of the field below the level, and its standard deviation, rad; None where it is not known.
@@ -384,24 +395,27 @@ class MagneticField(Data):
             observation="window",
         )
 
-    def about(self, imu: Imu) -> About:
+    def about_one(self, imu: Imu) -> About:
         """Return the conditions about the unit and their covariance."""
-        single = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
-        windows = self.windows.along(single)
-        whole = jax.tree.map(np.asarray, single.with_effects())
-        blank = FieldConditions(
-            windows.slope, windows.carried, windows.swept, windows.origin, np.zeros((len(windows), 2, 3)), windows.up,
-            windows.used, windows.turn, windows.level, np.float64(self.strength),
-            np.float64(0.0 if self.dip is None else np.sin(self.dip[0])), windows.alone,
-        )  # pyright: ignore # fmt: skip
-        field = windows.field(whole)
+        windows, bare = self.windows.along(imu), imu.with_effects()
+        field = windows.field(bare)
         basis = _across(field)
-        conditions = eqx.tree_at(lambda conditions: conditions.basis, blank, basis)
-        covariance = self._covariance(whole, field, basis)
-        lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions)
-        details = _At(conditions, windows.samples)
-        columns = self.own_columns(single, details, covariance.used.shape[1])
-        return About(lifted, covariance, columns[None], details)
+        conditions = FieldConditions(
+            windows.slope,
+            windows.carried,
+            windows.swept,
+            windows.origin,
+            basis,
+            windows.up,
+            windows.used,
+            windows.turn,
+            windows.level,
+            np.float64(self.strength),
+            np.float64(0.0 if self.dip is None else np.sin(self.dip[0])),
+            windows.alone,
+        )  # pyright: ignore
+        covariance, details = self._covariance(bare, field, basis), _At(conditions, windows.samples)
+        return About(conditions, covariance, self.own_columns(imu, details, len(covariance.used)), details)
 
     def reactions(self, details: _At):
         """Return how the conditions react to an effect of the magnetometer: its mean over each window, as a field."""
@@ -424,7 +438,6 @@ class MagneticField(Data):
     def _covariance(self, imu: Imu, field: FloatArray, basis: FloatArray) -> Covariance:
         """White noise that is known, and components: errors of a window, of a turn, of the measured up."""
         windows, n = self.windows, len(self.windows)
-        assert imu.magnetometer is not None
         length = np.linalg.norm(field, axis=1)
         along = field / length[:, None]
         window = np.arange(n)
@@ -438,7 +451,7 @@ class MagneticField(Data):
         rows, kinds = (n, slice(1)) if windows.alone else (4 * n, slice(None))
         used, places = used[:rows], places[:, kinds]
         values = values[:, kinds] * used[places][..., None]
-        inverse = np.linalg.inv(np.asarray(imu.magnetometer.gain))
+        inverse = np.linalg.inv(imu.triads()["magnetometer"].gain)
         shaken = BlockFactor(places, values * (windows.noise / np.sqrt(windows.count))[:, None, None] @ inverse)  # pyright: ignore
         turned = _UNITS[1] * (1 + _TURN_SHARE / _UNITS[1] * windows.angle) * length
         sizes = np.concatenate([np.full(n, _UNITS[0]), np.repeat(turned, 2), _UNITS[2] + windows.off])[:rows] * used
@@ -452,7 +465,7 @@ class MagneticField(Data):
             # what the hand and the accelerometer's errors do to its length, they do across it, where nothing shows it
             shaken_up = 1.4826 * np.median(windows.off) * np.linalg.norm(bent[:, 9:], axis=1)
             measured[3 * n :, 3 * n :] += bent @ windows.vertical @ bent.T + np.diag(shaken_up**2)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], Covariance(measured, tuple(factors), used, group))  # pyright: ignore
+        return Covariance(measured, tuple(factors), used, group)  # pyright: ignore
 
 
 def _across(field: FloatArray) -> FloatArray:

@@ -9,17 +9,25 @@ from jaxtyping import Float
 
 from jaximu.data.gravity_norm import recover_specific_force
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import conjugate, integrate_rates, rotate
+from jaximu.ground.rotation import conjugate, integrate_rates, multiply, rotate
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Turns
 
-__all__ = ["across", "gravity_direction", "gravity_direction_error", "turn_rotations", "unit_vectors"]
+__all__ = ["across", "gravity_direction", "gravity_direction_error", "level", "turn_rotations", "unit_vectors"]
 
 
 def unit_vectors(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     """Return vectors scaled to length one."""
     return vectors / jnp.sqrt(jnp.sum(vectors**2, axis=-1, keepdims=True))
+
+
+def level(attitude: Float[Array, "4"], force: Float[Array, "3"]) -> Float[Array, "4"]:
+    """Return the attitude turned the shortest way so that a specific force measured at rest points up."""
+    x, y, z = rotate(attitude, force / jnp.linalg.norm(force))
+    half_turn = jnp.array([0.0, 1.0, 0.0, 0.0])  # where it points straight down
+    turned = jnp.where(1 + z > 1e-9, jnp.stack([1 + z, y, -x, 0 * z]), half_turn)
+    return multiply(turned / jnp.linalg.norm(turned), attitude)
 
 
 def turn_rotations(
@@ -29,8 +37,7 @@ def turn_rotations(
 
     `stimulus` (T, S): what else the gyroscope's effects need at the samples.
     """
-    assert imu.gyroscope is not None
-    return integrate_rates(imu.gyroscope.recover(turns.output, stimulus), turns.interval, method)
+    return integrate_rates(imu.triads()["gyroscope"].recover(turns.output, stimulus), turns.interval, method)
 
 
 def across(basis: Float[Array, "T 2 3"], vectors: Float[Array, "T 3"]) -> Float[Array, "T 2"]:

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaximu.estimation.data import Handling
+from jaximu.estimation.problem import axis_scales
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Observations, Turns
-from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation
 
 __all__ = ["bend", "handling", "missed_by_sampling", "moved_by_hand", "sway"]
@@ -45,30 +45,25 @@ def handling(
     halved: where sampling is dense enough it is noise. `running` (T, S, 4): the turns' rotations after each sample.
     """
     poses, turns = observations.poses, observations.turns
-    count, steps = len(poses.mask), len(turns.mask)
+    count = len(poses.mask)
     tilting, spread = np.zeros(count), np.full(count, np.inf)
-    first = 0
-    for part in segmentations:
-        tilts, sigma = _tilts(part.recording.accelerometer, part.intervals, imu, noise.accelerometer)
-        here = slice(first, first + len(part.intervals))
-        tilting[here], spread[here] = np.linalg.norm(tilts, axis=1), sigma
-        first += len(part.intervals)
+    tilts, sigma = _tilts(segmentations, imu, noise.accelerometer)
+    tilting[: len(tilts)], spread[: len(tilts)] = np.linalg.norm(tilts, axis=1), sigma
     excess = np.maximum(tilting**2 - 2 * np.where(np.isfinite(spread), spread, 0.0) ** 2, 0.0)
-    off = excess / 2 * ((np.asarray(poses.stop) - np.asarray(poses.start)) / 2) ** 2
-    gyroscope = imu.gyroscope
-    assert gyroscope is not None and noise.gyroscope is not None
-    scale = np.linalg.norm(np.asarray(gyroscope.gain), axis=1)
+    off = excess / 2 * ((poses.stop - poses.start) / 2) ** 2
+    gyroscope = imu.triads()["gyroscope"]
+    assert noise.gyroscope is not None
+    scale = axis_scales(gyroscope)
     rest = (excess / 2)[:, None] * scale**2
     moving = np.concatenate([np.zeros(count), np.repeat(off[:-1] + off[1:], 2), rest.ravel()])
 
     turned = missed_by_sampling(turns, gyroscope, np.asarray(running))
-    interval = np.asarray(turns.interval)
+    interval = turns.interval
     white = float(np.mean(noise.gyroscope.split(_SHORT)[0]))
     known = white * np.sum(interval, axis=1)
     missed = np.sum(turned**2, axis=1) - 3 * known
-    missed = np.where(np.asarray(turns.mask), np.maximum(missed, 0.0), 0.0)
+    missed = np.where(turns.mask, np.maximum(missed, 0.0), 0.0)
     sampling = np.concatenate([np.zeros(count), np.repeat(missed / 3, 2), np.zeros(3 * count)])
-    assert len(sampling) == 4 * count + 2 * steps
     return Handling(moving, sampling, np.sqrt(excess), spread, np.sqrt(missed), np.sqrt(known))
 
 
@@ -78,22 +73,18 @@ def sway(segmentations: Sequence[Segmentation], imu: Imu, noise: NoiseModel) -> 
     A pose's second half is turned against its first by the rates, weighted by a triangle, and the accelerometer sees
     gravity turn by as much. Along the direction that the rates say, what it sees of a pose at rest is standard normal.
     """
-    tilting, turned, known = [], [], []
-    assert imu.gyroscope is not None
+    turned = []
     for part in segmentations:
-        tilts, sigma = _tilts(part.recording.accelerometer, part.intervals, imu, noise.accelerometer)
-        gyroscope = part.recording.gyroscope
-        assert gyroscope is not None
-        rate = imu.gyroscope.recover_on_host(gyroscope.values)
+        gyroscope = part.recording.signals["gyroscope"]
+        rate = imu.triads()["gyroscope"].recover_on_host(gyroscope.values)
         for start, stop in part.intervals:
             inside = (gyroscope.time >= start) & (gyroscope.time < stop)
             weight = 1 - np.abs(2 * (gyroscope.time[inside] - start) / (stop - start) - 1)
             turned.append(weight @ rate[inside] / max(float(weight.sum()), 1e-12))
-        tilting.append(tilts)
-        known.append(sigma)
+    tilts, sigma = _tilts(segmentations, imu, noise.accelerometer)
     rates = np.array(turned) - np.median(turned, axis=0)
-    both = np.sum(np.concatenate(tilting) * rates, axis=1)
-    along = both / np.maximum(np.linalg.norm(rates, axis=1), 1e-300) / np.concatenate(known)
+    both = np.sum(tilts * rates, axis=1)
+    along = both / np.maximum(np.linalg.norm(rates, axis=1), 1e-300) / sigma
     along = np.clip(along, -_BOUND, _BOUND)  # one pose that was bumped is not all
     if np.sum(along) < _SURE * np.sqrt(len(along)):
         return []
@@ -114,7 +105,7 @@ def bend(turns: Turns) -> FloatArray:
     The mean over an interval h is the rate in its middle and h²/24 of its second derivative, which over a turn about a
     moving axis does not vanish.
     """
-    output, inside = np.asarray(turns.output), np.asarray(turns.interval) > 0
+    output, inside = turns.output, turns.interval > 0
     bent = np.zeros(output.shape)
     bent[:, 1:-1] = (output[:, 2:] - 2 * output[:, 1:-1] + output[:, :-2]) * inside[:, 2:, None] / 24
     return bent
@@ -126,33 +117,24 @@ def moved_by_hand(
     """Return the poses that move, and the turns that are too quick; `undersampling`: share of what samples miss."""
     findings = []
     poses = observations.poses
-    start, stop = np.asarray(poses.start), np.asarray(poses.stop)
-    gyroscope = imu.gyroscope
-    assert gyroscope is not None
-    variance = np.asarray(poses.gyroscope_covariance).diagonal(axis1=1, axis2=2)
-    scale = np.linalg.norm(np.asarray(gyroscope.gain), axis=1)
+    start, stop = poses.start, poses.stop
+    variance = poses.gyroscope_covariance.diagonal(axis1=1, axis2=2)
+    scale = axis_scales(imu.triads()["gyroscope"])
     noise = np.sqrt(np.mean(variance / scale**2, axis=1))
-    moving = np.flatnonzero(np.asarray(poses.mask) & (hands.tilting > _SURE * hands.noise) & (hands.tilting > noise))
+    moving = np.flatnonzero(poses.mask & (hands.tilting > _SURE * hands.noise) & (hands.tilting > noise))
     if len(moving):
         worst = moving[np.argmax(hands.tilting[moving])]
-        rows = []
-        for pose in moving:
-            times = [
-                part.recording.accelerometer.time
-                for part in segmentations
-                if np.any(part.intervals[:, 0] == start[pose])
-            ]
-            rows += [int(np.searchsorted(time, start[pose])) + 1 for time in times[:1]]
+        times = [part.recording.accelerometer.time for part in segmentations for _ in part.intervals]
         findings.append(
             Finding(
                 "data.moving_pose",
-                tuple(rows[:5]),
+                tuple(int(np.searchsorted(times[pose], start[pose])) + 1 for pose in moving[:5]),
                 f"{len(moving)} of {int(np.sum(poses.mask))} poses are not still: the one from {start[worst]:.1f} to "
                 f"{stop[worst]:.1f} s tilts by {np.degrees(hands.tilting[worst]):.2g} °/s. They and the turns around "
                 "them count for less. Put the unit down, or hold it against something solid.",
             )
         )
-    real = np.asarray(observations.turns.mask)
+    real = observations.turns.mask
     expected, known = undersampling * hands.missed / np.sqrt(3), hands.turned
     coarse = real & (expected > 2 * known)
     if undersampling < 1 and np.sum(coarse) > _MANY * np.sum(real):
@@ -179,25 +161,26 @@ def _rounded(rate: float) -> str:
     return f"{np.ceil(rate / step) * step:.0f}"
 
 
-def _tilts(signal: Signal, intervals: FloatArray, imu: Imu, noise: AxisNoise) -> tuple[FloatArray, FloatArray]:
+def _tilts(segmentations: Sequence[Segmentation], imu: Imu, noise: AxisNoise) -> tuple[FloatArray, FloatArray]:
     """Return the rate (P, 3), rad/s, at which each pose tilts, and its standard deviation (P,) for each component."""
-    triad = imu.accelerometer
-    force = triad.recover_on_host(signal.values)
     rates, spreads = [], []
-    for start, stop in intervals:
-        middle = (start + stop) / 2
-        first, second = (force[(signal.time >= a) & (signal.time < b)] for a, b in ((start, middle), (middle, stop)))
-        if not len(first) or not len(second):
-            rates.append(np.zeros(3))
-            spreads.append(np.inf)
-            continue
-        before, after = first.mean(axis=0), second.mean(axis=0)
-        both = before + after
-        turned = np.cross(after - before, both) / np.sum(both * both) * 2
-        covariance = noise.covariance([start, middle], [middle, stop]).mean(axis=0)
-        variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
-        rates.append(turned / (middle - start))
-        spreads.append(float(np.sqrt(variance)) / (middle - start) / float(np.linalg.norm(both) / 2))
+    for part in segmentations:
+        signal = part.recording.accelerometer
+        force = imu.accelerometer.recover_on_host(signal.values)
+        for start, stop in part.intervals:
+            middle = (start + stop) / 2
+            halves = [force[(signal.time >= a) & (signal.time < b)] for a, b in ((start, middle), (middle, stop))]
+            if not all(map(len, halves)):
+                rates.append(np.zeros(3))
+                spreads.append(np.inf)
+                continue
+            before, after = (half.mean(axis=0) for half in halves)
+            both = before + after
+            turned = np.cross(after - before, both) / np.sum(both * both) * 2
+            covariance = noise.covariance([start, middle], [middle, stop]).mean(axis=0)
+            variance = covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1]
+            rates.append(turned / (middle - start))
+            spreads.append(float(np.sqrt(variance)) / (middle - start) / float(np.linalg.norm(both) / 2))
     return np.array(rates), np.array(spreads)
 
 
@@ -207,7 +190,7 @@ def missed_by_sampling(turns: Turns, gyroscope: Triad, running: FloatArray) -> F
     Where sampling is dense enough it is noise. running: the turns' rotations (T, S, 4) after each sample.
     """
     rates = gyroscope.recover_on_host(turns.output)
-    interval = np.asarray(turns.interval)
+    interval = turns.interval
     sign = np.where(np.arange(interval.shape[1]) % 2 == 0, 1.0, -1.0)
     axis = running[..., 1:]
     across = 2 * np.cross(axis, rates)

@@ -26,6 +26,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -36,14 +37,16 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from jaximu.data.gravity_direction import level
 from jaximu.data.preintegration import preintegrate_samples, white_covariance
 from jaximu.data.sightings import SIZE, AttitudeSeen, FieldSeen, Sighting, Standing, VelocitySeen
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
-from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.data import About, Conditions, OfOneUnit
 from jaximu.estimation.information_filter import Knowledge, WhiteRows, estimate, run, smooth, smoothed_variances
 from jaximu.estimation.problem import flatten
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.differences import interpolated, value_and_jacobian
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
@@ -53,6 +56,7 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.reference import Integral
 
 __all__ = [
     "FARTHEST_UNSEEN",
@@ -66,18 +70,17 @@ __all__ = [
     "first_field",
     "first_knowledge",
     "interval_rows",
-    "level",
     "longest_rest",
     "merged_drift",
     "sees_earth",
     "turned",
-]  # fmt: skip
+]
 
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
 _LEVEL, _HEADING, _STILL = 0.5, 1e-3, 1e-4
 """What is known of the first attitude (rad; heading is free and held) and of the velocity in a rest (m/s)."""
-_ANEW, _GYROCOMPASS = 2.0, 0.1 * EARTH_RATE * np.sqrt(10.0)
+_RESTARTED, _GYROCOMPASS = 2.0, 0.1 * EARTH_RATE * np.sqrt(10.0)
 """rad that heading may be off after motion that was left out, where it is measured or for a gyroscope with less noise
 than this, rad/√s, which shows a tenth of the Earth's rotation in ten seconds; else heading is held: both would chase
 each other."""
@@ -164,38 +167,26 @@ def merged_drift(noise: NoiseModel, shortest: float, most: int) -> tuple[FloatAr
     one with the sum of their variances and the mean of their times: near zero frequency the density stays what it was.
     """
     white, parts = [], []
-    for place, triad in enumerate((noise.gyroscope, noise.accelerometer)):
+    for axes, triad in zip(np.split(np.arange(6), 2), (noise.gyroscope, noise.accelerometer), strict=True):
         assert triad is not None
         density, slow = triad.split(shortest)
         white.append(density)
         for time, variance in zip(slow.correlation_time, slow.variance.T, strict=True):
-            whole = np.zeros(6)
-            whole[3 * place : 3 * place + 3] = variance
-            parts.append((float(time), whole))
+            parts.append((float(time), np.zeros(6)))
+            parts[-1][1][axes] = variance
     parts = sorted((part for part in parts if part[1].any()), key=lambda part: part[0])
-    unit = np.repeat([np.mean(each) for each in white], 3)
-
-    def together(one, other):
-        weights = [np.sum(each[1] / unit) for each in (one, other)]
-        return float(np.average([one[0], other[0]], weights=weights)), one[1] + other[1]
-
+    unit = np.repeat(np.mean(white, axis=1), 3)
     while len(parts) > most:
-        gaps = [later[0] / earlier[0] for earlier, later in pairwise(parts)]
-        place = int(np.argmin(gaps))
-        parts[place : place + 2] = [together(*parts[place : place + 2])]
+        times, variances = zip(*parts, strict=True)
+        k = int(np.argmin(np.divide(times[1:], times[:-1])))
+        weights = [np.sum(variance / unit) for variance in variances[k : k + 2]]
+        parts[k : k + 2] = [(float(np.average(times[k : k + 2], weights=weights)), variances[k] + variances[k + 1])]
     times = np.array([time for time, _ in parts])
-    variance = np.array([whole for _, whole in parts]).reshape(-1, 6)
+    variance = np.array([variance for _, variance in parts]).reshape(-1, 6)
     return np.concatenate(white), np.maximum(variance, _LEAST_DRIFT * unit / times[:, None]), times
 
 
 # --- one interval -----------------------------------------------------------------------------------------------------
-
-
-def level(attitude: Float[Array, 4], force: Float[Array, 3]) -> Float[Array, 4]:
-    """Return the attitude turned the shortest way so that a specific force measured at rest points up."""
-    up = rotate(attitude, force / jnp.linalg.norm(force))
-    turned = jnp.stack([1 + up[2], up[1], -up[0], jnp.zeros(())])
-    return multiply(turned / jnp.linalg.norm(turned), attitude)
 
 
 def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
@@ -209,7 +200,7 @@ def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
     )
 
 
-def _seen(like: Imu, numbers: Array, part: MotionIntervals):
+def _samples(like: Imu, numbers: Array, part: MotionIntervals):
     """Return rates and forces (S, 6) of an interval's samples, the Earth's rotation (3,) and the mounting's numbers.
 
     Errors of the set-up are undone by iteration: what they would make of the rates is taken off the rates.
@@ -217,13 +208,13 @@ def _seen(like: Imu, numbers: Array, part: MotionIntervals):
     imu = ravel_pytree(like)[1](numbers)
     bare = imu.without(GyroEarthRotation, *MOUNTING_EFFECTS)
     force, rate = bare.recover(part.accelerometer, part.gyroscope, Stimulus(time=part.time))
-    seen = jnp.concatenate([rate, force], axis=-1)
-    found = seen
+    felt = jnp.concatenate([rate, force], axis=-1)
+    true = felt
     for _ in range(_UNDONE if bare.setup else 0):
-        path = Stimulus(found[:, 3:], found[:, :3], time=part.time)
+        path = Stimulus(true[:, 3:], true[:, :3], time=part.time)
         made = [getattr(bare.acted(path, name), name) for name in ("angular_rate", "specific_force")]
-        found = seen - jnp.concatenate(made, axis=-1) + found
-    inside = found[part.time.shape[-1] - part.length.shape[-1] :]
+        true = felt - jnp.concatenate(made, axis=-1) + true
+    inside = true[part.time.shape[-1] - part.length.shape[-1] :]
     return inside, imu.coefficients(GyroEarthRotation), jnp.hstack(Mounting.of(imu))
 
 
@@ -256,7 +247,7 @@ def _condensed(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -
 
 
 def _of_motion(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> _Means:
-    samples, earth, mounting = _seen(like, numbers, part)
+    samples, earth, mounting = _samples(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     reaction = whole.reaction[:, :6]
     length = jnp.asarray(part.length)
@@ -268,17 +259,29 @@ def _of_motion(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -
         return jnp.concatenate([samples[last], (samples[last] - samples[before])[:3] / jnp.maximum(apart, 1e-9)])
 
     def moved(numbers):  # exactly: a change of rates and forces also changes coning and sculling
-        samples, earth, mounting = _seen(like, numbers, part)
+        samples, earth, mounting = _samples(like, numbers, part)
         varied = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
         turned = logarithm(multiply(conjugate(whole.rotation), varied.rotation))
         return jnp.concatenate([turned, varied.velocity]), earth, ended(samples), mounting
 
     increments, by_earth, by_ending, by_mounting = jax.jacfwd(moved)(numbers)
     return _Means(
-        whole.rotation, whole.velocity, white_covariance(reaction, jnp.diag(white), length),
-        reaction.sum(axis=0), increments, jnp.zeros(6), jnp.zeros_like(increments), earth, by_earth,
-        ended(samples), by_ending, length[last] / 2, mounting, by_mounting, _duration(part),
-    )  # fmt: skip
+        whole.rotation,
+        whole.velocity,
+        white_covariance(reaction, jnp.diag(white), length),
+        reaction.sum(axis=0),
+        increments,
+        jnp.zeros(6),
+        jnp.zeros_like(increments),
+        earth,
+        by_earth,
+        ended(samples),
+        by_ending,
+        length[last] / 2,
+        mounting,
+        by_mounting,
+        _duration(part),
+    )
 
 
 def _of_rest(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> _Means:
@@ -286,20 +289,34 @@ def _of_rest(like: Imu, numbers: Array, part: MotionIntervals, white: Array) -> 
     few = 2 * before + 1
     share = part.length / _duration(part)
     # effects see the mean output, as they do of poses, and nothing that changes: noise is no motion
-    force, rate = (jnp.broadcast_to(share @ each[before:], (few, 3)) for each in (part.accelerometer, part.gyroscope))
+    force, rate = (
+        jnp.broadcast_to(share @ output[before:], (few, 3)) for output in (part.accelerometer, part.gyroscope)
+    )
     still = replace(part, accelerometer=force, gyroscope=rate, length=part.length[: few - before], time=part.time[:few])
 
-    def mean(numbers):
-        samples, *apart = _seen(like, numbers, still)
-        return (samples[0], *apart), (samples[0], *apart)
+    def of(numbers):
+        samples, *beside = _samples(like, numbers, still)
+        return samples[0], *beside
 
-    (means, by_earth, by_mounting), (found, earth, mounting) = jax.jacfwd(mean, has_aux=True)(numbers)
-    alike, none = jnp.zeros(4).at[0].set(1.0), jnp.zeros((6, 6))
+    (mean, earth, mounting), (means, by_earth, by_mounting) = value_and_jacobian(of, numbers)
+    identity, none = jnp.zeros(4).at[0].set(1.0), jnp.zeros((6, 6))
     return _Means(
-        alike, jnp.zeros(3), none, none, jnp.zeros_like(means), found, means, earth, by_earth,
-        jnp.concatenate([found, jnp.zeros(3)]), jnp.concatenate([means, jnp.zeros_like(means[:3])]),
-        jnp.asarray(part.length)[0] / 2, mounting, by_mounting, _duration(part),
-    )  # fmt: skip
+        identity,
+        jnp.zeros(3),
+        none,
+        none,
+        jnp.zeros_like(means),
+        mean,
+        means,
+        earth,
+        by_earth,
+        jnp.concatenate([mean, jnp.zeros(3)]),
+        jnp.concatenate([means, jnp.zeros_like(means[:3])]),
+        jnp.asarray(part.length)[0] / 2,
+        mounting,
+        by_mounting,
+        _duration(part),
+    )
 
 
 def _duration(part: MotionIntervals) -> Array:
@@ -322,74 +339,69 @@ def _rows(
     drifts, size = errors.variance.size, errors.states
     moving = (1 - part.rest) * part.real
 
-    def motion(change):
-        first, last, increment = change[:6], change[6:12], change[12:18]
-        attitude, velocity = _carried(
-            multiply(before.attitude, exponential(first[:3])), before.velocity + first[3:],
-            multiply(means.rotation, exponential(increment[:3])), means.gained + increment[3:], means.duration,
-            means.earth + change[18:21], gravity + change[21],
-        )  # fmt: skip
-        reached = multiply(after.attitude, exponential(last[:3]))
-        return jnp.concatenate(
-            [logarithm(multiply(conjugate(reached), attitude)), velocity - after.velocity - last[3:]]
-        )
-
-    def rest(change):
-        first, last = change[:6], change[6:12]
-        start, reached = (multiply(each.attitude, exponential(moved[:3])) for each, moved in
-                          ((before, first), (after, last)))  # fmt: skip
-        return jnp.concatenate([logarithm(multiply(conjugate(reached), start)), -(after.velocity + last[3:])])
+    def off(change, attitude, velocity):
+        """Return by how much attitude (rad) and velocity (m/s) miss the end of the path, moved by a change (6,)."""
+        end = multiply(after.attitude, exponential(change[:3]))
+        return jnp.concatenate([logarithm(multiply(conjugate(end), attitude)), velocity - after.velocity - change[3:]])
 
     def both(change):
-        found = jnp.where(moving > 0, motion(change), rest(change))
-        return found, found
+        start, end, increment = change[:6], change[6:12], change[12:18]
+        begin = multiply(before.attitude, exponential(start[:3]))
+        moved = _carried(
+            begin,
+            before.velocity + start[3:],
+            multiply(means.rotation, exponential(increment[:3])),
+            means.gained + increment[3:],
+            means.duration,
+            means.earth + change[18:21],
+            gravity + change[21],
+        )
+        return jnp.where(moving > 0, off(end, *moved), off(end, begin, jnp.zeros(3)))
 
-    slopes, value = jax.jacfwd(both, has_aux=True)(jnp.zeros(22))
+    value, slopes = value_and_jacobian(both, jnp.zeros(22))
     push = slopes[:, 12:18]
     lost = (errors.lost * part.lost) ** 2
     swept = push @ (means.by_noise + jnp.diag(lost)) @ push.T + jnp.diag(jnp.asarray(_FLOOR) ** 2)
-    stays = jnp.diag(jnp.concatenate([jnp.full(3, errors.creep * means.duration + _FLOOR[0] ** 2),
-                                      jnp.full(3, _STILL**2)]))  # fmt: skip
-    weights = inverse_cholesky(jnp.where(moving > 0, swept, stays))
-    shared = jnp.concatenate(
-        [push @ means.increments + slopes[:, 18:21] @ means.by_earth, slopes[:, 21:]], axis=1
-    )  # fmt: skip
-    by_drift = -push @ means.by_drift
-    copies = errors.variance.shape[0]
-    anew = (part.restart > 0) & (part.real > 0)
+    stays = jnp.repeat(jnp.array([errors.creep * means.duration + _FLOOR[0] ** 2, _STILL**2]), 3)
+    weights = inverse_cholesky(jnp.where(moving > 0, swept, jnp.diag(stays)))
+    by_number = push @ means.increments + slopes[:, 18:21] @ means.by_earth
+    by_drift = jnp.tile(-push @ means.by_drift, (1, errors.variance.shape[0]))
     shown = sees_earth(errors) | bool(part.sightings)
-    known = jnp.array(_first_root(1.0)).at[2].set(1 / jnp.where(shown, _ANEW, _HEADING))
+    known = jnp.array(_first_root(1.0)).at[2].set(1 / jnp.where(shown, _RESTARTED, _HEADING))
 
-    def begun(moved):
-        reached = multiply(after.attitude, exponential(moved[:3]))
-        off = rotate(anchor, logarithm(multiply(conjugate(anchor), reached)))  # in the level frame: heading is its z
-        found = jnp.concatenate([off, after.velocity + moved[3:]])
-        return known * found, known * found
+    def restarted(change):
+        end = multiply(after.attitude, exponential(change[:3]))
+        turned = rotate(anchor, logarithm(multiply(conjugate(anchor), end)))  # in the level frame: heading is its z
+        return known * jnp.concatenate([turned, after.velocity + change[3:]])
 
-    by_begun, off = jax.jacfwd(begun, has_aux=True)(jnp.zeros(6))
-    process = WhiteRows(
-        weights @ jnp.concatenate([slopes[:, :6], jnp.tile(by_drift, (1, copies))], axis=1),
-        weights @ jnp.concatenate([slopes[:, 6:12], jnp.zeros((6, drifts))], axis=1),
-        weights @ shared, -weights @ value,
-    )  # fmt: skip
-    process = WhiteRows(
-        jnp.where(anew, 0.0, process.before),
-        jnp.where(anew, jnp.concatenate([by_begun, jnp.zeros((6, drifts))], axis=1), process.after),
-        jnp.where(anew, 0.0, process.shared),
-        jnp.where(anew, -off, process.right),
+    miss, by_end = value_and_jacobian(restarted, jnp.zeros(6))
+    none = jnp.zeros((6, drifts))
+    carrying = WhiteRows(
+        weights @ jnp.concatenate([slopes[:, :6], by_drift], axis=1),
+        weights @ jnp.concatenate([slopes[:, 6:12], none], axis=1),
+        weights @ jnp.concatenate([by_number, slopes[:, 21:]], axis=1),
+        -weights @ value,
     )
-    duration = jnp.where(part.real > 0, means.duration, 1.0)
+    beginning = carrying._replace(before=0.0, after=jnp.concatenate([by_end, none], axis=1), shared=0.0, right=-miss)
+    process = jax.tree.map(partial(jnp.where, (part.restart > 0) & (part.real > 0)), beginning, carrying)
+    wander = _wandering(jnp.where(part.real > 0, means.duration, 1.0), errors, by_number.shape[1] + 1)
+    rows = [process, wander, _measured(means, part, errors, gravity, after, size)]
+    rows += [_sighted(means, part, sighting, errors, gravity, after, size) for sighting in part.sightings]
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *rows)
+
+
+def _wandering(duration: Array, errors: Disturbances, numbers: int) -> WhiteRows:
+    """Return the rows of the drift, which dies away and is driven by noise over an interval."""
+    drifts = errors.variance.size
     kept = jnp.exp(-duration / errors.correlation_time)
     variance = errors.variance * -jnp.expm1(-2 * duration / errors.correlation_time)[:, None]
     white = 1 / jnp.sqrt(variance).reshape(-1)
-    wander = WhiteRows(
-        jnp.concatenate([jnp.zeros((drifts, 6)), jnp.diag(-white * jnp.repeat(kept, 6))], axis=1),
-        jnp.concatenate([jnp.zeros((drifts, 6)), jnp.diag(white)], axis=1),
-        jnp.zeros((drifts, shared.shape[1])), jnp.zeros(drifts),
-    )  # fmt: skip
-    rows = [process, wander, _measured(means, part, errors, gravity, after, size)]
-    rows += [_sighted(means, part, each, errors, gravity, after, size) for each in part.sightings]
-    return jax.tree.map(lambda *each: jnp.concatenate(each), *rows)
+    return WhiteRows(
+        jnp.pad(jnp.diag(-white * jnp.repeat(kept, 6)), ((0, 0), (6, 0))),
+        jnp.pad(jnp.diag(white), ((0, 0), (6, 0))),
+        jnp.zeros((drifts, numbers)),
+        jnp.zeros(drifts),
+    )
 
 
 def _measured(
@@ -399,26 +411,23 @@ def _measured(
 
     def still(change):  # attitude, earth, gravity
         back = conjugate(multiply(after.attitude, exponential(change[:3])))
-        expected = (
-            rotate(back, means.earth + change[3:6]),
-            rotate(back, jnp.array([0.0, 0.0, 1.0])) * (gravity + change[6]),
-        )
-        found = means.mean - jnp.concatenate(expected)
-        return found, found
+        up = rotate(back, jnp.array([0.0, 0.0, 1.0]))
+        return means.mean - jnp.concatenate([rotate(back, means.earth + change[3:6]), up * (gravity + change[6])])
 
-    slopes, value = jax.jacfwd(still, has_aux=True)(jnp.zeros(7))
-    weight = jnp.sqrt(means.duration / errors.rest)
-    copies, count = errors.variance.shape[0], means.means.shape[1]
+    value, slopes = value_and_jacobian(still, jnp.zeros(7))
+    copies = errors.variance.shape[0]
     by_state = jnp.concatenate([slopes[:, :3], jnp.zeros((6, 3)), jnp.tile(-jnp.eye(6), (1, copies))], axis=1)
     by_number = jnp.concatenate([means.means + slopes[:, 3:6] @ means.by_earth, slopes[:, 6:]], axis=1)
-    stop = jnp.zeros((6, size)).at[:3, 3:6].set(jnp.eye(3)) / errors.arrival
-    arrived = jnp.concatenate([after.velocity, jnp.zeros(3)]) / errors.arrival
-    resting, stopping = part.rest * part.real, part.arrival * part.real
+    weight = part.rest * part.real * jnp.sqrt(means.duration / errors.rest)
+    stopping = part.arrival * part.real / errors.arrival
+    stop = jnp.zeros((6, size)).at[:3, 3:6].set(jnp.eye(3))
+    velocity = jnp.concatenate([after.velocity, jnp.zeros(3)])
     return WhiteRows(
-        jnp.zeros((6, size)), resting * weight[:, None] * by_state + stopping * stop,
-        resting * weight[:, None] * by_number + jnp.zeros((6, count + 1)),
-        -resting * weight * value - stopping * arrived,
-    )  # fmt: skip
+        jnp.zeros((6, size)),
+        weight[:, None] * by_state + stopping * stop,
+        weight[:, None] * by_number,
+        -weight * value - stopping * velocity,
+    )
 
 
 def _sighted(
@@ -431,29 +440,39 @@ def _sighted(
     size: int,
 ) -> WhiteRows:
     """Return the rows of what was measured from outside at the end, or nothing."""
+    parts = 6, 6 + SIZE, 7 + SIZE
 
     def off(change):  # attitude and velocity, the end, gravity, the mounting
-        moved, ended, gravitated, remounted = jnp.split(change, (6, 6 + SIZE, 7 + SIZE))
+        moved, ended, gravitated, remounted = jnp.split(change, parts)
         rate, force, acceleration = jnp.split(means.ending + ended, 3)
         standing = Standing(
-            multiply(after.attitude, exponential(moved[:3])), after.velocity + moved[3:], rate, force, acceleration,
-            means.half, gravity + gravitated[0],
-        )  # fmt: skip
-        found = sighting.off(standing, Mounting.from_numbers(means.mounting + remounted))
-        return found, found
+            multiply(after.attitude, exponential(moved[:3])),
+            after.velocity + moved[3:],
+            rate,
+            force,
+            acceleration,
+            means.half,
+            gravity + gravitated[0],
+        )
+        return sighting.off(standing, Mounting.from_numbers(means.mounting + remounted))
 
-    slopes, value = jax.jacfwd(off, has_aux=True)(jnp.zeros(7 + SIZE + len(means.mounting)))
+    value, slopes = value_and_jacobian(off, jnp.zeros(parts[-1] + len(means.mounting)))
     weight = sighting.measured * part.real / getattr(errors, sighting.noise)
-    by_path, by_ending, by_gravity, by_mounting = jnp.split(slopes, (6, 6 + SIZE, 7 + SIZE), axis=1)
-    by_state = jnp.concatenate([by_path, jnp.zeros((len(value), size - 6))], axis=1)
+    by_path, by_ending, by_gravity, by_mounting = jnp.split(slopes, parts, axis=1)
+    by_state = jnp.pad(by_path, ((0, 0), (0, size - 6)))
     by_number = jnp.concatenate([by_ending @ means.by_ending + by_mounting @ means.by_mounting, by_gravity], axis=1)
     return WhiteRows(jnp.zeros_like(by_state), weight * by_state, weight * by_number, -weight * value)
 
 
 def interval_rows(
-    like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: MotionIntervals, errors: Disturbances,
-    before: MotionPath, after: MotionPath,
-) -> WhiteRows:  # fmt: skip
+    like: Imu,
+    numbers: Float[Array, " M"],
+    gravity: Float[Array, ""],
+    part: MotionIntervals,
+    errors: Disturbances,
+    before: MotionPath,
+    after: MotionPath,
+) -> WhiteRows:
     """Return the white rows of one interval, linearised about a unit and the path's two ends.
 
     The state is the rotation vector in the body frame that turns the path's attitude into the true one (rad), the
@@ -466,29 +485,29 @@ def interval_rows(
 
 def carried(
     like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: MotionIntervals, before: MotionPath
-) -> MotionPath:  # fmt: skip
+) -> MotionPath:
     """Return the path's end after an interval, as a unit's numbers have it: the same attitude in a rest or restart."""
-    samples, earth, _ = _seen(like, numbers, part)
+    samples, earth, _ = _samples(like, numbers, part)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], part.length)
     attitude, velocity = _carried(
         before.attitude, before.velocity, whole.rotation, whole.velocity, whole.duration, earth, gravity
-    )  # fmt: skip
+    )
     resting = (part.rest > 0) | (part.restart > 0)
     return MotionPath(jnp.where(resting, before.attitude, attitude), jnp.where(resting, 0.0, velocity))
 
 
 def first_field(intervals: MotionIntervals, imu: Imu) -> FloatArray:
     """Return the magnetic field (3,) in the level frame, µT, as the first rest in which it is measured has it."""
-    (sighting,) = (each for each in intervals.sightings if isinstance(each, FieldSeen))
-    at = int(np.argmax(np.asarray(sighting.measured) > 0))
+    (sighting,) = (sighting for sighting in intervals.sightings if isinstance(sighting, FieldSeen))
+    at = int(np.argmax(sighting.measured > 0))
     part = jax.tree.map(lambda leaf: np.asarray(leaf)[at], intervals)
     before = part.time.shape[-1] - part.length.shape[-1]
     mean = part.length @ part.accelerometer[before:] / part.length.sum()
     attitude = level(jnp.array([1.0, 0.0, 0.0, 0.0]), imu.with_effects().accelerometer.recover(mean))
-    for each in part.sightings:
-        if each.absolute and each.measured > 0:
-            attitude = each.placed(attitude, Mounting.of(imu))
-    return np.asarray(rotate(attitude, np.asarray(sighting.value)[at]))
+    for other in part.sightings:
+        if other.absolute and other.measured > 0:
+            attitude = other.placed(attitude, Mounting.of(imu))
+    return np.asarray(rotate(attitude, sighting.value[at]))
 
 
 def sees_earth(errors: Disturbances) -> Bool[Array, ""]:
@@ -500,9 +519,7 @@ def _first_root(heading: float) -> FloatArray:
     return np.array([1 / _LEVEL, 1 / _LEVEL, 1 / heading, *(3 * [1 / _STILL])])
 
 
-def first_knowledge(
-    errors: Disturbances, velocity: Float[Array, 3], shared: int, turned: bool = False
-) -> Knowledge:  # fmt: skip
+def first_knowledge(errors: Disturbances, velocity: Float[Array, 3], shared: int, turned: bool = False) -> Knowledge:
     """Return what is known of the first state, in a rest, about a path with that velocity; of shared numbers nothing.
 
     Tilt is as good as unknown; heading, which rests and motion do not determine, is held where the path has it, unless
@@ -524,118 +541,157 @@ def longest_rest(errors: Disturbances) -> float:
     Over T the mean of a process with variance σ² and correlation time τ differs from its end by 2σ²T/3τ, in variance;
     white noise of density N² by N²/T.
     """
-    white, variance = np.asarray(errors.rest), np.asarray(errors.variance)
-    squared = 1.5 * _SHARE * np.asarray(errors.correlation_time)[:, None] * white / variance
-    return float(np.sqrt(squared.min(initial=np.inf)))
+    squared = 1.5 * _SHARE * errors.correlation_time[:, None] * errors.rest / errors.variance
+    return float(np.sqrt(np.min(squared, initial=np.inf)))
+
+
+@dataclass(frozen=True)
+class _Pieces:
+    """Intervals of a recording: samples from `begin` to before `end` (N,), and which are rests or restarts (N,).
+
+    skipped: s of motion left out as too long; jumped: motions left out over missing samples; bridged: s without
+    samples in the others.
+    """
+
+    begin: NDArray[np.int64]
+    end: NDArray[np.int64]
+    rest: NDArray[np.bool_]
+    restart: NDArray[np.bool_]
+    skipped: float
+    jumped: int
+    bridged: float
+
+    @classmethod
+    def of(
+        cls,
+        gyroscope: Signal,
+        edges: FloatArray,
+        lost: FloatArray,
+        rests: NDArray[np.int64],
+        marks: FloatArray,
+        still: float,
+    ) -> _Pieces:
+        """Return the intervals between and in rests, first and last sample (P, 2)."""
+        time, unseen = gyroscope.time, lost * np.linalg.norm(gyroscope.si(), axis=1)
+        pieces, skipped, jumped, bridged = [], 0.0, 0, lost[rests[0, 0] : rests[-1, 1]].sum()
+        moved_from = None
+        for start, stop in rests.tolist():
+            if moved_from is not None:
+                far = unseen[moved_from:start].sum() > FARTHEST_UNSEEN
+                long = _unseen(marks, float(time[moved_from]), float(time[start])) > LONGEST_MOTION
+                if far or long:  # nothing of the attitude is left
+                    pieces.append((moved_from, moved_from + 1, False, True))
+                    skipped += long * float(time[start] - time[moved_from])
+                    jumped += far and not long
+                    bridged -= lost[moved_from:start].sum()
+                else:
+                    parts = _on_marks(_parts(time, moved_from, start, _LONGEST), edges, marks)
+                    pieces += [(*part, False, False) for part in parts]
+            longest = max(_LONGEST, min(still, float(time[stop] - time[start]) / _PARTS))
+            pieces += [(*part, True, False) for part in _parts(time, start, stop, longest)]
+            moved_from = stop
+        begin, end, rest, restart = map(np.array, zip(*pieces, strict=True))
+        return cls(begin, end, rest, restart, skipped, jumped, bridged)
+
+    def notes(self, name: str) -> list[str]:
+        """Say what of a recording was left out."""
+        notes = []
+        if self.skipped:
+            notes.append(
+                f"{name}: {self.skipped:.0f} s of motion without a rest for more than {LONGEST_MOTION:.0f} s were left "
+                "out: attitude cannot be carried so far."
+            )
+        if self.jumped:
+            notes.append(
+                f"{name}: {self.jumped} motion{'s' if self.jumped > 1 else ''} in which samples are missing while the "
+                "unit turned were left out: nobody knows how far it turned."
+            )
+        if self.bridged > 1e-9:
+            notes.append(
+                f"{name}: {self.bridged:.3g} s without samples were bridged by holding the neighbouring samples; "
+                "the uncertainty of attitude and velocity grows there."
+            )
+        return notes
 
 
 def cut(
-    recording: Recording, rests: FloatArray, still: float = _LONGEST, beyond: int = 0,
-    attitude: Attitude | None = None, mounting: Mounting | None = None, field: Signal | None = None,
-) -> tuple[MotionIntervals, list[str]]:  # fmt: skip
+    recording: Recording,
+    rests: FloatArray,
+    still: float = _LONGEST,
+    beyond: int = 0,
+    attitude: Attitude | None = None,
+    mounting: Mounting | None = None,
+    field: Signal | None = None,
+) -> tuple[MotionIntervals, list[str]]:
     """Cut a recording into intervals, from its first rest to its last, padded in number and length; and notes.
 
     **Arguments:** `rests` (P, 2): start and stop, s; `still`: s, the longest interval of a rest, of which each has
     eight or more (`longest_rest`); `beyond`: samples before and after each interval that are kept, for effects that
-    look at neighbours; `attitude`: measured, with its `mounting`, at whose stamps
-    intervals of motion then end; `field`: magnetic, in the body frame (µT), by a calibrated magnetometer on the
-    recording's clock, whose mean over each rest is used. Where the triads have stamps of their own
-    the accelerometer is interpolated to the gyroscope's.
+    look at neighbours; `attitude`: measured, with its `mounting`, at whose stamps intervals of motion then end;
+    `field`: magnetic, in the body frame (µT), by a calibrated magnetometer on the recording's clock, whose mean over
+    each rest is used. Where the triads have stamps of their own the accelerometer is interpolated to the gyroscope's.
     """
-    gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
-    assert gyroscope is not None
-    time, period, notes = gyroscope.time, 1 / gyroscope.rate, []
-    force = accelerometer.values
-    if not np.array_equal(accelerometer.time, time):
-        force = np.stack([np.interp(time, accelerometer.time, each) for each in force.T], 1)
-    middle = (time[1:] + time[:-1]) / 2
-    edges = np.concatenate([[time[0] - period / 2], middle, [time[-1] + period / 2]])
-    length = np.diff(edges)
+    gyroscope, accelerometer = recording.signals["gyroscope"], recording.accelerometer
+    time, period = gyroscope.time, 1 / gyroscope.rate
+    force = interpolated(accelerometer.time, accelerometer.values, time)
+    edges = Integral(gyroscope, gyroscope.values).edges
     step = np.diff(time, prepend=time[0] - period, append=time[-1] + period)
     missing = np.where(step > 2.5 * period, step - period, 0.0)
     lost = (missing[1:] + missing[:-1]) / 2
-    first, last = np.searchsorted(time, rests[:, 0] + _SETTLING), np.searchsorted(time, rests[:, 1] - _SETTLING)
+    resting = np.searchsorted(time, rests + np.array([_SETTLING, -_SETTLING]))
     marks = np.zeros(0) if attitude is None else np.asarray((mounting or Mounting()).on_log(attitude.time))
-    unseen = lost * np.linalg.norm(gyroscope.si(), axis=1)
-    pieces, skipped, jumped, bridged = [], 0.0, 0, lost[first[0] : last[-1]].sum()
-    for place, (start, stop) in enumerate(zip(first, last, strict=True)):
-        begin = last[place - 1]
-        far = bool(place) and unseen[begin:start].sum() > FARTHEST_UNSEEN
-        long = bool(place) and _unseen(marks, float(time[begin]), float(time[start])) > LONGEST_MOTION
-        if far or long:  # nothing of the attitude is left
-            pieces.append((begin, begin + 1, 2.0))
-            skipped += long * (time[start] - time[begin])
-            jumped += far and not long
-            bridged -= lost[begin:start].sum()
-        elif place:
-            pieces += [(*each, 0.0) for each in _on_marks(_parts(time, begin, start, _LONGEST), edges, marks)]
-        longest = max(_LONGEST, min(still, float(time[stop] - time[start]) / _PARTS))
-        pieces += [(*each, 1.0) for each in _parts(time, start, stop, longest)]
-    begin, end, rest = (np.array(each) for each in zip(*pieces, strict=True))
-    begin, end = begin.astype(int), end.astype(int)
-    samples, count = _bucket(int((end - begin).max()) + beyond), len(pieces)
+    pieces = _Pieces.of(gyroscope, edges, lost, resting, marks, still)
+    begin, end, rest, restart = pieces.begin, pieces.end, pieces.rest, pieces.restart
+    notes = pieces.notes(recording.name)
+    if (ahead := rests[0, 0] - time[0]) > 1.0:
+        notes.append(f"{recording.name}: the first {ahead:.1f} s, before the first rest, were left out.")
+    samples, count = _bucket(int((end - begin).max()) + beyond), len(begin)
     inside = begin[:, None] + np.arange(samples) < end[:, None]
     around = begin[:, None] + np.arange(-beyond, samples)
     around = np.clip(around, 0, np.minimum(end + beyond, len(time))[:, None] - 1)
-    place = around[:, beyond:]
-    if skipped:
-        notes.append(
-            f"{recording.name}: {skipped:.0f} s of motion without a rest for more than {LONGEST_MOTION:.0f} s were "
-            "left out: attitude cannot be carried so far."
-        )
-    if jumped:
-        notes.append(
-            f"{recording.name}: {jumped} motion{'s' if jumped > 1 else ''} in which samples are missing while the unit "
-            "turned were left out: nobody knows how far it turned."
-        )
-    if bridged > 1e-9:
-        notes.append(
-            f"{recording.name}: {bridged:.3g} s without samples were bridged by holding the neighbouring samples; "
-            "the uncertainty of attitude and velocity grows there."
-        )
-    if (ahead := rests[0, 0] - time[0]) > 1.0:
-        notes.append(f"{recording.name}: the first {ahead:.1f} s, before the first rest, were left out.")
-    restart, rest = (rest == 2).astype(float), (rest == 1).astype(float)
-    arrival = (rest == 0) & (restart == 0) & (np.append(rest[1:], 0) == 1)
+    rest_follows = np.append(rest[1:], False)
+    arrival = ~rest & ~restart & rest_follows
+    sightings, ends = [], _padded(edges[end])
+    if field is not None:
+        final = rest & ~rest_follows  # intervals that end a rest, in the order of rests
+        value, known = np.zeros((count, 3)), np.zeros(count)
+        value[final], known[final] = _mean_field(field, time[resting[:, 0]], time[resting[:, 1] - 1])
+        sightings.append(FieldSeen(ends, ends, _padded(known), _padded(value)))
     if attitude is not None:  # in a rest any stamp will do; in motion one in the last sample
         latest = np.searchsorted(marks, edges[end], side="right") - 1
-        since = np.where(rest > 0, edges[begin], edges[end - 1])
-        seen = (latest >= 0) & (marks[latest] > since) & ~arrival & (restart == 0)
-    padded = _bucket(count, 64) - count
-
-    def whole(values, fill=0.0):
-        return np.concatenate([values, np.full((padded, *values.shape[1:]), fill)])
-
-    sightings = []
-    if field is not None:
-        mean, known = _mean_field(field, time[first], time[last - 1])
-        final = (rest > 0) & (np.append(rest[1:], 0.0) == 0)  # intervals that end a rest, in the order of rests
-        value = np.zeros((count, 3))
-        value[final] = mean
-        counts = np.zeros(count)
-        counts[final] = known
-        sightings.append(FieldSeen(whole(edges[end]), whole(edges[end]), whole(counts), whole(value)))
-    if attitude is not None:
-        at = whole(attitude.time[latest]), whole(edges[end]), whole(seen.astype(float))
-        said = np.concatenate([attitude.quaternion[latest], np.tile([1.0, 0.0, 0.0, 0.0], (padded, 1))])
-        sightings.append(AttitudeSeen(*at, said))
+        since = np.where(rest, edges[begin], edges[end - 1])
+        measured = (latest >= 0) & (marks[latest] > since) & ~arrival & ~restart
+        at = _padded(attitude.time[latest]), ends, _padded(measured)
+        sightings.append(AttitudeSeen(*at, _padded(attitude.quaternion[latest], "edge")))
         if (velocity := attitude.velocities()) is not None:
-            sightings.append(VelocitySeen(*at, whole(velocity[latest])))
-    return MotionIntervals(
-        np.concatenate([force[around], np.repeat(force[around][-1:], padded, axis=0)]),
-        np.concatenate([gyroscope.values[around], np.repeat(gyroscope.values[around][-1:], padded, axis=0)]),
-        whole(np.where(inside, length[place], 0.0)), whole(time[around]), whole(rest),
-        whole(arrival.astype(float)), whole(restart),
-        whole((lost[place] * inside).sum(axis=1)), whole(np.ones(count)), tuple(sightings),
-    ), notes  # pyright: ignore[reportArgumentType] # fmt: skip
+            sightings.append(VelocitySeen(*at, _padded(velocity[latest])))
+    at_samples = around[:, beyond:]
+    intervals = MotionIntervals(
+        _padded(force[around], "edge"),
+        _padded(gyroscope.values[around], "edge"),
+        _padded(np.where(inside, np.diff(edges)[at_samples], 0.0)),
+        _padded(time[around]),
+        _padded(rest),
+        _padded(arrival),
+        _padded(restart),
+        _padded((lost[at_samples] * inside).sum(axis=1)),
+        _padded(np.ones(count)),
+        tuple(sightings),
+    )  # pyright: ignore[reportArgumentType]
+    return intervals, notes
+
+
+def _padded(values, mode: Any = "constant") -> FloatArray:
+    """Return values of intervals up to a bucket's number: zeros, or with mode "edge" the last one again."""
+    missing = [(0, _bucket(len(values), 64) - len(values)), *[(0, 0)] * (np.ndim(values) - 1)]
+    return np.pad(np.asarray(values, float), missing, mode=mode)
 
 
 def _mean_field(field: Signal, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return the mean (P, 3) of a field between times (P,), and whether there are samples (P,)."""
-    places = np.searchsorted(field.time, np.stack([start, stop], axis=1))
-    known = places[:, 1] > places[:, 0]
-    means = [field.values[begin:end].mean(axis=0) if end > begin else np.zeros(3) for begin, end in places.tolist()]
-    return np.array(means), known
+    first, last = np.searchsorted(field.time, (start, stop))
+    means = [field.values[a:b].mean(axis=0) if b > a else np.zeros(3) for a, b in zip(first, last, strict=True)]
+    return np.array(means), last > first
 
 
 def _parts(time: FloatArray, start: int, stop: int, longest: float) -> list[tuple[int, int]]:
@@ -689,10 +745,6 @@ class _Triangular(Conditions):
         change = jnp.append(ravel_pytree(imu)[0] - self.numbers, self.magnitude - self.gravity)
         return jnp.concatenate([self.root @ change - self.right, self.left])
 
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> _Triangular:
-        """Return the same with another gravity."""
-        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
-
 
 @dataclass(frozen=True)
 class Filtered:
@@ -725,7 +777,7 @@ class FilterPass:
 
 
 @dataclass
-class IntervalsOfMotion(Data):
+class IntervalsOfMotion(OfOneUnit):
     """One recording of a unit, cut into intervals of rest and of motion; its states are eliminated by a filter.
 
     The path about which it is linearised is kept from one evaluation to the next, and its first attitudes, `anchor`.
@@ -746,21 +798,22 @@ class IntervalsOfMotion(Data):
         """Return how many numbers (N, 1 + k) each interval measured: of rests (six) and ends of motion (three), and of
         each kind of sighting (three).
         """
-        rest, arrival = (np.asarray(each) for each in (self.intervals.rest, self.intervals.arrival))
-        seen = [3 * (np.asarray(each.measured) > 0) for each in self.intervals.sightings]
-        return np.asarray(np.stack([6 * rest + 3 * arrival, *seen], axis=1), np.float64)
+        intervals = self.intervals
+        sighted = [3 * (sighting.measured > 0) for sighting in intervals.sightings]
+        inner = 6 * intervals.rest + 3 * intervals.arrival
+        return np.stack([inner, *sighted], axis=1).astype(float)
 
     def filtered(self, imu: Imu) -> Filtered:
         """Return the intervals filtered about one unit, along the path that fits it best."""
         means = self._means(imu)
         if self.path is None:
             self.path = stored.call(_dead_reckoned, "dead reckoning", means, self.intervals, self.gravity)
-            self.anchor = np.asarray(self.path.attitude)[1:]
-        states, seen = self.errors.states, self._absolute
+            self.anchor = self.path.attitude[1:]
+        states, absolute = self.errors.states, self._absolute
         for number in range(_ROUNDS):
             rows = self._rows(means)
             shared = rows.shared.shape[-1]
-            start = first_knowledge(self.errors, self.path.velocity[0], shared, seen)
+            start = first_knowledge(self.errors, self.path.velocity[0], shared, absolute)
             last, eliminated, innovations, _ = run(start, rows)
             state = scipy.linalg.solve_triangular(last.root[:states, :states], last.right[:states])
             earlier = smooth(eliminated, state, np.zeros(shared))
@@ -770,7 +823,7 @@ class IntervalsOfMotion(Data):
                     "attitude and velocity could not be followed through this recording: the start is too far off. "
                     "Calibrate it with `jaximu calibrate` first."
                 )
-            change = _change(self.path, moved, seen)
+            change = _change(self.path, moved, absolute)
             if change < _UNMOVED or number + 1 == _ROUNDS:
                 break
             self.path = stored.call(_moved, "moved path", self.path, moved)
@@ -779,35 +832,33 @@ class IntervalsOfMotion(Data):
     @property
     def _absolute(self) -> bool:
         """Whether heading is measured in a frame that is not the filter's own."""
-        return any(each.absolute for each in self.intervals.sightings)
+        return any(sighting.absolute for sighting in self.intervals.sightings)
 
     def _means(self, imu: Imu) -> _Means:
         """Return the intervals without their samples; nothing is integrated in a rest."""
-        rest = np.asarray(self.intervals.rest) > 0
+        rest = self.intervals.rest > 0
         merged = None
-        for kind, inside in ((_of_motion, ~rest), (_of_rest, rest)):
-            place = np.flatnonzero(inside)
-            if not len(place):
+        for kind, chosen in ((_of_motion, ~rest), (_of_rest, rest)):
+            rows = np.flatnonzero(chosen)
+            if not len(rows):
                 continue
-            part = self._part(np.resize(place, _bucket(len(place), 64)))
+            part = self._part(np.resize(rows, _bucket(len(rows), 64)))
             small = part.length.size < _LARGE
             means = stored.call(partial(_all_means, kind), kind.__name__, imu, part, self.errors, quick=small)
             if merged is None:
                 merged = jax.tree.map(lambda leaf: np.zeros((len(rest), *leaf.shape[1:])), means)
             for whole, leaf in zip(jax.tree.leaves(merged), jax.tree.leaves(means), strict=True):
-                whole[place] = leaf[: len(place)]
+                whole[rows] = leaf[: len(rows)]
         assert merged is not None
         return merged
 
-    def _part(self, place: NDArray[np.int64]) -> MotionIntervals:
+    def _part(self, rows: NDArray[np.int64]) -> MotionIntervals:
         """Return some of the intervals, without the samples that none of them has."""
-        part = jax.tree.map(lambda leaf: np.asarray(leaf)[place], self.intervals)
+        part = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], self.intervals)
         before = part.time.shape[1] - part.length.shape[1]
         inside = min(_bucket(int((part.length > 0).sum(axis=1).max()) + before), part.length.shape[1])
-        return replace(
-            part, length=part.length[:, :inside],
-            **{name: getattr(part, name)[:, : before + inside] for name in ("accelerometer", "gyroscope", "time")},
-        )  # fmt: skip
+        samples = {name: getattr(part, name)[:, : before + inside] for name in ("accelerometer", "gyroscope", "time")}
+        return replace(part, length=part.length[:, :inside], **samples)
 
     def _rows(self, means: _Means) -> WhiteRows:
         """Return the white rows (N, r, …) of all intervals about the path."""
@@ -820,34 +871,31 @@ class IntervalsOfMotion(Data):
 
         **Arguments:** `index`: places of the free numbers; `prior`: of them and of gravity, less the unit's.
         """
-        found, states = self.filtered(imu), self.errors.states
-        path, rows = found.path, found.rows
+        filtered, states = self.filtered(imu), self.errors.states
+        path, rows = filtered.path, filtered.rows
         rows = rows._replace(shared=rows.shared[..., np.append(np.asarray(index, int), len(flatten(imu)))])
         start = first_knowledge(self.errors, path.velocity[0], len(prior.right), self._absolute)
         start.root[states:, states:], start.right[states:] = prior.root, prior.right
         count = rows.right.shape[1]
         ends = [count - 3 * (later + 1) for later in range(len(self.intervals.sightings))][::-1]
         last, eliminated, innovations, numbers = run(start, rows, ends)
-        values, covariances = zip(*(estimate(Knowledge(*each)) for each in zip(*numbers, strict=True)), strict=True)
+        values, covariances = zip(*(estimate(Knowledge(*known)) for known in zip(*numbers, strict=True)), strict=True)
         final, covariance = estimate(last)
         smoothed = smooth(eliminated, final[:states], final[states:])
         variances = smoothed_variances(eliminated, covariance)
         sigmas = np.sqrt(np.diagonal(np.array(covariances), axis1=-2, axis2=-1))
         return FilterPass(innovations, self.freedom, np.array(values), sigmas, smoothed, np.sqrt(variances))
 
-    def about(self, imu: Imu) -> About:
-        """Return the triangular system about one unit, the leading axis of length one."""
-        unit = jax.tree.map(lambda leaf: np.asarray(leaf)[0], imu)
-        found = self.filtered(unit)
-        states, numbers = self.errors.states, flatten(unit)
-        root, right = found.last.root[states:, states:], found.last.right[states:]
+    def about_one(self, imu: Imu) -> About:
+        """Return the triangular system about the unit."""
+        filtered, states = self.filtered(imu), self.errors.states
+        root, right = filtered.last.root[states:, states:], filtered.last.right[states:]
         free = max(int(self.freedom.sum()) - len(right), 1)
-        left = np.full(free, np.sqrt(found.misfit / free))
-        conditions = _Triangular(root, right, numbers, np.float64(self.gravity), left, np.float64(self.gravity))  # pyright: ignore
+        left, gravity = np.full(free, np.sqrt(filtered.misfit / free)), np.float64(self.gravity)
+        conditions = _Triangular(root, right, flatten(imu), gravity, left, gravity)  # pyright: ignore
         rows = len(right) + free
-        one, none = np.ones((1, rows)), np.zeros((1, rows, 0))
-        covariance = Covariance(one, (one,), one, np.zeros((1, rows), int))  # pyright: ignore[reportArgumentType]
-        return About(jax.tree.map(lambda leaf: np.asarray(leaf)[None], conditions), covariance, none, found)
+        covariance = Covariance(np.ones(rows), (np.ones(rows),), np.ones(rows), np.zeros(rows, int))  # pyright: ignore[reportArgumentType]
+        return About(conditions, covariance, np.zeros((rows, 0)), filtered)
 
 
 def _all_means(kind: Callable[..., _Means], imu: Imu, intervals: MotionIntervals, errors: Disturbances) -> _Means:
@@ -863,21 +911,20 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
         resting = interval.rest > 0
         moved = _carried(attitude, jnp.zeros(3), means.rotation, means.gained, means.duration, means.earth, gravity)[0]
         moved = jnp.where(resting, attitude, moved)
-        for each in interval.sightings if sighted else ():
-            placed = each.placed(moved, Mounting.from_numbers(means.mounting))
-            moved = jnp.where(each.measured > 0, placed, moved)
-        levelled = jnp.where(resting, level(moved, means.mean[3:]), moved)
-        attitude = jnp.where(resting, levelled, moved)
+        for sighting in interval.sightings if sighted else ():
+            placed = sighting.placed(moved, Mounting.from_numbers(means.mounting))
+            moved = jnp.where(sighting.measured > 0, placed, moved)
+        attitude = jnp.where(resting, level(moved, means.mean[3:]), moved)
         return attitude, attitude
 
     def reckoned(start, sighted):
         return jax.lax.scan(partial(step, sighted), start, (means, intervals))[1]
 
     start = level(jnp.array([1.0, 0.0, 0.0, 0.0]), means.mean[0, 3:])
-    for each in intervals.sightings:  # the heading at the first sighting is the heading of all
-        first = jnp.argmax(each.measured > 0)
-        sighting, numbers = jax.tree.map(lambda leaf, first=first: leaf[first], (each, means.mounting))
-        now = reckoned(start, False)[first]
+    for sightings in intervals.sightings:  # the heading at the first sighting is the heading of all
+        k = jnp.argmax(sightings.measured > 0)
+        sighting, numbers = jax.tree.map(lambda leaf, k=k: leaf[k], (sightings, means.mounting))
+        now = reckoned(start, False)[k]
         placed = sighting.placed(now, Mounting.from_numbers(numbers))
         heading = multiply(placed, conjugate(now)) * jnp.array([1.0, 0.0, 0.0, 1.0])
         start = multiply(heading / jnp.linalg.norm(heading), start)
@@ -887,7 +934,7 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
 
 def _along(
     means: _Means, intervals: MotionIntervals, errors: Disturbances, gravity: Array, path: MotionPath, anchor: Array
-) -> WhiteRows:  # fmt: skip
+) -> WhiteRows:
     before, after = (jax.tree.map(lambda leaf, part=part: leaf[part], path) for part in (slice(-1), slice(1, None)))
 
     def rows(part):
@@ -897,10 +944,10 @@ def _along(
     return jax.lax.map(rows, (means, intervals, before, after, anchor), batch_size=_TOGETHER)
 
 
-def _change(path: MotionPath, moved: FloatArray, seen: bool) -> float:
+def _change(path: MotionPath, moved: FloatArray, absolute: bool) -> float:
     """Return how far attitudes move, rad, but for the heading of all unless it is measured: it is held, and creeps."""
     turned = np.array(rotate(path.attitude, moved[:, :3]))  # pyright: ignore[reportArgumentType]
-    turned[:, 2] -= 0.0 if seen else turned[0, 2]
+    turned[:, 2] -= 0.0 if absolute else turned[0, 2]
     return float(np.max(np.abs(turned)))
 
 

@@ -18,6 +18,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from jaximu.estimation.problem import axis_scales
+from jaximu.estimation.track import TRIADS
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
@@ -51,29 +53,27 @@ def attitudes(entries: Sequence[Entry]) -> list[Rotation | None]:
     A pose's heading is stated, or follows through the turns from a neighbour that has one. Without any stated heading
     the first pose's is the zero.
     """
-    found: list[Rotation | None] = [
-        attitude_of(each.vector, each.heading) if each.kind == "pose" and each.heading is not None else None
-        for each in entries
+    starts: list[Rotation | None] = [
+        attitude_of(entry.vector, entry.heading) if entry.kind == "pose" and entry.heading is not None else None
+        for entry in entries
     ]
-    if all(each is None for each in found):
-        first = next((k for k, each in enumerate(entries) if each.kind == "pose"), None)
+    if all(attitude is None for attitude in starts):
+        first = next((k for k, entry in enumerate(entries) if entry.kind == "pose"), None)
         if first is not None:
-            found[first] = attitude_of(entries[first].vector)
+            starts[first] = attitude_of(entries[first].vector)
     for order in (1, -1):
-        places = range(len(entries))[::order]
-        for before, here in pairwise(places):
-            known, (early, late) = found[before], sorted((before, here))
-            if known is None or found[here] is not None or entries[late].start - entries[early].stop > _STILL:
+        for before, here in pairwise(range(len(entries))[::order]):
+            known, (entry, following) = starts[before], (entries[k] for k in sorted((before, here)))
+            if known is None or starts[here] is not None or following.start - entry.stop > _STILL:
                 continue
-            each = entries[early]
-            angle = each.angle if each.kind == "turn" else 0.0
-            turned = scipy.spatial.transform.Rotation.from_rotvec(angle * np.asarray(each.vector))
+            angle = entry.angle if entry.kind == "turn" else 0.0
+            turned = scipy.spatial.transform.Rotation.from_rotvec(angle * np.asarray(entry.vector))
             carried = known * (turned if order > 0 else turned.inv())
             if entries[here].kind == "pose":  # its own "up" is what the set-up says; only the heading is carried
                 up = entries[here].vector
                 carried = attitude_of(up, (carried * attitude_of(up).inv()).as_rotvec()[2])
-            found[here] = carried
-    return found
+            starts[here] = carried
+    return starts
 
 
 def observe_stations(
@@ -100,74 +100,74 @@ def observe_stations(
         recordings, references = [recordings], [references]  # pyright: ignore[reportAssignmentType]
     parts, notes = [], []
     for recording, entries in zip(recordings, references, strict=True):
-        matched, said = match_reference(recording, entries)  # pyright: ignore[reportArgumentType]
+        matched, remarks = match_reference(recording, entries)  # pyright: ignore[reportArgumentType]
         parts.append((recording, matched))
-        notes += said
+        notes += remarks
     known = all(None not in attitudes(entries) for recording, entries in parts if recording.attitude is None)
     stimuli, means, covariances, spans, turns = [], [], [], [], []
     for recording, entries in parts:
-        span = np.array([(each.start, each.stop) for each in entries])
+        span = np.array([(entry.start, entry.stop) for entry in entries])
+        turn = np.array([entry.kind == "turn" for entry in entries])
         stimulus = _recorded_stimulus(recording, entries, span, gravity, temperature_reference)
         stimuli.append(stimulus if known else replace(stimulus, attitude=None))
-        turn = np.array([each.kind == "turn" for each in entries])
-        signals = [each for each in (recording.accelerometer, recording.gyroscope) if each is not None]
-        duration = np.diff(span)
-        means.append(
-            [
-                Integral(each, each.values).over(*span.T) / duration if len(each) else np.zeros((len(span), 3))
-                for each in signals
-            ]
-        )
+        signals = [signal for signal in (recording.accelerometer, recording.gyroscope) if signal is not None]
+        means.append([_means(signal, span) for signal in signals])
         if noise is None:
-            covariances.append(
-                [
-                    _mean_covariance(each, span, turn, recording.name)
-                    if len(each)
-                    else np.zeros((3, len(span), len(span)))
-                    for each in signals
-                ]
-            )
+            covariances.append([_mean_covariance(signal, span, turn, recording.name) for signal in signals])
         spans.append(span)
         turns.append(turn)
-    owner = np.repeat(np.arange(len(parts)), [len(each) for each in spans])
+    owner = np.repeat(np.arange(len(parts)), [len(span) for span in spans])
+    together = owner[:, None] == owner
     span, turn = np.concatenate(spans), np.concatenate(turns)
-    count = min(map(len, means))
+    stacked = [np.concatenate(of_triad) for of_triad in zip(*means, strict=False)]
     if noise is None:
-        measured = [_joined([each[place] for each in covariances]) for place in range(count)]
+        measured = [
+            np.array([scipy.linalg.block_diag(*blocks) for blocks in zip(*of_triad, strict=True)])
+            for of_triad in zip(*covariances, strict=False)
+        ]
     else:
-        measured = []
-        for name in ("accelerometer", "gyroscope")[:count]:
-            signal: Signal = getattr(parts[0][0], name)
-            if not len(signal):
-                measured.append(np.zeros((3, len(span), len(span))))
-                continue
-            known_noise = require_model(signal, getattr(noise, name), name)
-            white, slow = noise_by_model(signal, known_noise, span[:, 0], span[:, 1], owner[:, None] == owner)
-            measured.append(slow + (np.diag(white)[:, None] / np.diff(span)[:, 0])[:, :, None] * np.eye(len(span)))
-    if count > 1 and parts[0][0].gyroscope is not None:  # a later power-on has another bias
-        anew = (owner[:, None] == owner) & (owner > 0)
-        measured[1] += anew * np.square(POWER_ON["gyroscope"] * parts[0][0].gyroscope.nominal_scale)[:, None, None]
-    stacked = [np.concatenate([each[place] for each in means]) for place in range(count)]
+        measured = [
+            _known_covariance(getattr(parts[0][0], name), getattr(noise, name), name, span, together)
+            for name in TRIADS[: len(stacked)]
+        ]
+    if len(stacked) > 1 and parts[0][0].gyroscope is not None:  # a later power-on has another bias
+        later = together & (owner > 0)
+        measured[1] += later * np.square(POWER_ON["gyroscope"] * parts[0][0].gyroscope.nominal_scale)[:, None, None]
     stimulus = jax.tree.map(lambda *leaves: np.concatenate(leaves), *stimuli)
     force = len(parts[0][0].accelerometer) > 0
     return _assembled(stacked, measured, stimulus, span, turn, gravity, force), tuple(dict.fromkeys(notes))
 
 
-def _joined(blocks: Sequence[FloatArray]) -> FloatArray:
-    return np.array([scipy.linalg.block_diag(*(block[axis] for block in blocks)) for axis in range(3)])
+def _means(signal: Signal, span: FloatArray) -> FloatArray:
+    """Return the means (n, 3) of a signal over spans; zero where it has no samples."""
+    if not len(signal):
+        return np.zeros((len(span), 3))
+    return Integral(signal, signal.values).over(*span.T) / np.diff(span)
 
 
 def _mean_covariance(signal: Signal, span: FloatArray, turn: NDArray[np.bool_], name: str) -> FloatArray:
     """Covariance (3, n, n) of means as the scatter within the poses tells it; turns are as noisy as rests."""
+    if not len(signal):
+        return np.zeros((3, len(span), len(span)))
     if turn.all():
         raise NotPossibleError(
             f"{name}: the reference has no pose, so the noise is unknown: add a rest to it, or give a recording of "
             "the unit at rest with --static."
         )
-    density, _, own = rest_statistics(signal, span[~turn])
+    density, _, in_poses = rest_statistics(signal, span[~turn])
     variance = np.diagonal(density) / np.diff(span)
-    variance[~turn] = np.diagonal(own, axis1=1, axis2=2)
+    variance[~turn] = np.diagonal(in_poses, axis1=1, axis2=2)
     return variance.T[:, :, None] * np.eye(len(span))
+
+
+def _known_covariance(
+    signal: Signal, noise: AxisNoise | None, name: str, span: FloatArray, together: NDArray[np.bool_]
+) -> FloatArray:
+    """Covariance (3, n, n) of means by a noise model; slow noise ties those of one recording, `together` (n, n)."""
+    if not len(signal):
+        return np.zeros((3, len(span), len(span)))
+    white, slow = noise_by_model(signal, require_model(signal, noise, name), span[:, 0], span[:, 1], together)
+    return slow + (np.diag(white)[:, None] / np.diff(span)[:, 0])[:, :, None] * np.eye(len(span))
 
 
 def _recorded_stimulus(
@@ -182,12 +182,10 @@ def _recorded_stimulus(
         if recording.gyroscope is not None:
             integral = Integral(recording.gyroscope, recording.gyroscope.si())
             bias = rest_rate(integral, entries)
-            for place, each in enumerate(entries):
-                if each.kind == "turn":
-                    moved = (
-                        integral.over(span[place, :1], nodes[place]) - bias * (nodes[place] - span[place, 0])[:, None]
-                    )
-                    course[place] = moved @ each.vector / (moved[-1] @ each.vector)
+            for k, entry in enumerate(entries):
+                if entry.kind == "turn":
+                    moved = integral.over(span[k, :1], nodes[k]) - bias * (nodes[k] - span[k, 0])[:, None]
+                    course[k] = moved @ entry.vector / (moved[-1] @ entry.vector)
         stimulus = _stimulus(entries, attitudes(entries), course, gravity)
     temperature = np.full(time.shape, temperature_reference)
     if recording.temperature is not None:
@@ -232,21 +230,26 @@ def scheme_stations(
     imu = Imu.nominal() if imu is None else imu
     plan = protocol.plan(np.random.default_rng(0), replace(environment or Environment(), latitude=None))
     entries, motion = plan.intervals, plan.motion
-    span = np.array([(each.start, each.stop) for each in entries])
+    span = np.array([(entry.start, entry.stop) for entry in entries])
     segment = np.searchsorted(motion.start, span[:, 0] + 1e-9, side="right") - 1
-    begin = [scipy.spatial.transform.Rotation.from_quat(motion.attitude[place], scalar_first=True) for place in segment]
+    begin = [
+        scipy.spatial.transform.Rotation.from_quat(attitude, scalar_first=True) for attitude in motion.attitude[segment]
+    ]
     nodes = np.linspace(0.0, 1.0, 2 * NODES + 1)  # edges and, between them, middles
     course = np.asarray(jax.jit(smooth_course)(nodes, motion.ramp[segment][:, None]))
     time = span[:, :1] + np.diff(span) * nodes[1::2]
     stimulus = _stimulus(entries, begin, course, float(motion.gravity))
     stimulus = replace(stimulus, time=time, temperature=np.interp(time, motion.temperature_time, motion.temperature))
-    turn = np.array([each.kind == "turn" for each in entries])
-    scale = [np.linalg.norm(np.asarray(triad.gain), axis=1) for triad in imu.triads().values()]
+    turn = np.array([entry.kind == "turn" for entry in entries])
+    scale = [axis_scales(triad) for triad in imu.triads().values()]
     known = [noise.accelerometer, noise.gyroscope][: len(scale)]
     if known[-1] is None:
         raise NotPossibleError("the noise model has no gyroscope, but the unit has one: record both at rest.")
-    covariances = [each.covariance(*span.T) * gain[:, None, None] ** 2
-                   for each, gain in zip(known, scale, strict=True) if each is not None]  # fmt: skip
+    covariances = [
+        axes.covariance(*span.T) * gain[:, None, None] ** 2
+        for axes, gain in zip(known, scale, strict=True)
+        if axes is not None
+    ]
     zero = np.zeros((len(entries), 3))
     stations = _assembled([zero, zero][: len(scale)], covariances, stimulus, span, turn, float(motion.gravity))
     means = stored.call(_mean_outputs, "station means", imu, stations)
@@ -256,7 +259,7 @@ def scheme_stations(
 
 def _mean_outputs(imu: Imu, stations: Stations):
     outputs = imu.respond(stations.stimulus)
-    return [jnp.sum(stations.weight[..., None] * each, axis=-2) for each in outputs if each is not None]
+    return [jnp.sum(stations.weight[..., None] * output, axis=-2) for output in outputs if output is not None]
 
 
 def _stimulus(
@@ -266,28 +269,35 @@ def _stimulus(
     (S, 2Q + 1). Where an attitude is not known there is none, and the force in turns is that of the turn's begin.
     """
     steps = course.shape[1] // 2
-    duration = np.array([each.stop - each.start for each in entries])
-    vector = np.stack([np.asarray(each.vector) / np.linalg.norm(each.vector) for each in entries])
-    turned = np.array([each.angle if each.kind == "turn" else 0.0 for each in entries])[:, None] * vector
+    duration = np.array([entry.stop - entry.start for entry in entries])
+    vector = np.stack([np.asarray(entry.vector) / np.linalg.norm(entry.vector) for entry in entries])
+    turned = np.array([entry.angle if entry.kind == "turn" else 0.0 for entry in entries])[:, None] * vector
     share = np.diff(course[:, ::2], axis=1) * steps / duration[:, None]
     rate = share[..., None] * turned[:, None]
-    whole = np.array([scipy.spatial.transform.Rotation.identity() if each is None else each for each in begin])
-    attitude = np.stack([
-        (start * scipy.spatial.transform.Rotation.from_rotvec(middle[:, None] * turn)).as_quat(scalar_first=True)
+    rotation = scipy.spatial.transform.Rotation
+    whole = [rotation.identity() if start is None else start for start in begin]
+    middles = (
+        start * rotation.from_rotvec(middle[:, None] * turn)
         for start, middle, turn in zip(whole, course[:, 1::2], turned, strict=True)
-    ])  # fmt: skip
-    back = scipy.spatial.transform.Rotation.from_quat(attitude.reshape(-1, 4), scalar_first=True).inv()
+    )
+    attitude = np.stack([middle.as_quat(scalar_first=True) for middle in middles])
+    back = rotation.from_quat(attitude.reshape(-1, 4), scalar_first=True).inv()
     up = back.apply([0.0, 0.0, 1.0]).reshape(*attitude.shape[:2], 3)
-    pose = np.array([each.kind == "pose" for each in entries])
+    pose = np.array([entry.kind == "pose" for entry in entries])
     up[pose] = vector[pose][:, None]  # as stated, to the last digit
-    known = all(each is not None for each in begin)
+    known = all(start is not None for start in begin)
     return Stimulus(specific_force=gravity * up, angular_rate=rate, attitude=attitude if known else None)
 
 
 def _assembled(
-    means: Sequence[FloatArray], covariances: Sequence[FloatArray], stimulus: Stimulus, span: FloatArray,
-    turn: NDArray[np.bool_], gravity: float, force: bool = True,
-) -> Stations:  # fmt: skip
+    means: Sequence[FloatArray],
+    covariances: Sequence[FloatArray],
+    stimulus: Stimulus,
+    span: FloatArray,
+    turn: NDArray[np.bool_],
+    gravity: float,
+    force: bool = True,
+) -> Stations:
     """Put stations together, padded to a bucket; without `force` the accelerometer is not used."""
     count = len(turn)
     size = max(_FEWEST, 1 << (count - 1).bit_length())

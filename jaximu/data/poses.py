@@ -36,7 +36,7 @@ from jaximu.data.tracks_by_hand import SamplesByHand, during_turns, pose_means, 
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import effect_numbers
-from jaximu.estimation.problem import Name
+from jaximu.estimation.problem import Name, axis_scales
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import Track, added, mean_outputs
 from jaximu.ground import stored
@@ -52,7 +52,7 @@ from jaximu.ground.rotation import (
     multiply,
     rotate,
 )
-from jaximu.ground.tracing import array_module, one_by_one, repeated
+from jaximu.ground.tracing import array_module, first, lifted, one_by_one, repeated
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import NoiseModel
@@ -69,6 +69,7 @@ __all__ = [
     "Condensed",
     "HandHeldConditions",
     "PosesAndTurns",
+    "as_observations",
     "condense",
     "condensed",
     "felt_by_hand",
@@ -79,6 +80,7 @@ __all__ = [
     "residual_rms",
     "resized",
     "stack",
+    "with_gyroscope",
 ]
 
 EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
@@ -116,8 +118,7 @@ class HandHeldConditions(Conditions):
 
     def rotations(self, imu: Imu) -> Float[Array, "T 4"]:
         """Return the turns' rotations, quaternions from the last body frame to the first, at a unit close by."""
-        assert imu.gyroscope is not None
-        moved = jnp.einsum("tijk,jk->ti", self.slope, imu.gyroscope.inverse() - self.linear)
+        moved = jnp.einsum("tijk,jk->ti", self.slope, imu.triads()["gyroscope"].inverse() - self.linear)
         return multiply(self.rotation, exponential(moved))
 
     def forces(self, imu: Imu) -> Float[Array, "P 3"]:
@@ -127,11 +128,10 @@ class HandHeldConditions(Conditions):
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the norms (m/s²), two components of carried gravity a turn, and the means at rest (output units)."""
-        assert imu.gyroscope is not None
         force = self.forces(imu)
         norm = jnp.where(self.pose, gravity_norm_error(force, self.magnitude), 0.0)
         direction = gravity_direction_error(self.rotations(imu), unit_vectors(force), self.basis)
-        rest = jnp.where(self.pose[:, None], self.gyroscope_mean - imu.gyroscope.bias, 0.0)
+        rest = jnp.where(self.pose[:, None], self.gyroscope_mean - imu.triads()["gyroscope"].bias, 0.0)
         turned = jnp.where(self.turn[:, None], direction, 0.0)
         return jnp.concatenate([norm, turned.reshape(-1), rest.reshape(-1)])
 
@@ -141,17 +141,22 @@ def condense(
 ) -> tuple[HandHeldConditions, Covariance | Chain, Turned, Sensitivities]:
     """Return the conditions about a unit, without its effects, their covariance, and what both were made of."""
     imu, poses, turns = imu.with_effects(), observations.poses, observations.turns
-    gyroscope = imu.gyroscope
-    assert gyroscope is not None
+    gyroscope = imu.triads()["gyroscope"]
     whole = turned_by(gyroscope, turns)
     rotation = whole.rotation
     if method != "exponential":
         rotation = integrate_rates(gyroscope.recover(turns.output), turns.interval, method)
     conditions = HandHeldConditions(
-        poses.accelerometer_mean, poses.gyroscope_mean, poses.mask, turns.mask, turns.basis, rotation,
-        jnp.einsum("tij,tjkl->tikl", whole.back, linear_slope(whole.sweep, turns.output)), gyroscope.inverse(),
+        poses.accelerometer_mean,
+        poses.gyroscope_mean,
+        poses.mask,
+        turns.mask,
+        turns.basis,
+        rotation,
+        jnp.einsum("tij,tjkl->tikl", whole.back, linear_slope(whole.sweep, turns.output)),
+        gyroscope.inverse(),
         observations.gravity,
-    )  # fmt: skip
+    )
     covariance = condition_covariance(imu, observations, whole)
     return conditions, covariance, whole, sensitivities(imu, observations, whole)
 
@@ -171,6 +176,11 @@ class Condensed(NamedTuple):
     running: FloatArray | None
 
 
+def as_observations(observations: Observations) -> Observations:
+    """Return the observations alone, without what a kind of data adds to them: one structure, one program."""
+    return Observations(observations.poses, observations.turns, observations.gravity, observations.slow)
+
+
 def condensed(
     imu: Imu,
     observations: Observations,
@@ -181,7 +191,7 @@ def condensed(
     """Condense observations of units, compiled; `rows` and what follows as for `PosesAndTurns`."""
     count = len(imu.accelerometer.bias)
     excess = np.zeros(count) if accelerometer_excess is None else accelerometer_excess
-    observations = Observations(observations.poses, observations.turns, observations.gravity, observations.slow)
+    observations = as_observations(observations)
 
     def batch(imu, observations, excess):
         def lane(unit):
@@ -195,7 +205,7 @@ def condensed(
     units: Condensed = stored.call(
         batch, f"condensed {rows} {method}", imu.with_effects(), observations, excess, quick=count == 1
     )
-    reaction, running = jax.tree.map(lambda leaf: leaf[0], (units.reaction, units.running))
+    reaction, running = first((units.reaction, units.running))
     return units._replace(reaction=reaction, running=running)
 
 
@@ -236,8 +246,7 @@ class PosesAndTurns(Observations, Data):
     @classmethod
     def of(cls, observations: Observations, conditions: str = "all", **settings: Any) -> Self:
         """Return what was observed as data of a fit."""
-        fields = observations.poses, observations.turns, observations.gravity, observations.slow
-        return cls(*fields, conditions=conditions, **settings)
+        return cls(**vars(as_observations(observations)), conditions=conditions, **settings)
 
     def free(self, name: Name) -> bool:
         """Return whether a number is free: of the triads that the conditions tell of."""
@@ -281,8 +290,8 @@ class PosesAndTurns(Observations, Data):
 
         def one(imu: Imu, data: Self) -> tuple[Any, ...]:
             details = data.along(imu, felt_by_hand(imu))
-            evaluated = jax.tree.map(lambda leaf: leaf[0], (details.condensed.conditions, details.condensed.covariance))
-            return *evaluated, data.own_columns(imu, details, len(evaluated[1].used))
+            conditions, covariance = first((details.condensed.conditions, details.condensed.covariance))
+            return conditions, covariance, data.own_columns(imu, details, len(covariance.used))
 
         return About(*one_by_one(one, imu, data))
 
@@ -292,17 +301,15 @@ class PosesAndTurns(Observations, Data):
         The tracks tell what effects add, and what they add changes the tracks: an error of theirs shrinks every time by
         as much as the effects are small beside what the unit measures.
         """
-        bare, unit = imu.with_effects(), imu.with_effects(*effects)
+        bare, affected = imu.with_effects(), imu.with_effects(*effects)
 
         def tracks(data: PosesAndTurns) -> tuple[Condensed, list[dict[str, Track]]]:
-            lifted, of = jax.tree.map(
-                lambda leaf: array_module(leaf).asarray(leaf)[None], (bare, replace(data, samples=()))
-            )
-            whole = condensed(lifted, of, self.conditions, self.method, of.accelerometer_excess)
+            unit, of = lifted((bare, replace(data, samples=())))
+            whole = condensed(unit, of, self.conditions, self.method, of.accelerometer_excess)
             return whole, [tracks_by_hand(bare, part, whole.running) for part in data.samples]
 
         def without(data: PosesAndTurns) -> PosesAndTurns:
-            return _without_added(unit, self, tracks(data)[1])
+            return _without_added(affected, self, tracks(data)[1])
 
         left = repeated(without, self, _ROUNDS, imu) if effects else self
         return Along(left, *tracks(left))
@@ -345,8 +352,7 @@ class PosesAndTurns(Observations, Data):
 
     def _by_unit(self) -> Self:
         """Return the data with a leading axis."""
-        numerics = array_module(self)
-        return jax.tree.map(lambda leaf: numerics.asarray(leaf)[None], self) if np.ndim(self.gravity) == 0 else self
+        return lifted(self) if np.ndim(self.gravity) == 0 else self
 
 
 @partial(stored.compiled, quick=True)
@@ -430,8 +436,7 @@ def resized(leaf: Array, *lengths: int, numerics: Any = np) -> Array:
 def pose_rows(imu: Imu, observations: Observations) -> Rows:
     """Return what each of the conditions of poses and turns is, by a unit close to this one."""
     poses, turns = jax.tree.map(np.asarray, (observations.poses, observations.turns))
-    gyroscope = imu.gyroscope
-    assert gyroscope is not None
+    gyroscope = imu.triads()["gyroscope"]
     pose, turn = np.arange(len(poses.mask)), np.arange(len(turns.mask))
 
     def placed(of_poses, of_turns):
@@ -453,9 +458,7 @@ def pose_rows(imu: Imu, observations: Observations) -> Rows:
         kind=np.repeat([0, 1, 2], [len(pose), 2 * len(turn), 3 * len(pose)]),
         first=placed(pose, turn),
         last=placed(pose, turn + 1),
-        to_si=np.concatenate(
-            [np.ones(len(pose) + 2 * len(turn)), np.tile(1 / np.linalg.norm(gyroscope.gain, axis=1), len(pose))]
-        ),
+        to_si=np.concatenate([np.ones(len(pose) + 2 * len(turn)), np.tile(1 / axis_scales(gyroscope), len(pose))]),
         used=placed(poses.mask, turns.mask).astype(bool),
         covariates=covariates,
         spans=np.stack([poses.start, poses.stop], axis=1),
@@ -502,7 +505,7 @@ def residual_rms(
     if turns.any():
         sizes["gravity_direction"] = (_rms(np.degrees(angle)[turns]), "deg")
     rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
-    scale = np.linalg.norm(np.asarray(imu.gyroscope.gain), axis=1)
+    scale = axis_scales(imu.gyroscope)
     sizes["static_gyroscope"] = (_rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
     return sizes
 
@@ -514,10 +517,13 @@ def forces_and_angles(
 
     Padding included; the angles mean nothing where `imu` has no gyroscope. Effects are not looked at.
     """
-    full = imu if imu.gyroscope is not None else Imu(imu.accelerometer, Imu.nominal().gyroscope)
-    lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (full.with_effects(), observations))
-    unit = condensed(*lifted, method=method)
+    unit = condensed(*lifted((with_gyroscope(imu).with_effects(), observations)), method=method)
     return unit.force[0], unit.angle[0]
+
+
+def with_gyroscope(imu: Imu) -> Imu:
+    """Return the unit; where it has no gyroscope with one that puts out rad/s, as the conditions need one."""
+    return imu if "gyroscope" in imu.triads() else Imu(imu.accelerometer, Imu.nominal().gyroscope)
 
 
 def _rms(values: FloatArray) -> float:

@@ -74,9 +74,8 @@ def _pose_sensitivities(imu: Imu, observations: Observations, rotations: Float[A
 
 def sensitivities(imu: Imu, observations: Observations, whole: Turned) -> Sensitivities:
     """Return the derivatives of the conditions by mean accelerometer outputs and by gyroscope samples."""
-    assert imu.gyroscope is not None
     norm, after, before, lever = _pose_sensitivities(imu, observations, whole.rotation)
-    inverse = inverse_matrix(imu.gyroscope.gain)
+    inverse = inverse_matrix(imu.triads()["gyroscope"].gain)
     return Sensitivities(norm, after, before, (lever[:, None] @ whole.reaction @ inverse).swapaxes(1, 2))
 
 
@@ -88,10 +87,10 @@ def condition_covariance(imu: Imu, observations: Observations, whole: Turned | N
     `whole`: the turns' rotations at this model, where at hand.
     """
     poses, turns, slow = observations.poses, observations.turns, observations.slow
-    assert imu.gyroscope is not None
-    whole = turned_by(imu.gyroscope, turns) if whole is None else whole
+    gyroscope = imu.triads()["gyroscope"]
+    whole = turned_by(gyroscope, turns) if whole is None else whole
     norm, after, before, lever = _pose_sensitivities(imu, observations, whole.rotation)
-    spread = turn_noise(imu.gyroscope, turns, whole)
+    spread = turn_noise(gyroscope, turns, whole)
     real, moved = poses.mask[:, None, None], turns.mask[:, None, None]
     none = jnp.zeros((1, 2, 3))
     # what a pose reaches: its norm and the turn after it, of which the last has none, and the turn before it
@@ -108,9 +107,15 @@ def condition_covariance(imu: Imu, observations: Observations, whole: Turned | N
     chain = Chain(
         white * (reached @ force @ reached.swapaxes(1, 2) + following(earlier @ force @ earlier.swapaxes(1, 2)))
         + by_turn @ noise @ by_turn.swapaxes(1, 2),
-        white * reached @ force @ earlier.swapaxes(1, 2), white * rest,
-        reached @ roots[0], earlier @ roots[0], by_turn @ roots[1], real * roots[2], used, group,
-    )  # fmt: skip
+        white * reached @ force @ earlier.swapaxes(1, 2),
+        white * rest,
+        reached @ roots[0],
+        earlier @ roots[0],
+        by_turn @ roots[1],
+        real * roots[2],
+        used,
+        group,
+    )
     if slow is None:
         return chain
 
@@ -119,7 +124,7 @@ def condition_covariance(imu: Imu, observations: Observations, whole: Turned | N
         at = reached[..., axis, None] * matrix[:, None] + following(earlier[..., axis, None] * matrix[:, None])
         return in_order(at, jnp.zeros_like(at))
 
-    inverse = inverse_matrix(imu.gyroscope.gain)
+    inverse = inverse_matrix(gyroscope.gain)
     member = slow.part[..., None] == jnp.arange((slow.gyroscope.shape[-1] - len(norm)) // len(lever))
     by_part = jnp.einsum("tsb,tsij->tbij", member.astype(norm.dtype), whole.reaction)
     by_part = (lever[:, None] @ by_part @ inverse).swapaxes(1, 2)

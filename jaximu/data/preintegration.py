@@ -24,6 +24,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import (
@@ -141,9 +142,12 @@ class Preintegrated(NamedTuple):
         assert self.parameters is not None
         error = jnp.einsum("...im,...m->...i", self.parameters, change)
         return Preintegrated(
-            multiply(self.rotation, exponential(error[..., :3])), self.velocity + error[..., 3:6],
-            self.displacement + error[..., 6:], self.duration, self.reaction,
-        )  # fmt: skip
+            multiply(self.rotation, exponential(error[..., :3])),
+            self.velocity + error[..., 3:6],
+            self.displacement + error[..., 6:],
+            self.duration,
+            self.reaction,
+        )
 
 
 def preintegrate_samples(
@@ -197,7 +201,6 @@ def preintegrate(
         force, rate = restore(numbers).recover(accelerometer, gyroscope, stimulus)
         return jnp.concatenate([rate, force], axis=-1)
 
-    samples = recovered(numbers)
+    samples, slopes = value_and_jacobian(recovered, numbers)
     whole = preintegrate_samples(samples[:, :3], samples[:, 3:], intervals)
-    slopes = jax.jacfwd(recovered)(numbers)
     return whole._replace(parameters=jnp.einsum("sij,sjm->im", whole.reaction, slopes))

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from jaximu.data.observe_stations import observe_stations
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.stations import KnownStations, StationConditions, station_covariances, station_rms, station_rows
-from jaximu.estimation.data import About, Data, Observed
+from jaximu.estimation.data import About, Observed, OfOneUnit
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
-from jaximu.estimation.track import Track, added, mean_outputs, stimuli
+from jaximu.estimation.track import TRIADS, Track, added, mean_outputs, stimuli
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.tracing import first, lifted
 from jaximu.model.noise import drawn_noise
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
@@ -45,7 +47,7 @@ class AtStations:
 
 
 @dataclass
-class RecordedStations(Data):
+class RecordedStations(OfOneUnit):
     """A recording of one unit whose set-up says what the unit went through; `entries`: what it says, where known."""
 
     recording: Recording
@@ -54,6 +56,9 @@ class RecordedStations(Data):
 
     excess_names = EXCESS_NAMES
     coarse = KnownStations.coarse
+
+    def __post_init__(self):
+        self.stations = jax.tree.map(np.asarray, self.stations)
 
     @classmethod
     def of(
@@ -78,16 +83,14 @@ class RecordedStations(Data):
         """Return what each condition is."""
         return station_rows(imu, self.stations)
 
-    def about(self, imu: Imu) -> About:
-        """Return the errors of the mean outputs of one unit, the leading axis, and its effects' columns."""
-        unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        path, stations = _path(self.recording, self.stations, unit), self.stations
-        if unit.all_effects():
-            stations = self._without_outputs(self._means(path, added(unit, path)))
+    def about_one(self, imu: Imu) -> About:
+        """Return the errors of the mean outputs of the unit, and its effects' columns."""
+        path, stations = _path(self.recording, self.stations, imu), self.stations
+        if imu.all_effects():
+            stations = self._without_outputs(self._means(path, added(imu, path)))
         details = AtStations(path, stations)
-        lifted = jax.tree.map(lambda leaf: np.asarray(leaf)[None], stations)
-        columns = self.own_columns(unit, details, 6 * len(stations.turn))
-        return About(StationConditions(lifted), station_covariances(lifted), columns[None], details)
+        columns = self.own_columns(imu, details, 6 * len(stations.turn))
+        return About(StationConditions(stations), first(station_covariances(lifted(stations))), columns, details)
 
     def reactions(self, details: AtStations):
         """Return how the mean outputs react to effects."""
@@ -114,7 +117,7 @@ class RecordedStations(Data):
 
     def rests(self) -> list[FloatArray]:
         """Return the spans of the poses alone."""
-        return [_spans(self.stations, _used(self.stations) & ~np.asarray(self.stations.turn))]
+        return [_spans(self.stations, _used(self.stations) & ~self.stations.turn)]
 
     @property
     def sampled(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -140,12 +143,9 @@ class RecordedStations(Data):
 
     def observed(self, imu: Imu, details: AtStations) -> Observed:
         """Return the stations, padding included; orientation is compared in poses."""
-        stations, turn = self.stations, np.asarray(self.stations.turn)
-        used = {
-            "accelerometer": np.asarray(stations.accelerometer_used),
-            "gyroscope": np.asarray(stations.gyroscope_used),
-        }
-        middle, real = (np.asarray(stations.start) + np.asarray(stations.stop)) / 2, _used(stations)
+        stations, turn = self.stations, self.stations.turn
+        used = {"accelerometer": stations.accelerometer_used, "gyroscope": stations.gyroscope_used}
+        middle, real = (stations.start + stations.stop) / 2, _used(stations)
         force = np.asarray(stations.stimulus.specific_force).mean(axis=1)
         return Observed(
             lambda triad, shape: output_reaction(triad, shape, used[triad]),
@@ -159,7 +159,7 @@ class RecordedStations(Data):
     def without(self, observation: int) -> RecordedStations:
         """Return the recording with a station left out."""
         stations, kept = self.stations, np.arange(len(self.stations.turn)) != observation
-        used = {name: np.asarray(getattr(stations, name)) & kept for name in ("accelerometer_used", "gyroscope_used")}
+        used = {name: getattr(stations, name) & kept for name in ("accelerometer_used", "gyroscope_used")}
         return replace(self, stations=replace(stations, **used))
 
     def rms(self, imu: Imu, details: AtStations, conditions: FloatArray) -> dict[str, tuple[float, str]]:
@@ -186,8 +186,8 @@ class RecordedStations(Data):
         force, rate = np.split(outputs.reshape(-1, 6), 2, axis=1)
         return replace(
             self.stations,
-            accelerometer_mean=np.asarray(self.stations.accelerometer_mean) - force,
-            gyroscope_mean=np.asarray(self.stations.gyroscope_mean) - rate,
+            accelerometer_mean=self.stations.accelerometer_mean - force,
+            gyroscope_mean=self.stations.gyroscope_mean - rate,
         )
 
     def _means(self, path: dict[str, Track], outputs: Mapping[str, Array | FloatArray]) -> FloatArray:
@@ -200,31 +200,30 @@ def output_reaction(triad: str, shape: FloatArray, used: NDArray[np.bool_]) -> F
 
     **Arguments:** `shape`: (o, k) of each axis alike; `used` (o,): observations in which the triad counts.
     """
-    first = 0 if triad == "accelerometer" else 3
     columns = np.zeros((len(shape), 6, shape.shape[1], 3))
     for axis in range(3):
-        columns[used, first + axis, :, axis] = shape[used]
+        columns[used, 3 * TRIADS.index(triad) + axis, :, axis] = shape[used]
     return columns.reshape(6 * len(shape), -1)
 
 
 def _used(stations: Stations) -> NDArray[np.bool_]:
-    return np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
+    return stations.accelerometer_used | stations.gyroscope_used
 
 
 def _spans(stations: Stations, chosen: NDArray[np.bool_]) -> FloatArray:
-    return np.stack([np.asarray(stations.start)[chosen], np.asarray(stations.stop)[chosen]], axis=1)
+    return np.stack([stations.start[chosen], stations.stop[chosen]], axis=1)
 
 
 def _in_order(stations: Stations) -> NDArray[np.int64]:
     """Return the places of the stations that are used, in the order of time."""
     real = np.flatnonzero(_used(stations))
-    return real[np.argsort(np.asarray(stations.start)[real])]
+    return real[np.argsort(stations.start[real])]
 
 
 def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:
     """Return the station (n,) that each stamp lies in, S where in none."""
     order = _in_order(stations)
-    start, stop = np.asarray(stations.start)[order], np.asarray(stations.stop)[order]
+    start, stop = stations.start[order], stations.stop[order]
     latest = np.maximum(np.searchsorted(start, time, side="right") - 1, 0)
     inside = (time >= start[latest]) & (time < stop[latest])
     return np.where(inside, order[latest], len(stations.turn))
@@ -233,7 +232,7 @@ def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:
 def _path(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track]:
     """Return the stimulus at every sample: in a station as the set-up says, in between as `imu` measured it."""
     count, order = len(stations.turn), _in_order(stations)
-    nodes = jax.tree.map(lambda leaf: np.asarray(leaf)[order].reshape(-1, *np.shape(leaf)[2:]), stations.stimulus)
+    nodes = jax.tree.map(lambda leaf: leaf[order].reshape(-1, *np.shape(leaf)[2:]), stations.stimulus)
     tracks = {}
     for name, known in stimuli(recording, imu).items():
         signal = recording.signals[name]
@@ -242,12 +241,9 @@ def _path(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track
         nearest = np.clip(np.searchsorted((nodes.time[1:] + nodes.time[:-1]) / 2, signal.time), 0, len(nodes.time) - 1)
         motion = {field: np.array(getattr(known, field)) for field in ("specific_force", "angular_rate")}
         for field, values in motion.items():
-            stated = getattr(nodes, field)
-            for axis in range(3):
-                values[inside, axis] = np.interp(signal.time[inside], nodes.time, stated[:, axis])
-        pose = inside & ~np.asarray(stations.turn)[np.minimum(station, count - 1)]
-        first = np.asarray(stations.stimulus.specific_force)[:, 0]
-        motion["specific_force"][pose] = first[station[pose]]
+            values[inside] = interpolated(nodes.time, getattr(nodes, field), signal.time[inside])
+        pose = inside & ~stations.turn[np.minimum(station, count - 1)]
+        motion["specific_force"][pose] = np.asarray(stations.stimulus.specific_force)[station[pose], 0]
         motion["angular_rate"][pose] = 0.0
         acceleration = np.gradient(motion["angular_rate"], signal.time, axis=0)
         acceleration[pose] = 0.0

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.data import About, Conditions, Data, derivatives_by_numbers, free_columns
+from jaximu.estimation.data import About, Conditions, OfOneUnit, derivatives_by_numbers, free_columns
 from jaximu.estimation.track import Track
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -30,7 +29,10 @@ _ROWS = 256
 
 
 class _WhiteOutputs(Conditions):
-    """White combinations of mean outputs without what effects add, less those of the bias."""
+    """White combinations of mean outputs without what effects add, less those of the bias.
+
+    magnitude: of nothing, as at rest gravity is a part of the levels.
+    """
 
     output: Float[Array, " n"]
     bias: Float[Array, "n 3"]
@@ -43,12 +45,8 @@ class _WhiteOutputs(Conditions):
         bias = jnp.where(self.gyroscope == 1, imu.gyroscope.bias, imu.accelerometer.bias)
         return self.output - self.bias @ bias
 
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> _WhiteOutputs:
-        """Return the same: at rest gravity is a part of the levels."""
-        return self
 
-
-class RestOverTemperature(Data):
+class RestOverTemperature(OfOneUnit):
     """Mean outputs (n, 3) of one triad over blocks at rest, in output units.
 
     **Arguments:** `weights` (3, n, n): by axis, whiten the outputs' noise. `level` (n,): the rest of each block.
@@ -65,32 +63,29 @@ class RestOverTemperature(Data):
         apart = member[:, 1:] - member[:, :1]  # levels that add up to nothing: their mean is the bias
         self.weights = weights
         if apart.shape[1]:  # combinations that no level moves
-            whole = [np.linalg.qr(own @ apart, mode="complete")[0] for own in weights]
-            self.weights = np.stack([q[:, apart.shape[1] :].T @ own for q, own in zip(whole, weights, strict=True)])
+            whole = np.linalg.qr(weights @ apart, mode="complete")[0]
+            self.weights = whole[:, :, apart.shape[1] :].swapaxes(1, 2) @ weights
         self._length = padded_count(self.weights.shape[1])  # of an axis
         used = np.zeros((3, self._length))
         used[:, : self.weights.shape[1]] = 1.0
-        factors = tuple((used * axis[:, None]).reshape(1, -1) for axis in np.eye(3))
-        group = np.repeat(np.arange(3), self._length)[None]
-        one = np.ones((1, 3 * self._length))
-        self.covariance = Covariance(one, factors, used.reshape(1, -1), group)  # pyright: ignore[reportArgumentType]
+        factors = tuple((used * axis[:, None]).ravel() for axis in np.eye(3))
+        group = np.repeat(np.arange(3), self._length)
+        self.covariance = Covariance(np.ones(3 * self._length), factors, used.ravel(), group)  # pyright: ignore[reportArgumentType]
         self.bias = self._white(np.tile(np.eye(3), (len(output), 1, 1)))
 
-    def about(self, imu: Imu) -> About:
-        """Return the outputs without what the effects of one unit, the leading axis, add to them."""
-        unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        added, slopes = mean_terms(tuple(unit.all_effects().values()), self.paths, len(self.output))
-        conditions = _WhiteOutputs(
-            self._white((self.output - added)[:, :, None])[:, :, 0], self.bias, np.zeros(1),
-            np.full(1, int(self.triad == "gyroscope")),
-        )  # pyright: ignore[reportCallIssue] # fmt: skip
+    def about_one(self, imu: Imu) -> About:
+        """Return the outputs without what the effects of the unit add to them."""
+        added, slopes = mean_terms(tuple(imu.all_effects().values()), self.paths, len(self.output))
+        output = self._white((self.output - added)[:, :, None])[:, 0]
+        gyroscope = np.int64(self.triad == "gyroscope")
+        conditions = _WhiteOutputs(output, self.bias, np.float64(0.0), gyroscope)  # pyright: ignore[reportCallIssue]
         return About(conditions, self.covariance, self._white(-slopes))
 
     def _white(self, values: FloatArray) -> FloatArray:
-        """Return (1, 3 rows, q) of values (n, 3, q) by block and axis."""
-        found = np.zeros((3, self._length, values.shape[2]))
-        found[:, : self.weights.shape[1]] = self.weights @ values.transpose(1, 0, 2)
-        return found.reshape(1, 3 * self._length, -1)
+        """Return (3 rows, q) of values (n, 3, q) by block and axis."""
+        white = np.zeros((3, self._length, values.shape[2]))
+        white[:, : self.weights.shape[1]] = self.weights @ values.transpose(1, 0, 2)
+        return white.reshape(3 * self._length, -1)
 
 
 def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -> tuple[FloatArray, FloatArray]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
-from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
+from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS, Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.summary import sentence
@@ -21,9 +23,11 @@ from jaximu.recordings.recording import Recording, Signal, recordings_of, same_o
 __all__ = [
     "LEAST_RANGE",
     "RATE_BANDWIDTH",
+    "RATIO",
     "WAYS",
     "Leg",
     "RestBlocks",
+    "correlation_times",
     "folds_of",
     "joined",
     "rest_blocks",
@@ -37,6 +41,8 @@ RATE_BANDWIDTH = 0.578 / TEMPERATURE_WINDOW
 3 (sin x − x cos x) / x³ with x = π f window."""
 WAYS = 4
 """Ways of the temperature from which on they are left out whole."""
+RATIO = 4.0
+"""Of neighbouring correlation times of the processes that make flicker noise."""
 _FOLDS = 8  # parts that are left out in turn, at most
 _MOST_BLOCKS = 600
 _FEWEST_BLOCKS = 30
@@ -212,13 +218,16 @@ class RestBlocks:
         numbers = np.full(len(self) + 1, int(keep.sum()))
         numbers[:-1][keep] = np.arange(keep.sum())
         rest, level = (np.unique(part[keep], return_inverse=True)[1] for part in (self.rest, self.level))
+        kept = {name: getattr(self, name)[keep] for name in ("start", "stop", "log", "temperature", "rate")}
         return replace(
-            self, start=self.start[keep], stop=self.stop[keep], log=self.log[keep], rest=rest, level=level,
-            temperature=self.temperature[keep], rate=self.rate[keep],
+            self,
+            **kept,
+            rest=rest,
+            level=level,
             means={name: values[keep] for name, values in self.means.items()},
             nodes=tuple(track.renumbered(numbers) for track in self.nodes),
             ambient=None if self.ambient is None else self.ambient[keep],
-        )  # fmt: skip
+        )
 
     def parted(self, edges: Sequence[int]) -> RestBlocks:
         """Return the same with a bias of its own from each of some blocks on."""
@@ -324,27 +333,37 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
 
 def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
     """Return the blocks of several recordings as those of one unit; every recording has rests of its own."""
-    total, first, log, rest, level = sum(map(len, parts)), 0, 0, 0, 0
-    logs, rests, levels, nodes = [], [], [], []
-    for part in parts:
-        logs.append(part.log + log)
-        rests.append(part.rest + rest)
-        levels.append(part.level + level)
-        numbers = np.append(first + np.arange(len(part)), total)
-        nodes += [track.renumbered(numbers) for track in part.nodes]
-        first, log, level = first + len(part), log + len(part.nodes), level + part.levels
-        rest += int(part.rest.max(initial=-1)) + 1
 
-    def whole(name: str) -> FloatArray:
+    def whole(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(part, name) for part in parts])
 
+    def counted(name: str, counts: Iterable[int]) -> NDArray[np.int64]:
+        """Return indices that each part counts from zero, counted on from part to part."""
+        starts = np.cumsum([0, *counts])[:-1]
+        return np.concatenate([getattr(part, name) + start for part, start in zip(parts, starts, strict=True)])
+
+    total = sum(map(len, parts))
+    blocks = np.split(np.arange(total), np.cumsum([len(part) for part in parts])[:-1])
     return RestBlocks(
-        tuple(recording for part in parts for recording in part.recordings), whole("start"), whole("stop"),
-        np.concatenate(logs), np.concatenate(rests), np.concatenate(levels), whole("temperature"), whole("rate"),
-        {name: np.concatenate([part.means[name] for part in parts]) for name in parts[0].means}, tuple(nodes),
-        None if any(part.ambient is None for part in parts) else whole("ambient"), parts[0].duration,
-        sum(part.dropped for part in parts), (),
-    )  # fmt: skip
+        tuple(recording for part in parts for recording in part.recordings),
+        whole("start"),
+        whole("stop"),
+        counted("log", (len(part.nodes) for part in parts)),
+        counted("rest", (int(part.rest.max(initial=-1)) + 1 for part in parts)),
+        counted("level", (part.levels for part in parts)),
+        whole("temperature"),
+        whole("rate"),
+        {name: np.concatenate([part.means[name] for part in parts]) for name in parts[0].means},
+        tuple(
+            track.renumbered(np.append(numbers, total))
+            for part, numbers in zip(parts, blocks, strict=True)
+            for track in part.nodes
+        ),
+        None if any(part.ambient is None for part in parts) else whole("ambient"),
+        parts[0].duration,
+        sum(part.dropped for part in parts),
+        (),
+    )
 
 
 def _cut(recording: Recording, block: float) -> RestBlocks:
@@ -358,8 +377,8 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
     time = (edges[1:] + edges[:-1]) / 2
     count = nodes // _NODES
     good, moved, means = np.ones(count, bool), np.zeros(count, bool), {}
-    for name in ("accelerometer", "gyroscope"):
-        signal = getattr(recording, name)
+    for name in TRIADS:
+        signal = recording.signals.get(name)
         if signal is None:
             continue
         at = np.floor((signal.time - begin) / block).astype(int)
@@ -376,8 +395,8 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
     means = {name: values[keep] for name, values in means.items()}
     jumps = np.linalg.norm(np.diff(means["accelerometer"], axis=0), axis=1) > _TURNED
     celsius = _cells(temperature, edges)
-    slope = np.interp(time, temperature.time, smoothed_slope(temperature.time, temperature.values[:, 0],
-                                                             TEMPERATURE_WINDOW))  # fmt: skip
+    slope = smoothed_slope(temperature.time, temperature.values[:, 0], TEMPERATURE_WINDOW)
+    slope = np.interp(time, temperature.time, slope)
 
     def by_block(values: FloatArray) -> FloatArray:
         return values[: count * _NODES].reshape(count, _NODES).mean(axis=1)[keep]
@@ -386,13 +405,23 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
     kept[keep] = np.arange(len(keep))
     start, ambient = np.asarray(begin + block * keep, np.float64), recording.ambient_temperature
     rest = np.cumsum(np.concatenate([[0], jumps]), dtype=np.int64)[: len(keep)]
+    block_of_node = kept[np.minimum(np.arange(nodes) // _NODES, count)]
     return RestBlocks(
-        (recording,), start, np.asarray(start + block, np.float64), np.zeros(len(keep), np.int64), rest, rest,
-        by_block(celsius), by_block(slope), means,
-        (Track(Stimulus(temperature=celsius, temperature_rate=slope, time=time),
-               kept[np.minimum(np.arange(nodes) // _NODES, count)]),),
-        None if ambient is None else by_block(_cells(ambient, edges)), float(block), int(np.sum(good & moved)), (),
-    )  # fmt: skip
+        (recording,),
+        start,
+        np.asarray(start + block, np.float64),
+        np.zeros(len(keep), np.int64),
+        rest,
+        rest,
+        by_block(celsius),
+        by_block(slope),
+        means,
+        (Track(Stimulus(temperature=celsius, temperature_rate=slope, time=time), block_of_node),),
+        None if ambient is None else by_block(_cells(ambient, edges)),
+        float(block),
+        int(np.sum(good & moved)),
+        (),
+    )
 
 
 def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
@@ -482,6 +511,12 @@ def _startup(signal: Signal) -> int:
     return end
 
 
+def correlation_times(shortest: float, longest: float) -> FloatArray:
+    """Return the correlation times (s) of Gauss–Markov processes that together are flicker noise, `RATIO` apart."""
+    count = 1 + int(np.ceil(np.log(longest / shortest) / np.log(RATIO)))
+    return np.asarray(shortest * RATIO ** np.arange(count), np.float64)
+
+
 def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     """Fit white noise, flicker and a random walk to what smooth functions of temperature leave of the blocks.
 
@@ -490,18 +525,18 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     """
     shortest = blocks.duration
     longest = 4 * max(blocks.spans)
-    members = 1 + int(np.ceil(np.log(longest / shortest) / np.log(4.0)))
-    times = np.asarray(shortest * 4.0 ** np.arange(members), np.float64)
+    times = correlation_times(shortest, longest)
     indicator = np.eye(blocks.levels)[blocks.level]
     taken = np.concatenate([indicator, smooth / np.maximum(np.linalg.norm(smooth, axis=0), 1e-300)], axis=1)
-    u, s, _ = np.linalg.svd(taken, full_matrices=True)
-    null = u[:, int(np.sum(s > 1e-9 * s[0])) :]
+    null = scipy.linalg.null_space(taken.T, rcond=1e-9)
     left = {name: null.T @ means for name, means in blocks.means.items()}
     flicker, walk = np.ones(len(times)), np.zeros(len(times))
     walk[-1] = 1.0  # so slow that it is a random walk here
     nothing = np.zeros(3)
-    slow = [null.T @ blocks.covariance(AxisNoise(nothing, nothing, np.tile(shape, (3, 1)), times))[0] @ null
-            for shape in (flicker, walk)]  # fmt: skip
+    slow = [
+        null.T @ blocks.covariance(AxisNoise(nothing, nothing, np.tile(shape, (3, 1)), times))[0] @ null
+        for shape in (flicker, walk)
+    ]
     sizes = [max(float(np.trace(covariance)), 1e-300) / len(covariance) for covariance in slow]
     tried: dict[str, list[tuple[FloatArray, ...]]] = {name: [] for name in left}
     for share in _WALKS:
@@ -520,7 +555,7 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     for name, fits in tried.items():
         cost, white, variance = (np.stack(values) for values in zip(*fits, strict=True))
         best = np.argmin(cost, axis=0), np.arange(3)
-        usual = _FLICKER**2 * white[best] * shortest * np.log(4.0) / np.pi
+        usual = _FLICKER**2 * white[best] * shortest * np.log(RATIO) / np.pi
         slowly = np.maximum(variance[best], usual[:, None])
         noise[name] = AxisNoise(white[best] * shortest, nothing, slowly, times, longest / 4)
     return NoiseModel(noise["accelerometer"], noise.get("gyroscope"))

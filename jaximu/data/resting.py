@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -17,25 +16,23 @@ from numpy.typing import NDArray
 
 from jaximu.data.recorded_stations import output_reaction
 from jaximu.data.rest_blocks import WAYS, RestBlocks, folds_of
+from jaximu.data.twin_signal import twin_signal
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.data import About, Conditions, Data, Observed
+from jaximu.estimation.data import About, Conditions, Observed, OfOneUnit
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
-from jaximu.estimation.track import Track, added, mean_outputs
+from jaximu.estimation.track import TRIADS, Track, added, mean_outputs
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import apply_matrix
 from jaximu.model.effects.base import Extent
-from jaximu.model.noise import drawn_noise
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
 
 __all__ = ["Resting", "RestingConditions"]
 
-_TRIADS = ("accelerometer", "gyroscope")
-_LEVEL = (1.0, 0.1)  # m/s² and rad/s: how far a rest may lie from another, as good as free
-_SMOOTH = (1.0, 0.1)  # m/s² and rad/s: the same of a smooth function of temperature
+_FREE = (1.0, 0.1)  # m/s² and rad/s: how far a rest, or a smooth function of temperature, may lie off, as good as free
 _IN_POSES = ("accel.scale_temperature", "accel.misalignment_temperature")
 _PLACES = 40  # at which a step is sought
 _RESIDUALS = (
@@ -45,7 +42,10 @@ _RESIDUALS = (
 
 
 class RestingConditions(Conditions):
-    """Mean outputs (n, 6) of blocks, without what effects add, less those of a unit at rest under the force (n, 3)."""
+    """Mean outputs (n, 6) of blocks, without what effects add, less those of a unit at rest under the force (n, 3).
+
+    magnitude: of nothing, as the force is the measured one.
+    """
 
     output: Float[Array, "n 6"]
     force: Float[Array, "n 3"]
@@ -53,14 +53,9 @@ class RestingConditions(Conditions):
 
     def __call__(self, imu: Imu) -> Float[Array, " 6*n"]:
         """Return the errors of the mean outputs, accelerometer and gyroscope of one block after another."""
-        assert imu.gyroscope is not None
         force = apply_matrix(imu.accelerometer.gain, self.force) + imu.accelerometer.bias
-        rate = jnp.broadcast_to(imu.gyroscope.bias, force.shape)
+        rate = jnp.broadcast_to(imu.triads()["gyroscope"].bias, force.shape)
         return (self.output - jnp.concatenate([force, rate], axis=-1)).reshape(-1)
-
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> RestingConditions:
-        """Return the same: the force is the measured one."""
-        return self
 
 
 @dataclass(frozen=True)
@@ -71,7 +66,7 @@ class _AtRests:
 
 
 @dataclass
-class Resting(Data):
+class Resting(OfOneUnit):
     """A unit at rest over temperature, its noise known.
 
     curves (n, k): smooth functions of temperature over the blocks. smooth: whether any sum of them is allowed
@@ -83,7 +78,7 @@ class Resting(Data):
     curves: FloatArray
     smooth: bool = False
 
-    excess_names = _TRIADS
+    excess_names = TRIADS
     coarse = (0.0, 0.0)
     no_fixture = "a recording at rest has no set-up to compare with"
     advice = staticmethod(pose_advice)
@@ -112,15 +107,14 @@ class Resting(Data):
         """Return whether a number is free: gain does not show at rest."""
         return name.part != "gain"
 
-    def about(self, imu: Imu) -> About:
-        """Return the mean outputs less those of one unit, the leading axis, and its effects' columns."""
-        unit = jax.tree.map(lambda leaf: leaf[0], imu)
-        force = self._force(unit)
-        tracks = self.blocks.tracks(force, unit.accelerometer.temperature_reference)
-        details = _AtRests([dict.fromkeys(_TRIADS, track) for track in tracks])
-        output = self._outputs - (self._added(unit, details.tracks) if unit.all_effects() else 0.0)
-        conditions = RestingConditions(output[None], force[None], np.zeros(1))  # pyright: ignore[reportArgumentType]
-        return About(conditions, self._covariance, self.own_columns(unit, details, output.size)[None], details)
+    def about_one(self, imu: Imu) -> About:
+        """Return the mean outputs less those of the unit, and its effects' columns."""
+        force = self._force(imu)
+        tracks = self.blocks.tracks(force, imu.accelerometer.temperature_reference)
+        details = _AtRests([dict.fromkeys(TRIADS, track) for track in tracks])
+        output = self._outputs - (self._added(imu, details.tracks) if imu.all_effects() else 0.0)
+        conditions = RestingConditions(output, force, np.float64(0.0))  # pyright: ignore[reportArgumentType]
+        return About(conditions, self._covariance, self.own_columns(imu, details, output.size), details)
 
     def reactions(self, details: _AtRests):
         """Return how the mean outputs react to effects, recording by recording."""
@@ -188,12 +182,9 @@ class Resting(Data):
             start, stop = blocks.start[mine], blocks.stop[mine]
             for number, (name, triad) in enumerate(imu.triads().items()):
                 signal = recording.signals[name]
-                samples = drawn_noise(getattr(noise, name), len(signal), signal.rate, [seed, log, number])
-                level = np.asarray(triad.bias)
-                if name == "accelerometer":
-                    nearest = np.clip(np.searchsorted(start, signal.time, side="right") - 1, 0, len(start) - 1)
-                    level = level + self._force(imu)[mine][nearest] @ np.asarray(triad.gain).T
-                changed[name] = replace(signal, values=level + samples * signal.nominal_scale)
+                nearest = np.clip(np.searchsorted(start, signal.time, side="right") - 1, 0, len(start) - 1)
+                true = self._force(imu)[mine][nearest] if name == "accelerometer" else np.zeros((len(signal), 3))
+                changed[name] = twin_signal(signal, triad, true, getattr(noise, name), [seed, log, number])
                 values, edges = changed[name].si(), np.searchsorted(signal.time, np.stack([start, stop], axis=1))
                 means[name] += [values[a:b].mean(axis=0) for a, b in edges]
             made.append(replace(recording, **changed, notes=()))
@@ -202,13 +193,13 @@ class Resting(Data):
 
     @property
     def _scale(self) -> FloatArray:
-        return np.concatenate([self.recordings[0].signals[name].nominal_scale for name in _TRIADS])
+        return np.concatenate([self.recordings[0].signals[name].nominal_scale for name in TRIADS])
 
     @property
     def _outputs(self) -> FloatArray:
         """Mean outputs (n, 6), in output units."""
-        offset = np.concatenate([self.recordings[0].signals[name].nominal_offset for name in _TRIADS])
-        return np.concatenate([self.blocks.means[name] for name in _TRIADS], axis=1) * self._scale + offset
+        offset = np.concatenate([self.recordings[0].signals[name].nominal_offset for name in TRIADS])
+        return np.concatenate([self.blocks.means[name] for name in TRIADS], axis=1) * self._scale + offset
 
     def _force(self, imu: Imu) -> FloatArray:
         """The specific force (n, 3) of each block's rest, by the mean over it."""
@@ -222,17 +213,17 @@ class Resting(Data):
         unit = np.zeros((2, count, 6))
         same = (blocks.level[:, None] == blocks.level).astype(float)
         curved = self.curves @ self.curves.T if self.smooth else 0.0
-        for triad, name in enumerate(_TRIADS):
+        for triad, name in enumerate(TRIADS):
             noise = blocks.covariance(getattr(self.noise, name))
-            covariance = noise + _LEVEL[triad] ** 2 * same + _SMOOTH[triad] ** 2 * curved
+            covariance = noise + _FREE[triad] ** 2 * (same + curved)
             for axis in range(3):
                 column = 3 * triad + axis
                 whole[:, column, :, column] = covariance[axis] * self._scale[column] ** 2
                 unit[triad, :, column] = np.sqrt(np.mean(np.diag(noise[axis]))) * self._scale[column]
         size = 6 * count
-        factors = tuple(factor.ravel()[None] for factor in unit)
-        group = np.tile(np.repeat([0, 1], 3), count)[None]
-        return Covariance(whole.reshape(size, size)[None], factors, np.ones((1, size)), group)  # pyright: ignore[reportArgumentType]
+        factors = tuple(factor.ravel() for factor in unit)
+        group = np.tile(np.repeat([0, 1], 3), count)
+        return Covariance(whole.reshape(size, size), factors, np.ones(size), group)  # pyright: ignore[reportArgumentType]
 
     def _added(self, imu: Imu, tracks: Sequence[dict[str, Track]]) -> FloatArray:
         """What the unit's effects add to the mean outputs (n, 6)."""

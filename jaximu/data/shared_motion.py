@@ -8,8 +8,11 @@ and turns that are too quick to be followed by integration still count. NumPy, h
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.differences import interpolated
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, Signal
@@ -23,9 +26,14 @@ _BUCKET = 32
 
 
 def shared_stations(
-    recording: Recording, first: Recording, span: FloatArray, delay: float, density: tuple[FloatArray, FloatArray],
-    gravity: float, still: bool = False,
-) -> Stations:  # fmt: skip
+    recording: Recording,
+    first: Recording,
+    span: FloatArray,
+    delay: float,
+    density: tuple[FloatArray, FloatArray],
+    gravity: float,
+    still: bool = False,
+) -> Stations:
     """Return what a unit put out over S intervals, beside what the first unit measured over them.
 
     **Arguments:** `recording`: the unit's, as logged; `first`: the other's, compensated, m/s² and rad/s; `span`: (S, 2)
@@ -34,37 +42,52 @@ def shared_stations(
 
     **Returns:** stations padded to a multiple of 32.
     """
-    gyroscope = first.gyroscope
-    assert gyroscope is not None and recording.gyroscope is not None
-    time = gyroscope.time - delay
-    accelerometer, rate = first.accelerometer, gyroscope.values
-    force = np.stack([np.interp(gyroscope.time, accelerometer.time, axis) for axis in accelerometer.values.T], axis=1)
-    turning = np.gradient(rate, time, axis=0)
+    accelerometer, gyroscope = (first.signals[name] for name in TRIADS)
+    time, rate = gyroscope.time - delay, gyroscope.values
+    force = interpolated(accelerometer.time, accelerometer.values, gyroscope.time)
     count, size = len(span), -(-len(span) // _BUCKET) * _BUCKET
     used = np.arange(size) < count
     span = np.concatenate([span, np.repeat(span[:1], size - count, axis=0)])
     start, stop = span.T
+    length = np.diff(span)
     if still:
-        signals = [Integral(Signal(time, values, "1"), values) for values in (force, rate)]
-        means = [np.repeat((each.over(start, stop) / np.diff(span))[:, None], 2, axis=1) for each in signals]
-        stimulus = Stimulus(specific_force=means[0], angular_rate=means[1], angular_acceleration=0 * means[1],
-                            time=span, temperature=None)  # fmt: skip
+        means = (Integral(Signal(time, values, "1"), values).over(start, stop) / length for values in (force, rate))
+        force, rate = (np.repeat(mean[:, None], 2, axis=1) for mean in means)
+        stimulus = Stimulus(force, rate, angular_acceleration=0 * rate, time=span)
         weight = np.full(span.shape, 0.5)
     else:
-        edges = np.concatenate([[2 * time[0] - time[1]], time, [2 * time[-1] - time[-2]]])
-        edges = (edges[1:] + edges[:-1]) / 2
-        begin = np.searchsorted(edges, start, side="right") - 1 - _MARGIN
-        nodes = int(np.ceil(np.max(stop - start) * gyroscope.rate - 1e-6)) + 2 * _MARGIN + 1
-        place = np.clip(begin, 0, len(time) - nodes)[:, None] + np.arange(nodes)
-        held = np.minimum(edges[place + 1], stop[:, None]) - np.maximum(edges[place], start[:, None])
-        held = np.maximum(held, 0.0)
+        index, held = _held(time, span, gyroscope.rate)
         weight = held / held.sum(axis=1, keepdims=True)
-        stimulus = Stimulus(specific_force=force[place], angular_rate=rate[place], angular_acceleration=turning[place],
-                            time=time[place])  # fmt: skip
-    length = np.diff(span)
-    outputs = [Integral(each, each.values).over(start, stop) / length
-               for each in (recording.accelerometer, recording.gyroscope)]  # fmt: skip
-    covariances = [np.where(used, np.diagonal(each)[:, None] / length[:, 0], 1.0)[:, :, None] * np.eye(size)
-                   for each in density]  # fmt: skip
-    return Stations(outputs[0], outputs[1], covariances[0], covariances[1], stimulus, weight, start, stop,
-                    np.full(size, not still), used, used, np.asarray(gravity))  # pyright: ignore # fmt: skip
+        turning = np.gradient(rate, time, axis=0)
+        stimulus = Stimulus(force[index], rate[index], angular_acceleration=turning[index], time=time[index])
+    force_mean, rate_mean = (
+        Integral(signal, signal.values).over(start, stop) / length
+        for signal in (recording.signals[name] for name in TRIADS)
+    )
+    variances = (np.where(used, np.diagonal(axes)[:, None] / length[:, 0], 1.0) for axes in density)
+    force_covariance, rate_covariance = (variance[:, :, None] * np.eye(size) for variance in variances)
+    return Stations(
+        force_mean,
+        rate_mean,
+        force_covariance,
+        rate_covariance,
+        stimulus,
+        weight,
+        start,
+        stop,
+        np.full(size, not still),
+        used,
+        used,
+        np.asarray(gravity),
+    )  # pyright: ignore
+
+
+def _held(time: FloatArray, span: FloatArray, rate: float) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return which samples lie in each span, some beside it included, and how long each holds in it (S, Q), s."""
+    edges = np.concatenate([[2 * time[0] - time[1]], time, [2 * time[-1] - time[-2]]])
+    edges = (edges[1:] + edges[:-1]) / 2
+    begin = np.searchsorted(edges, span[:, 0], side="right") - 1 - _MARGIN
+    nodes = int(np.ceil(np.max(np.diff(span)) * rate - 1e-6)) + 2 * _MARGIN + 1
+    index = np.clip(begin, 0, len(time) - nodes)[:, None] + np.arange(nodes)
+    held = np.minimum(edges[index + 1], span[:, 1:]) - np.maximum(edges[index], span[:, :1])
+    return index, np.maximum(held, 0.0)

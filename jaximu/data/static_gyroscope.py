@@ -19,9 +19,8 @@ def static_gyroscope(
     **Arguments:** `weights`: the inverse Cholesky factor of each mean's covariance. `stimulus` (P,): what the effects
     need in the poses, angular rate included; without it, no rate and the temperature.
     """
-    assert imu.gyroscope is not None
     poses = observations.poses
     if stimulus is None:
         stimulus = Stimulus(angular_rate=jnp.zeros_like(poses.gyroscope_mean), temperature=poses.temperature)
-    error = jnp.where(poses.mask[..., None], poses.gyroscope_mean - imu.gyroscope.respond(stimulus), 0.0)
+    error = jnp.where(poses.mask[..., None], poses.gyroscope_mean - imu.triads()["gyroscope"].respond(stimulus), 0.0)
     return jnp.sum(weights * error[..., None, :], axis=-1).reshape(-1)

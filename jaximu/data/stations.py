@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jaximu.data.station_error import turntable_error
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.problem import axis_scales
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
@@ -66,8 +67,8 @@ class StationConditions(Conditions):
 
 def station_rows(imu: Imu, stations: Stations) -> Rows:
     """Return what each error of a mean output is, by a unit close to this one."""
-    count, turn = len(stations.turn), np.asarray(stations.turn)
-    start, stop = np.asarray(stations.start), np.asarray(stations.stop)
+    stations = jax.tree.map(np.asarray, stations)
+    count, turn, start, stop = len(stations.turn), stations.turn, stations.start, stations.stop
     station, stimulus = np.repeat(np.arange(count), 6), stations.stimulus
     kind = np.repeat(np.stack([np.zeros(count, np.int64), np.where(turn, 1, 2)], axis=1), 3, axis=1).ravel()
     covariates = {TIME: np.repeat((start + stop) / 2, 6)}
@@ -80,8 +81,8 @@ def station_rows(imu: Imu, stations: Stations) -> Rows:
     turning = (kind == 1)[:, None]
     covariates |= by_axis("specific force", "m/s²", np.where(turning, np.nan, force))
     covariates |= by_axis("rate", "°/s", np.where(turning, np.degrees(rate), np.nan))
-    scale = [np.linalg.norm(np.asarray(triad.gain), axis=1) for triad in imu.triads().values()]
-    used = np.stack([np.asarray(stations.accelerometer_used), np.asarray(stations.gyroscope_used)], axis=1)
+    scale = [axis_scales(triad) for triad in imu.triads().values()]
+    used = np.stack([stations.accelerometer_used, stations.gyroscope_used], axis=1)
     return Rows(
         kinds=RESIDUALS,
         kind=kind,
@@ -168,11 +169,11 @@ def station_covariances(stations: Stations) -> Covariance:
 
 @dataclass(frozen=True)
 class StationErrors:
-    """Errors of one kind, by station: `name`, `unit`, `place` (n,) of the stations, `error` and `sigma` (3, n)."""
+    """Errors of one kind, by station: `name`, `unit`, index `station` (n,), `error` and `sigma` (3, n)."""
 
     name: str
     unit: str
-    place: np.ndarray
+    station: np.ndarray
     error: np.ndarray
     sigma: np.ndarray
 
@@ -185,18 +186,21 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
         return turntable_error(imu, stations), jnp.sqrt(variance)
 
     error, sigma = map(np.asarray, stored.call(compute, "station errors", imu, stations, excess))
-    scale = [np.linalg.norm(np.asarray(triad.gain), axis=1)[:, None] for triad in imu.triads().values()]
-    gyroscope, turn = np.asarray(stations.gyroscope_used), np.asarray(stations.turn)
-    degrees = np.degrees(np.asarray(stations.stop) - np.asarray(stations.start))
-    kinds = [("specific_force", "m/s^2", np.asarray(stations.accelerometer_used), slice(3), 1.0)]
+    stations = jax.tree.map(np.asarray, stations)
+    scale = [axis_scales(triad)[:, None] for triad in imu.triads().values()]
+    gyroscope, turn = stations.gyroscope_used, stations.turn
+    degrees = np.degrees(stations.stop - stations.start)
+    kinds = [("specific_force", "m/s^2", stations.accelerometer_used, slice(3), 1.0)]
     if len(scale) > 1:
-        kinds += [("rate_at_rest", "rad/s", gyroscope & ~turn, slice(3, 6), 1.0),
-                  ("turn_angle", "deg", gyroscope & turn, slice(3, 6), degrees)]  # fmt: skip
+        kinds += [
+            ("rate_at_rest", "rad/s", gyroscope & ~turn, slice(3, 6), 1.0),
+            ("turn_angle", "deg", gyroscope & turn, slice(3, 6), degrees),
+        ]
     errors = []
     for name, unit, used, rows, factor in kinds:
-        per = factor / scale[rows.start is not None]
-        place = np.flatnonzero(used)
-        errors.append(StationErrors(name, unit, place, (error[rows] * per)[:, place], (sigma[rows] * per)[:, place]))
+        station, per = np.flatnonzero(used), factor / scale[rows.start is not None]
+        values = ((part[rows] * per)[:, station] for part in (error, sigma))
+        errors.append(StationErrors(name, unit, station, *values))
     return errors
 
 
@@ -205,5 +209,5 @@ def station_rms(imu: Imu, stations: Stations) -> dict[str, tuple[float, str]]:
     return {
         kind.name: (float(np.sqrt(np.mean(np.sum(kind.error**2, axis=0)))), kind.unit)
         for kind in station_errors(imu, stations, np.zeros(len(KnownStations.coarse)))
-        if len(kind.place)
+        if len(kind.station)
     }

@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from jaximu.estimation.track import Recorded, Track
+from jaximu.data.gravity_direction import level
+from jaximu.estimation.track import TRIADS, Recorded, Track
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.rotation import multiply, rotate
+from jaximu.ground.rotation import multiply
 from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
@@ -55,7 +56,7 @@ class SamplesByHand(eqx.Module):
 
         **Arguments:** `shift` (3,): what the observations took off the gyroscope's output.
         """
-        signals = {name: part.recording.signals[name] for name in ("accelerometer", "gyroscope")}
+        signals = {name: part.recording.signals[name] for name in TRIADS}
         gyroscope = signals["gyroscope"]
         turn, order = np.full((2, len(gyroscope)), _NONE)
         sample = np.full(interval.shape, _NONE)
@@ -140,17 +141,17 @@ def tracks_by_hand(imu: Imu, samples: SamplesByHand, running: Float[Array, "T S 
     """
     poses, pose = len(running) + 1, samples.pose
     triads = imu.with_effects().triads()
-    force, rate = (triads[name].recover(samples.outputs[name]) for name in ("accelerometer", "gyroscope"))
+    force, rate = (triads[name].recover(samples.outputs[name]) for name in TRIADS)
     means, counts = pose_means(force, pose["accelerometer"], poses)
     rate = jnp.where((pose["gyroscope"] < poses)[:, None], 0.0, rate)
     attitudes = _attitudes(means, counts > 0, running[:, -1])
 
-    level = jnp.array([1.0, 0.0, 0.0, 0.0])
+    identity = jnp.array([1.0, 0.0, 0.0, 0.0])
     before = jnp.minimum(pose["gyroscope"], samples.turn)  # the pose that a sample lies in, or the one before its turn
     attitude = attitudes.at[before].get(mode="fill", fill_value=0.0)
     turned = running.at[samples.turn, samples.order].get(mode="fill", fill_value=0.0)
-    attitude = multiply(attitude, jnp.where(samples.turn[:, None] < poses, turned, level))
-    attitude = jnp.where(before[:, None] < poses, attitude, level)
+    attitude = multiply(attitude, jnp.where(samples.turn[:, None] < poses, turned, identity))
+    attitude = jnp.where(before[:, None] < poses, attitude, identity)
     tracks = {}
     for name, known in samples.recorded.stimuli(force, rate).items():
         assert known.specific_force is not None and known.angular_acceleration is not None
@@ -181,18 +182,11 @@ def pose_means(values: Float[Array, "n 3"], pose: Int[Array, " n"], poses: int) 
 
 def _attitudes(force: Float[Array, "P 3"], real: Array, turned: Float[Array, "T 4"]) -> Float[Array, "P 4"]:
     """The attitude in each pose that is real: carried over the turn from the one before, and levelled by its force."""
-    level = jnp.array([1.0, 0.0, 0.0, 0.0])
+    identity = jnp.array([1.0, 0.0, 0.0, 0.0])
 
     def step(carried, pose):
         force, real, turned = pose
-        attitude = _levelled(carried, jnp.where(real, force, jnp.array([0.0, 0.0, 1.0])))
-        return jnp.where(real, multiply(attitude, turned), level), attitude
+        attitude = level(carried, jnp.where(real, force, jnp.array([0.0, 0.0, 1.0])))
+        return jnp.where(real, multiply(attitude, turned), identity), attitude
 
-    return jax.lax.scan(step, level, (force, real, jnp.concatenate([turned, level[None]])))[1]
-
-
-def _levelled(attitude: Float[Array, 4], force: Float[Array, 3]) -> Float[Array, 4]:
-    """The attitude turned by the smallest rotation that brings the specific force upright."""
-    x, y, z = rotate(attitude, force / jnp.linalg.norm(force))
-    half = jnp.where(1 + z > 1e-9, jnp.stack([1 + z, y, -x, 0 * z]), jnp.array([0.0, 1.0, 0.0, 0.0]))
-    return multiply(half / jnp.linalg.norm(half), attitude)  # straight down: half a turn
+    return jax.lax.scan(step, identity, (force, real, jnp.concatenate([turned, identity[None]])))[1]

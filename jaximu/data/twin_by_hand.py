@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from jaximu.data.poses import PosesAndTurns
+from jaximu.data.twin_signal import twin_signal
 from jaximu.estimation.track import Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.rotation import rotation_matrix_on_host
-from jaximu.model.noise import drawn_noise
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
@@ -56,16 +56,14 @@ def twin_recordings(
         )
         up = {int(k): force[row] / gravity for k, row in zip(*np.unique(pose, return_index=True), strict=True)}
         for k in range(first, first + len(part.intervals) - 1):
-            if np.asarray(turns.mask)[k]:
-                inside = np.asarray(samples.sample)[k][np.asarray(turns.interval)[k] > 0]
+            if turns.mask[k]:
+                inside = samples.sample[k][turns.interval[k] > 0]
                 rate[inside] += _correction(attitude[inside], up[k + 1], float(np.sum(turns.interval[k])))
         first += len(part.intervals)
         changed = {}
         for order, ((name, triad), values) in enumerate(zip(imu.triads().items(), (force, rate), strict=True)):
-            signal = signals[name]
-            drawn = drawn_noise(getattr(noise, name), len(signal), signal.rate, [seed, number, order])
-            outputs = values @ np.asarray(triad.gain).T + np.asarray(triad.bias) + drawn * signal.nominal_scale
-            changed[name] = replace(signal, values=outputs + (shift if name == "gyroscope" else 0.0))
+            twin = twin_signal(signals[name], triad, values, getattr(noise, name), [seed, number, order])
+            changed[name] = replace(twin, values=twin.values + (shift if name == "gyroscope" else 0.0))
         made.append(replace(part.recording, **changed, notes=()))
     return made
 

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from jaximu.data.drift import (
     USUAL_DRIFT,
     drift_text,
-    orthonormal_basis,
     power_on_text,
     restricted_likelihood,
     with_noise,
 )
 from jaximu.estimation.data import Data, Handling
 from jaximu.estimation.fitting import Linear
+from jaximu.estimation.leave_out import orthonormal
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
@@ -103,7 +103,7 @@ class DriftComponents:
             return values + sum(amount * (part @ values) for amount, part in zip(change, parts, strict=True))
 
         drawn = changed(drawn, np.linalg.cholesky(self.uncertainty) @ random.standard_normal((len(sizes), DRAWS)))
-        basis = orthonormal_basis(np.concatenate([jacobian, weights @ self.beside[used]], axis=1))
+        basis = orthonormal(np.concatenate([jacobian, weights @ self.beside[used]], axis=1))
         pulled = drawn - basis @ (basis.T @ drawn)
         inside = [np.trace(part) - np.trace(basis.T @ part @ basis) for part in parts]
         gradient = (

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import inverse_matrix
 from jaximu.ground.tracing import array_module
@@ -31,6 +32,7 @@ __all__ = [
     "in_order",
     "inverse_cholesky",
     "mean_root",
+    "parts_of",
     "update_excess",
 ]
 
@@ -49,8 +51,7 @@ class BlockFactor(eqx.Module):
 
     def transposed(self, matrix: Float[Array, "n q"]) -> Float[Array, "_ q"]:
         """Return Fᵀ times a matrix."""
-        found = jnp.einsum("bmc,bmq->bcq", self.values, matrix[self.rows])
-        return found.reshape(-1, matrix.shape[1])
+        return jnp.einsum("bmc,bmq->bcq", self.values, matrix[self.rows]).reshape(-1, matrix.shape[1])
 
     def times(self, matrix: Float[Array, "_ q"], size: int) -> Float[Array, "n q"]:
         """Return F, of so many rows, times a matrix."""
@@ -67,6 +68,13 @@ class BlockFactor(eqx.Module):
 
 
 Factor = Float[Array, "... n _"] | Float[Array, "... n"] | BlockFactor
+
+
+def _transposed(factor: Factor, matrix: Float[Array, "n q"]) -> Float[Array, "_ q"]:
+    """Return Fᵀ times a matrix."""
+    if isinstance(factor, BlockFactor):
+        return factor.transposed(matrix)
+    return (factor * matrix.T).T if factor.ndim == 1 else factor.T @ matrix
 
 
 class Weights(eqx.Module):
@@ -142,9 +150,10 @@ class Covariance(eqx.Module):
     def spread(self, number: int, rows: Float[Array, "n q"]) -> Float[Array, "n q"]:
         """Return the covariance of a component, at an excess of one, times rows."""
         factor = self.factors[number]
+        product = _transposed(factor, rows)
         if isinstance(factor, BlockFactor):
-            return factor.times(factor.transposed(rows), len(rows))
-        return (factor**2 * rows.T).T if factor.ndim == 1 else factor @ (factor.T @ rows)
+            return factor.times(product, len(rows))
+        return (factor * product.T).T if factor.ndim == 1 else factor @ product
 
     def traces(self, excess: Float[Array, " k"], weights: Weights) -> tuple[Float[Array, " k"], Float[Array, "k k"]]:
         """Return tr C⁻¹V_i and tr C⁻¹V_i C⁻¹V_j of the components V_i at the excess that the weights are of."""
@@ -157,20 +166,10 @@ class Covariance(eqx.Module):
             squares = jnp.stack(roots) ** 2
             return squares @ jnp.diagonal(inverse), squares @ inverse**2 @ squares.T
 
-        def transposed(factor, matrix):
-            """Return Fᵀ times a matrix (n, q)."""
-            return (
-                factor.transposed(matrix)
-                if isinstance(factor, BlockFactor)
-                else (factor.T * matrix.T).T
-                if factor.ndim == 1
-                else factor.T @ matrix
-            )
-
-        beside = [transposed(factor, inverse).T for factor in self.factors]  # C⁻¹ F_i
-        entries = [[transposed(factor, other) for other in beside] for factor in self.factors]
-        first = jnp.stack([jnp.trace(entries[k][k]) for k in range(len(beside))])
-        return first, jnp.stack([jnp.stack([jnp.sum(entry**2) for entry in row]) for row in entries])
+        beside = [_transposed(factor, inverse).T for factor in self.factors]  # C⁻¹ F_i
+        entries = [[_transposed(factor, other) for other in beside] for factor in self.factors]
+        first = jnp.stack([jnp.trace(row[k]) for k, row in enumerate(entries)])
+        return first, jnp.array([[jnp.sum(entry**2) for entry in row] for row in entries])
 
 
 class ChainWeights(eqx.Module):
@@ -218,14 +217,14 @@ class Chain(eqx.Module):
     independent of all others. Components: a pose's noise reaches its own block and the one before it; a turn's its own;
     the means' theirs. In the order of conditions norms come first, then turns, then means at rest.
 
-    diagonal, below: what was measured, a block and its covariance with the block before it. own, earlier, turned: roots
-    of the components.
+    diagonal, below: what was measured, a block and its covariance with the block before it. pose, earlier, turned,
+    rested: roots of the components, of which `earlier` is that of a pose's noise in the block before.
     """
 
     diagonal: Float[Array, "... P 3 3"]
     below: Float[Array, "... P 3 3"]
     means: Float[Array, "... P 3 3"]
-    own: Float[Array, "... P 3 3"]
+    pose: Float[Array, "... P 3 3"]
     earlier: Float[Array, "... P 3 3"]
     turned: Float[Array, "... P 3 3"]
     rested: Float[Array, "... P 3 3"]
@@ -237,9 +236,9 @@ class Chain(eqx.Module):
     def _total(self, excess) -> tuple[Array, Array]:
         """Return the blocks of the chain at an excess of poses and turns, ones on the diagonal of padding."""
         padding = 1 - _blocks(self.used[:, None], len(self.means))[0]
-        reached = _squared(self.own) + following(_squared(self.earlier))
+        reached = _squared(self.pose) + following(_squared(self.earlier))
         diagonal = self.diagonal + excess[0] * reached + excess[1] * _squared(self.turned) + padding * jnp.eye(3)
-        return diagonal, self.below + excess[0] * self.own @ self.earlier.swapaxes(1, 2)
+        return diagonal, self.below + excess[0] * self.pose @ self.earlier.swapaxes(1, 2)
 
     def _factored(self, excess) -> tuple[Array, Array]:
         def step(before, block):
@@ -261,12 +260,12 @@ class Chain(eqx.Module):
     def dense(self) -> Covariance:
         """Return the same with whole matrices."""
         poses = self.means.shape[-3]
-        pose = np.arange(poses)
-        turn = np.where(pose + 1 < poses, poses + 2 * pose, 0)[:, None]  # the last pose's turn is none, and zero
-        block = np.concatenate([pose[:, None], turn, turn + 1], axis=1)
+        norm = np.arange(poses)[:, None]
+        turn = np.where(norm + 1 < poses, poses + 2 * norm, 0)  # the last pose's turn is none, and zero
+        block = np.concatenate([norm, turn, turn + 1], axis=1)
         before = np.concatenate([block[:1], block[:-1]])
-        rest = 3 * poses - 2 + 3 * pose[:, None] + np.arange(3)
-        values = array_module(self).concatenate([self.own, self.earlier], axis=1)
+        rest = 3 * poses - 2 + 3 * norm + np.arange(3)
+        values = array_module(self).concatenate([self.pose, self.earlier], axis=1)
         factors = (
             BlockFactor(np.concatenate([block, before], axis=1), values),
             BlockFactor(block, self.turned),
@@ -282,16 +281,22 @@ class Chain(eqx.Module):
         chain, means = _blocks(used[:, None], len(self.means))
         before = _preceding(chain)
         return Chain(
-            chain * self.diagonal * chain.swapaxes(1, 2), chain * self.below * before.swapaxes(1, 2),
-            means * self.means * means.swapaxes(1, 2), chain * self.own, before * self.earlier, chain * self.turned,
-            means * self.rested, used, self.group,
-        )  # fmt: skip
+            chain * self.diagonal * chain.swapaxes(1, 2),
+            chain * self.below * before.swapaxes(1, 2),
+            means * self.means * means.swapaxes(1, 2),
+            chain * self.pose,
+            before * self.earlier,
+            chain * self.turned,
+            means * self.rested,
+            used,
+            self.group,
+        )
 
     def turn_by_turn(self, excess: Float[Array, ""]) -> "Chain":
         """Return the covariance with turns independent of each other, the excess of the poses known."""
-        none = jnp.zeros_like(self.own)
+        none = jnp.zeros_like(self.pose)
         diagonal = self._total(excess * jnp.array([1.0, 0.0]))[0]
-        return replace(self, diagonal=diagonal, below=none, own=none, earlier=none)
+        return replace(self, diagonal=diagonal, below=none, pose=none, earlier=none)
 
     def spread(self, number: int, rows: Float[Array, "n q"]) -> Float[Array, "n q"]:
         """Return the covariance of a component, at an excess of one, times rows."""
@@ -300,8 +305,8 @@ class Chain(eqx.Module):
             return in_order(jnp.zeros_like(chain), _squared(self.rested) @ means)
         if number == 1:
             return in_order(_squared(self.turned) @ chain, jnp.zeros_like(means))
-        noise = self.own.swapaxes(1, 2) @ chain + self.earlier.swapaxes(1, 2) @ _preceding(chain)
-        return in_order(self.own @ noise + following(self.earlier @ noise), jnp.zeros_like(means))
+        noise = self.pose.swapaxes(1, 2) @ chain + self.earlier.swapaxes(1, 2) @ _preceding(chain)
+        return in_order(self.pose @ noise + following(self.earlier @ noise), jnp.zeros_like(means))
 
     def traces(
         self, excess: Float[Array, " k"], weights: ChainWeights
@@ -315,11 +320,7 @@ class Chain(eqx.Module):
             inverse, _ = self._factored(sizes)
             return -2 * jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=1, axis2=2)))
 
-        def slope(sizes):
-            slopes = jax.jacfwd(volume)(sizes)
-            return slopes, slopes
-
-        curvature, slopes = jax.jacfwd(slope, has_aux=True)(excess[:2])
+        slopes, curvature = value_and_jacobian(jax.jacfwd(volume), excess[:2])
         white = weights.means @ self.rested
         rest = jnp.sum(white**2)
         first = jnp.concatenate([slopes, rest[None]])
@@ -390,11 +391,17 @@ def _eliminated(covariance: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
     size = covariance.shape[-1]
     beside = jnp.broadcast_to(jnp.eye(size), covariance.shape)
     rows = jnp.concatenate([covariance, beside], axis=-1)
-    for place in range(size):
-        own = rows[..., place, :] / jnp.sqrt(rows[..., place, place])[..., None]
-        below = jnp.where(jnp.arange(size) > place, own[..., :size], 0.0)
-        rows = (rows - below[..., None] * own[..., None, :]).at[..., place, :].set(own)
+    for k in range(size):
+        pivot = rows[..., k, :] / jnp.sqrt(rows[..., k, k])[..., None]
+        below = jnp.where(jnp.arange(size) > k, pivot[..., :size], 0.0)
+        rows = (rows - below[..., None] * pivot[..., None, :]).at[..., k, :].set(pivot)
     return rows[..., size:]
+
+
+def parts_of(covariances: Sequence[Covariance | Chain]) -> list[tuple[slice, slice]]:
+    """Return where the rows of each covariance are among those of all, and its components among all components."""
+    edges = np.cumsum([(0, 0), *((len(kind.used), kind.components) for kind in covariances)], axis=0).tolist()
+    return [(slice(row, end), slice(number, last)) for (row, number), (end, last) in pairwise(edges)]
 
 
 def update_excess(
@@ -415,24 +422,23 @@ def update_excess(
     """
     basis = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(information), jacobian.T, lower=True)
     left = residual - basis.T @ (basis @ residual)
-    ends = np.cumsum([0, *(len(kind.used) for kind in covariances)])
-    edges = np.cumsum([0, *(kind.components for kind in covariances)])
     gradient, within, scoring = [], [], jnp.zeros((len(excess),) * 2)
-    for kind, root, rows, numbers in zip(covariances, weights, pairwise(ends), pairwise(edges), strict=True):
-        part = slice(*rows)
+    for kind, root, (part, numbers) in zip(covariances, weights, parts_of(covariances), strict=True):
         back = root.back(jnp.concatenate([left[part, None], basis[:, part].T], axis=1))
-        pull, seen = back[:, 0], back[:, 1:]
-        first, second = kind.traces(excess[slice(*numbers)], root)  # pyright: ignore[reportArgumentType]
+        pull, pulled = back[:, 0], back[:, 1:]
+        first, second = kind.traces(excess[numbers], root)  # pyright: ignore[reportArgumentType]
         moved = [kind.spread(number, back) for number in range(kind.components)]
-        own = [seen.T @ rows[:, 1:] for rows in moved]
-        gradient += [pull @ rows[:, 0] - trace + jnp.trace(inner)
-                     for rows, trace, inner in zip(moved, first, own, strict=True)]  # fmt: skip
+        inner = [pulled.T @ rows[:, 1:] for rows in moved]
+        gradient += [
+            pull @ rows[:, 0] - trace + jnp.trace(product)
+            for rows, trace, product in zip(moved, first, inner, strict=True)
+        ]
         white = root.whiten(jnp.stack([rows[:, 1:] for rows in moved], axis=1))
         second = second - 2 * jnp.einsum("nip,njp->ij", white, white)
-        scoring = scoring.at[slice(*numbers), slice(*numbers)].add(second)
-        within += own
-    inner = jnp.stack(within)
-    return _scored(excess, jnp.stack(gradient), scoring + jnp.einsum("ipq,jqp->ij", inner, inner))
+        scoring = scoring.at[numbers, numbers].add(second)
+        within += inner
+    products = jnp.stack(within)
+    return _scored(excess, jnp.stack(gradient), scoring + jnp.einsum("ipq,jqp->ij", products, products))
 
 
 def _scored(excess: Float[Array, " k"], gradient: Float[Array, " k"], scoring: Float[Array, "k k"]):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -27,14 +27,14 @@ from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.tracing import array_module
+from jaximu.ground.tracing import array_module, first, lifted
 from jaximu.model.effects.base import Effect, Extent, Place, inner_owners
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
-__all__ = ["About", "Conditions", "Data", "Handling", "Observed", "derivatives_by_numbers", "free_columns"]
+__all__ = ["About", "Conditions", "Data", "Handling", "Observed", "OfOneUnit", "derivatives_by_numbers", "free_columns"]
 
 _GRID = 16
 """Inner parameters of an effect are asked for in multiples of so many."""
@@ -52,7 +52,7 @@ class Conditions(eqx.Module):
 
     def at_magnitude(self, magnitude: Float[Array, ""]) -> Self:
         """Return the same with another magnitude."""
-        return eqx.tree_at(lambda conditions: conditions.magnitude, self, magnitude)  # pyright: ignore[reportAttributeAccessIssue]
+        return replace(self, magnitude=magnitude)  # pyright: ignore[reportCallIssue]
 
 
 @dataclass(frozen=True)
@@ -322,6 +322,21 @@ class Data(ABC):
     def change_by_averaging(self, details: Any) -> FloatArray:
         """Return how the conditions (n,) change by that."""
         raise NotImplementedError
+
+
+class OfOneUnit(Data):
+    """What recordings say about one unit: the leading axis of `about` has length one."""
+
+    @abstractmethod
+    def about_one(self, imu: Imu) -> About:
+        """Return what is measured about a unit; no array has a leading axis."""
+
+    def about(self, imu: Imu) -> About:
+        """Return what is measured about the one unit along the leading axis."""
+        about = self.about_one(first(imu))
+        return replace(
+            about, **lifted({name: getattr(about, name) for name in ("conditions", "covariance", "columns")})
+        )
 
 
 def _slope(kind: type[Effect], of: Callable[[Array], Array], numbers: Array) -> Array:

@@ -14,7 +14,6 @@ import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,15 +24,16 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from jaximu.estimation.covariance import Chain, ChainWeights, Covariance, Weights, update_excess
+from jaximu.estimation.covariance import Chain, ChainWeights, Covariance, Weights, parts_of, update_excess
 from jaximu.estimation.data import Conditions, Data
 from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, typical_sizes, unflatten
 from jaximu.estimation.solver import MAX_STEPS, Failure, solve
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, Computed, FloatArray
+from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
-from jaximu.ground.tracing import array_module, is_traced
+from jaximu.ground.tracing import array_module, first, is_traced, lifted
 from jaximu.model.effects.base import inner_owners
 from jaximu.model.sensor import Imu
 
@@ -98,12 +98,12 @@ class Prior(eqx.Module):
         if unknown := sorted(set(stated) - {effect.name for effect in effects.values()}):
             raise InputError(f"{unknown[0]} is known beforehand but not fitted: name it as an effect, too.")
         names, values, sigma = [], [], []
-        for (owner, place), effect in effects.items():
+        for (owner, number), effect in effects.items():
             width = stated.get(effect.name, effect.known)
             if effect.name in stated and np.min(width) <= 0:
                 raise InputError(f"a standard deviation must be greater than zero, found {np.min(width):g}.")
             if np.any(width):
-                names += [Name(owner, "coefficients", (k,), place) for k in range(effect.size)]
+                names += [Name(owner, "coefficients", (k,), number) for k in range(effect.size)]
                 values += np.asarray(effect.coefficients).tolist()
                 sigma += np.broadcast_to(width, effect.size).tolist()
         return cls(tuple(names), np.array(values), np.diag(1 / np.array(sigma))) if names else None
@@ -134,9 +134,7 @@ class Fit(eqx.Module):
 
     def failure(self) -> Failure:
         """Return how an unbatched fit ended."""
-        if not bool(self.finite):
-            return Failure.NONFINITE
-        return Failure.NONE if bool(self.converged) else Failure.MAX_STEPS
+        return Failure.of(self.converged, self.finite)
 
     def sigmas(self, magnitude_sigma: float = 0.0) -> Float[Array, "... p"]:
         """Return the standard deviations of the free numbers, the uncertainty of the magnitude included."""
@@ -147,13 +145,14 @@ class Fit(eqx.Module):
 
         Rates times stamps are angles: stamps that run fast by a share make the gain K too large by it, dK = K dc.
         """
-        reach = np.asarray(self.magnitude_sensitivity) * magnitude_sigma
+        magnitude = np.asarray(self.magnitude_sensitivity) * magnitude_sigma
         turning = [name.owner == "gyroscope" and name.part == "gain" for name in self.names]
         clock = np.where(turning, np.asarray(self.values), 0.0) * clock_sigma
-        return sum((each[..., :, None] * each[..., None, :] for each in (reach, clock)), np.asarray(self.covariance))
+        shifts = (shift[..., :, None] * shift[..., None, :] for shift in (magnitude, clock))
+        return sum(shifts, np.asarray(self.covariance))
 
 
-def unwhitened(found: Fit, covariance: Covariance | Chain) -> tuple[FloatArray, FloatArray]:
+def unwhitened(fitted: Fit, covariance: Covariance | Chain) -> tuple[FloatArray, FloatArray]:
     """Return the residual (n,) and Jacobian (n, p) of an unbatched fit of one kind of data, in its conditions' units.
 
     **Arguments:** `covariance`: of the conditions, close to where the fit ended.
@@ -162,35 +161,34 @@ def unwhitened(found: Fit, covariance: Covariance | Chain) -> tuple[FloatArray, 
     def rows(covariance, excess, white):
         return covariance.weights(excess).unwhiten(white)
 
-    white = np.concatenate([np.asarray(found.residual)[:, None], found.jacobian], axis=1)
-    conditions = np.asarray(stored.call(rows, "unwhitened", covariance, np.asarray(found.excess), white))
+    white = np.concatenate([np.asarray(fitted.residual)[:, None], fitted.jacobian], axis=1)
+    conditions = np.asarray(stored.call(rows, "unwhitened", covariance, np.asarray(fitted.excess), white))
     return conditions[:, 0], conditions[:, 1:]
 
 
-def informed(found: Fit, prior: Prior) -> Fit:
+def informed(fitted: Fit, prior: Prior) -> Fit:
     """Return an unbatched fit with what else is known of gains and biases, in the closed form of two normal laws.
 
     For a fit whose covariance was widened after it, beside which a prior inside `fit` would count for too little.
     """
-    rows = [found.names.index(name) for name in prior.names]
-    spread, values = np.asarray(found.covariance), np.asarray(found.values)
+    rows = [fitted.names.index(name) for name in prior.names]
+    covariance, values = np.asarray(fitted.covariance), np.asarray(fitted.values)
     known = np.linalg.inv(prior.root.T @ prior.root)
-    share = spread[:, rows] @ np.linalg.inv(spread[np.ix_(rows, rows)] + known)
+    share = covariance[:, rows] @ np.linalg.inv(covariance[np.ix_(rows, rows)] + known)
     keep = np.eye(len(values))
     keep[:, rows] -= share
     moved = values + share @ (prior.mean - values[rows])
-    bare = found.imu.with_effects()
-    place = {name: k for k, name in enumerate(names_of(bare))}
+    base = np.array([name.effect is None for name in fitted.names])
+    bare = fitted.imu.with_effects()
     flat = flatten(bare)
-    for name, value in zip(found.names, moved, strict=True):
-        if name.effect is None:
-            flat[place[name]] = value
-    model = unflatten(bare, flat).with_effects(*found.imu.all_effects().values())
-    values = np.where([name.effect is None for name in found.names], moved, values)
+    flat[[name in fitted.names for name in names_of(bare)]] = moved[base]
     return replace(
-        found, imu=model, values=values, covariance=keep @ spread,
-        magnitude_sensitivity=keep @ np.asarray(found.magnitude_sensitivity),
-    )  # fmt: skip
+        fitted,
+        imu=unflatten(bare, flat).with_effects(*fitted.imu.all_effects().values()),
+        values=np.where(base, moved, values),
+        covariance=keep @ covariance,
+        magnitude_sensitivity=keep @ np.asarray(fitted.magnitude_sensitivity),
+    )
 
 
 # --- the effects' numbers ---------------------------------------------------------------------------------------------
@@ -204,16 +202,16 @@ def effect_numbers(imu: Imu) -> tuple[tuple[Name, ...], Float[Array, "... q"], F
     numerics, effects = array_module(imu), imu.all_effects()
     owners = inner_owners(effects)
     names, values, sizes = [], [numerics.zeros((*np.shape(imu.accelerometer.bias)[:-1], 0))], []
-    for (owner, place), effect in effects.items():
+    for (owner, number), effect in effects.items():
         gain = imu.triads().get(owner, imu.accelerometer).gain
         scale = numerics.mean(numerics.linalg.norm(gain, axis=-1), axis=-1, keepdims=True)
         typical = effect.typical_sizes(scale).coefficients
-        names += [Name(owner, "coefficients", (k,), place) for k in range(effect.size)]
+        names += [Name(owner, "coefficients", (k,), number) for k in range(effect.size)]
         values.append(effect.coefficients)
         sizes.append(numerics.broadcast_to(typical, np.shape(effect.coefficients)))
-        for inner in effect.inner if owners[owner, place] == (owner, place) else ():
+        for inner in effect.inner if owners[owner, number] == (owner, number) else ():
             value = numerics.asarray(getattr(effect, inner))[..., None]
-            names.append(Name(owner, inner, (), place))
+            names.append(Name(owner, inner, (), number))
             values.append(value)
             sizes.append(numerics.maximum(numerics.abs(value), 1e-9))
     together = numerics.concatenate(values, axis=-1)
@@ -260,26 +258,25 @@ class Linear:
 def linearise(imu: Imu, measurement: Data, free: Callable[[Name], bool]) -> Linear:
     """Return a measurement about one unit with its effects, as a linear problem in the free numbers."""
     imu = jax.tree.map(lambda leaf: np.asarray(leaf, float), imu)
-    about = measurement.about(jax.tree.map(lambda leaf: leaf[None], imu))
+    about = measurement.about(lifted(imu))
     like = imu if measurement.effects_inside else imu.with_effects()
     parameters = Parameters.select(like, free)
     names, _, sizes = ((), None, np.zeros(0)) if measurement.effects_inside else effect_numbers(imu)
-    conditions = jax.tree.map(lambda leaf: leaf[0], about.conditions)
 
     def both(like, parameters, conditions):
-        def twice(z):
-            found = conditions(parameters.model(like, z))
-            return found, found
+        zero = jnp.zeros(len(parameters.index))
+        return value_and_jacobian(lambda z: conditions(parameters.model(like, z)), zero)
 
-        slope, value = jax.jacfwd(twice, has_aux=True)(jnp.zeros(len(parameters.index)))
-        return value, slope
-
-    covariance = jax.tree.map(lambda leaf: np.asarray(leaf[0]), about.covariance).dense()
-    value, slope = stored.call(both, "linearised", like, parameters, conditions)
+    value, slope = stored.call(both, "linearised", like, parameters, first(about.conditions))
     return Linear(
-        np.asarray(value), np.asarray(slope), about.columns[0], covariance.measured,
-        (*parameters.names, *names), np.concatenate([np.asarray(parameters.size), sizes]), about.details,
-    )  # fmt: skip
+        value,
+        slope,
+        about.columns[0],
+        first(about.covariance).dense().measured,
+        (*parameters.names, *names),
+        np.concatenate([np.asarray(parameters.size), sizes]),
+        about.details,
+    )
 
 
 # --- a compiled pass --------------------------------------------------------------------------------------------------
@@ -329,8 +326,8 @@ class _Whitened(eqx.Module):
     def residuals(self, z):
         count = len(self.parameters.index)
         model = self.parameters.model(self.like, z[:count])
-        plain = jnp.concatenate([w.whiten(used * each(model)) for w, used, each in
-                                 zip(self.weights, self.used, self.conditions, strict=True)])  # fmt: skip
+        kinds = zip(self.weights, self.used, self.conditions, strict=True)
+        plain = jnp.concatenate([weights.whiten(used * conditions(model)) for weights, used, conditions in kinds])
         return plain + self.columns @ z[count:]
 
     def objective(self, z):
@@ -341,8 +338,8 @@ class _Whitened(eqx.Module):
 def _robust_excess(residual: Array, groups: Array, excess: Array) -> Array:
     """Excess from the median absolute residual of each group of rows: outliers do not reach it."""
     size = jnp.where(residual == 0.0, jnp.nan, jnp.abs(residual))  # padding is exactly zero
-    found = [jnp.nanmedian(jnp.where(groups == k, size, jnp.nan)) / 0.6745 for k in range(len(excess))]
-    spread = jnp.stack(found)
+    medians = jnp.stack([jnp.nanmedian(jnp.where(groups == k, size, jnp.nan)) for k in range(len(excess))])
+    spread = medians / 0.6745
     return jnp.where(jnp.isnan(spread), excess, jnp.maximum((1 + excess) * jnp.nan_to_num(spread) ** 2 - 1, 0.0))
 
 
@@ -359,15 +356,22 @@ class _Unit(NamedTuple):
 
     def problem(self, loss: str, like: Imu, parameters: Parameters) -> _Whitened:
         """Return the problem of a pass."""
-        edges = np.cumsum([0, *(kind.components for kind in self.covariances)])
-        parts = [self.excess[a:b] for a, b in pairwise(edges)]
-        weights = tuple(kind.weights(part) for kind, part in zip(self.covariances, parts, strict=True))
-        split = [slice(a, b) for a, b in pairwise(self._ends())]
+        weights, white = [], []
+        for kind, (rows, numbers) in zip(self.covariances, parts_of(self.covariances), strict=True):
+            weights.append(kind.weights(self.excess[numbers]))
+            white.append(weights[-1].whiten(kind.used[:, None] * self.columns[rows]))
         used = tuple(kind.used for kind in self.covariances)
-        white = jnp.concatenate([w.whiten(rows[:, None] * self.columns[part])
-                                 for w, rows, part in zip(weights, used, split, strict=True)])  # fmt: skip
         return _Whitened(
-            like, parameters, self.conditions, weights, used, white, self.mean, self.root, self.damping, loss
+            like,
+            parameters,
+            self.conditions,
+            tuple(weights),
+            used,
+            jnp.concatenate(white),
+            self.mean,
+            self.root,
+            self.damping,
+            loss,
         )
 
     def evaluated(self, problem: _Whitened, z: Array, residual: Array, jacobian: Array) -> _Evaluated:
@@ -376,22 +380,19 @@ class _Unit(NamedTuple):
         if problem.loss == "linear":
             better = update_excess(self.covariances, problem.weights, residual, jacobian, information, self.excess)
         else:
-            edges = np.cumsum([0, *(kind.components for kind in self.covariances)])
-            groups = jnp.concatenate([kind.group + a for kind, a in zip(self.covariances, edges[:-1], strict=True)])
+            kinds = zip(self.covariances, parts_of(self.covariances), strict=True)
+            groups = jnp.concatenate([kind.group + numbers.start for kind, (_, numbers) in kinds])
             better = _robust_excess(problem.residuals(z), groups, self.excess)
         covariance = jnp.linalg.inv(information)
         gradient = jacobian.T @ residual + self.root.T @ (self.root @ (z - self.mean))
 
         def of_magnitude(magnitude):
             moved = tuple(kind.at_magnitude(magnitude) for kind in self.conditions)
-            return eqx.tree_at(lambda p: p.conditions, problem, moved).objective(z)[0]
+            return replace(problem, conditions=moved).objective(z)[0]
 
         magnitude = self.conditions[0].magnitude  # pyright: ignore[reportAttributeAccessIssue]
         slope = jax.jvp(of_magnitude, (magnitude,), (jnp.ones_like(magnitude),))[1]
         return _Evaluated(residual, jacobian, gradient, covariance, better, -covariance @ (jacobian.T @ slope))
-
-    def _ends(self) -> NDArray[np.int64]:
-        return np.cumsum([0, *(len(kind.used) for kind in self.covariances)])
 
 
 class _Solving(NamedTuple):
@@ -434,13 +435,8 @@ def _single_pass(how: _Solving, like: Imu, parameters: Parameters, unit: _Unit) 
 def _no_step(how: _Solving, like: Imu, parameters: Parameters, unit: _Unit) -> _Evaluated:
     """Return the problem where the passes are."""
     problem = unit.problem(how.loss, like, parameters)
-
-    def twice(z):
-        value = problem.objective(z)[0]
-        return value, value
-
     zero = jnp.zeros(len(unit.mean))
-    jacobian, residual = jax.jacfwd(twice, has_aux=True)(zero)
+    residual, jacobian = value_and_jacobian(lambda z: problem.objective(z)[0], zero)
     return unit.evaluated(problem, zero, residual, jacobian)
 
 
@@ -458,8 +454,7 @@ def _run(
     def batch(like, parameters, references, sizes, units):
         def lane(item):
             reference, size, unit = item
-            own = eqx.tree_at(lambda p: (p.reference, p.size), parameters, (reference, size))
-            return one(how, like, own, unit)
+            return one(how, like, replace(parameters, reference=reference, size=size), unit)
 
         lanes = None if jax.default_backend() == "cpu" else count
         return jax.lax.map(lane, (references, sizes, units), batch_size=lanes)
@@ -512,9 +507,7 @@ def fit(
     measured = (data,) if isinstance(data, Data) else tuple(data)
     numerics = array_module(imu, measured, prior, excess, most)
     single = np.ndim(imu.accelerometer.bias) == 1
-    imu = jax.tree.map(
-        lambda leaf: numerics.asarray(leaf, float)[None] if single else numerics.asarray(leaf, float), imu
-    )
+    imu = jax.tree.map(lambda leaf: numerics.asarray(leaf, float), lifted(imu) if single else imu)
     farthest = np.inf if most is None else numerics.asarray(most, float)
     begin = [size for kind in measured for size in kind.coarse] if excess is None else excess
     blunted = estimate_excess and (is_traced(begin) or bool(np.any(begin)))
@@ -523,7 +516,7 @@ def fit(
     begin = numerics.asarray(begin, float)
     begin = numerics.broadcast_to(begin, (len(imu.accelerometer.bias), begin.shape[-1]))
     fitted = passes.traced(begin) if numerics is jnp else passes.run(begin)
-    return jax.tree.map(lambda leaf: leaf[0], fitted) if single else fitted
+    return first(fitted) if single else fitted
 
 
 class _State(eqx.Module):
@@ -547,6 +540,7 @@ class _State(eqx.Module):
     settled: Bool[Array, " N"]
 
 
+@dataclass(eq=False)
 class _Passes:
     """What stays the same in the passes of units: free numbers, data, what is known beforehand.
 
@@ -554,42 +548,49 @@ class _Passes:
     JAX does. There the result is differentiated as what solves the equations that it solves, not as what led to it.
     """
 
-    def __init__(
-        self, imu: Imu, data: tuple[Data, ...], free: Callable[[Name], bool] | None, prior: Prior | None, how: _Solving,
-        estimated: bool, follow: bool, most: FloatArray | float, max_passes: int, blunted: bool, numerics: Any,
-    ):  # fmt: skip
-        self.data, self.estimated, self.follow = data, estimated, follow
-        self.prior, self.most, self.max_passes, self.blunted = prior, most, max_passes, blunted
-        self.numerics, self.how = numerics, how
-        free = free or (lambda name: any(kind.free(name) for kind in data))
-        inside = data[0].effects_inside
-        self.full = imu
+    full: Imu
+    data: tuple[Data, ...]
+    free: Callable[[Name], bool] | None
+    prior: Prior | None
+    how: _Solving
+    estimated: bool
+    follow: bool
+    most: FloatArray | float
+    max_passes: int
+    blunted: bool
+    numerics: Any
+
+    def __post_init__(self):
+        numerics, imu, free = self.numerics, self.full, self.free or self._free
+        inside = self.data[0].effects_inside
         bare = imu if inside else imu.with_effects()
-        self.like = jax.tree.map(lambda leaf: leaf[0], bare)
+        self.like = first(bare)
         self.count = len(imu.accelerometer.bias)
         self.parameters = Parameters.select(self.like, free)
-        nothing = (), self.numerics.zeros((self.count, 0)), self.numerics.zeros((self.count, 0))
+        nothing = (), numerics.zeros((self.count, 0)), numerics.zeros((self.count, 0))
         names, self.numbers, sizes = nothing if inside else effect_numbers(imu)
         effects = imu.all_effects()
-        placed = [name.part == effects[name.owner, name.effect].beginning() for name in names]
-        self.kept = np.array([free(name) for name in names], bool) & ~np.array(placed, bool)
+        self.kept = np.array(
+            [free(name) and name.part != effects[name.owner, name.effect].beginning() for name in names], bool
+        )
         chosen = tuple(name for name, kept in zip(names, self.kept, strict=True) if kept)
         self.names = (*self.parameters.names, *chosen)
         self.base = len(self.parameters.names)
         self.index = np.array(self.parameters.index, int)
         self.reference = self._beside(bare)
-        own = numerics.tile(self.parameters.size, (self.count, 1))
+        of_base = numerics.tile(self.parameters.size, (self.count, 1))
         if not bare.all_effects():  # units may have other scales
-            own = self._beside(typical_sizes(bare))[:, self.index]
-        self.sizes = self.numerics.concatenate([own, sizes[:, self.kept]], axis=1)
+            of_base = self._beside(typical_sizes(bare))[:, self.index]
+        self.sizes = numerics.concatenate([of_base, sizes[:, self.kept]], axis=1)
         self.spare = 0
         if self.count == 1 and not inside:
-            needed = len(self.names) - self.base
-            self.spare = next((size for size in _SPARE if size >= needed), needed) - needed
+            self.spare = next((size for size in _SPARE if size >= len(chosen)), len(chosen)) - len(chosen)
         # where the data do not say, an effect is absent, wherever the fit starts
-        coefficients = [name.part == "coefficients" for name in chosen]
-        absent = np.array([False] * self.base + coefficients, bool)
-        self.anchor = self.numerics.where(absent, 0.0, self.values(self.reference, self.numbers))
+        absent = np.array([False] * self.base + [name.part == "coefficients" for name in chosen], bool)
+        self.anchor = numerics.where(absent, 0.0, self.values(self.reference, self.numbers))
+
+    def _free(self, name: Name) -> bool:
+        return any(kind.free(name) for kind in self.data)
 
     def _beside(self, imu: Imu) -> Array:
         """Return the numbers (N, m) of units."""
@@ -608,7 +609,7 @@ class _Passes:
         start = jax.tree.map(lambda leaf: leaf[lanes], self.full)
         return bare.with_effects(*_with_numbers(start, state.numbers).all_effects().values())
 
-    def known(self, state: _State, lanes: NDArray[np.int64], first: bool | Array) -> tuple[Array, Array]:
+    def known(self, state: _State, lanes: NDArray[np.int64], blunt: bool | Array) -> tuple[Array, Array]:
         """Return mean (N, p) and root (N, p, p) of what is known beforehand, about where the passes are, scaled."""
         numerics, here = self.numerics, self.values(state.reference, state.numbers)
         effects = self.full.all_effects()
@@ -618,7 +619,7 @@ class _Passes:
             for name in self.names[self.base :]
         ]
         of_base = np.arange(len(width)) < self.base
-        root = numerics.diag(1 / numerics.where(of_base & numerics.asarray(first), _COARSE, width))
+        root = numerics.diag(1 / numerics.where(of_base & numerics.asarray(blunt), _COARSE, width))
         mean = numerics.zeros_like(here) if self.follow else (self.anchor[lanes] - here) / self.sizes[lanes]
         if self.prior is not None:
             chosen = np.zeros((len(self.prior.names), len(self.names)))
@@ -635,7 +636,7 @@ class _Passes:
         whole = whole + np.diag(np.arange(count + self.spare) >= count).astype(float)
         return mean, whole
 
-    def once(self, one: Callable, state: _State, lanes: NDArray[np.int64], first: bool | Array = False) -> Any:
+    def once(self, one: Callable, state: _State, lanes: NDArray[np.int64], blunt: bool | Array = False) -> Any:
         """Evaluate the data where the passes are, and run `_single_pass` or `_no_step`; `state` is of `lanes`."""
         imu = self.model(state, lanes)
         data = self.data if self.numerics is jnp else [kind.take(lanes) for kind in self.data]
@@ -644,9 +645,13 @@ class _Passes:
         columns = columns[..., self.kept] * self.sizes[lanes][:, None, self.base :]
         columns = self.numerics.pad(columns, [(0, 0), (0, 0), (0, self.spare)])
         unit = _Unit(
-            tuple(kind.conditions for kind in about), tuple(kind.covariance for kind in about), columns,
-            *self.known(state, lanes, first), state.damping, state.excess,
-        )  # fmt: skip
+            tuple(kind.conditions for kind in about),
+            tuple(kind.covariance for kind in about),
+            columns,
+            *self.known(state, lanes, blunt),
+            state.damping,
+            state.excess,
+        )
         sizes = self.sizes[lanes][:, : self.base]
         return _run(one, self.how, self.like, self.parameters, state.reference, sizes, unit)
 
@@ -655,9 +660,18 @@ class _Passes:
         many, numerics = (self.count,), self.numerics
         none, far, yes = numerics.zeros(many), numerics.full(many, np.inf), numerics.ones(many, bool)
         return _State(
-            self.reference, self.numbers, excess, excess, none, far, (self.reference, self.numbers), none + 1.0,
-            numerics.zeros_like(excess), yes, ~yes,
-        )  # fmt: skip
+            self.reference,
+            self.numbers,
+            excess,
+            excess,
+            none,
+            far,
+            (self.reference, self.numbers),
+            none + 1.0,
+            numerics.zeros_like(excess),
+            yes,
+            ~yes,
+        )
 
     def advanced(
         self, state: _State, lanes: NDArray[np.int64], out: _Pass, number: int | Array
@@ -667,7 +681,8 @@ class _Passes:
         A pass solves a problem that is linear in what the turns rotate by and in what effects add. Where its step made
         the sum of squares larger after all, it is taken back, and the next one is damped.
         """
-        numerics, first = self.numerics, (number == 0) & self.blunted
+        numerics = self.numerics
+        blunt = numerics.asarray((number == 0) & self.blunted)
         worse = out.start > state.least
         fine, excess = ~worse, state.excess
         way = numerics.minimum(out.there.excess, self.most) - excess if self.estimated else 0.0 * excess
@@ -682,12 +697,12 @@ class _Passes:
         creep = numerics.abs(way / scale).max(axis=1, initial=0.0)
         still = (change < _SETTLED) & (length < _STILL)
         still = still | ((number >= _CREEPING) & (creep < _CREEPS[0]) & (length < _CREEPS[1]))
-        still = still & (state.damping <= _MILD) & ~numerics.asarray(first)
+        still = still & (state.damping <= _MILD) & ~blunt
         # the last pass takes no step that none after it would check
         taking = fine & (still | (number + 1 < self.max_passes))
         reference, numbers = self.moved(state, lanes, numerics.where(taking[:, None], out.z, 0.0))
         # sums of squares compare where they are weighted alike
-        alike = (change < _SETTLED) & (not self.follow) & ~numerics.asarray(first)
+        alike = (change < _SETTLED) & (not self.follow) & ~blunt
         damped = numerics.where(state.damping > _DAMPING / 100, state.damping / 10, 0.0)
         pick = partial(_where, numerics)
         return _State(
@@ -745,14 +760,12 @@ class _Passes:
 
     def traced(self, excess: Array) -> Fit:
         """Alternate until nothing moves, all units side by side, in a loop that JAX traces."""
-        lanes, first_state = np.arange(self.count), self.start(excess)
+        lanes, start = np.arange(self.count), self.start(excess)
 
         def at(x: tuple[Array, Array, Array]) -> _State:
-            free, numbers, own = x
+            free, numbers, sizes = x
             changed = self.reference.at[:, self.index].set(free)
-            return eqx.tree_at(
-                lambda p: (p.reference, p.numbers, p.excess, p.used), first_state, (changed, numbers, own, own)
-            )
+            return replace(start, reference=changed, numbers=numbers, excess=sizes, used=sizes)
 
         def left(x):
             """Return what a fit brings to zero: a Newton step, and the change of the excess."""
@@ -768,7 +781,7 @@ class _Passes:
                 out = self.once(_single_pass, state, lanes, (number == 0) & self.blunted)
                 after, fine = self.advanced(state, lanes, out, number)
                 after = jax.tree.map(partial(_where, jnp, state.active), after, state)
-                after = eqx.tree_at(lambda p: p.active, after, state.active & after.active)
+                after = replace(after, active=state.active & after.active)
                 ended = jax.tree.map(
                     partial(_where, jnp, state.active & fine), (out.steps, out.converged, out.finite), ended
                 )
@@ -787,10 +800,10 @@ class _Passes:
             matrix = jax.vmap(lambda row: ravel_pytree(linear(restore(row)))[0], out_axes=1)(jnp.eye(len(flat)))
             return restore(jnp.linalg.solve(matrix, flat))
 
-        first = self.reference[:, self.index], self.numbers, excess
-        x, about = jax.lax.custom_root(left, first, passes, undo, has_aux=True)
+        begin = self.reference[:, self.index], self.numbers, excess
+        x, about = jax.lax.custom_root(left, begin, passes, undo, has_aux=True)
         steps, (converged, finite, settled) = about[0].astype(int), (leaf > 0 for leaf in about[1:])
-        state = eqx.tree_at(lambda p: p.settled, at(x), settled)
+        state = replace(at(x), settled=settled)
         there = self.once(_no_step, state, lanes)
         cost = 0.5 * jnp.sum(there.residual**2, axis=-1)
         return self.fit(state, there, cost, steps, converged, finite)
@@ -800,10 +813,20 @@ class _Passes:
         size, keep = self.sizes, len(self.names)
         covariance = there.covariance[:, :keep, :keep] * size[:, :, None] * size[:, None]
         return Fit(
-            self.model(state, np.arange(self.count)), self.names, size,
-            self.values(state.reference, state.numbers), covariance, there.magnitude[:, :keep] * size, there.residual,
-            there.jacobian[..., :keep], state.used, cost, steps, converged & state.settled, finite,
-        )  # pyright: ignore[reportCallIssue] # fmt: skip
+            self.model(state, np.arange(self.count)),
+            self.names,
+            size,
+            self.values(state.reference, state.numbers),
+            covariance,
+            there.magnitude[:, :keep] * size,
+            there.residual,
+            there.jacobian[..., :keep],
+            state.used,
+            cost,
+            steps,
+            converged & state.settled,
+            finite,
+        )  # pyright: ignore[reportCallIssue]
 
 
 def _secant(share: Array, before: Array, now: Array, leap: Array | float) -> Array:

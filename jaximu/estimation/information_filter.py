@@ -67,7 +67,7 @@ def advance(known: Knowledge, rows: WhiteRows) -> tuple[Knowledge, Eliminated, f
 
 def run(
     start: Knowledge, rows: WhiteRows, ends: Sequence[int] = ()
-) -> tuple[Knowledge, Eliminated, Float[Array, "N k"], Knowledge]:  # fmt: skip
+) -> tuple[Knowledge, Eliminated, Float[Array, "N k"], Knowledge]:
     """Run N steps; return the final knowledge, what each step eliminated, its innovations, and each step's knowledge.
 
     **Arguments:** `rows`: leading axis N; `ends`: places that part them in k groups. The innovation of a group is what
@@ -76,7 +76,7 @@ def run(
     """
     n, known, steps = rows.before.shape[-1], start, []
     for part in zip(*rows, strict=True):
-        sums = [advance(known, WhiteRows(*(each[:end] for each in part)))[-1] for end in ends]
+        sums = [advance(known, WhiteRows(*(array[:end] for array in part)))[-1] for end in ends]
         known, eliminated, innovation = advance(known, WhiteRows(*part))
         innovations = np.diff([0.0, *sums, innovation])
         steps.append((eliminated, innovations, Knowledge(known.root[n:, n:], known.right[n:])))
@@ -86,7 +86,7 @@ def run(
 
 def _stacked(parts):
     """Return like tuples of arrays as one, with a leading axis."""
-    return type(parts[0])(*(np.stack(each) for each in zip(*parts, strict=True)))
+    return type(parts[0])(*map(np.stack, zip(*parts, strict=True)))
 
 
 def estimate(known: Knowledge) -> tuple[Float[Array, " k"], Float[Array, "k k"]]:
@@ -95,12 +95,10 @@ def estimate(known: Knowledge) -> tuple[Float[Array, " k"], Float[Array, "k k"]]
     return inverse @ known.right, inverse @ inverse.T
 
 
-def smooth(
-    eliminated: Eliminated, state: Float[Array, " n"], shared: Float[Array, " m"]
-) -> Float[Array, "N n"]:  # fmt: skip
+def smooth(eliminated: Eliminated, state: Float[Array, " n"], shared: Float[Array, " m"]) -> Float[Array, "N n"]:
     """Return the states before each of N steps from all of them: `state` is after the last, `shared` the numbers."""
     states = []
-    for root, onward, right in zip(*(each[::-1] for each in eliminated), strict=True):
+    for root, onward, right in zip(*(array[::-1] for array in eliminated), strict=True):
         state = solve_triangular(root, right - onward @ np.concatenate([state, shared]), check_finite=False)
         states.append(state)
     return np.array(states[::-1])

@@ -82,7 +82,7 @@ def check_jacobian(
       one unit; entries that are zero by cancellation would make a share of themselves meaningless).
     """
     x = jnp.asarray(x)
-    names = tuple(f"x[{place}]" for place in range(len(x))) if names is None else tuple(names)
+    names = tuple(f"x[{k}]" for k in range(len(x))) if names is None else tuple(names)
     automatic = np.asarray(jax.jit(jax.jacfwd(residual))(x))
     hand = np.asarray(hand_jacobian(x))
     if automatic.ndim != 2 or not automatic.size:
@@ -107,10 +107,7 @@ def check_jacobian(
 
 def _unpack(theta):
     myx, mzx, mzy = theta[:3]
-    zero = jnp.zeros(())
-    one = jnp.ones(())
-    inverse = jnp.stack([jnp.stack([one, zero, zero]), jnp.stack([-myx, one, zero]), jnp.stack([-mzx, -mzy, one])])
-    return inverse, theta[3:6], theta[6:9]
+    return jnp.array([[1.0, 0.0, 0.0], [-myx, 1.0, 0.0], [-mzx, -mzy, 1.0]]), theta[3:6], theta[6:9]
 
 
 def gravity_norm_hand(
@@ -166,10 +163,7 @@ def gravity_direction_hand(
 
 
 def _skew(v):
-    zero = jnp.zeros(())
-    return jnp.stack([
-        jnp.stack([zero, -v[2], v[1]]), jnp.stack([v[2], zero, -v[0]]), jnp.stack([-v[1], v[0], zero])
-    ])  # fmt: skip
+    return jnp.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def hand_jacobian_gravity_direction(

@@ -70,12 +70,12 @@ def leave_out(
     back = weights.T @ basis[:count]
     pull = weights.T @ (target - basis @ (basis.T @ target))[:count]
     for rows in parts:
-        own = weights[:, rows]
-        values, vectors = np.linalg.eigh(own.T @ own - back[rows] @ back[rows].T)
-        seen = values > _BLIND * values[-1]
-        values, vectors = values[seen], vectors[:, seen]
+        weighted = weights[:, rows]
+        values, vectors = np.linalg.eigh(weighted.T @ weighted - back[rows] @ back[rows].T)
+        predicted = values > _BLIND * values[-1]
+        values, vectors = values[predicted], vectors[:, predicted]
         errors = vectors @ ((vectors.T @ pull[rows]) / values)
-        others = basis.T @ target - basis[:count].T @ (own @ errors)
+        others = basis.T @ target - basis[:count].T @ (weighted @ errors)
         yield LeftOut(rows, errors, values, vectors, v[kept].T @ (others / s[kept]) / size)
 
 

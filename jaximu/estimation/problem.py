@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, Literal
 
 import equinox as eqx
@@ -11,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float, PyTree
 
-from jaximu.ground.array_types import Array
+from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Board, Imu, Triad
 
@@ -22,6 +23,7 @@ __all__ = [
     "Name",
     "Parameters",
     "Problem",
+    "axis_scales",
     "flatten",
     "names_of",
     "typical_sizes",
@@ -34,6 +36,8 @@ __all__ = [
 TOLERANCE = 5.0
 """How far, in typical sizes, a parameter may lie from the data sheet (one sigma). A scale may be off by half:
 recordings labelled with another range are common, and a tighter tolerance would hold such a fit half way."""
+_BIAS_SIZE = {"accelerometer": 1.0, "gyroscope": 0.1, "magnetometer": 20.0}
+"""Plausible biases: m/s², rad/s, µT."""
 
 
 def typical_sizes(imu: Imu) -> Imu:
@@ -52,14 +56,15 @@ def typical_sizes(imu: Imu) -> Imu:
         gain = 0.1 * numerics.broadcast_to(scale[..., None], (*scale.shape, 3))
         return replace(triad, gain=gain, bias=bias * scale, effects=effects)
 
-    gyroscope = None if imu.gyroscope is None else sizes(imu.gyroscope, 0.1)
-    magnetometer = None if imu.magnetometer is None else sizes(imu.magnetometer, 20.0)
-    setup = tuple(effect.typical_sizes(1.0) for effect in imu.setup)
-    accelerometer = sizes(imu.accelerometer, 1.0)
+    changed: dict[str, Any] = {name: sizes(triad, _BIAS_SIZE[name]) for name, triad in imu.triads().items()}
     if isinstance(imu, Board):
-        others = tuple(typical_sizes(each) for each in imu.others)
-        return Board(accelerometer, gyroscope, setup, magnetometer, others)  # pyright: ignore[reportArgumentType]
-    return Imu(accelerometer, gyroscope, setup, magnetometer)  # pyright: ignore[reportArgumentType]
+        changed["others"] = tuple(map(typical_sizes, imu.others))
+    return replace(imu, **changed, setup=tuple(effect.typical_sizes(1.0) for effect in imu.setup))
+
+
+def axis_scales(triad: Triad) -> FloatArray:
+    """Return how much each axis (3,) of a triad puts out for an SI unit, on the host."""
+    return np.linalg.norm(triad.gain, axis=1)
 
 
 def flatten(model: Imu) -> Float[Array, " m"]:
@@ -71,9 +76,11 @@ def flatten(model: Imu) -> Float[Array, " m"]:
 def unflatten(like: Imu, flat: Float[Array, "... m"]) -> Imu:
     """Return models of the structure of `like` from vectors (..., m), with their leading axes."""
     leaves, structure = jax.tree.flatten(like)
-    ends = np.cumsum([0, *(np.size(leaf) for leaf in leaves)])
-    shaped = [flat[..., first:last].reshape(*flat.shape[:-1], *np.shape(leaf))
-              for first, last, leaf in zip(ends[:-1], ends[1:], leaves, strict=True)]  # fmt: skip
+    ends = pairwise(np.cumsum([0, *map(np.size, leaves)]))
+    shaped = [
+        flat[..., start:stop].reshape(*flat.shape[:-1], *np.shape(leaf))
+        for (start, stop), leaf in zip(ends, leaves, strict=True)
+    ]
     return jax.tree.unflatten(structure, shaped)
 
 
@@ -104,16 +111,16 @@ class Name(str):
 
 def names_of(model: Imu) -> tuple[Name, ...]:
     """Return the names of all numbers of a model, in the order of `flatten`."""
-    found = []
+    names = []
     for path, leaf in jax.tree_util.tree_flatten_with_path(model)[0]:
         words = [key.name for key in path if isinstance(key, jax.tree_util.GetAttrKey)]
-        places = [key.idx for key in path if isinstance(key, jax.tree_util.SequenceKey)]
+        indices = [key.idx for key in path if isinstance(key, jax.tree_util.SequenceKey)]
         owner = words[0]
         if owner == "others":
-            owner, places = f"others[{places[0]}].{words[1]}", places[1:]
-        effect = places[0] if places else None
-        found += [Name(owner, words[-1], axes, effect) for axes in np.ndindex(*np.shape(leaf))]
-    return tuple(found)
+            owner, indices = f"others[{indices[0]}].{words[1]}", indices[1:]
+        effect = indices[0] if indices else None
+        names += [Name(owner, words[-1], axes, effect) for axes in np.ndindex(*np.shape(leaf))]
+    return tuple(names)
 
 
 class Parameters(eqx.Module):
@@ -128,12 +135,12 @@ class Parameters(eqx.Module):
     names: tuple[Name, ...] = eqx.field(static=True)
 
     @classmethod
-    def select(cls, model: Imu, keep: Callable[[Name], bool], sizes: Imu | None = None) -> "Parameters":
+    def select(cls, model: Imu, keep: Callable[[Name], bool]) -> "Parameters":
         """Free every number of the model whose name `keep` accepts."""
         names = names_of(model)
-        index = tuple(place for place, name in enumerate(names) if keep(name))
-        size = flatten(typical_sizes(model) if sizes is None else sizes)[np.array(index, int)]
-        return cls(flatten(model), size, index, tuple(names[place] for place in index))  # pyright: ignore[reportArgumentType]
+        index = tuple(k for k, name in enumerate(names) if keep(name))
+        size = flatten(typical_sizes(model))[np.array(index, int)]
+        return cls(flatten(model), size, index, tuple(names[k] for k in index))  # pyright: ignore[reportArgumentType]
 
     def model(self, like: Imu, z: Float[Array, " p"]) -> Imu:
         """Return the model at z; `like` gives the structure."""

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaximu.estimation.problem import Problem
 from jaximu.ground.array_types import Array, Computed
+from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.precision import require_float64
 
 __all__ = ["MAX_STEPS", "Failure", "Solution", "solve"]
@@ -24,6 +25,13 @@ class Failure(enum.Enum):
         "residuals by pose, or use --loss cauchy"
     )
     NONFINITE = "the fit met numbers that are not finite: a channel or a start value is unusable"
+
+    @classmethod
+    def of(cls, converged: Any, finite: Any) -> "Failure":
+        """Return how a solve ended that converged, or met numbers that are not finite, or neither."""
+        if not finite:
+            return cls.NONFINITE
+        return cls.NONE if converged else cls.MAX_STEPS
 
 
 class Solution(eqx.Module):
@@ -43,9 +51,7 @@ class Solution(eqx.Module):
 
     def failure(self) -> Failure:
         """Return how an unbatched solve ended."""
-        if not bool(self.finite):
-            return Failure.NONFINITE
-        return Failure.NONE if bool(self.converged) else Failure.MAX_STEPS
+        return Failure.of(self.converged, self.finite)
 
 
 MAX_STEPS = 256
@@ -65,11 +71,7 @@ def _objective_jvp(primals, tangents):
     z, problem = primals
     z_dot, problem_dot = tangents
 
-    def twice(z):
-        value = problem.objective(z)
-        return value, value
-
-    jacobian, value = jax.jacfwd(twice, has_aux=True)(z)
+    value, jacobian = value_and_jacobian(problem.objective, z)
     moved = jax.tree.map(lambda j, v: jnp.zeros_like(v) if _is_zero(z_dot) else j @ z_dot, jacobian, value)
     if not all(_is_zero(leaf) for leaf in jax.tree.leaves(problem_dot, is_leaf=_is_zero)):
         # Only implicit differentiation of a solution asks how the objective moves with the data.
@@ -124,7 +126,7 @@ def solve(
     require_float64()
     # Cholesky of the normal equations: the tolerance rows keep them well conditioned, and QR costs four times as much.
     usual = LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()))  # pyright: ignore[reportCallIssue]
-    found = optx.least_squares(
+    ended = optx.least_squares(
         _objective,
         usual if solver is None else solver,
         start,
@@ -133,14 +135,9 @@ def solve(
         max_steps=MAX_STEPS,
         throw=False,
     )
-    z = found.value
-
-    def data_part(z):
-        value, beforehand = problem.objective(z)
-        return value, (value, beforehand)
-
-    jacobian, (residual, beforehand) = jax.jacfwd(data_part, has_aux=True)(z)
+    z = ended.value
+    (residual, beforehand), (jacobian, _) = value_and_jacobian(problem.objective, z)
     finite = jnp.isfinite(residual).all() & jnp.isfinite(jacobian).all() & jnp.isfinite(z).all()
     cost = 0.5 * (jnp.sum(residual**2) + jnp.sum(beforehand**2))
-    converged = (found.result == optx.RESULTS.successful) & (found.stats["num_steps"] < limit) & finite
-    return Solution(z, residual, jacobian, cost, found.stats["num_steps"], converged, finite)
+    converged = (ended.result == optx.RESULTS.successful) & (ended.stats["num_steps"] < limit) & finite
+    return Solution(z, residual, jacobian, cost, ended.stats["num_steps"], converged, finite)

@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
-from jaximu.ground.differences import slopes
+from jaximu.ground.differences import interpolated, slopes
 from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, smoothed_slope
 
-__all__ = ["TEMPERATURE_WINDOW", "Recorded", "Track", "added", "mean_outputs", "stimuli"]
+__all__ = ["TEMPERATURE_WINDOW", "TRIADS", "Recorded", "Track", "added", "mean_outputs", "stimuli"]
 
+TRIADS = ("accelerometer", "gyroscope")
 TEMPERATURE_WINDOW = 20.0
 """Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""
 _VIBRATION_WINDOW, _QUIETEST = 0.5, 0.1
@@ -99,12 +100,11 @@ def mean_outputs(
     tracks: Mapping[str, Track], outputs: Mapping[str, Float[Array, "n 3"]], count: int
 ) -> Float[Array, "count k"]:
     """Return the mean outputs of triads over each observation, one triad's beside the other's."""
-    return _mean_outputs(tracks, outputs, np.zeros(count))
 
+    def means(tracks, outputs):
+        return jnp.concatenate([track.means(outputs[name], count) for name, track in tracks.items()], axis=-1)
 
-@partial(stored.compiled, quick=True)
-def _mean_outputs(tracks, outputs, rows):
-    return jnp.concatenate([track.means(outputs[name], len(rows)) for name, track in tracks.items()], axis=-1)
+    return stored.call(means, f"mean outputs {count}", tracks, outputs)
 
 
 def _longer(stimulus: Stimulus, missing: int) -> Stimulus:
@@ -131,9 +131,9 @@ class Recorded(eqx.Module):
     @classmethod
     def of(cls, recording: Recording) -> Recorded:
         """Return what a recording of both says."""
-        accelerometer, gyroscope = recording.accelerometer, recording.signals["gyroscope"]
-        known = {}
-        for name, time in (("accelerometer", accelerometer.time), ("gyroscope", gyroscope.time)):
+        accelerometer, known = recording.accelerometer, {}
+        for name in TRIADS:
+            time = recording.signals[name].time
             known[name] = Stimulus(time=time)  # pyright: ignore[reportArgumentType]
             if recording.temperature is not None:
                 celsius = np.interp(time, recording.temperature.time, recording.temperature.values[:, 0])
@@ -174,10 +174,10 @@ class Recorded(eqx.Module):
         for name, known in self.known.items():
             sampled, turned, shaken = force, rate, power
             if name == "accelerometer":
-                turned = _at(turning, rate, sensed)
+                turned = interpolated(turning, rate, sensed)
             else:
-                sampled = _at(sensed, force, turning)
-                shaken = None if power is None else _at(sensed, power, turning)
+                sampled = interpolated(sensed, force, turning)
+                shaken = None if power is None else interpolated(sensed, power, turning)
             stimuli[name] = replace(
                 known,
                 specific_force=sampled,
@@ -199,12 +199,8 @@ def stimuli(recording: Recording, imu: Imu) -> dict[str, Stimulus]:
 
     Force, rate and its derivative, temperature and its rate, vibration that stands out; no attitude.
     """
-    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
-    assert gyroscope is not None and imu.gyroscope is not None
-    force, rate = (
-        triad.recover_on_host(signal.values)
-        for triad, signal in ((imu.accelerometer, accelerometer), (imu.gyroscope, gyroscope))
-    )
+    triads, signals = imu.triads(), recording.signals
+    force, rate = (triads[name].recover_on_host(signals[name].values) for name in TRIADS)
     return Recorded.of(recording).stimuli(force, rate)
 
 
@@ -213,11 +209,5 @@ def _window_means(values: Float[Array, "n k"], window: Int[Array, ""]) -> Float[
     numerics = array_module(values, window)
     sums = numerics.cumsum(numerics.pad(values, [(1, 0), (0, 0)]), axis=0)
     stop = np.arange(len(values)) + (window + 1) // 2
-    first, last = (numerics.clip(place, 0, len(values)) for place in (stop - window, stop))
+    first, last = (numerics.clip(edge, 0, len(values)) for edge in (stop - window, stop))
     return (sums[last] - sums[first]) / window
-
-
-def _at(time: Float[Array, " n"], values: Float[Array, "n k"], wanted: Float[Array, " m"]) -> Float[Array, "m k"]:
-    """Return values at other times, along straight lines."""
-    numerics = array_module(time, values, wanted)
-    return numerics.stack([numerics.interp(wanted, time, column) for column in values.T], axis=1)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.estimation.problem import TOLERANCE, Name
+from jaximu.estimation.problem import TOLERANCE, Name, axis_scales
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.quantities import listed, number, size
-from jaximu.ground.units import SENSOR_UNITS
+from jaximu.ground.units import SENSOR_UNITS, STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 
 __all__ = [
@@ -29,7 +29,6 @@ __all__ = [
 # Standard deviations along a direction, in typical sizes (10 % of a scale, 1 m/s², 0.1 rad/s).
 UNDETERMINED = 1.0  # the data say no more than the data sheet
 WEAK = 0.05
-_GRAVITY = 9.80665
 _GRID = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
 _GRID /= np.linalg.norm(_GRID, axis=1, keepdims=True)
 
@@ -59,7 +58,7 @@ def pose_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, mo
     """Say which poses by hand, or turns between them, would excite a direction most."""
     change, bias = _in_si(vector, names, sizes, model, "accelerometer")
     # norm change at gravity direction u: u·(δK u g + δb)
-    effect = np.abs(np.einsum("ni,ij,nj->n", _GRID, change * _GRAVITY, _GRID) + _GRID @ bias)
+    effect = np.abs(np.einsum("ni,ij,nj->n", _GRID, change * STANDARD_GRAVITY, _GRID) + _GRID @ bias)
     gyro, _ = _in_si(vector, names, sizes, model, "gyroscope")
     turning = np.linalg.norm(gyro, axis=0)
     if np.linalg.norm(gyro) > 0.5 * np.linalg.norm(vector) * 0.1:
@@ -73,17 +72,17 @@ def pose_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, mo
 def station_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
     """Say which known poses or turns would excite a direction most."""
     change, bias = _in_si(vector, names, sizes, model, "accelerometer")
-    force = np.linalg.norm(_GRID @ change.T * _GRAVITY + bias, axis=1)
+    force = np.linalg.norm(_GRID @ change.T * STANDARD_GRAVITY + bias, axis=1)
     gyro, drift = _in_si(vector, names, sizes, model, "gyroscope")
     turning = np.linalg.norm(gyro, axis=0)
-    asked = []
+    remedies = []
     if force.max() > 0.1:
-        asked.append(f"a pose with this body direction up: {_strongest(force)}")
+        remedies.append(f"a pose with this body direction up: {_strongest(force)}")
     if turning.max() > 0.01:
-        asked.append(f"a full turn each way about the {'xyz'[int(np.argmax(turning))]} axis")
+        remedies.append(f"a full turn each way about the {'xyz'[int(np.argmax(turning))]} axis")
     elif np.linalg.norm(drift) > 0.01:
-        asked.append("a rest in any pose")
-    return ", and ".join(asked or ["more of these poses and turns, and longer rests"]) + "."
+        remedies.append("a rest in any pose")
+    return ", and ".join(remedies or ["more of these poses and turns, and longer rests"]) + "."
 
 
 def weak_directions(
@@ -100,27 +99,27 @@ def weak_directions(
     """
     _, values, right = np.linalg.svd(np.asarray(jacobian), full_matrices=jacobian.shape[0] < jacobian.shape[1])
     values = np.pad(values, (0, len(right) - len(values)))  # fewer residuals than parameters
-    found = []
+    weak = []
     for value, vector in sorted(zip(values, right, strict=True), key=lambda pair: pair[0]):
         sigma = 1 / np.hypot(value, 1 / TOLERANCE)
         if sigma < WEAK:
             break
         order = np.argsort(-np.abs(vector))
         vector = vector * np.sign(vector[order[0]])  # either sign is the same direction
-        main = [place for place in order[:4] if abs(vector[place]) > 0.3] or order[:4]  # many may take part a little
-        named = tuple((names[place], float(vector[place])) for place in main)
+        main = [k for k in order[:4] if abs(vector[k]) > 0.3] or order[:4]  # many may take part a little
+        named = tuple((names[k], float(vector[k])) for k in main)
         amounts = 1.96 * sigma * np.abs(vector) * np.asarray(sizes)
-        moves = [(names[place], float(amounts[place])) for place in main]
+        moves = [(names[k], float(amounts[k])) for k in main]
         what = _words(moves, bool(sigma <= UNDETERMINED), model)
         text = f"{what} What to record: {advice(vector, names, sizes, model)}"
-        found.append(WeakDirection(float(sigma), bool(sigma <= UNDETERMINED), named, text))
+        weak.append(WeakDirection(float(sigma), bool(sigma <= UNDETERMINED), named, text))
     rank = int(np.sum(1 / np.hypot(values, 1 / TOLERANCE) <= UNDETERMINED))
-    return rank, tuple(found)
+    return rank, tuple(weak)
 
 
 def describe(name: Name, model: Imu | None = None) -> str:
     """Turn `accelerometer.gain[1,0]` into words."""
-    axes = ["xyz"[place] for place in name.axes] if name.part in ("gain", "bias") else []
+    axes = ["xyz"[axis] for axis in name.axes] if name.part in ("gain", "bias") else []
     if name.part == "gain":
         scale = axes[0] == axes[1]
         return f"{name.owner} scale {axes[0]}" if scale else f"{name.owner} misalignment {axes[0]} from {axes[1]}"
@@ -155,7 +154,7 @@ def spoken_amount(name: Name, amount: float, model: Imu) -> str:
         output = model.triads()[effect.owner].output_unit if effect.owner in model.triads() else ""
         unit = effect.coefficient_unit(output) if name.part == "coefficients" else effect.inner[name.part].unit
         return size(amount, unit, 2)
-    amount /= float(np.linalg.norm(np.asarray(getattr(model, name.owner).gain)[name.axes[0]]))
+    amount /= float(axis_scales(model.triads()[name.owner])[name.axes[0]])
     if name.part == "bias":
         return size(amount, SENSOR_UNITS[name.owner], 2)
     return f"{number(100 * amount, 2)} %" if name.axes[0] == name.axes[1] else f"{number(1e3 * amount, 2)} mrad"
@@ -169,8 +168,7 @@ def _in_si(
     for name, weight, typical in zip(names, vector, np.asarray(sizes), strict=True):
         if name.owner == triad and name.effect is None:
             parts[name.part][name.axes] += weight * typical
-    known = getattr(model, triad)
-    scale = np.ones(3) if known is None else np.linalg.norm(np.asarray(known.gain), axis=1)
+    scale = axis_scales(model.triads()[triad]) if triad in model.triads() else np.ones(3)
     return parts["gain"] / scale[:, None], parts["bias"] / scale
 
 
@@ -193,7 +191,7 @@ _CHANCE = 1e-3
 
 
 def allowing_for_neighbours(
-    covariance: Array, sizes: Array, residual: Array, jacobian: Array, place: NDArray[np.int64]
+    covariance: Array, sizes: Array, residual: Array, jacobian: Array, order: NDArray[np.int64]
 ) -> FloatArray | None:
     """Return a covariance (p, p) for errors of which neighbours in time are alike; None where they are not.
 
@@ -201,12 +199,12 @@ def allowing_for_neighbours(
     direction smaller than the one for independent errors.
 
     **Arguments:** `covariance`: of the numbers, for independent errors; `residual` (n,), `jacobian` (n, p): whitened,
-    the latter by numbers over their `sizes` (p,); `place`: of each row in time, counted from zero.
+    the latter by numbers over their `sizes` (p,); `order`: of each row in time, counted from zero.
     """
-    count = int(place.max()) + 1
+    count = int(order.max()) + 1
     scores = np.zeros((count, jacobian.shape[1]))
-    np.add.at(scores, place, jacobian * residual[:, None])
-    error = residual[np.unique(place, return_index=True)[1]]  # of each place the first kind of its rows
+    np.add.at(scores, order, jacobian * residual[:, None])
+    error = residual[np.unique(order, return_index=True)[1]]  # of each time the first kind of its rows
     error = error[error != 0]  # padding, and what was left out
     error = error - error.mean()
     lags = np.arange(1, min(_LAGS, len(error) // 4) + 1)

@@ -1,11 +1,14 @@
-"""Rates of change from samples."""
+"""Rates of change from samples, values between them, and derivatives with the value."""
+
+from collections.abc import Callable
+from typing import Any
 
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
 from jaximu.ground.tracing import array_module
 
-__all__ = ["slopes"]
+__all__ = ["interpolated", "slopes", "value_and_jacobian"]
 
 
 def slopes(values: Float[Array, "... n m"], time: Float[Array, "... n"]) -> Float[Array, "... n m"]:
@@ -25,3 +28,23 @@ def slopes(values: Float[Array, "... n m"], time: Float[Array, "... n"]) -> Floa
     weighted = after * chord[..., :-1, :] + before * chord[..., 1:, :]
     inner = numerics.where(span > 0, weighted / numerics.where(span > 0, span, 1.0), 0.0)
     return numerics.concatenate([chord[..., :1, :], inner, chord[..., -1:, :]], axis=-2)
+
+
+def interpolated(
+    time: Float[Array, " n"], values: Float[Array, "n k"], wanted: Float[Array, "..."]
+) -> Float[Array, "... k"]:
+    """Return values at other times, along straight lines; the first and last value beyond the ends."""
+    numerics = array_module(time, values, wanted)
+    return numerics.stack([numerics.interp(wanted, time, column) for column in values.T], axis=-1)
+
+
+def value_and_jacobian(function: Callable[[Array], Any], at: Array) -> tuple[Any, Any]:
+    """Return what a function of a vector makes of it, and its derivatives there (forward mode), traced once."""
+    import jax
+
+    def twice(vector):
+        value = function(vector)
+        return value, value
+
+    jacobian, value = jax.jacfwd(twice, has_aux=True)(at)
+    return value, jacobian

@@ -4,10 +4,11 @@ import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-__all__ = ["array_module", "is_traced", "one_by_one", "repeated"]
+__all__ = ["array_module", "first", "is_traced", "lifted", "one_by_one", "repeated"]
 
 Result = TypeVar("Result")
 State = TypeVar("State")
+Tree = TypeVar("Tree")
 
 
 def is_traced(*trees: Any) -> bool:
@@ -26,6 +27,20 @@ def array_module(*trees: Any) -> Any:
     import numpy
 
     return jax.numpy if is_traced(*trees) else numpy
+
+
+def first(tree: Tree) -> Tree:
+    """Return the first entry along the leading axis of every array."""
+    import jax
+
+    return jax.tree.map(lambda leaf: array_module(leaf).asarray(leaf)[0], tree)
+
+
+def lifted(tree: Tree) -> Tree:
+    """Return every array with a leading axis of length one."""
+    import jax
+
+    return jax.tree.map(lambda leaf: array_module(leaf).asarray(leaf)[None], tree)
 
 
 def repeated(step: Callable[[State], State], state: State, times: int, *others: Any) -> State:

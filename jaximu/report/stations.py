@@ -79,14 +79,14 @@ def _figure(calibration: Calibration) -> Figure:
     """Draw each station's errors after calibration, by axis, with the standard deviation of its mean."""
     fit, stations = calibration.fit, calibration.stations
     assert fit is not None and stations is not None
-    panels = [panel for panel in station_errors(fit.imu, stations, np.asarray(fit.excess)) if len(panel.place)]
+    panels = [panel for panel in station_errors(fit.imu, stations, np.asarray(fit.excess)) if len(panel.station)]
     figure = new_figure(2.3 * len(panels))
     grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
     for axes, panel in zip(grid, panels, strict=True):
         for shift, (axis, color), error, sigma in zip(
             (-0.2, 0.0, 0.2), AXES.items(), panel.error, panel.sigma, strict=True
         ):
-            axes.errorbar(panel.place + shift, error, 1.96 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
+            axes.errorbar(panel.station + shift, error, 1.96 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
         axes.axhline(0, color="#888888", lw=0.8)
         dressed(axes, f"Error of the {_WORDS[panel.name]}", ylabel=panel.unit)
     grid[0].legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
