@@ -68,16 +68,19 @@ class HandHeldThermal(Document):
             "schema": SCHEMA,
             "kind": "hand-held",
             "temperature_range": list(self.range),
-            "effects": [{"name": name, "statistic": statistic, "heldout_loglik": gain}
-                        for name, statistic, gain in self.steps],
+            "effects": [
+                {"name": name, "statistic": statistic, "heldout_loglik": gain} for name, statistic, gain in self.steps
+            ],
             "detection_limits": {name: {"value": value, "unit": unit} for name, (value, unit) in self.limits.items()},
             "undetermined": self.undetermined,
-            "rms": {name: {"before": before, "after": after, "unit": unit}
-                    for name, (before, after, unit) in self.calibration.rms.items()},
+            "rms": {
+                name: {"before": before, "after": after, "unit": unit}
+                for name, (before, after, unit) in self.calibration.rms.items()
+            },
             "notes": list(self.notes),
             "calibration": self.calibration.document(),
             "software": self.software,
-        }  # fmt: skip
+        }
 
 
 def turned_by_hand(recording: Recording) -> bool:
@@ -105,19 +108,19 @@ def calibrate_thermal_by_hand(
     temperature does not change, or the fit does not converge.
     """
     gravity = as_gravity(gravity)
-    given = recordings_of(recordings)
-    for recording in given:
+    logs = recordings_of(recordings)
+    for recording in logs:
         if recording.gyroscope is None or recording.temperature is None:
             raise NotPossibleError(f"{recording.name}: poses by hand over temperature need gyroscope and temperature.")
-    kelvin = np.concatenate([r.temperature.values[:, 0] for r in given if r.temperature is not None])
-    low, high = float(kelvin.min()), float(kelvin.max())
+    temperature = np.concatenate([log.temperature.values[:, 0] for log in logs if log.temperature is not None])
+    low, high = float(temperature.min()), float(temperature.max())
     if high - low < LEAST_RANGE:
         raise NotPossibleError(
-            f"{given[0].name}: the temperature only goes from {low:.2f} to {high:.2f} °C; {LEAST_RANGE:g} K or more "
+            f"{logs[0].name}: the temperature only goes from {low:.2f} to {high:.2f} °C; {LEAST_RANGE:g} K or more "
             "are needed to see what depends on it. Record poses while the unit warms or cools."
         )
     noise = noise_of(static)
-    calibration = calibrate(given, gravity)
+    calibration = calibrate(logs, gravity)
 
     def made(known: NoiseModel) -> Experiment:
         observations = observed_poses(calibration.segmentations, gravity.value, noise=known)
@@ -125,17 +128,17 @@ def calibrate_thermal_by_hand(
         return Experiment(data, calibration.imu, candidates=ASKED)
 
     if noise is None:
-        own = own_noise(calibration)
-        plain = made(own)
-        noise = with_usual_drift(own, plain.shortest(), plain.extent().duration)
+        in_poses = own_noise(calibration)
+        plain = made(in_poses)
+        noise = with_usual_drift(in_poses, plain.shortest(), plain.extent().duration)
     experiment = made(noise)
     base = state = experiment.fit()
     steps: list[tuple[str, float, float]] = []
     refused: set[str] = set()
     while (name := _next(state, refused)) is not None:
         evidence = state.evidence
-        place = next(k for k, block in enumerate(evidence.blocks) if block.name == name)
-        statistic = float(evidence.scores().statistic[place])
+        index = [block.name for block in evidence.blocks].index(name)
+        statistic = float(evidence.scores().statistic[index])
         try:
             tried = experiment.fit((*state.effects, CATALOGUE[name].dormant()), state.imu)
         except NotPossibleError:  # beside the others it comes to nothing
@@ -147,28 +150,34 @@ def calibrate_thermal_by_hand(
             steps.append((name, statistic, gain))
         else:
             refused.add(name)
-    found = extended(calibration, experiment, state)
-    assert found.fit is not None
-    require_solved(found.fit, given[0].name)
+    result = extended(calibration, experiment, state)
+    assert result.fit is not None
+    require_solved(result.fit, logs[0].name)
     notes = tuple(dict.fromkeys((*calibration.notes, *noise.notes)))
-    data = found.data | {"temperature_range": [low, high]}
+    data = result.data | {"temperature_range": [low, high]}
     return HandHeldThermal(
-        replace(found, data=data, notes=notes), base, state, experiment, (low, high), tuple(steps), state.limits,
-        state.blind, notes,
-    )  # fmt: skip
+        replace(result, data=data, notes=notes),
+        base,
+        state,
+        experiment,
+        (low, high),
+        tuple(steps),
+        state.limits,
+        state.blind,
+        notes,
+    )
 
 
 def _next(state: State, refused: set[str]) -> str | None:
     """Return the effect whose statistic exceeds its penalty by most, if any does."""
     evidence, inside = state.evidence, {(effect.owner, effect.plain) for effect in state.effects}
-    statistic, count = evidence.scores().statistic, len(state.conditions)
     gains = {}
-    for place, block in enumerate(evidence.blocks):
+    for block, statistic in zip(evidence.blocks, evidence.scores().statistic, strict=True):
         if block.kind != "effect" or block.name in refused:
             continue
         kind = CATALOGUE[block.name]
         before = _FIRST.get(kind.plain)
         if before is None or (kind.owner, before) in inside:
-            gains[block.name] = float(statistic[place] - len(block.sizes) * np.log(count))
-    best = max(gains, key=lambda name: gains[name], default=None)
-    return best if best is not None and gains[best] > 0 else None
+            gains[block.name] = float(statistic - len(block.sizes) * np.log(len(state.conditions)))
+    best = max(gains, key=lambda name: gains[name], default="")
+    return best if gains.get(best, 0.0) > 0 else None
