@@ -29,7 +29,7 @@ from jaximu.model.effects.base import Extent
 
 __all__ = ["MagneticCause", "MagneticDiagnosis", "MagneticShift", "check_magnetometer", "diagnose_magnetometer"]
 
-_PLACES = 40
+_ONSETS = 40
 """Onsets at which a step is sought."""
 _FOLDS = 5
 _PAYS = 3.0
@@ -57,8 +57,8 @@ class MagneticCause:
 
     def text(self) -> str:
         """Return what was found, and what to do."""
-        begun, name = self.effect.since(), self.effect.beginning()
-        since, option = ("", "") if begun is None else (f", from {begun:.4g} s on", f":{name}={begun:.4g}")
+        onset, name = self.effect.since(), self.effect.beginning()
+        since, option = ("", "") if onset is None else (f", from {onset:.4g} s on", f":{name}={onset:.4g}")
         rivals = ", or " + " or ".join(map(effect_title, self.rivals)) if self.rivals else ""
         rivals += " (this recording cannot tell them apart)" if rivals else ""
         return (
@@ -94,7 +94,7 @@ class MagneticDiagnosis:
         """Return the diagnosis as `calibration.json` has it."""
         return {
             "verdict": "effects" if self.causes else "adequate",
-            "effects": [each.document() for each in self.causes],
+            "effects": [cause.document() for cause in self.causes],
             "p_value": self.p_value,
             "not_observable": self.not_asked,
         }
@@ -109,29 +109,28 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
     An effect is named where its test stands out over all tests together (5 %) and fifths of the recording that were
     left out are predicted better with it by three nats or more. An onset is chosen on the whole recording.
     """
-    found, windows = calibration.fit, measurement.windows
-    assert found is not None
-    kept = set(found.names)
-    model = jax.tree.map(np.asarray, found.imu)
-    linear = linearise(model, measurement, lambda name: name in kept)
+    fit, windows = calibration.fit, measurement.windows
+    assert fit is not None
+    model = jax.tree.map(np.asarray, fit.imu)
+    linear = linearise(model, measurement, set(fit.names).__contains__)
     about = measurement.about(jax.tree.map(lambda leaf: leaf[None], model))
     covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)
     rows = covariance.used > 0
-    total = np.asarray(covariance.total(np.asarray(found.excess)))[np.ix_(rows, rows)]
+    total = np.asarray(covariance.total(np.asarray(fit.excess)))[np.ix_(rows, rows)]
     weights = np.asarray(np.linalg.inv(np.linalg.cholesky(total)), np.float64)
     columns = np.concatenate([linear.slope, linear.columns * linear.sizes[linear.slope.shape[1] :]], axis=1)
     residual, jacobian = weights @ linear.conditions[rows], weights @ columns[rows]
-    asked, refused = _askable(windows, model.magnetometer)
+    kinds, refused = _askable(windows, model.magnetometer)
     extent = _extent(windows)
-    grids = {kind: kind.grid(extent) for kind in asked}
+    grids = {kind: kind.grid(extent) for kind in kinds}
     bare = model.with_effects()
     scale = float(np.mean(np.linalg.norm(np.asarray(bare.magnetometer.gain), axis=1)))
     blocks = []
     for kind, slopes in measurement.dormant_columns(bare, linear.details, grids).items():
         size = np.asarray(kind.dormant().typical_sizes(scale).coefficients)
         blocks += [
-            EffectBlock(kind.name, weights @ (each * size)[rows], size, "effect", inner, kind.beginning() in inner)
-            for inner, each in zip(grids[kind], slopes, strict=True)
+            EffectBlock(kind.name, weights @ (slope * size)[rows], size, "effect", inner, kind.beginning() in inner)
+            for inner, slope in zip(grids[kind], slopes, strict=True)
         ]
     if not blocks:
         return MagneticDiagnosis((), 1.0, refused)
@@ -142,8 +141,9 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
     for cause in selection.causes:
         block = evidence.blocks[cause.block]
         effect = CATALOGUE[block.name].make(evidence.coefficients([cause.block]) * block.sizes, **block.inner)
-        pair = [np.asarray(jacobian), np.concatenate([jacobian, block.columns], axis=1)]
-        (first, before), (second, after) = (_left_out(weights, each, residual, real) for each in pair)
+        extended = np.concatenate([jacobian, block.columns], axis=1)
+        first, before = _left_out(weights, jacobian, residual, real)
+        second, after = _left_out(weights, extended, residual, real)
         if second - first < _PAYS:
             refused[effect.name] = "it stands out, but parts left out are predicted no better with it"
             continue
@@ -213,7 +213,7 @@ def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
     are of one recording.
     """
     require_another(old, [file.get("sha256", "") for file in new.data.get("files", ())])
-    triads = [each.imu.magnetometer for each in (old, new) if each.magnetic is not None and each.imu.magnetometer]
+    triads = [one.imu.magnetometer for one in (old, new) if one.magnetic is not None and one.imu.magnetometer]
     if len(triads) < 2:
         raise InputError("there is no magnetometer in one of the two calibrations that are to be compared.")
     if triads[0].output_unit != triads[1].output_unit:
@@ -221,7 +221,7 @@ def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
             f"the old calibration is of a magnetometer in {triads[0].output_unit}, the new one in "
             f"{triads[1].output_unit}: state the columns' units as in the recording that was calibrated."
         )
-    gains = [np.asarray(each.gain) for each in triads]
+    gains = [np.asarray(triad.gain) for triad in triads]
     factor = float(np.sum(gains[0] * gains[1]) / np.sum(gains[1] ** 2))
     names = [name for name in new.names if name.owner == "magnetometer" and name.effect is None and name in old.names]
     spreads, values = [], []
@@ -256,13 +256,12 @@ def _heading_off(triads, magnetic: dict[str, Any]) -> float | None:
         return None
     dip, strength = np.radians(field["dip"]["value"]), field["strength"]["value"]
     angle = np.radians(np.arange(0.0, 360.0, 15.0))
-    body = strength * np.stack(
-        [-np.cos(dip) * np.sin(angle), np.cos(dip) * np.cos(angle), np.full(len(angle), -np.sin(dip))], axis=1
-    )
+    east, north, up = -np.cos(dip) * np.sin(angle), np.cos(dip) * np.cos(angle), -np.sin(dip)
+    body = strength * np.stack([east, north, np.full(len(angle), up)], axis=1)
     old, new = triads
     output = body @ np.asarray(new.gain).T + np.asarray(new.bias)
-    seen = np.linalg.solve(np.asarray(old.gain), (output - np.asarray(old.bias)).T).T
-    off = np.angle((seen[:, 0] + 1j * seen[:, 1]) / (body[:, 0] + 1j * body[:, 1]))
+    corrected = np.linalg.solve(np.asarray(old.gain), (output - np.asarray(old.bias)).T).T
+    off = np.angle((corrected[:, 0] + 1j * corrected[:, 1]) / (body[:, 0] + 1j * body[:, 1]))
     return float(np.degrees(np.sqrt(np.mean(off**2))))
 
 
@@ -274,7 +273,7 @@ def _askable(windows: FieldWindows, triad) -> tuple[list[type[Effect]], dict[str
         "current": (stimulus.current, _LEAST_CURRENT),
         "angular_rate": (stimulus.angular_rate, 0.0),
     }
-    asked, refused = [], {}
+    kinds, refused = [], {}
     for kind in CATALOGUE.values():
         if kind.owner != "magnetometer" or kind.name in fitted:
             continue
@@ -289,15 +288,15 @@ def _askable(windows: FieldWindows, triad) -> tuple[list[type[Effect]], dict[str
         if reason:
             refused[kind.name] = reason
         else:
-            asked.append(kind)
-    return asked, refused
+            kinds.append(kind)
+    return kinds, refused
 
 
 def _extent(windows: FieldWindows) -> Extent:
     edges = windows.time[1:, 0]
     warm = windows.samples.track.stimulus.temperature
     span = 0.0 if warm is None else float(np.ptp(np.asarray(warm)))
-    return Extent(float(np.ptp(windows.time)), tuple(edges[:: -(-len(edges) // _PLACES)].tolist()), span)
+    return Extent(float(np.ptp(windows.time)), tuple(edges[:: -(-len(edges) // _ONSETS)].tolist()), span)
 
 
 def _left_out(weights: FloatArray, columns: FloatArray, residual: FloatArray, real: Rows) -> tuple[float, float]:

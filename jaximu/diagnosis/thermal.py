@@ -53,15 +53,15 @@ def diagnose_thermal(
     **Arguments:** as for [`jaximu.calibration.calibrate_thermal`]; `heldout`: other such recordings of the unit, to
     measure the gain on. Raises what that raises, and `NotPossibleError` without a gyroscope.
     """
-    given, noise = recordings_of(recordings), noise_of(static)
-    if any(recording.gyroscope is None for recording in given):
+    logs, noise = recordings_of(recordings), noise_of(static)
+    if any(recording.gyroscope is None for recording in logs):
         raise NotPossibleError("a diagnosis needs accelerometer and gyroscope.")
-    thermal = calibrate_thermal(given, static=noise)
+    thermal = calibrate_thermal(logs, static=noise)
     start = jax.tree.map(np.asarray, thermal.calibration.imu.with_effects())
     calibration = thermal.calibration.of_numbers(lambda name: name.effect is None, imu=start)
     known = thermal.noise if noise is None else noise
-    blocks = _apart(_coarse(given), thermal.jumps)
-    findings = [finding for recording in given for finding in inspect(recording)]
+    blocks = _apart(_coarse(logs), thermal.jumps)
+    findings = [finding for recording in logs for finding in inspect(recording)]
     held = None if heldout is None else _coarse(recordings_of(heldout))
     notes = [*thermal.blocks.notes, *known.notes, *(note for note in thermal.notes if "jumps by" in note)]
     chosen = [effect for triad in thermal.calibration.triads().values() for effect in triad.effects]
@@ -75,15 +75,15 @@ def diagnose_thermal(
         return examine(Examination(*about, trusted=noise is None, taken=tuple(taken), measured=left_out))
 
     wanted = {effect.name for effect in beyond if effect.cause}
-    first = found = asked(False, ()) if len(chosen) <= _NAMED else None
+    first = diagnosis = asked(False, ()) if len(chosen) <= _NAMED else None
     if first is None or first.verdict == "unexplained" or (first.verdict == "effects" and _misses(first, wanted)):
-        found = asked(True, beyond)
-        hides = first is not None and first.verdict == "effects" and _misses(found, wanted)
-        found = first if hides else found  # any smooth function may hide a cause
-    assert found is not None
+        diagnosis = asked(True, beyond)
+        hides = first is not None and first.verdict == "effects" and _misses(diagnosis, wanted)
+        diagnosis = first if hides else diagnosis  # any smooth function may hide a cause
+    assert diagnosis is not None
     if "thermal_lag" not in thermal.identifiability.told:  # temperature, its rate and time go together
-        found = replace(found, suggestion=f"{found.suggestion} {_CYCLE}".strip())
-    return found
+        diagnosis = replace(diagnosis, suggestion=f"{diagnosis.suggestion} {_CYCLE}".strip())
+    return diagnosis
 
 
 def _remade(blocks: RestBlocks, start: Imu, smooth: bool) -> Callable[[NoiseModel], Experiment]:

@@ -106,19 +106,19 @@ def calibrate_thermal_by_hand(
     temperature does not change, or the fit does not converge.
     """
     gravity = as_gravity(gravity)
-    given = recordings_of(recordings)
-    for recording in given:
+    logs = recordings_of(recordings)
+    for recording in logs:
         if recording.gyroscope is None or recording.temperature is None:
             raise NotPossibleError(f"{recording.name}: poses by hand over temperature need gyroscope and temperature.")
-    kelvin = np.concatenate([r.temperature.values[:, 0] for r in given if r.temperature is not None])
-    low, high = float(kelvin.min()), float(kelvin.max())
+    temperature = np.concatenate([log.temperature.values[:, 0] for log in logs if log.temperature is not None])
+    low, high = float(temperature.min()), float(temperature.max())
     if high - low < LEAST_RANGE:
         raise NotPossibleError(
-            f"{given[0].name}: the temperature only goes from {low:.2f} to {high:.2f} °C; {LEAST_RANGE:g} K or more "
+            f"{logs[0].name}: the temperature only goes from {low:.2f} to {high:.2f} °C; {LEAST_RANGE:g} K or more "
             "are needed to see what depends on it. Record poses while the unit warms or cools."
         )
     noise = noise_of(static)
-    calibration = calibrate(given, gravity)
+    calibration = calibrate(logs, gravity)
 
     experiment = Experiment(recorded_by_hand(calibration), calibration.imu.with_effects(), candidates=ASKED)
     noise = usual_noise(experiment) if noise is None else noise
@@ -128,8 +128,8 @@ def calibrate_thermal_by_hand(
     refused: set[str] = set()
     while (name := _next(state, refused)) is not None:
         evidence = state.evidence
-        place = next(k for k, block in enumerate(evidence.blocks) if block.name == name)
-        statistic = float(evidence.scores().statistic[place])
+        index = [block.name for block in evidence.blocks].index(name)
+        statistic = float(evidence.scores().statistic[index])
         try:
             tried = experiment.fit((*state.effects, CATALOGUE[name].dormant()), state.imu)
         except NotPossibleError:  # beside the others it comes to nothing
@@ -141,13 +141,13 @@ def calibrate_thermal_by_hand(
             steps.append((name, statistic, gain))
         else:
             refused.add(name)
-    found = extended(calibration, experiment, state)
-    assert found.fit is not None
-    require_solved(found.fit, given[0].name)
+    result = extended(calibration, experiment, state)
+    assert result.fit is not None
+    require_solved(result.fit, logs[0].name)
     notes = tuple(dict.fromkeys((*calibration.notes, *noise.notes)))
-    data = found.data | {"temperature_range": [low, high]}
+    data = result.data | {"temperature_range": [low, high]}
     return HandHeldThermal(
-        replace(found, data=data, notes=notes),
+        replace(result, data=data, notes=notes),
         base,
         state,
         experiment,
@@ -162,14 +162,13 @@ def calibrate_thermal_by_hand(
 def _next(state: State, refused: set[str]) -> str | None:
     """Return the effect whose statistic exceeds its penalty by most, if any does."""
     evidence, inside = state.evidence, {(effect.owner, effect.plain) for effect in state.effects}
-    statistic, count = evidence.scores().statistic, len(state.conditions)
     gains = {}
-    for place, block in enumerate(evidence.blocks):
+    for block, statistic in zip(evidence.blocks, evidence.scores().statistic, strict=True):
         if block.kind != "effect" or block.name in refused:
             continue
         kind = CATALOGUE[block.name]
         before = _FIRST.get(kind.plain)
         if before is None or (kind.owner, before) in inside:
-            gains[block.name] = float(statistic[place] - len(block.sizes) * np.log(count))
-    best = max(gains, key=lambda name: gains[name], default=None)
-    return best if best is not None and gains[best] > 0 else None
+            gains[block.name] = float(statistic - len(block.sizes) * np.log(len(state.conditions)))
+    best = max(gains, key=lambda name: gains[name], default="")
+    return best if gains.get(best, 0.0) > 0 else None

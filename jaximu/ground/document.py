@@ -44,9 +44,9 @@ def read_document(path: str | os.PathLike[str], schema: str | None, what: str) -
             document = json.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:
         raise InputError(f"{name} is not {what}: it is not JSON ({error}).") from error
-    found = document.get("schema") if isinstance(document, dict) else None
-    if found != schema if schema else not str(found).startswith("jaximu."):
-        raise InputError(f"{name} is not {what}: its schema is {found!r}, expected {schema or 'jaximu.…'!r}.")
+    stated = document.get("schema") if isinstance(document, dict) else None
+    if stated != schema if schema else not str(stated).startswith("jaximu."):
+        raise InputError(f"{name} is not {what}: its schema is {stated!r}, expected {schema or 'jaximu.…'!r}.")
     return document
 
 

@@ -51,10 +51,10 @@ def worded(text: str) -> str:
     return text if _command_line else _TEXT.sub(_argument, text)
 
 
-def _argument(found: re.Match[str]) -> str:
-    option, value = found["option"], found["value"]
+def _argument(match: re.Match[str]) -> str:
+    option, value = match["option"], match["value"]
     if option is None:
-        return found[0]
+        return match[0]
     argument = _ARGUMENTS.get(option, option[2:].replace("-", "_") + "=")
     if value is None:
         return argument

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from datetime import date
 
@@ -60,10 +61,11 @@ def world_magnetic_model(latitude: float, longitude: float, day: date, height: f
         raise InputError(
             f"latitude {latitude:g} or longitude {longitude:g} is not on the Earth: -90 to 90 and -180 to 360 degrees."
         )
-    begun = [year for year in _SETS if year <= day.year]
-    year = day.year + (day - date(day.year, 1, 1)).days / (date(day.year + 1, 1, 1) - date(day.year, 1, 1)).days
-    beyond = 0.0 if not begun else max(year - begun[-1] - _SPAN, 0.0)
-    if not begun or beyond > _EXTENDED:
+    epoch = max((year for year in _SETS if year <= day.year), default=math.inf)
+    new_year = date(day.year, 1, 1)
+    year = day.year + (day - new_year) / (date(day.year + 1, 1, 1) - new_year)
+    beyond = max(year - epoch - _SPAN, 0.0)
+    if epoch > year or beyond > _EXTENDED:
         raise InputError(
             f"the World Magnetic Model that is installed has no field for {day.isoformat()}: its coefficients are for "
             f"{_SETS[0]} to {_SETS[-1] + _SPAN:.0f}. State the field itself (--field), or the right --date."
@@ -74,20 +76,19 @@ def world_magnetic_model(latitude: float, longitude: float, day: date, height: f
         raise InputError(
             "the field of a place and date needs pygeomag: pip install 'jaximu[field]', or state it (--field)."
         ) from None
-    name = f"WMM{begun[-1]}"
-    model = GeoMag(coefficients_file=f"wmm/WMM_{begun[-1]}{'v2' if begun[-1] == 2015 else ''}.COF")
-    found = model.calculate(
+    model = GeoMag(coefficients_file=f"wmm/WMM_{epoch}{'v2' if epoch == 2015 else ''}.COF")
+    field = model.calculate(
         glat=latitude, glon=longitude, alt=height / 1e3, time=year, allow_date_outside_lifespan=True
     )
-    strength, dip = found.f / 1e3, found.i
+    strength, dip = field.f / 1e3, field.i
     sigma, dip_sigma = _SIGMA + _SIGMA_YEAR * beyond, _DIP_SIGMA + _DIP_SIGMA_YEAR * beyond
     note = (
-        f"the field is that of {name} at {latitude:g}°, {longitude:g}° on {day.isoformat()}: {strength:.2f} ± "
+        f"the field is that of WMM{epoch} at {latitude:g}°, {longitude:g}° on {day.isoformat()}: {strength:.2f} ± "
         f"{1.96 * sigma:.2f} µT, dip {dip:.2f} ± {1.96 * dip_sigma:.2f}° (95 %, outdoors and away from iron)."
     )
     if beyond:
         note += (
-            f" Its coefficients are outdated since {begun[-1] + _SPAN:.0f}, and the uncertainty is wider for it: "
+            f" Its coefficients are outdated since {epoch + _SPAN:.0f}, and the uncertainty is wider for it: "
             "pip install -U pygeomag, or --field."
         )
     return FieldStrength(strength, sigma, dip, dip_sigma, note)

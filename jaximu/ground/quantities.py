@@ -26,8 +26,17 @@ __all__ = [
 
 Z95 = 1.96
 """Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
-_SYMBOLS = (("sqrt(Hz)", "√Hz"), ("sqrt(h)", "√h"), ("^2", "²"), ("^3", "³"), ("^4", "⁴"), ("degC", "°C"),
-            ("deg", "°"), ("ug", "µg"), ("uT", "µT"))  # fmt: skip
+_SYMBOLS = {
+    "sqrt(Hz)": "√Hz",
+    "sqrt(h)": "√h",
+    "^2": "²",
+    "^3": "³",
+    "^4": "⁴",
+    "degC": "°C",
+    "deg": "°",
+    "ug": "µg",
+    "uT": "µT",
+}
 _RATIO = re.compile(r"\((?P<unit>[^()]+)\)/\((?P=unit)\)(?:\^(?P<power>\d))?(?P<rest>(?:/s)?)")
 """A unit over a power of itself, as coefficients have it."""
 _NUMERATOR = re.compile(r"(\(?)(rad|m/s\^2)(?![\w^])(.*)")
@@ -42,13 +51,13 @@ def raised(power: int) -> str:
 
 def unit_text(unit: str) -> str:
     """Return a unit as it is printed: m/s^2 as m/s², deg/s as °/s, uT as µT; "1" and (m/s^2)/(m/s^2) are nothing."""
-    if found := _RATIO.fullmatch(unit):
-        power, rest = int(found["power"] or 1) - 1, found["rest"]
-        over = ("" if not power else f"({found['unit']})" + (f"^{power}" if power > 1 else "")) + rest.removeprefix("/")
+    if ratio := _RATIO.fullmatch(unit):
+        base, power = f"({ratio['unit']})", int(ratio["power"] or 1) - 1
+        over = (f"{base}^{power}" if power > 1 else base * power) + ratio["rest"].removeprefix("/")
         unit = f"1/{over}" if over else "1"
     if unit == "1":
         return ""
-    for plainly, printed in _SYMBOLS:
+    for plainly, printed in _SYMBOLS.items():
         unit = unit.replace(plainly, printed)
     return unit
 
@@ -82,8 +91,10 @@ def change(before: float, after: float, unit: str, digits: int = 3) -> str:
 
 def number(value: float, digits: int = 3) -> str:
     """Return a number with so many significant digits, with a power of ten only where a person would use one."""
-    if value == 0 or not math.isfinite(value):
-        return "0" if value == 0 else str(value)
+    if value == 0:
+        return "0"
+    if not math.isfinite(value):
+        return str(value)
     exponent = math.floor(math.log10(abs(value)))
     if -5 <= exponent < 6:
         return f"{value:.{max(0, digits - 1 - exponent)}f}".replace("-", "−")

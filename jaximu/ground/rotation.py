@@ -19,6 +19,9 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.prefixes import running
 
 __all__ = [
+    "Matrix",
+    "Quaternion",
+    "Vector",
     "apply_matrix",
     "compose_rotation_vectors",
     "conjugate",
@@ -27,7 +30,6 @@ __all__ = [
     "inverse_matrix",
     "logarithm",
     "multiply",
-    "neighbours",
     "product",
     "right_jacobian",
     "right_jacobian_rows",
@@ -40,18 +42,24 @@ __all__ = [
     "transport",
 ]
 
+Vector = Float[Array, "... 3"]
+Vectors = Float[Array, "... S 3"]
+"""Of S samples."""
+Quaternion = Float[Array, "... 4"]
+Matrix = Float[Array, "... 3 3"]
+
 MEAN_RATES, POINT_RATES = (7 / 120, 1 / 120), (41 / 1440, 11 / 2880)
 """p and q of coning by samples that are means over their intervals, or points; see `rotation_vectors`."""
 _SMALL = 1e-8  # squared angle (rad²) below which a series to second order is exact in double precision
 
 
-def apply_matrix(matrix: Float[Array, "... 3 3"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+def apply_matrix(matrix: Matrix, vector: Vector) -> Vector:
     """Return `matrix @ vector`, broadcast over leading axes, written element by element."""
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     return jnp.stack([matrix[..., i, 0] * x + matrix[..., i, 1] * y + matrix[..., i, 2] * z for i in range(3)], axis=-1)
 
 
-def inverse_matrix(matrix: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+def inverse_matrix(matrix: Matrix) -> Matrix:
     """Return the exact inverse of (..., 3, 3) matrices by cofactors."""
     a, b, c = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
     columns = [jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)]
@@ -75,12 +83,12 @@ def _parts(array):
     return tuple(array[..., i] for i in range(array.shape[-1]))
 
 
-def multiply(p: Float[Array, "... 4"], q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
+def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
     """Return the Hamilton product p ⊗ q."""
     return jnp.stack(product(_parts(p), _parts(q)), axis=-1)
 
 
-def conjugate(q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
+def conjugate(q: Quaternion) -> Quaternion:
     """Return the conjugate, which is the inverse of a unit quaternion."""
     return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
 
@@ -95,7 +103,7 @@ def rotation_rows(quaternion: Sequence[Any]) -> list[list[Any]]:
     ]
 
 
-def rotation_matrix(q: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
+def rotation_matrix(q: Quaternion) -> Matrix:
     """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`."""
     return jnp.stack([jnp.stack(row, axis=-1) for row in rotation_rows(_parts(q))], axis=-2)
 
@@ -105,7 +113,7 @@ def rotation_matrix_on_host(q: FloatArray) -> FloatArray:
     return np.moveaxis(np.array(rotation_rows(_parts(q))), (0, 1), (-2, -1))
 
 
-def rotate(q: Float[Array, "... 4"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+def rotate(q: Quaternion, vector: Vector) -> Vector:
     """Rotate body vectors into the reference frame."""
     return apply_matrix(rotation_matrix(q), vector)
 
@@ -120,13 +128,13 @@ def _half_angle(rotation_vector):
     return cosine, sine
 
 
-def exponential(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
+def exponential(rotation_vector: Vector) -> Quaternion:
     """Return the unit quaternion of a rotation vector (rad)."""
     cosine, sine = _half_angle(rotation_vector)
     return jnp.concatenate([cosine[..., None], sine[..., None] * rotation_vector], axis=-1)
 
 
-def logarithm(q: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
+def logarithm(q: Quaternion) -> Vector:
     """Return the rotation vector (rad, length at most π) of a unit quaternion."""
     q = jnp.where(q[..., :1] < 0, -q, q)
     squared = jnp.sum(q[..., 1:] ** 2, axis=-1)
@@ -137,7 +145,7 @@ def logarithm(q: Float[Array, "... 4"]) -> Float[Array, "... 3"]:
     return factor[..., None] * q[..., 1:]
 
 
-def right_jacobian(rotation_vector: Float[Array, "... 3"]) -> Float[Array, "... 3 3"]:
+def right_jacobian(rotation_vector: Vector) -> Matrix:
     """Return J_r with exp(θ + δ) = exp(θ) exp(J_r(θ) δ) to first order in δ.
 
     J_r = I − (1 − cos θ)/θ² [θ]× + (θ − sin θ)/θ³ [θ]×² (Chirikjian, Stochastic Models, Information Theory, and Lie
@@ -178,12 +186,12 @@ def _prefixes(rotation_vectors):
     return _normalised(running(product, tuple(jnp.moveaxis(part, -1, 0) for part in parts)))
 
 
-def running_rotations(rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... S 4"]:
+def running_rotations(rotation_vectors: Vectors) -> Float[Array, "... S 4"]:
     """Return exp(θ_1) ⊗ … ⊗ exp(θ_k) for every k: the attitude after each sample, relative to the first body frame."""
     return jnp.moveaxis(jnp.stack(_prefixes(rotation_vectors)), (0, 1), (-1, -2))
 
 
-def transport(running: Float[Array, "... S 4"], rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... S 3 3"]:
+def transport(running: Float[Array, "... S 4"], rotation_vectors: Vectors) -> Float[Array, "... S 3 3"]:
     """Return how a small change of each rotation vector turns all frames after it, in the first frame: R(P_k) J_r(θ_k).
 
     Laid out component by component: half the time, and sums over the samples become products of matrices.
@@ -198,7 +206,7 @@ def transport(running: Float[Array, "... S 4"], rotation_vectors: Float[Array, "
 
 
 @jax.custom_jvp
-def compose_rotation_vectors(rotation_vectors: Float[Array, "... S 3"]) -> Float[Array, "... 4"]:
+def compose_rotation_vectors(rotation_vectors: Vectors) -> Quaternion:
     """Return exp(θ_1) ⊗ … ⊗ exp(θ_S): the rotation of S successive body rotation vectors (rad), exactly.
 
     A zero vector is the identity, so padded samples cost nothing but time. The derivative is not traced through the
@@ -220,17 +228,9 @@ def _compose_rotation_vectors_jvp(primals, tangents):
     return final, multiply(final, half)
 
 
-def neighbours(values, axis: int = -2):
-    """Return what the samples before and after each have, zero beyond the ends."""
-    edge = jnp.zeros_like(jax.lax.slice_in_dim(values, 0, 1, axis=axis))
-    count = values.shape[axis]
-    before = jnp.concatenate([edge, jax.lax.slice_in_dim(values, 0, count - 1, axis=axis)], axis=axis)
-    return before, jnp.concatenate([jax.lax.slice_in_dim(values, 1, count, axis=axis), edge], axis=axis)
-
-
 def rotation_vectors(
-    rates: Float[Array, "... S 3"], intervals: Float[Array, "... S"], sampled: tuple[float, float] = MEAN_RATES
-) -> Float[Array, "... S 3"]:
+    rates: Vectors, intervals: Float[Array, "... S"], sampled: tuple[float, float] = MEAN_RATES
+) -> Vectors:
     """Return the rotation vector of each sample of an angular rate whose axis moves.
 
     A sample of length h turns by α = ∫ω dt and by coning, ½ ∫∫_{s<t} ω(s) × ω(t) = h³/12 ω × ω' + O(h⁵) (Magnus's
@@ -250,7 +250,9 @@ def rotation_vectors(
     """
     p, q = sampled
     vectors = rates * intervals[..., None]
-    before, after = neighbours(vectors)
+    rest = jnp.zeros_like(vectors[..., :1, :])
+    padded = jnp.concatenate([rest, vectors, rest], axis=-2)
+    before, after = padded[..., :-2, :], padded[..., 2:, :]
     return vectors + jnp.cross(p * vectors - q * (before + after), after - before)
 
 
@@ -260,11 +262,10 @@ def _integrate_rk4(rates, intervals):
     Sample k is taken to hold over its interval, so the step runs from its first edge to its last; the rate at an edge
     is the mean of the two samples that meet there (Tedaldi, Pretto, Menegatti, ICRA 2014, eq. 13 to 17).
     """
-    used = (intervals > 0)[..., None]
-    before = jnp.concatenate([rates[..., :1, :], rates[..., :-1, :]], axis=-2)
-    after = jnp.concatenate([rates[..., 1:, :], rates[..., -1:, :]], axis=-2)
-    after_used = jnp.concatenate([used[..., 1:, :], jnp.zeros_like(used[..., :1, :])], axis=-2)
-    first, last = (before + rates) / 2, jnp.where(after_used, (rates + after) / 2, rates)
+    meeting = (rates[..., :-1, :] + rates[..., 1:, :]) / 2
+    followed = (intervals[..., 1:] > 0)[..., None]
+    first = jnp.concatenate([rates[..., :1, :], meeting], axis=-2)
+    last = jnp.concatenate([jnp.where(followed, meeting, rates[..., :-1, :]), rates[..., -1:, :]], axis=-2)
 
     def derivative(q, rate):
         return tuple(part / 2 for part in product(q, (jnp.zeros_like(rate[0]), *rate)))
@@ -281,19 +282,13 @@ def _integrate_rk4(rates, intervals):
         total = tuple((a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
         return _normalised(add(q, total, step)), None
 
-    def by_sample(array):
-        return tuple(jnp.moveaxis(part, -1, 0) for part in _parts(array))
-
-    shape = rates.shape[:-2]
-    start = (jnp.ones(shape, rates.dtype), *(jnp.zeros(shape, rates.dtype) for _ in range(3)))
-    samples = (by_sample(first), by_sample(rates), by_sample(last), jnp.moveaxis(intervals, -1, 0))
+    samples = (*(_parts(jnp.moveaxis(array, -2, 0)) for array in (first, rates, last)), jnp.moveaxis(intervals, -1, 0))
+    start = tuple(jnp.full(rates.shape[:-2], part, rates.dtype) for part in (1.0, 0.0, 0.0, 0.0))
     final, _ = jax.lax.scan(advance, start, samples)
     return jnp.stack(final, axis=-1)
 
 
-def integrate_rates(
-    rates: Float[Array, "... S 3"], intervals: Float[Array, "... S"], method: str = "exponential"
-) -> Float[Array, "... 4"]:
+def integrate_rates(rates: Vectors, intervals: Float[Array, "... S"], method: str = "exponential") -> Quaternion:
     """Return the rotation that angular rates accumulate, a quaternion from the last body frame to the first.
 
     **Arguments:**

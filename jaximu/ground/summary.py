@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import html
 import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
@@ -38,23 +39,20 @@ class Block:
     def text(self) -> str:
         """Return the table in columns, the first to the left and the others to the right."""
         table = [self.headers, *self.rows] if any(self.headers) else list(self.rows)
-        widths = [max(len(row[place]) for row in table) for place in range(len(self.headers))]
-        lines = [
-            "  ".join(
-                cell.ljust(width) if not place else cell.rjust(width)
-                for place, (cell, width) in enumerate(zip(row, widths, strict=True))
-            ).rstrip()
-            for row in table
-        ]
+        first, *others = (max(map(len, column)) for column in zip(*table, strict=True))
+        lines = ["  ".join([head.ljust(first), *map(str.rjust, cells, others)]).rstrip() for head, *cells in table]
         if any(self.headers):
-            lines.insert(1, "─" * (sum(widths) + 2 * len(widths) - 2))
+            lines.insert(1, "─" * (first + sum(width + 2 for width in others)))
         return "\n".join(lines)
 
     def html(self) -> str:
         """Return the table as HTML."""
-        head = "".join(f"<th>{html.escape(each)}</th>" for each in self.headers)
-        rows = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in self.rows)
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+
+        def row(cells: Iterable[str], tag: str) -> str:
+            return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+        rows = "".join(row(cells, "td") for cells in self.rows)
+        return f"<table><thead>{row(self.headers, 'th')}</thead><tbody>{rows}</tbody></table>"
 
 
 @dataclass(frozen=True)
@@ -68,20 +66,27 @@ class Summary:
 
     def __str__(self) -> str:
         parts = [self.title, "═" * min(len(self.title), _WIDTH)]
-        parts += [textwrap.fill(worded(each), _WIDTH, subsequent_indent="  ") for each in self.verdict]
+        parts += map(_filled, self.verdict)
         if self.table is not None:
             parts += ["", self.table.text()]
         if self.notes:
-            parts += ["", *(textwrap.fill(f"- {worded(each)}", _WIDTH, subsequent_indent="  ") for each in self.notes)]
+            parts += ["", *(_filled(note, "- ") for note in self.notes)]
         return "\n".join(parts)
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        parts = [f"<p><b>{html.escape(self.title)}</b></p>", *(f"<p>{html.escape(each)}</p>" for each in self.verdict)]
-        parts += [] if self.table is None else [self.table.html()]
-        notes = "".join(f"<li>{html.escape(each)}</li>" for each in self.notes)
-        return worded("\n".join([*parts, f"<ul>{notes}</ul>"] if notes else parts))
+        parts = [f"<p><b>{html.escape(self.title)}</b></p>"]
+        parts += [f"<p>{html.escape(text)}</p>" for text in self.verdict]
+        if self.table is not None:
+            parts.append(self.table.html())
+        if self.notes:
+            parts.append(f"<ul>{''.join(f'<li>{html.escape(note)}</li>' for note in self.notes)}</ul>")
+        return worded("\n".join(parts))
+
+
+def _filled(text: str, start: str = "") -> str:
+    return textwrap.fill(start + worded(text), _WIDTH, subsequent_indent="  ")
 
 
 class Described:
@@ -93,11 +98,7 @@ class Described:
 
     def __repr__(self) -> str:
         summary = self.summary()
-        return (
-            f"<{type(self).__name__}: {summary.title}. {summary.verdict[0]}>"
-            if summary.verdict
-            else (f"<{type(self).__name__}: {summary.title}>")
-        )
+        return f"<{type(self).__name__}: {'. '.join((summary.title, *summary.verdict[:1]))}>"
 
     def _repr_html_(self) -> str:
         return self.summary()._repr_html_()
@@ -145,18 +146,16 @@ class ParameterTable(Mapping[str, Parameter]):
     """
 
     def __init__(self, parameters: Sequence[Parameter]):
-        self._parameters = {each.name: each for each in parameters}
-        self._words = {each.words: each.name for each in parameters}
-        self._words |= {each.words.rpartition("(")[2].removesuffix(")"): each.name for each in parameters}
+        self._parameters = {parameter.name: parameter for parameter in parameters}
+        self._words = {parameter.words: parameter.name for parameter in parameters}
+        self._words |= {words.rpartition("(")[2].removesuffix(")"): name for words, name in self._words.items()}
 
     def __getitem__(self, name: str) -> Parameter:
-        found = self._parameters.get(self._words.get(name, name))
-        if found is None:
-            import difflib
-
+        parameter = self._parameters.get(self._words.get(name, name))
+        if parameter is None:
             near = difflib.get_close_matches(str(name), [*self._words, *self._parameters], 3, 0.5)
             raise KeyError(f"no parameter {name!r}; near it: {', '.join(near) or 'none'}")
-        return found
+        return parameter
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._parameters)
@@ -167,13 +166,12 @@ class ParameterTable(Mapping[str, Parameter]):
     def block(self) -> Block:
         """Return the table as texts; a star marks what is weakly determined."""
         largest: dict[tuple[str, str], float] = {}
-        for each in self.values():
-            largest[each.group] = max(largest.get(each.group, 0.0), abs(each.value), each.sigma)
-        rows = [
-            (words + (" *" if each.weak else ""), value, sigma, unit)
-            for each in self.values()
-            for words, value, sigma, unit in [each.cells(largest[each.group])]
-        ]
+        for one in self.values():
+            largest[one.group] = max(largest.get(one.group, 0.0), abs(one.value), one.sigma)
+        rows = []
+        for one in self.values():
+            words, *numbers = one.cells(largest[one.group])
+            rows.append((words + " *" * one.weak, *numbers))
         return Block(("parameter", "value", "standard uncertainty", "unit"), tuple(rows))
 
     def __repr__(self) -> str:
@@ -186,7 +184,7 @@ class ParameterTable(Mapping[str, Parameter]):
         """Return name, words, value, sigma, unit and weak as an Arrow table, which polars and DuckDB read, too."""
         import pyarrow as pa
 
-        return pa.table({each.name: [getattr(one, each.name) for one in self.values()] for each in fields(Parameter)})
+        return pa.table({key.name: [getattr(one, key.name) for one in self.values()] for key in fields(Parameter)})
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the same as a pandas data frame by name. Raises `InputError` where pandas is not installed."""
@@ -195,12 +193,12 @@ class ParameterTable(Mapping[str, Parameter]):
     @property
     def value(self) -> np.ndarray:
         """(p,) all values, in the order of the covariance."""
-        return np.array([each.value for each in self.values()])
+        return np.array([one.value for one in self.values()])
 
     @property
     def sigma(self) -> np.ndarray:
         """(p,) all standard deviations."""
-        return np.array([each.sigma for each in self.values()])
+        return np.array([one.sigma for one in self.values()])
 
 
 def data_frame(table: pa.Table) -> pd.DataFrame:

@@ -49,47 +49,54 @@ class Unit:
         return BASE_UNITS[self.quantity]
 
 
-_DEGREE = math.pi / 180.0
-_UNITS = (
-    # names (the first is canonical), quantity, factor, offset
-    ("m/s^2 m/s² m/s2 m/s/s m/s**2 m/(s^2) m/(sec^2) m/sec^2 m/sec2 ms^-2 ms-2 meters/s^2", "acceleration", 1.0, 0.0),
-    ("mm/s^2 mm/s² mm/s2", "acceleration", 1e-3, 0.0),
-    ("cm/s^2 cm/s² cm/s2 Gal", "acceleration", 1e-2, 0.0),
-    ("ft/s^2 ft/s² ft/s2", "acceleration", 0.3048, 0.0),
-    ("g gn g0 gs g's", "acceleration", STANDARD_GRAVITY, 0.0),
-    ("mg", "acceleration", STANDARD_GRAVITY * 1e-3, 0.0),
-    ("ug µg μg", "acceleration", STANDARD_GRAVITY * 1e-6, 0.0),
-    ("rad/s rads rad/sec radian/s radians/s radians/sec", "angular rate", 1.0, 0.0),
-    ("mrad/s", "angular rate", 1e-3, 0.0),
-    ("deg/s dps °/s deg/sec degrees/s degree/s degrees/sec degree/sec", "angular rate", _DEGREE, 0.0),
-    ("mdeg/s mdps", "angular rate", _DEGREE * 1e-3, 0.0),
-    ("deg/h dph °/h", "angular rate", _DEGREE / 3600.0, 0.0),
-    ("rad/h", "angular rate", 1.0 / 3600.0, 0.0),
-    ("s sec secs seconds second", "time", 1.0, 0.0),
-    ("ms msec msecs milliseconds", "time", 1e-3, 0.0),
-    ("us µs μs usec microseconds", "time", 1e-6, 0.0),
-    ("ns nsec nanosec nanoseconds", "time", 1e-9, 0.0),
-    ("degC °C C celsius ℃", "temperature", 1.0, 0.0),
-    ("K kelvin", "temperature", 1.0, -273.15),
-    ("degF °F F fahrenheit", "temperature", 5.0 / 9.0, -160.0 / 9.0),
-    ("uT µT μT", "magnetic field", 1.0, 0.0),
-    ("T tesla", "magnetic field", 1e6, 0.0),
-    ("mT", "magnetic field", 1e3, 0.0),
-    ("nT", "magnetic field", 1e-3, 0.0),
-    ("G gauss Gs", "magnetic field", 1e2, 0.0),
-    ("mG mgauss", "magnetic field", 0.1, 0.0),
-    ("m/s", "velocity increment", 1.0, 0.0),
-    ("A ampere amperes amp amps", "electric current", 1.0, 0.0),
-    ("mA", "electric current", 1e-3, 0.0),
-    ("deg ° degrees", "angle", _DEGREE, 0.0),
-    ("rad", "angle", 1.0, 0.0),
-    ("count counts lsb LSB raw digit digits", "raw count", 1.0, 0.0),
-    ("1 dimensionless -", "ratio", 1.0, 0.0),
-)
+DEGREE = math.pi / 180.0
+"""rad."""
+_FACTORS = {
+    # names, the first of which is canonical
+    "acceleration": {
+        "m/s^2 m/s² m/s2 m/s/s m/s**2 m/(s^2) m/(sec^2) m/sec^2 m/sec2 ms^-2 ms-2 meters/s^2": 1.0,
+        "mm/s^2 mm/s² mm/s2": 1e-3,
+        "cm/s^2 cm/s² cm/s2 Gal": 1e-2,
+        "ft/s^2 ft/s² ft/s2": 0.3048,
+        "g gn g0 gs g's": STANDARD_GRAVITY,
+        "mg": STANDARD_GRAVITY * 1e-3,
+        "ug µg μg": STANDARD_GRAVITY * 1e-6,
+    },
+    "angular rate": {
+        "rad/s rads rad/sec radian/s radians/s radians/sec": 1.0,
+        "mrad/s": 1e-3,
+        "deg/s dps °/s deg/sec degrees/s degree/s degrees/sec degree/sec": DEGREE,
+        "mdeg/s mdps": DEGREE * 1e-3,
+        "deg/h dph °/h": DEGREE / 3600.0,
+        "rad/h": 1.0 / 3600.0,
+    },
+    "time": {
+        "s sec secs seconds second": 1.0,
+        "ms msec msecs milliseconds": 1e-3,
+        "us µs μs usec microseconds": 1e-6,
+        "ns nsec nanosec nanoseconds": 1e-9,
+    },
+    "temperature": {"degC °C C celsius ℃": 1.0, "K kelvin": 1.0, "degF °F F fahrenheit": 5.0 / 9.0},
+    "magnetic field": {
+        "uT µT μT": 1.0,
+        "T tesla": 1e6,
+        "mT": 1e3,
+        "nT": 1e-3,
+        "G gauss Gs": 1e2,
+        "mG mgauss": 0.1,
+    },
+    "velocity increment": {"m/s": 1.0},
+    "electric current": {"A ampere amperes amp amps": 1.0, "mA": 1e-3},
+    "angle": {"deg ° degrees": DEGREE, "rad": 1.0},
+    "raw count": {"count counts lsb LSB raw digit digits": 1.0},
+    "ratio": {"1 dimensionless -": 1.0},
+}
+_OFFSETS = {"K": -273.15, "degF": -160.0 / 9.0}
 _TABLE = {
-    alias: Unit(aliases.split()[0], quantity, factor, offset)
-    for aliases, quantity, factor, offset in _UNITS
-    for alias in aliases.split()
+    alias: Unit(names[0], quantity, factor, _OFFSETS.get(names[0], 0.0))
+    for quantity, factors in _FACTORS.items()
+    for names, factor in ((aliases.split(), factor) for aliases, factor in factors.items())
+    for alias in names
 }
 
 
@@ -104,25 +111,29 @@ _OF_COUNTS = re.compile(r"(?:counts?|lsb)\s*/\s*(\d+\.?\d*)\s*([-−+]\s*\d+\.?\
 """A chip's temperature as its data sheet has it, in °C: "count/340 + 36.53"."""
 
 
+def _wanted(quantity: str | tuple[str, ...] | None) -> tuple[str, ...]:
+    return (quantity,) if isinstance(quantity, str) else quantity or tuple(BASE_UNITS)
+
+
 def find_unit(text: str, quantity: str | tuple[str, ...] | None = None) -> Unit | None:
     """The unit called `text`, None if unknown or of another quantity. A number scales it: "0.061 mg", "100 us".
 
     Letter case counts only where it must (mg and mG, s and S differ), and not where the quantity decides: an
     acceleration in "G" is in g, a temperature in "°" is in degC, and may be a line through counts: "count/340+36.53".
     """
-    wanted = (quantity,) if isinstance(quantity, str) else quantity
+    wanted = _wanted(quantity)
     text = text.strip().replace("º", "°")
     if match := _SCALED.fullmatch(text):
         scaled = find_unit(match[2], quantity)
         return scaled and Unit(text, scaled.quantity, scaled.factor * float(match[1]), scaled.offset)
-    if (wanted is None or "temperature" in wanted) and (match := _OF_COUNTS.fullmatch(text)) and float(match[1]) > 0:
+    if "temperature" in wanted and (match := _OF_COUNTS.fullmatch(text)) and float(match[1]) > 0:
         offset = (match[2] or "0").replace(" ", "").replace("−", "-")
         return Unit(text, "temperature", 1 / float(match[1]), float(offset))
     if product := _FACTOR.fullmatch(text):
         text = f"{product[1]}/{product[2]}" + ("^2" if (product[3] or product[4]) in ("2", "²") else "")
     if wanted == ("temperature",) and text == "°":
         text = "degC"
-    fitting = {alias: unit for alias, unit in _TABLE.items() if wanted is None or unit.quantity in wanted}
+    fitting = {alias: unit for alias, unit in _TABLE.items() if unit.quantity in wanted}
     if text in fitting:
         return fitting[text]
     alike = {unit for alias, unit in fitting.items() if alias.lower() == text.lower()}
@@ -137,19 +148,19 @@ def unit(text: str, quantity: str | tuple[str, ...] | None = None, *, file: str 
     """
     named = column if column.startswith("--") else column and f"column {column!r}"
     where = ", ".join(filter(None, (file, named))) or "unit"
-    wanted = (quantity,) if isinstance(quantity, str) else quantity
-    found = find_unit(text, wanted) or find_unit(text)
-    if found is None:
-        choices = [alias for alias, each in _TABLE.items() if wanted is None or each.quantity in wanted]
+    wanted = _wanted(quantity)
+    known = find_unit(text, wanted) or find_unit(text)
+    if known is None:
+        choices = [alias for alias, unit in _TABLE.items() if unit.quantity in wanted]
         lowered = {alias.lower(): alias for alias in reversed(choices)}
         near = [lowered[name] for name in difflib.get_close_matches(text.lower(), lowered, n=3, cutoff=0.4)]
         canonical = [_TABLE[alias].name for alias in choices]
         offer = list(dict.fromkeys(near or canonical[:40]))
         raise InputError(f"{where}: unknown unit {text!r}; known units near it: {', '.join(offer)}.")
-    if wanted is not None and found.quantity not in wanted:
-        expected = " or ".join(f"{each} ({BASE_UNITS[each]})" for each in wanted)
-        raise InputError(f"{where}: the unit {text!r} is one of {found.quantity}, expected one of {expected}.")
-    return found
+    if known.quantity not in wanted:
+        expected = " or ".join(f"{name} ({BASE_UNITS[name]})" for name in wanted)
+        raise InputError(f"{where}: the unit {text!r} is one of {known.quantity}, expected one of {expected}.")
+    return known
 
 
 _AXIS = re.compile(r"[xyz](?:[- ]?axis)?", re.IGNORECASE)

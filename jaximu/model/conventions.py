@@ -14,16 +14,16 @@ Between conventions with different body frames no single entry of K can be compa
 What every frame agrees on is K Kᵀ, so the norms of K's rows and the angles between them.
 """
 
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
 
 from jaximu.ground.errors import InputError
-from jaximu.ground.rotation import inverse_matrix
+from jaximu.ground.rotation import Matrix, Vector, inverse_matrix
 
 __all__ = [
     "FrameChange",
@@ -40,12 +40,9 @@ __all__ = [
     "upper_triangular_frame",
 ]
 
-Matrix = Float[Array | np.ndarray, "... 3 3"]
-Vector = Float[Array | np.ndarray, "... 3"]
-
 _PPM = 1e6
-_SINGULAR = 1e-9  # smallest singular value or diagonal, of a matrix whose rows are scaled to unit length
-_ORTHONORMAL = 1e-9
+_SINGULAR = 1e-9
+"""Smallest singular value or diagonal of a matrix whose rows are scaled to unit length, and a rotation's departure."""
 
 
 class ScaleMisalignment(eqx.Module):
@@ -121,7 +118,36 @@ class PartsPerMillion(eqx.Module):
         return _diag(1.0 + jnp.asarray(self.scale_error) / _PPM) + jnp.asarray(self.coupling) / _PPM, self.bias
 
 
-class Tedaldi(eqx.Module):
+Form = TypeVar("Form", bound="_Inverse")
+
+
+class _Inverse(eqx.Module):
+    misalignment: Matrix
+    scale: Vector
+    bias: Vector
+    adds_bias: ClassVar[bool]
+
+    @classmethod
+    def from_gain(cls: type[Form], gain: Matrix, bias: Vector) -> Form:
+        """Split K⁻¹ = T K'. Raises InputError if K is singular or K⁻¹ has a zero on its diagonal."""
+        _refuse_singular(gain, "gain")
+        inverse = inverse_matrix(jnp.asarray(gain))
+        _refuse_zero_diagonal(inverse, "inverse of the gain")
+        scale = _diagonal(inverse)
+        return cls(inverse / scale[..., None, :], scale, cls._turned(bias))
+
+    def to_gain(self) -> tuple[Matrix, Vector]:
+        """Return (K, b). Raises InputError if T K' is singular."""
+        inverse = jnp.asarray(self.misalignment) * jnp.asarray(self.scale)[..., None, :]
+        _refuse_singular(inverse, "matrix T K'")
+        return inverse_matrix(inverse), self._turned(self.bias)
+
+    @classmethod
+    def _turned(cls, bias: Vector) -> Vector:
+        return -jnp.asarray(bias) if cls.adds_bias else jnp.asarray(bias)
+
+
+class Tedaldi(_Inverse):
     """The inverse form of Tedaldi, Pretto and Menegatti, ICRA 2014, which *adds* its bias to the output.
 
     u = T K' (y + b'), T with a unit diagonal, K' = diag(scale), so K' = diag(K⁻¹), T = K⁻¹ K'⁻¹ and b' = −b.
@@ -131,23 +157,11 @@ class Tedaldi(eqx.Module):
     The paper's accelerometer has an upper-triangular T: take the gains through `upper_triangular_frame` first.
     """
 
-    misalignment: Matrix
-    scale: Vector
-    bias: Vector
     equation: ClassVar[str] = "u = T K' (y + b')"
-
-    @classmethod
-    def from_gain(cls, gain: Matrix, bias: Vector) -> "Tedaldi":
-        """Split K⁻¹ = T K'. Raises InputError if K is singular or K⁻¹ has a zero on its diagonal."""
-        misalignment, scale = _split_inverse(gain)
-        return cls(misalignment, scale, -jnp.asarray(bias))
-
-    def to_gain(self) -> tuple[Matrix, Vector]:
-        """Return (K, b). Raises InputError if T K' is singular."""
-        return _join_inverse(self.misalignment, self.scale), -jnp.asarray(self.bias)
+    adds_bias = True
 
 
-class ImuTk(eqx.Module):
+class ImuTk(_Inverse):
     """The inverse form as the program imu_tk writes it, which *subtracts* its bias, unlike the paper it implements.
 
     u = T K' (y − b''), T and K' as in `Tedaldi`, b'' = b.
@@ -157,20 +171,8 @@ class ImuTk(eqx.Module):
     `upper_triangular_frame`, not the library's.
     """
 
-    misalignment: Matrix
-    scale: Vector
-    bias: Vector
     equation: ClassVar[str] = "u = T K' (y - b'')"
-
-    @classmethod
-    def from_gain(cls, gain: Matrix, bias: Vector) -> "ImuTk":
-        """Split K⁻¹ = T K'. Raises InputError if K is singular or K⁻¹ has a zero on its diagonal."""
-        misalignment, scale = _split_inverse(gain)
-        return cls(misalignment, scale, jnp.asarray(bias))
-
-    def to_gain(self) -> tuple[Matrix, Vector]:
-        """Return (K, b). Raises InputError if T K' is singular."""
-        return _join_inverse(self.misalignment, self.scale), self.bias
+    adds_bias = False
 
 
 class ReciprocalScale(eqx.Module):
@@ -223,9 +225,13 @@ class Kalibr(eqx.Module):
 
     @classmethod
     def from_gains(
-        cls, gain_accel: Matrix, bias_accel: Vector, gain_gyro: Matrix, bias_gyro: Vector,
+        cls,
+        gain_accel: Matrix,
+        bias_accel: Vector,
+        gain_gyro: Matrix,
+        bias_gyro: Vector,
         g_sensitivity: Matrix | None = None,
-    ) -> "Kalibr":  # fmt: skip
+    ) -> "Kalibr":
         """Split K_a = M_a Q and K_g Qᵀ = M_g C; a g-sensitivity G, y_g = K_g ω + G f + b_g, gives A = G Qᵀ Cᵀ.
 
         Raises InputError if a gain is singular or left-handed.
@@ -241,10 +247,10 @@ class Kalibr(eqx.Module):
             g_sensitivity=(
                 jnp.zeros_like(gyro_matrix)
                 if g_sensitivity is None
-                else _product(_product(g_sensitivity, rotation), _transpose(gyro_rotation))
+                else jnp.matmul(jnp.matmul(g_sensitivity, rotation), jnp.matrix_transpose(gyro_rotation))
             ),
             gyro_bias=jnp.asarray(bias_gyro),
-            body_rotation=_transpose(rotation),
+            body_rotation=jnp.matrix_transpose(rotation),
         )
 
     def to_gains(self) -> tuple[Matrix, Vector, Matrix, Vector]:
@@ -254,13 +260,13 @@ class Kalibr(eqx.Module):
         """
         if not isinstance(self.g_sensitivity, Tracer) and np.any(np.asarray(self.g_sensitivity)):
             raise InputError("A gain and a bias cannot hold a g-sensitivity (A is not zero): give it as an effect.")
-        gain_accel = _product(self.accel_matrix, self.body_rotation)
-        gain_gyro = _product(_product(self.gyro_matrix, self.gyro_rotation), self.body_rotation)
+        gain_accel = jnp.matmul(self.accel_matrix, self.body_rotation)
+        gain_gyro = jnp.matmul(jnp.matmul(self.gyro_matrix, self.gyro_rotation), self.body_rotation)
         return gain_accel, self.accel_bias, gain_gyro, self.gyro_bias
 
     def to_g_sensitivity(self) -> Matrix:
         """Return G = A C Q of y_g = K_g ω + G f + b_g, in the frame that `from_gains` was given."""
-        return _product(_product(self.g_sensitivity, self.gyro_rotation), self.body_rotation)
+        return jnp.matmul(jnp.matmul(self.g_sensitivity, self.gyro_rotation), self.body_rotation)
 
 
 class FrameChange(NamedTuple):
@@ -279,9 +285,9 @@ def rotate_body_frame(gain_accel: Matrix, gain_gyro: Matrix, rotation: Matrix) -
     if not isinstance(rotation, Tracer):
         values = np.asarray(rotation)
         departure = np.max(np.abs(values @ np.swapaxes(values, -1, -2) - np.eye(3)), initial=0.0)
-        if not departure <= _ORTHONORMAL or np.any(np.linalg.det(values) < 0):
+        if not departure <= _SINGULAR or np.any(np.linalg.det(values) < 0):
             raise InputError("The rotation of the body frame must be orthonormal with determinant +1.")
-    return FrameChange(_product(gain_accel, rotation), _product(gain_gyro, rotation), jnp.asarray(rotation))
+    return FrameChange(jnp.matmul(gain_accel, rotation), jnp.matmul(gain_gyro, rotation), jnp.asarray(rotation))
 
 
 def lower_triangular_frame(gain_accel: Matrix, gain_gyro: Matrix) -> FrameChange:
@@ -293,7 +299,9 @@ def lower_triangular_frame(gain_accel: Matrix, gain_gyro: Matrix) -> FrameChange
     """
     _refuse_improper(gain_accel, "accelerometer gain")
     triangular, rotation = _lower_times_rotation(gain_accel)
-    return FrameChange(triangular, _product(gain_gyro, _transpose(rotation)), _transpose(rotation))
+    return FrameChange(
+        triangular, jnp.matmul(gain_gyro, jnp.matrix_transpose(rotation)), jnp.matrix_transpose(rotation)
+    )
 
 
 def upper_triangular_frame(gain_accel: Matrix, gain_gyro: Matrix) -> FrameChange:
@@ -305,8 +313,8 @@ def upper_triangular_frame(gain_accel: Matrix, gain_gyro: Matrix) -> FrameChange
     """
     _refuse_improper(gain_accel, "accelerometer gain")
     triangular, rotation = _lower_times_rotation(jnp.flip(jnp.asarray(gain_accel), (-2, -1)))
-    triangular, back = jnp.flip(triangular, (-2, -1)), _transpose(jnp.flip(rotation, (-2, -1)))
-    return FrameChange(triangular, _product(gain_gyro, back), back)
+    triangular, back = jnp.flip(triangular, (-2, -1)), jnp.matrix_transpose(jnp.flip(rotation, (-2, -1)))
+    return FrameChange(triangular, jnp.matmul(gain_gyro, back), back)
 
 
 def first_order_inverse(gain: Matrix) -> Matrix:
@@ -324,30 +332,13 @@ def first_order_inverse(gain: Matrix) -> Matrix:
     return (identity - _off_diagonal(gain) / scale[..., :, None]) / scale[..., None, :]
 
 
-def _split_inverse(gain: Matrix) -> tuple[Matrix, Vector]:
-    """Return T and the diagonal of K', where K⁻¹ = T K'."""
-    _refuse_singular(gain, "gain")
-    inverse = inverse_matrix(jnp.asarray(gain))
-    _refuse_zero_diagonal(inverse, "inverse of the gain")
-    scale = _diagonal(inverse)
-    return inverse / scale[..., None, :], scale
-
-
-def _join_inverse(misalignment: Matrix, scale: Vector) -> Matrix:
-    inverse = jnp.asarray(misalignment) * jnp.asarray(scale)[..., None, :]
-    _refuse_singular(inverse, "matrix T K'")
-    return inverse_matrix(inverse)
-
-
 def _lower_times_rotation(gain: Matrix) -> tuple[Matrix, Matrix]:
     """Factor K = L Q, L lower-triangular with a positive diagonal, Q orthogonal."""
-    orthogonal, upper = jnp.linalg.qr(_transpose(gain))
+    orthogonal, upper = jnp.linalg.qr(jnp.matrix_transpose(gain))
     sign = jnp.where(_diagonal(upper) < 0, -1.0, 1.0)
-    return jnp.tril(_transpose(upper * sign[..., :, None])), _transpose(orthogonal * sign[..., None, :])
-
-
-def _product(left: Matrix, right: Matrix) -> Matrix:
-    return jnp.asarray(left) @ jnp.asarray(right)
+    return jnp.tril(jnp.matrix_transpose(upper * sign[..., :, None])), jnp.matrix_transpose(
+        orthogonal * sign[..., None, :]
+    )
 
 
 def _diagonal(matrix: Matrix) -> Vector:
@@ -363,35 +354,38 @@ def _diag(vector: Vector) -> Matrix:
     return vector[..., :, None] * jnp.eye(3, dtype=vector.dtype)
 
 
-def _transpose(matrix: Matrix) -> Matrix:
-    return jnp.swapaxes(jnp.asarray(matrix), -1, -2)
-
-
-def _unit_rows(matrix: Matrix) -> np.ndarray | None:
-    """Return the values with rows scaled to unit length (zero rows stay), or None while JAX traces."""
+def _refuse(matrix: Matrix, wrong: Callable[[np.ndarray], np.ndarray], message: str) -> None:
+    """Raise InputError where the matrix is wrong, its rows scaled to unit length (zero rows stay); not in a trace."""
     if isinstance(matrix, Tracer):
-        return None
+        return
     values = np.asarray(matrix, np.float64)
     if not np.all(np.isfinite(values)):
         raise InputError("A gain or bias in another convention must be finite, but it holds inf or NaN.")
     norm = np.linalg.norm(values, axis=-1, keepdims=True)
-    return values / np.where(norm > 0, norm, 1.0)
+    if np.any(wrong(values / np.where(norm > 0, norm, 1.0))):
+        raise InputError(message)
 
 
 def _refuse_singular(matrix: Matrix, name: str) -> None:
-    values = _unit_rows(matrix)
-    if values is not None and np.any(np.linalg.svd(values, compute_uv=False)[..., -1] < _SINGULAR):
-        raise InputError(f"The {name} is singular: its three axes do not span space, so it cannot be inverted.")
+    _refuse(
+        matrix,
+        lambda rows: np.linalg.svd(rows, compute_uv=False)[..., -1] < _SINGULAR,
+        f"The {name} is singular: its three axes do not span space, so it cannot be inverted.",
+    )
 
 
 def _refuse_zero_diagonal(matrix: Matrix, name: str) -> None:
-    values = _unit_rows(matrix)
-    if values is not None and np.any(np.abs(np.diagonal(values, axis1=-2, axis2=-1)) < _SINGULAR):
-        raise InputError(f"The {name} has a zero on its diagonal: are the sensor's axes permuted? Map them first.")
+    _refuse(
+        matrix,
+        lambda rows: np.abs(np.diagonal(rows, axis1=-2, axis2=-1)) < _SINGULAR,
+        f"The {name} has a zero on its diagonal: are the sensor's axes permuted? Map them first.",
+    )
 
 
 def _refuse_improper(matrix: Matrix, name: str) -> None:
     _refuse_singular(matrix, name)
-    values = _unit_rows(matrix)
-    if values is not None and np.any(np.linalg.det(values) < 0):
-        raise InputError(f"The {name} is left-handed (negative determinant): flip or map an axis first.")
+    _refuse(
+        matrix,
+        lambda rows: np.linalg.det(rows) < 0,
+        f"The {name} is left-handed (negative determinant): flip or map an axis first.",
+    )

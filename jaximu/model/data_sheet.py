@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaximu.ground.errors import InputError
-from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.ground.units import DEGREE, STANDARD_GRAVITY
 
 __all__ = [
     "DATASHEET_UNITS",
@@ -59,45 +59,37 @@ DATASHEET_UNITS = {
 }
 """The unit that data sheets mostly state a term in."""
 
-_DEGREE = math.pi / 180
-_ATOMS: dict[str, tuple[float, tuple[Fraction, ...]]] = {}  # factor; powers of metre, radian, second, µT, kelvin
-
-
-def _atoms(names: str, factor: float, metre: int, radian: int, second: int, field: int = 0, kelvin: int = 0) -> None:
-    for name in names.split():
-        _ATOMS[name] = factor, tuple(map(Fraction, (metre, radian, second, field, kelvin)))
-
-
-_atoms("1", 1.0, 0, 0, 0)
-_atoms("%", 1e-2, 0, 0, 0)
-_atoms("ppm", 1e-6, 0, 0, 0)
-_atoms("K degC °C", 1.0, 0, 0, 0, 0, 1)
-_atoms("m", 1.0, 1, 0, 0)
-_atoms("mm", 1e-3, 1, 0, 0)
-_atoms("s sec", 1.0, 0, 0, 1)
-_atoms("ms", 1e-3, 0, 0, 1)
-_atoms("us µs μs", 1e-6, 0, 0, 1)
-_atoms("min", 60.0, 0, 0, 1)
-_atoms("h hr hour", 3600.0, 0, 0, 1)
-_atoms("Hz", 1.0, 0, 0, -1)
-_atoms("rad", 1.0, 0, 1, 0)
-_atoms("mrad", 1e-3, 0, 1, 0)
-_atoms("urad µrad μrad", 1e-6, 0, 1, 0)
-_atoms("deg ° degree", _DEGREE, 0, 1, 0)
-_atoms("mdeg m°", _DEGREE * 1e-3, 0, 1, 0)
-_atoms("arcmin", _DEGREE / 60, 0, 1, 0)
-_atoms("arcsec", _DEGREE / 3600, 0, 1, 0)
-_atoms("dps", _DEGREE, 0, 1, -1)
-_atoms("mdps", _DEGREE * 1e-3, 0, 1, -1)
-_atoms("dph", _DEGREE / 3600, 0, 1, -1)
-_atoms("g", STANDARD_GRAVITY, 1, 0, -2)
-_atoms("mg", STANDARD_GRAVITY * 1e-3, 1, 0, -2)
-_atoms("ug µg μg", STANDARD_GRAVITY * 1e-6, 1, 0, -2)
-_atoms("mGal", 1e-5, 1, 0, -2)
-_atoms("uT µT μT", 1.0, 0, 0, 0, 1)
-_atoms("nT", 1e-3, 0, 0, 0, 1)
-_atoms("mG mgauss", 0.1, 0, 0, 0, 1)
-
+# by powers of metre, radian, second, µT, kelvin: names, and the factor to SI (of a field: µT)
+_UNITS = {
+    (0, 0, 0, 0, 0): {"1": 1.0, "%": 1e-2, "ppm": 1e-6},
+    (0, 0, 0, 0, 1): {"K degC °C": 1.0},
+    (1, 0, 0, 0, 0): {"m": 1.0, "mm": 1e-3},
+    (0, 0, 1, 0, 0): {"s sec": 1.0, "ms": 1e-3, "us µs μs": 1e-6, "min": 60.0, "h hr hour": 3600.0},
+    (0, 0, -1, 0, 0): {"Hz": 1.0},
+    (0, 1, 0, 0, 0): {
+        "rad": 1.0,
+        "mrad": 1e-3,
+        "urad µrad μrad": 1e-6,
+        "deg ° degree": DEGREE,
+        "mdeg m°": DEGREE * 1e-3,
+        "arcmin": DEGREE / 60,
+        "arcsec": DEGREE / 3600,
+    },
+    (0, 1, -1, 0, 0): {"dps": DEGREE, "mdps": DEGREE * 1e-3, "dph": DEGREE / 3600},
+    (1, 0, -2, 0, 0): {
+        "g": STANDARD_GRAVITY,
+        "mg": STANDARD_GRAVITY * 1e-3,
+        "ug µg μg": STANDARD_GRAVITY * 1e-6,
+        "mGal": 1e-5,
+    },
+    (0, 0, 0, 1, 0): {"uT µT μT": 1.0, "nT": 1e-3, "mG mgauss": 0.1},
+}
+_ATOMS = {
+    name: (factor, powers)
+    for powers, units in _UNITS.items()
+    for names, factor in units.items()
+    for name in names.split()
+}
 _FACTOR = re.compile(r"(?:(sqrt|√)\s*\(?\s*([^\s()^*/·]+)\s*\)?|([^\s()^*/·√]+))(?:\^\(?(-?[0-9.]+(?:/[0-9]+)?)\)?)?")
 _SUPERSCRIPTS = str.maketrans({"²": "^2", "³": "^3"})
 

@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float
 
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import conjugate, exponential, multiply
+from jaximu.ground.rotation import Quaternion, conjugate, exponential, multiply
 from jaximu.ground.stored import compiled
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.clock_scale import SetupClockScale
@@ -87,11 +87,11 @@ class Mounting(NamedTuple):
         return exponential(jnp.append(self.tilt, 0.0))
 
     @compiled
-    def unit_attitude(self, reported: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
+    def unit_attitude(self, reported: Quaternion) -> Quaternion:
         """Return the unit's attitude, to the level frame, from the one that the reference reports."""
         return multiply(self.tilted, multiply(reported, self.turned))
 
     @compiled
-    def reported(self, attitude: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
+    def reported(self, attitude: Quaternion) -> Quaternion:
         """Return what a reference reports of a unit that stands so."""
         return multiply(conjugate(self.tilted), multiply(attitude, conjugate(self.turned)))

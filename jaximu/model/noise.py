@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import zlib
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,9 +33,21 @@ from jaximu.model.noise_model import AxisNoise
 from jaximu.model.processes import FirstOrderGaussMarkov, Process, White
 from jaximu.model.state_space import BLOCK, BlockSystem, LinearSystem, combine, linear_system, run
 
-__all__ = ["Noise", "NoiseStream", "drawn_noise"]
+__all__ = ["FIGURE_TERMS", "Noise", "NoiseStream", "drawn_noise"]
 
+Generators = list[np.random.Generator]
+"""A stream of draws for every unit and axis, in their order."""
 
+FIGURE_TERMS = {
+    "white": "N",
+    "bias_instability": "B",
+    "rate_random_walk": "K",
+    "quantisation": "Q",
+    "rate_ramp": "R",
+    "repeatability": "B",
+    "bias": "B",
+}
+"""The term in whose unit `Noise.from_datasheet` takes a figure."""
 ALLAN_MINIMUM = float(np.sqrt(2 * np.log(2) / np.pi))
 """Allan deviation of flicker noise of B = 1: 0.664."""
 
@@ -82,40 +96,30 @@ class Noise:
 
         Raises `InputError` for a wrong unit, a negative figure, or what is left unsaid.
         """
-        units = SI_UNITS.get(quantity)
-        if units is None:
-            raise InputError(f"noise belongs to one of {', '.join(SI_UNITS)}, not to {quantity!r}.")
-        found: list[Process] = []
-
-        def figure(text: str | float, term: str, what: str) -> float:
-            return parse_quantity(text, units[term], what)
-
-        if white is not None:
-            found.append(kinds.White(_white(white, units, density, rate)))
+        units = SI_UNITS[cls((), quantity).quantity]  # which the constructor checks
+        processes: list[Process] = [] if white is None else [kinds.White(_white(white, units, density, rate))]
         if bias_instability is not None:
-            value = figure(bias_instability, "B", "bias_instability")
+            value = parse_quantity(bias_instability, units["B"], "bias_instability")
             if bias_instability_is not in ("B", "allan-minimum"):
                 raise InputError(
                     "bias_instability_is must say what the sheet means by its bias (in-)stability: 'B', or "
                     "'allan-minimum' for the lowest point of the Allan deviation, which is 0.664 B."
                 )
-            found.append(kinds.BiasInstability(value if bias_instability_is == "B" else value / ALLAN_MINIMUM))
-        if rate_random_walk is not None:
-            found.append(kinds.RandomWalk(figure(rate_random_walk, "K", "rate_random_walk")))
-        if quantisation is not None:
-            found.append(kinds.Quantisation(figure(quantisation, "Q", "quantisation")))
-        if rate_ramp is not None:
-            found.append(kinds.RateRamp(figure(rate_ramp, "R", "rate_ramp")))
-        if repeatability is not None:
-            found.append(kinds.BiasRepeatability(figure(repeatability, "B", "repeatability")))
-        if bias is not None:
-            found.append(kinds.RandomConstant(figure(bias, "B", "bias")))
-        return cls(tuple(found), quantity)
+            processes.append(kinds.BiasInstability(value if bias_instability_is == "B" else value / ALLAN_MINIMUM))
+        for name, kind, figure in (
+            ("rate_random_walk", kinds.RandomWalk, rate_random_walk),
+            ("quantisation", kinds.Quantisation, quantisation),
+            ("rate_ramp", kinds.RateRamp, rate_ramp),
+            ("repeatability", kinds.BiasRepeatability, repeatability),
+            ("bias", kinds.RandomConstant, bias),
+        ):
+            if figure is not None:
+                processes.append(kind(parse_quantity(figure, units[FIGURE_TERMS[name]], name)))
+        return cls(tuple(processes), quantity)
 
     def allan_deviation(self, tau: ArrayLike) -> FloatArray:
         """Return the Allan deviation in theory at averaging times (n,), s: variances of the processes added up."""
-        total = sum((process.allan_variance(tau) for process in self.processes), start=np.zeros(np.shape(tau)))
-        return np.sqrt(total)
+        return np.sqrt(sum((process.allan_variance(tau) for process in self.processes), start=np.zeros(np.shape(tau))))
 
     def figures(self, rate: float | None = None) -> list[dict[str, object]]:
         """Return each term as a data sheet would: continuous in SI and in the customary unit; discrete where it is one.
@@ -165,13 +169,13 @@ def _white(white: str | float, units: dict[str, str], density: str | None, rate:
             raise InputError(f"white: {text!r} is a standard deviation per sample; give the rate it belongs to (Hz).")
         return float(from_discrete("N", parse_quantity(text, units["B"], "white"), rate))
     value = parse_quantity(white, units["N"], "white")
-    if "Hz" in unit:
-        if density not in ("one-sided", "two-sided"):
-            raise InputError(
-                f"density must say whether {text!r} is 'one-sided' (N is that over √2) or 'two-sided' (N itself)."
-            )
-        return value / np.sqrt(2) if density == "one-sided" else value
-    return value
+    if "Hz" not in unit:
+        return value
+    if density not in ("one-sided", "two-sided"):
+        raise InputError(
+            f"density must say whether {text!r} is 'one-sided' (N is that over √2) or 'two-sided' (N itself)."
+        )
+    return value / np.sqrt(2) if density == "one-sided" else value
 
 
 class NoiseStream:
@@ -187,32 +191,26 @@ class NoiseStream:
         if not rate > 0:
             raise InputError(f"the sample rate must be positive, found {rate}.")
         self.shape = shape
-        self._moving: list[LinearSystem] = []
-        self._still: list[FloatArray] = []
-        self._moving_draws: list[list[np.random.Generator]] = []
-        self._still_draws: list[list[np.random.Generator]] = []
+        self._still: list[tuple[FloatArray, Generators]] = []
+        self._moving: list[tuple[LinearSystem, Generators]] = []
         starts: list[FloatArray] = []
         root = list(seed) if isinstance(seed, Sequence) else [seed]
-        seen: dict[str, int] = {}
+        counts = Counter[str]()
         for process in noise.processes:
             kind = type(process).__name__
-            seen[kind] = seen.get(kind, 0) + 1
-            key = [
-                zlib.crc32(f"{noise.quantity}.{kind}.{seen[kind]}".encode()),
-                0 if process.per_unit else power_on + 1,
-            ]
+            counts[kind] += 1
+            key = zlib.crc32(f"{noise.quantity}.{kind}.{counts[kind]}".encode())
+            period = 0 if process.per_unit else power_on + 1
             system = linear_system(*vars(process.system(1 / rate)).values(), leading=(*shape, 3))
-            generators = [np.random.default_rng([*root, *key, *place]) for place in np.ndindex(*shape, 3)]
+            generators = [np.random.default_rng([*root, key, period, *axis]) for axis in np.ndindex(*shape, 3)]
             if system.transition.shape[-1] == 0:
-                self._still.append(np.asarray(system.through))
-                self._still_draws.append(generators)
+                self._still.append((np.asarray(system.through), generators))
                 continue
-            initial = np.stack([each.standard_normal(system.root.shape[-1]) for each in generators])
+            initial = np.stack([generator.standard_normal(system.root.shape[-1]) for generator in generators])
             initial = initial.reshape(*shape, 3, -1)
             starts.append(np.asarray(system.start) + np.einsum("...sr,...r->...s", system.root, initial))
-            self._moving.append(system)
-            self._moving_draws.append(generators)
-        self._blocks = combine(self._moving).blocked() if self._moving else None
+            self._moving.append((system, generators))
+        self._blocks = combine([system for system, _ in self._moving]).blocked() if starts else None
         self._state = jnp.asarray(np.concatenate(starts, axis=-1)) if starts else None
         self._ended = False
 
@@ -222,48 +220,31 @@ class NoiseStream:
             raise ValueError("the stream has ended: an earlier take was not of a multiple of the block")
         self._ended = samples % BLOCK != 0
         padded = -(-samples // BLOCK) * BLOCK
-        still = tuple(
-            self._draw(each, through.shape[-1], padded)
-            for each, through in zip(self._still_draws, self._still, strict=True)
-        )
-        moving = tuple(
-            self._draw(each, system.drive.shape[-1], padded)
-            for each, system in zip(self._moving_draws, self._moving, strict=True)
-        )
-        output, self._state = _advance(
-            tuple(self._still), self._blocks, self._state, still, moving, (*self.shape, 3, padded)
-        )
+        still = [(through, self._draw(draws, through.shape[-1], padded)) for through, draws in self._still]
+        moving = [self._draw(draws, system.drive.shape[-1], padded) for system, draws in self._moving]
+        output, self._state = _advance(still, self._blocks, self._state, moving, (*self.shape, 3, padded))
         return np.asarray(output)[..., :samples, :]
 
-    def _draw(self, generators: list[np.random.Generator], inputs: int, samples: int) -> FloatArray:
+    def _draw(self, generators: Generators, inputs: int, samples: int) -> FloatArray:
         """Unit normals (*shape, 3, inputs, samples), by as many threads as there are processors."""
         draws = np.empty((len(generators), inputs, samples))
         if inputs == 1:
-            list(
-                _threads().map(
-                    lambda pair: pair[0].standard_normal(out=pair[1][0]), zip(generators, draws, strict=True)
-                )
-            )
+            list(_threads().map(lambda generator, out: generator.standard_normal(out=out[0]), generators, draws))
         elif inputs:
             for generator, out in zip(generators, draws, strict=True):
                 out[:] = generator.standard_normal((samples, inputs)).T  # sample by sample: no take may change the next
         return draws.reshape(*self.shape, 3, inputs, samples)
 
 
+@cache
 def _threads() -> ThreadPoolExecutor:
-    global _POOL
-    if _POOL is None:
-        _POOL = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="jaximu-noise")
-    return _POOL
-
-
-_POOL: ThreadPoolExecutor | None = None
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="jaximu-noise")
 
 
 @eqx.filter_jit
-def _advance(still, blocks: BlockSystem | None, state, still_draws, moving_draws, shape):
+def _advance(still, blocks: BlockSystem | None, state, moving_draws, shape):
     total = jnp.zeros(shape)
-    for through, draws in zip(still, still_draws, strict=True):
+    for through, draws in still:
         total = total + jnp.sum(through[..., None] * draws, axis=-2)
     if blocks is not None:
         output, state = run(blocks, state, jnp.concatenate(moving_draws, axis=-2))

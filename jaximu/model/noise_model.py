@@ -23,11 +23,11 @@ from numpy.typing import ArrayLike, NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import number, readable, size
 from jaximu.ground.summary import Block, Described, Summary
+from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_UNITS
+from jaximu.model.processes import RATIO
 
 __all__ = ["AxisNoise", "NoiseModel"]
 
-_RATIO = 4.0
-"""Ratio of neighbouring correlation times: flicker noise between them ripples by 0.3 %."""
 _LONGEST = 4.0
 """Longest correlation time, in lengths of the recording: slower than this looks like a random walk in it."""
 _FELT = 4.0
@@ -108,18 +108,19 @@ class NoiseModel(Described):
     def summary(self) -> Summary:
         """Return each axis's white noise and the spread of its slow bias, and the notes."""
         rows = []
-        for name, unit in (("accelerometer", "m/s^2"), ("gyroscope", "rad/s")):
+        for name in INERTIAL_QUANTITIES:
             noise: AxisNoise | None = getattr(self, name)
             if noise is None:
                 continue
-            for place, axis in enumerate("xyz"):
-                white, slow = float(np.sqrt(noise.white[place])), float(np.sqrt(noise.variance[place].sum()))
+            unit = SENSOR_UNITS[name]
+            for axis, *densities in zip("xyz", noise.white, noise.variance.sum(axis=1), strict=True):
+                white, slow = map(float, np.sqrt(densities))
                 factor, printed = readable(unit, white)
                 rows.append((f"{name} {axis}", f"{number(factor * white)} {printed}/√Hz", size(slow, unit)))
         duration = self.accelerometer.duration
-        said = f"Fitted to {duration:.0f} s at rest." if duration else "Stated, not fitted."
+        origin = f"Fitted to {duration:.0f} s at rest." if duration else "Stated, not fitted."
         headers = ("axis", "white noise", "slow bias (standard deviation)")
-        return Summary("Noise model", (said,), Block(headers, tuple(rows)), self.notes)
+        return Summary("Noise model", (origin,), Block(headers, tuple(rows)), self.notes)
 
 
 def fit_bank(values: FloatArray, rate: float) -> AxisNoise:
@@ -138,9 +139,13 @@ def fit_bank(values: FloatArray, rate: float) -> AxisNoise:
 
 
 def _fitted(
-    expected: FloatArray, mean: FloatArray, counts: NDArray[np.int64], edges: NDArray[np.int64], duration: float,
+    expected: FloatArray,
+    mean: FloatArray,
+    counts: NDArray[np.int64],
+    edges: NDArray[np.int64],
+    duration: float,
     times: FloatArray,
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Fit all frequencies if the terms can follow them, else those that poses and turns feel.
 
     A low-pass filter in the sensor bends the spectrum as no sum of these terms does, and its high frequencies, known
@@ -173,9 +178,8 @@ def _non_negative(expected: FloatArray, mean: FloatArray, counts: NDArray[np.int
         weight = np.sqrt(counts) / spectrum
         columns, target = (expected * weight).T, mean * weight
         if levels.any():
-            alike = np.zeros((len(slow), len(expected)))
-            place = np.arange(len(slow))
-            alike[place, slow], alike[place, slow - 1], alike[place, slow - 2] = 1.0, -0.5, -0.5
+            unit = np.eye(len(expected))
+            alike = unit[slow] - (unit[slow - 1] + unit[slow - 2]) / 2
             columns = np.concatenate([columns, alike / (_ALIKE * levels[:, None])])
             target = np.concatenate([target, np.zeros(len(slow))])
         scale = np.linalg.norm(columns, axis=0)
@@ -198,7 +202,7 @@ def _expectations(samples: int, rate: float) -> tuple[NDArray[np.int64], FloatAr
     edges = np.unique(np.concatenate([np.arange(13), np.round(wider)])).astype(np.int64)
     counts = np.diff(edges)
     longest, shortest = _LONGEST * samples / rate, 2 / rate
-    times = longest / _RATIO ** np.arange(1 + int(np.log(longest / shortest) / np.log(_RATIO)))[::-1]
+    times = longest / RATIO ** np.arange(1 + int(np.log(longest / shortest) / np.log(RATIO)))[::-1]
     lag = np.arange(samples)
     share = (1 - lag / samples) / rate
 

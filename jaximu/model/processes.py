@@ -10,8 +10,10 @@ Signals and Applied Kalman Filtering, 2012 (Gauss–Markov processes).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
+from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
@@ -44,38 +46,40 @@ class Process:
     per_unit: ClassVar[bool] = False  # drawn once for a unit, not at every power-on
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = np.asarray(getattr(self, each.name), float)
+        for name, parameter in asdict(self).items():
+            value = np.asarray(parameter, float)
             if not np.isfinite(value).all() or (value < 0).any():
                 raise InputError(
-                    f"{type(self).__name__}: {each.name} must be finite and must not be negative, found "
-                    f"{value.tolist()}."
+                    f"{type(self).__name__}: {name} must be finite and must not be negative, found {value.tolist()}."
                 )
-            object.__setattr__(self, each.name, value)
+            object.__setattr__(self, name, value)
+
+    @property
+    def size(self) -> FloatArray:
+        """The first parameter as (..., 1), against a last axis of frequencies or states."""
+        return np.asarray(getattr(self, fields(self)[0].name), float)[..., None]
 
     def system(self, interval: float) -> LinearSystem:
         """Return the process sampled every `interval` seconds."""
         raise NotImplementedError
 
     def density(self, frequency: ArrayLike) -> FloatArray:
-        """Return the two-sided power spectral density at frequencies (n,), Hz: shape (..., n), signal unit² · s."""
-        raise NotImplementedError
+        """Return the two-sided power spectral density at frequencies (n,), Hz: shape (..., n), signal unit² · s.
+
+        Zero of what does not fluctuate.
+        """
+        return 0 * self.size * np.asarray(frequency)
 
     def allan_variance(self, tau: ArrayLike) -> FloatArray:
         """Return the Allan variance at averaging times (n,), s: shape (..., n), signal unit²."""
         raise NotImplementedError
 
 
-def _inverse(cls, correlation_time):
-    time = np.asarray(correlation_time, float)
-    if not (time > 0).all():
-        raise InputError(f"{cls.__name__}: the correlation time must be positive, found {time.tolist()}.")
-    return 1 / time
-
-
-def _column(value: ArrayLike) -> FloatArray:
-    """Parameters (...) as (..., 1), against a last axis of frequencies or states."""
-    return np.asarray(value, float)[..., None]
+def _by_series(x: FloatArray, closed: Callable[[FloatArray], FloatArray], terms: Iterable[tuple[float, int]]):
+    """A function of x (...) in closed form, which cancels for small x: there by terms of a factor and a power of x."""
+    small = x < 0.5
+    within = np.where(small, x, 0.0)
+    return np.where(small, sum(factor * within**power for factor, power in terms), closed(np.where(small, 1.0, x)))
 
 
 @dataclass(frozen=True)
@@ -87,15 +91,13 @@ class White(Process):
     letter = "N"
 
     def system(self, interval):
-        through = _column(self.N) / np.sqrt(interval)
-        none = np.zeros((0, 0))
-        return linear_system(none, np.zeros((0, 1)), np.zeros(0), through, np.zeros(0), none)
+        return linear_system(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros(0), self.size / np.sqrt(interval))
 
     def density(self, frequency):
-        return _column(self.N) ** 2 * np.ones_like(np.asarray(frequency, float))
+        return self.size**2 * np.ones_like(np.asarray(frequency, float))
 
     def allan_variance(self, tau):
-        return _column(self.N) ** 2 / np.asarray(tau)
+        return self.size**2 / np.asarray(tau)
 
 
 @dataclass(frozen=True)
@@ -107,31 +109,47 @@ class RandomWalk(Process):
     letter = "K"
 
     def system(self, interval):
-        drive = _column(self.K)[..., None] * np.sqrt(interval)
-        return linear_system(np.ones((1, 1)), drive, np.ones(1), np.zeros(1), np.zeros(1), np.zeros((1, 0)))
+        return linear_system(np.ones((1, 1)), self.size[..., None] * np.sqrt(interval), np.ones(1))
 
     def density(self, frequency):
-        return (_column(self.K) / (2 * np.pi * np.asarray(frequency))) ** 2
+        return (self.size / (2 * np.pi * np.asarray(frequency))) ** 2
 
     def allan_variance(self, tau):
-        return _column(self.K) ** 2 * np.asarray(tau) / 3
+        return self.size**2 * np.asarray(tau) / 3
 
 
 @dataclass(frozen=True)
-class FirstOrderGaussMarkov(Process):
+class _GaussMarkov(Process):
+    q: ArrayLike  # density of the driving noise, signal unit / s^{order − 1/2}
+    beta: ArrayLike  # 1/s
+    order: ClassVar[int]
+
+    @classmethod
+    def _rate(cls, correlation_time: ArrayLike) -> FloatArray:
+        time = np.asarray(correlation_time, float)
+        if not (time > 0).all():
+            raise InputError(f"{cls.__name__}: the correlation time must be positive, found {time.tolist()}.")
+        return 1 / time
+
+    def density(self, frequency):
+        rate = np.asarray(self.beta)[..., None]
+        return self.size**2 / (rate**2 + (2 * np.pi * np.asarray(frequency)) ** 2) ** self.order
+
+
+@dataclass(frozen=True)
+class FirstOrderGaussMarkov(_GaussMarkov):
     """ẋ = −βx + q w, sampled exactly: x_{k+1} = e^{−βΔt} x_k + √(q² (1 − e^{−2βΔt})/2β) · w_k.
 
     Starts in its stationary spread q/√(2β). β → 0 is the random walk K = q (from zero); β → ∞ with q/β held is white
     noise N = q/β to whatever averages over many 1/β.
     """
 
-    q: ArrayLike  # density of the driving noise, signal unit / √s
-    beta: ArrayLike  # 1/s
+    order = 1
 
     @classmethod
     def of(cls, sigma: ArrayLike, correlation_time: ArrayLike) -> FirstOrderGaussMarkov:
         """Return the process of standard deviation `sigma` and correlation time 1/β (s)."""
-        beta = _inverse(cls, correlation_time)
+        beta = cls._rate(correlation_time)
         return cls(np.asarray(sigma) * np.sqrt(2 * beta), beta)
 
     def system(self, interval):
@@ -139,44 +157,34 @@ class FirstOrderGaussMarkov(Process):
         moving = beta > 0
         safe = np.where(moving, beta, 1.0)
         variance = np.where(moving, -np.expm1(-2 * safe * interval) / (2 * safe), interval)
-        spread = np.where(moving, q / np.sqrt(2 * safe), 0.0)
+        start = np.where(moving, q / np.sqrt(2 * safe), 0.0)
         decay = np.exp(-beta * interval)
         drive = q * np.sqrt(variance)
         wide = (..., None, None)
-        return linear_system(decay[wide], drive[wide], np.ones(1), np.zeros(1), np.zeros(1), spread[wide])
-
-    def density(self, frequency):
-        return _column(self.q) ** 2 / (_column(self.beta) ** 2 + (2 * np.pi * np.asarray(frequency)) ** 2)
+        return linear_system(decay[wide], drive[wide], np.ones(1), root=start[wide])
 
     def allan_variance(self, tau):
+        def closed(x):
+            return (1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x)) / x**2
+
         tau = np.asarray(tau, float)
-        x = _column(self.beta) * tau
-        # (1 − (3 − 4e^{−x} + e^{−2x})/2x)/x² cancels for small x; there its series is taken
-        small = x < 0.5
-        series = sum(
-            -((-1) ** n) * (2**n - 4) / (2 * math.factorial(n)) * np.where(small, x, 0.0) ** (n - 3)
-            for n in range(3, 22)
-        )
-        safe = np.where(small, 1.0, x)
-        exact = (1 - (3 - 4 * np.exp(-safe) + np.exp(-2 * safe)) / (2 * safe)) / safe**2
-        over = tau * np.where(small, series, exact)
-        return _column(self.q) ** 2 * over
+        terms = ((-((-1) ** n) * (2**n - 4) / (2 * math.factorial(n)), n - 3) for n in range(3, 22))
+        return self.size**2 * (tau * _by_series(np.asarray(self.beta)[..., None] * tau, closed, terms))
 
 
 @dataclass(frozen=True)
-class SecondOrderGaussMarkov(Process):
+class SecondOrderGaussMarkov(_GaussMarkov):
     """ẍ = −2βẋ − β²x + q w: critically damped, two states, sampled exactly by the matrix exponential.
 
     Starts in its stationary spread: x has q/(2 β^{3/2}), ẋ q/(2 β^{1/2}). Sampled it is an ARMA(2, 1).
     """
 
-    q: ArrayLike  # density of the driving noise, signal unit / s^{3/2}
-    beta: ArrayLike  # 1/s, positive
+    order = 2
 
     @classmethod
     def of(cls, sigma: ArrayLike, correlation_time: ArrayLike) -> SecondOrderGaussMarkov:
         """Return the process of standard deviation `sigma` and 1/β = `correlation_time` (s)."""
-        beta = _inverse(cls, correlation_time)
+        beta = cls._rate(correlation_time)
         return cls(2 * np.asarray(sigma) * beta**1.5, beta)
 
     def __post_init__(self):
@@ -192,35 +200,27 @@ class SecondOrderGaussMarkov(Process):
             step = scipy.linalg.expm(rate * interval)
             stationary = np.diag([1 / (4 * beta[at] ** 3), 1 / (4 * beta[at])])
             if beta[at] * interval > 1e-2:
-                spread = stationary - step @ stationary @ step.T
+                covariance = stationary - step @ stationary @ step.T
             else:  # the difference cancels; Van Loan's integral does not
                 block = np.block([[-rate, np.diag([0.0, 1.0])], [np.zeros((2, 2)), rate.T]])
-                spread = step @ scipy.linalg.expm(block * interval)[:2, 2:]
+                covariance = step @ scipy.linalg.expm(block * interval)[:2, 2:]
             # Cholesky with the rows scaled to one: the position's spread is far below the velocity's
-            scale = np.sqrt(np.diag(spread))
+            scale = np.sqrt(np.diag(covariance))
             transition[at], root[at] = step, q[at] * np.sqrt(stationary)
-            drive[at] = q[at] * scale[:, None] * np.linalg.cholesky(spread / np.outer(scale, scale))
-        return linear_system(transition, drive, np.array([1.0, 0.0]), np.zeros(2), np.zeros(2), root)
-
-    def density(self, frequency):
-        return _column(self.q) ** 2 / (_column(self.beta) ** 2 + (2 * np.pi * np.asarray(frequency)) ** 2) ** 2
+            drive[at] = q[at] * scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
+        return linear_system(transition, drive, np.array([1.0, 0.0]), root=root)
 
     def allan_variance(self, tau):
-        tau = np.asarray(tau, float)
-        beta = _column(self.beta)
-        # V(τ), the variance of the integral over τ, from the autocovariance σ²(1 + β|t|)e^{−β|t|}; (4V(τ) − V(2τ))/2τ²
-        x = beta * tau
-        small = x < 0.5
-        series = sum(
-            (-1) ** n * (n - 3) * (2**n - 4) / math.factorial(n) * np.where(small, x, 0.0) ** (n - 2)
-            for n in range(4, 23)
-        )
-        safe = np.where(small, 1.0, x)
-        once = 2 * safe - 3 + np.exp(-safe) * (3 + safe)
-        twice = 4 * safe - 3 + np.exp(-2 * safe) * (3 + 2 * safe)
-        shape = np.where(small, series, (4 * once - twice) / safe**2)  # cancels for small x
-        variance = _column(self.q) ** 2 / (4 * beta**3)
-        return variance * shape
+        def closed(x):
+            # V(τ), the variance of the integral over τ, from the autocovariance σ²(1 + β|t|)e^{−β|t|};
+            # (4V(τ) − V(2τ))/2τ²
+            once = 2 * x - 3 + np.exp(-x) * (3 + x)
+            twice = 4 * x - 3 + np.exp(-2 * x) * (3 + 2 * x)
+            return (4 * once - twice) / x**2
+
+        beta = np.asarray(self.beta)[..., None]
+        terms = (((-1) ** n * (n - 3) * (2**n - 4) / math.factorial(n), n - 2) for n in range(4, 23))
+        return self.size**2 / (4 * beta**3) * _by_series(beta * np.asarray(tau, float), closed, terms)
 
 
 @dataclass(frozen=True)
@@ -232,19 +232,15 @@ class RandomConstant(Process):
     per_unit = True
 
     def system(self, interval):
-        root = _column(self.sigma)[..., None]
-        return linear_system(np.ones((1, 1)), np.zeros((1, 0)), np.ones(1), np.zeros(0), np.zeros(1), root)
-
-    def density(self, frequency):
-        return 0 * _column(self.sigma) * np.asarray(frequency)
+        return linear_system(np.ones((1, 1)), np.zeros((1, 0)), np.ones(1), root=self.size[..., None])
 
     def allan_variance(self, tau):
-        return 0 * _column(self.sigma) * np.asarray(tau)
+        return 0 * self.size * np.asarray(tau)
 
 
 @dataclass(frozen=True)
 class BiasRepeatability(RandomConstant):
-    """A bias drawn anew at every power-on, of standard deviation `sigma`: only several recordings show it."""
+    """A bias drawn at every power-on, of standard deviation `sigma`: only several recordings show it."""
 
     per_unit = False
 
@@ -258,15 +254,12 @@ class RateRamp(Process):
     letter = "R"
 
     def system(self, interval):
-        start = np.concatenate([0 * _column(self.R), _column(self.R) * interval], axis=-1)
+        start = self.size * np.array([0.0, interval])
         transition = np.array([[1.0, 1.0], [0.0, 1.0]])
-        return linear_system(transition, np.zeros((2, 0)), np.array([1.0, 0.0]), np.zeros(0), start, np.zeros((2, 0)))
-
-    def density(self, frequency):
-        return 0 * _column(self.R) * np.asarray(frequency)
+        return linear_system(transition, np.zeros((2, 0)), np.array([1.0, 0.0]), start=start)
 
     def allan_variance(self, tau):
-        return (_column(self.R) * np.asarray(tau)) ** 2 / 2
+        return (self.size * np.asarray(tau)) ** 2 / 2
 
 
 @dataclass(frozen=True)
@@ -278,18 +271,18 @@ class Quantisation(Process):
     letter = "Q"
 
     def system(self, interval):
-        size = _column(self.Q) / interval
-        return linear_system(np.zeros((1, 1)), -size[..., None], np.ones(1), size, np.zeros(1), size[..., None])
+        step = self.size / interval
+        return linear_system(np.zeros((1, 1)), -step[..., None], np.ones(1), step, root=step[..., None])
 
     def density(self, frequency):
         raise NotImplementedError("the spectrum of quantisation noise depends on the sample interval")
 
     def allan_variance(self, tau):
-        return 3 * (_column(self.Q) / np.asarray(tau)) ** 2
+        return 3 * (self.size / np.asarray(tau)) ** 2
 
 
-_RATIO = 4.0
-"""Ratio of neighbouring correlation times in the bank that makes flicker noise; its spectrum ripples by
+RATIO = 4.0
+"""Ratio of neighbouring correlation times in a bank that stands for flicker noise; its spectrum ripples by
 2 / cosh(π² / ln 4) = 0.3 %."""
 
 
@@ -317,20 +310,19 @@ class BiasInstability(Process):
     def bank(self, interval: float) -> FloatArray:
         """Return the correlation times (s)."""
         shortest = 0.7 * interval
-        count = 1 + max(0, math.ceil(np.log(float(self.longest) / shortest) / np.log(_RATIO)))
-        return np.asarray(shortest * _RATIO ** np.arange(count), np.float64)
+        count = 1 + max(0, math.ceil(np.log(float(self.longest) / shortest) / np.log(RATIO)))
+        return np.asarray(shortest * RATIO ** np.arange(count), np.float64)
 
     def system(self, interval):
         transition, gain, output, through, root = _innovations(tuple(self.bank(interval)), interval)
-        size = _column(self.B)
-        wide = size[..., None]
-        return linear_system(transition, wide * gain, output, size * through, np.zeros(len(output)), wide * root)
+        wide = self.size[..., None]
+        return linear_system(transition, wide * gain, output, self.size * through, root=wide * root)
 
     def density(self, frequency):
-        return _column(self.B) ** 2 / (2 * np.pi * np.abs(np.asarray(frequency)))
+        return self.size**2 / (2 * np.pi * np.abs(np.asarray(frequency)))
 
     def allan_variance(self, tau):
-        return 2 * np.log(2) / np.pi * _column(self.B) ** 2 * np.ones_like(np.asarray(tau, float))
+        return 2 * np.log(2) / np.pi * self.size**2 * np.ones_like(np.asarray(tau, float))
 
 
 @lru_cache(maxsize=64)
@@ -344,24 +336,22 @@ def _innovations(correlation_times: tuple[float, ...], interval: float):
     spread.
     """
     pole = interval / np.sort(correlation_times)
-    variance = np.log(_RATIO) / np.pi
-    place, weight = 2 * np.sinh(pole / 2) ** 2, variance * np.sinh(pole)  # cosh p − 1, and the numerators
+    variance = np.log(RATIO) / np.pi
+    excess, weight = 2 * np.sinh(pole / 2) ** 2, variance * np.sinh(pole)  # cosh p − 1, and the numerators
 
     def imbalance(logarithm: float) -> float:
-        return float(np.sum(weight / (place - np.exp(logarithm))))
+        return float(np.sum(weight / (excess - np.exp(logarithm))))
 
     zeros = []
-    for high, low in zip(np.log(place[:-1]), np.log(place[1:]), strict=True):
+    for high, low in pairwise(np.log(excess)):
         inset = 1e-12 * (high - low)
         zeros.append(scipy.optimize.brentq(imbalance, low + inset, high - inset, xtol=1e-15))
     zero = 2 * np.arcsinh(np.sqrt(np.exp(zeros) / 2))
     decay = np.exp(-pole)
-    nyquist = np.sum(weight / (place + 2))  # the spectrum at cos ω = −1, where nothing cancels: |H|² there
+    nyquist = np.sum(weight / (excess + 2))  # the spectrum at cos ω = −1, where nothing cancels: |H|² there
     deviation = np.sqrt(nyquist) * np.prod(1 + decay) / np.prod(1 + np.exp(-zero))
-    gain = np.empty(len(pole))
-    for i, each in enumerate(pole):
-        gain[i] = deviation * decay[i] * np.prod(np.expm1(each - zero) / np.expm1(each - np.delete(pole, i)))
-    spread = np.outer(gain, gain) / -np.expm1(-np.add.outer(pole, pole))
-    values, vectors = np.linalg.eigh(spread)
+    residues = [np.prod(np.expm1(p - zero) / np.expm1(p - np.delete(pole, i))) for i, p in enumerate(pole)]
+    gain = deviation * decay * np.array(residues)
+    values, vectors = np.linalg.eigh(np.outer(gain, gain) / -np.expm1(-np.add.outer(pole, pole)))
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
     return np.diag(decay), gain[:, None], np.ones(len(pole)), np.array([deviation]), root

@@ -10,7 +10,7 @@ changes what the sensor goes through, as against what the set-up says.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,14 +22,15 @@ from jaxtyping import Float
 
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import InputError
-from jaximu.ground.rotation import apply_matrix, inverse_matrix
+from jaximu.ground.rotation import Matrix, Vector, apply_matrix, inverse_matrix
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.effects.base import Effect, SetupEffect
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus, rate_of_change
 
 __all__ = ["Board", "Imu", "Triad"]
 
 _REFRESHED = 3
-"""Rounds of `recover` in which a derivative of the input is taken anew. More would amplify what it cannot resolve:
+"""Rounds of `recover` in which a derivative of the input is taken again. More would amplify what it cannot resolve:
 a lag τ is undone up to (τ d/dt)³."""
 
 
@@ -40,8 +41,8 @@ class Triad(eqx.Module):
     and `time_reference` (s) are where gain and bias hold.
     """
 
-    gain: Float[Array, "... 3 3"]
-    bias: Float[Array, "... 3"]
+    gain: Matrix
+    bias: Vector
     effects: tuple[Effect, ...] = ()
     quantity: str = eqx.field(static=True, default="specific_force")
     output_unit: str = eqx.field(static=True, default="m/s^2")
@@ -49,7 +50,7 @@ class Triad(eqx.Module):
     temperature_reference: float = eqx.field(static=True, default=REFERENCE_TEMPERATURE)
     time_reference: float = eqx.field(static=True, default=0.0)
 
-    def respond(self, stimulus: Stimulus) -> Float[Array, "... 3"]:
+    def respond(self, stimulus: Stimulus) -> Vector:
         """Return the noise-free output (..., 3) in `output_unit`."""
         stimulus = self._referred(stimulus)
         true = getattr(stimulus, self.quantity)
@@ -58,7 +59,7 @@ class Triad(eqx.Module):
         sensed = true + _total(self._effects("input"), stimulus)
         return apply_matrix(self.gain, sensed) + self.bias + _total(self._effects("output"), stimulus)
 
-    def recover(self, output: Float[Array, "... 3"], stimulus: Stimulus | None = None) -> Float[Array, "... 3"]:
+    def recover(self, output: Vector, stimulus: Stimulus | None = None) -> Vector:
         """Return the input (..., 3) in SI that gives `output`: the exact inverse of `respond`.
 
         Without effects this is K⁻¹(y − b). With effects it is the fixed point of
@@ -69,38 +70,33 @@ class Triad(eqx.Module):
         other triad's input …).
         """
         inverse = inverse_matrix(self.gain)
-        centred = output - self.bias
-        value = apply_matrix(inverse, centred)
-        at_input, at_output = (
-            tuple(effect for effect in self._effects(side) if effect.invertible) for side in ("input", "output")
-        )
+        stimulus = self._referred(Stimulus() if stimulus is None else stimulus)
+        derived = self._derived(stimulus)
+        sought = {self.quantity} | ({"angular_acceleration"} if derived else set())
+
+        def parted(side: str) -> tuple[list[Effect], list[Effect]]:
+            effects = [effect for effect in self._effects(side) if effect.invertible]
+            moving = [effect for effect in effects if sought & set(effect.needs)]
+            return moving, [effect for effect in effects if not sought & set(effect.needs)]
+
+        (at_input, known_input), (at_output, known_output) = parted("input"), parted("output")
+        # what does not depend on the input sought (a lagged temperature, say) is taken off once
+        offset = _total(known_input, stimulus)
+        centred = output - self.bias - _total(known_output, stimulus)
+        value = apply_matrix(inverse, centred) - offset
+
+        def round_(count, carried):
+            value, derivative = carried
+            context = replace(stimulus, **{self.quantity: value})
+            if derived:
+                derivative = jnp.where(count < _REFRESHED, rate_of_change(value, context.time), derivative)
+                context = replace(context, angular_acceleration=derivative)
+            value = apply_matrix(inverse, centred - _total(at_output, context)) - _total(at_input, context) - offset
+            return value, derivative
+
         if at_input or at_output:
-            given = self._referred(Stimulus() if stimulus is None else stimulus)
-            derived = self._derived(given)
-            sought = {self.quantity} | ({"angular_acceleration"} if derived else set())
-
-            def parted(effects):
-                moving = tuple(effect for effect in effects if sought & set(effect.needs))
-                return moving, tuple(effect for effect in effects if not sought & set(effect.needs))
-
-            (at_input, known_input), (at_output, known_output) = parted(at_input), parted(at_output)
-            # what does not depend on the input sought (a lagged temperature, say) is taken off once
-            offset = _total(known_input, given)
-            centred = centred - _total(known_output, given)
-            value = apply_matrix(inverse, centred) - offset
-
-            def round_(count, carried):
-                value, derivative = carried
-                context = self._with_input(given, value)
-                if derived:
-                    derivative = jnp.where(count < _REFRESHED, rate_of_change(value, context.time), derivative)
-                    context = replace(context, angular_acceleration=derivative)
-                value = apply_matrix(inverse, centred - _total(at_output, context)) - _total(at_input, context) - offset
-                return value, derivative
-
-            if at_input or at_output:
-                # a loop, not its unrolled rounds: many effects compile ten times quicker
-                value, _ = jax.lax.fori_loop(0, self.iterations, round_, (value, jnp.zeros_like(value)))
+            # a loop, not its unrolled rounds: many effects compile ten times quicker
+            value, _ = jax.lax.fori_loop(0, self.iterations, round_, (value, jnp.zeros_like(value)))
         return value
 
     def recover_on_host(self, output: FloatArray) -> FloatArray:
@@ -126,14 +122,12 @@ class Triad(eqx.Module):
     def _derived(self, context: Stimulus) -> bool:
         """Whether an effect needs the derivative of this triad's own input, which then follows from the iterate."""
         wanted = any("angular_acceleration" in effect.needs for effect in self.effects)
-        path = context.time is not None and context.time.ndim > 0
-        return wanted and path and self.quantity == "angular_rate" and context.angular_acceleration is None
-
-    def _with_input(self, stimulus: Stimulus, value: Float[Array, "... 3"]) -> Stimulus:
-        return eqx.tree_at(lambda s: getattr(s, self.quantity), stimulus, value, is_leaf=lambda leaf: leaf is None)
+        return (
+            wanted and context.on_a_path() and self.quantity == "angular_rate" and context.angular_acceleration is None
+        )
 
 
-def _total(effects: tuple[Effect, ...], stimulus: Stimulus) -> Float[Array, "... 3"] | float:
+def _total(effects: Iterable[Effect], stimulus: Stimulus) -> Vector | float:
     return sum((effect.term(stimulus) for effect in effects), start=0.0)
 
 
@@ -149,8 +143,15 @@ class Imu(eqx.Module):
     magnetometer: Triad | None = None
 
     @classmethod
-    def nominal(cls, accelerometer_scale=(1.0,) * 3, accelerometer_offset=(0.0,) * 3, accelerometer_unit="m/s^2",
-                gyroscope_scale=(1.0,) * 3, gyroscope_offset=(0.0,) * 3, gyroscope_unit="rad/s") -> Imu:  # fmt: skip
+    def nominal(
+        cls,
+        accelerometer_scale=(1.0,) * 3,
+        accelerometer_offset=(0.0,) * 3,
+        accelerometer_unit="m/s^2",
+        gyroscope_scale=(1.0,) * 3,
+        gyroscope_offset=(0.0,) * 3,
+        gyroscope_unit="rad/s",
+    ) -> Imu:
         """Return the unit as its data sheet describes it: diagonal gains, the given offsets, no effects."""
 
         def triad(scale, offset, quantity, unit):
@@ -164,24 +165,21 @@ class Imu(eqx.Module):
 
     def triads(self) -> dict[str, Triad]:
         """Return the triads that are there, by name."""
-        found = {
-            "accelerometer": self.accelerometer, "gyroscope": self.gyroscope, "magnetometer": self.magnetometer
-        }  # fmt: skip
-        return {name: triad for name, triad in found.items() if triad is not None}
+        return {name: triad for name in SENSOR_UNITS if (triad := getattr(self, name)) is not None}
 
     def all_effects(self) -> dict[tuple[str, int | None], Effect]:
         """Return all effects by owner and place, in the order of the unit's numbers."""
         owners = {name: triad.effects for name, triad in self.triads().items()} | {"setup": self.setup}
-        return {(owner, place): each for owner, effects in owners.items() for place, each in enumerate(effects)}
+        return {(owner, index): effect for owner, effects in owners.items() for index, effect in enumerate(effects)}
 
     def coefficients(self, kind: type[Effect]) -> Array:
         """Return the coefficients (q,) of the unit's effect of a kind; zeros where it has none."""
-        found = (each.coefficients for each in self.all_effects().values() if isinstance(each, kind))
-        return next(found, np.zeros(kind.size))
+        effects = (effect.coefficients for effect in self.all_effects().values() if isinstance(effect, kind))
+        return next(effects, np.zeros(kind.size))
 
     def without(self, *kinds: type[Effect]) -> Imu:
         """Return the unit without its effects of some kinds."""
-        return self.with_effects(*(each for each in self.all_effects().values() if not isinstance(each, kinds)))
+        return self.with_effects(*(effect for effect in self.all_effects().values() if not isinstance(effect, kinds)))
 
     def with_effects(self, *effects: Effect) -> Imu:
         """Return the unit with these effects and no others, each with its owner.
@@ -191,21 +189,21 @@ class Imu(eqx.Module):
         if not effects and not self.all_effects():
             return self
         triads = self.triads()
-        found: dict[str, tuple] = {name: () for name in (*triads, "setup")}
+        owned: dict[str, tuple] = {name: () for name in (*triads, "setup")}
         for effect in effects:
-            if effect.owner not in found:
+            if effect.owner not in owned:
                 raise InputError(f"the unit has no {effect.owner}, which the effect {effect.name} belongs to.")
-            found[effect.owner] += (effect,)
-        changed: dict[str, Any] = {name: replace(triad, effects=found[name]) for name, triad in triads.items()}
-        return replace(self, **changed, setup=found["setup"])
+            owned[effect.owner] += (effect,)
+        changed: dict[str, Any] = {name: replace(triad, effects=owned[name]) for name, triad in triads.items()}
+        return replace(self, **changed, setup=owned["setup"])
 
-    def respond(self, stimulus: Stimulus) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"] | None]:
+    def respond(self, stimulus: Stimulus) -> tuple[Vector, Vector | None]:
         """Return the outputs of both triads to what the set-up says they go through."""
-        accelerometer, gyroscope = (
-            None if triad is None else triad.respond(self.acted(stimulus, triad.quantity))
-            for triad in (self.accelerometer, self.gyroscope)
-        )
-        return accelerometer, gyroscope
+
+        def output(triad: Triad) -> Vector:
+            return triad.respond(self.acted(stimulus, triad.quantity))
+
+        return output(self.accelerometer), self.gyroscope and output(self.gyroscope)
 
     def acted(self, stimulus: Stimulus, quantity: str) -> Stimulus:
         """Return what the triad that senses `quantity` truly goes through where the set-up says `stimulus`."""
@@ -215,10 +213,10 @@ class Imu(eqx.Module):
 
     def recover(
         self,
-        accelerometer_output: Float[Array, "... 3"],
-        gyroscope_output: Float[Array, "... 3"] | None,
+        accelerometer_output: Vector,
+        gyroscope_output: Vector | None,
         stimulus: Stimulus | None = None,
-    ) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"] | None]:
+    ) -> tuple[Vector, Vector | None]:
         """Return specific force (m/s²) and angular rate (rad/s) from both outputs on the same stamps.
 
         Each triad's effects may depend on the other's input (g-sensitivity, lever arms). Then the two are recovered in
@@ -232,12 +230,12 @@ class Imu(eqx.Module):
             "specific_force" in e.needs for e in self.gyroscope.effects
         )
         accelerometer, gyroscope = self.accelerometer, self.gyroscope
-        known = stimulus.angular_acceleration is not None
+        derived = stimulus.angular_acceleration is None and stimulus.on_a_path()
 
         def turn(_, carried):
             _, rate = carried
             context = replace(stimulus, angular_rate=rate)
-            if not known and stimulus.time is not None and stimulus.time.ndim:
+            if derived:
                 context = replace(context, angular_acceleration=rate_of_change(rate, stimulus.time))
             force = accelerometer.recover(accelerometer_output, context)
             return force, gyroscope.recover(gyroscope_output, replace(stimulus, specific_force=force))
@@ -248,12 +246,7 @@ class Imu(eqx.Module):
 
     def transferable(self) -> Imu:
         """Return the unit without what does not belong to it: effects of a session and of the set-up."""
-
-        def device(triad: Triad) -> Triad:
-            return replace(triad, effects=tuple(effect for effect in triad.effects if effect.scope == "device"))
-
-        kept: dict[str, Any] = {name: device(triad) for name, triad in self.triads().items()}
-        return replace(self, **kept, setup=())
+        return self.with_effects(*(effect for effect in self.all_effects().values() if effect.scope == "device"))
 
 
 class Board(Imu):

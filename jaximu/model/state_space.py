@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
@@ -34,30 +35,39 @@ class LinearSystem(eqx.Module):
 
     def blocked(self, length: int = BLOCK) -> BlockSystem:
         """Return the system that advances by `length` samples at a time. On the host, once for a recording."""
-        a, b, c = (np.asarray(each) for each in (self.transition, self.drive, self.output))
+        a, b, c = map(np.asarray, (self.transition, self.drive, self.output))
         leading, states, inputs = a.shape[:-2], a.shape[-1], b.shape[-1]
         free = np.empty((*leading, length + 1, states))  # C A^k: what a state puts out k samples later
         power = np.broadcast_to(np.eye(states), a.shape)
-        reach = np.empty((*leading, length, states, inputs))  # A^k B: what a draw does to the state k samples later
+        pushes = np.empty((*leading, length, states, inputs))  # A^k B: what a draw does to the state k samples later
         for k in range(length + 1):
             free[..., k, :] = np.einsum("...s,...st->...t", c, power)
             if k < length:
-                reach[..., k, :, :] = power @ b
-            power = power @ a if k < length else power
+                pushes[..., k, :, :] = power @ b
+                power = power @ a
         response = np.empty((*leading, length, inputs))  # of the output to a draw, k samples later
         response[..., 0, :] = self.through
-        response[..., 1:, :] = np.einsum("...s,...ksm->...km", c, reach[..., : length - 1, :, :])
+        response[..., 1:, :] = np.einsum("...s,...ksm->...km", c, pushes[..., : length - 1, :, :])
         forced = np.zeros((*leading, inputs, length, length))  # Toeplitz: output k from draw j ≤ k
         for k in range(length):
             forced[..., k, : k + 1] = np.moveaxis(response[..., k::-1, :], -1, -2)
-        driven = np.moveaxis(reach[..., ::-1, :, :], -3, -1)  # (..., s, m, length)
+        driven = np.moveaxis(pushes[..., ::-1, :, :], -3, -1)  # (..., s, m, length)
         return BlockSystem(power, np.swapaxes(driven, -3, -2), free[..., :length, :], forced)
 
 
-def linear_system(*parts, leading: tuple[int, ...] = ()) -> LinearSystem:
-    """Return a system of its parts, their leading axes broadcast against each other and `leading`. On the host."""
-    ranks, arrays = (2, 2, 1, 1, 1, 2), [np.asarray(part, float) for part in parts]
-    pairs = list(zip(arrays, ranks, strict=True))
+def linear_system(
+    transition, drive, output, through=None, start=None, root=None, leading: tuple[int, ...] = ()
+) -> LinearSystem:
+    """Return a system of its parts, their leading axes broadcast against each other and `leading`. On the host.
+
+    Parts that are left out are zero.
+    """
+    states, inputs = np.shape(drive)[-2:]
+    through = np.zeros(inputs) if through is None else through
+    start = np.zeros(states) if start is None else start
+    root = np.zeros((states, 0)) if root is None else root
+    parts, ranks = (transition, drive, output, through, start, root), (2, 2, 1, 1, 1, 2)
+    pairs = [(np.asarray(part, float), rank) for part, rank in zip(parts, ranks, strict=True)]
     leading = np.broadcast_shapes(leading, *(part.shape[: part.ndim - rank] for part, rank in pairs))
     whole = (np.broadcast_to(part, leading + part.shape[part.ndim - rank :]) for part, rank in pairs)
     return LinearSystem(*whole)  # pyright: ignore[reportArgumentType]
@@ -66,20 +76,11 @@ def linear_system(*parts, leading: tuple[int, ...] = ()) -> LinearSystem:
 def combine(systems: Sequence[LinearSystem]) -> LinearSystem:
     """Return the sum of independent systems (of the same leading axes) as one system."""
 
-    def diagonal(parts):
-        rows, columns = (sum(part.shape[axis] for part in parts) for axis in (-2, -1))
-        whole = np.zeros((*parts[0].shape[:-2], rows, columns))
-        row = column = 0
-        for part in parts:
-            whole[..., row : row + part.shape[-2], column : column + part.shape[-1]] = part
-            row, column = row + part.shape[-2], column + part.shape[-1]
-        return whole
-
     def joined(name):
-        return np.concatenate([np.asarray(getattr(system, name)) for system in systems], axis=-1)
+        return np.concatenate([getattr(system, name) for system in systems], axis=-1)
 
     def blocks(name):
-        return diagonal([np.asarray(getattr(system, name)) for system in systems])
+        return scipy.linalg.block_diag(*(getattr(system, name) for system in systems))
 
     return LinearSystem(
         blocks("transition"), blocks("drive"), joined("output"), joined("through"), joined("start"), blocks("root")

@@ -1,14 +1,19 @@
 """What a sensor goes through, at sample rate: what effects read, and what the sensor model answers to."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import equinox as eqx
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
 from jaximu.ground.differences import slopes
 from jaximu.ground.errors import InputError
+from jaximu.ground.rotation import Quaternion, Vector
 
 __all__ = ["REFERENCE_TEMPERATURE", "Stimulus", "rate_of_change"]
 
+Numbers = Float[Array, " ..."]
 REFERENCE_TEMPERATURE = 25.0
 """°C at which gain and bias are stated, unless a triad says otherwise."""
 
@@ -27,19 +32,28 @@ class Stimulus(eqx.Module):
     effects count from; `memory` is what effects with a memory carry over from the path before this one, by name.
     """
 
-    specific_force: Float[Array, "... 3"] | None = None
-    angular_rate: Float[Array, "... 3"] | None = None
-    angular_acceleration: Float[Array, "... 3"] | None = None
-    temperature: Float[Array, " ..."] | None = None
-    temperature_rate: Float[Array, " ..."] | None = None
-    time: Float[Array, " ..."] | None = None
-    attitude: Float[Array, "... 4"] | None = None
-    vibration_power: Float[Array, " ..."] | None = None
-    magnetic_field: Float[Array, "... 3"] | None = None
-    current: Float[Array, " ..."] | None = None
+    specific_force: Vector | None = None
+    angular_rate: Vector | None = None
+    angular_acceleration: Vector | None = None
+    temperature: Numbers | None = None
+    temperature_rate: Numbers | None = None
+    time: Numbers | None = None
+    attitude: Quaternion | None = None
+    vibration_power: Numbers | None = None
+    magnetic_field: Vector | None = None
+    current: Numbers | None = None
     memory: dict[str, Float[Array, "... _"]] | None = None
     temperature_reference: float = eqx.field(static=True, default=REFERENCE_TEMPERATURE)
     time_reference: float = eqx.field(static=True, default=0.0)
+
+    def changed(self, change: Callable[[Array], Array], *fields: str) -> "Stimulus":
+        """Return the stimulus with some fields changed by a function, where they are known."""
+        values = {field: getattr(self, field) for field in fields}
+        return replace(self, **{field: change(value) for field, value in values.items() if value is not None})
+
+    def on_a_path(self) -> bool:
+        """Return whether there are stamps along a path, not one instant."""
+        return self.time is not None and self.time.ndim > 0
 
     def need(self, field: str, name: str) -> Array:
         """Return a field for the effect called `name`.
@@ -48,18 +62,18 @@ class Stimulus(eqx.Module):
         field that is neither there nor to be had.
         """
         value = getattr(self, field)
-        source = _DERIVATIVES.get(field)
-        if value is None and source and getattr(self, source) is not None and self.time is not None and self.time.ndim:
-            value = rate_of_change(getattr(self, source), self.time)
+        source = getattr(self, _DERIVATIVES.get(field, field))
+        if value is None and source is not None and self.on_a_path():
+            value = rate_of_change(source, self.time)
         if value is None:
             raise InputError(f"the effect {name} needs the {field.replace('_', ' ')}, which this recording lacks.")
         return value
 
-    def warmth(self, name: str) -> Float[Array, " ..."]:
+    def warmth(self, name: str) -> Numbers:
         """Return T − T_ref (K) for the effect called `name`."""
         return self.need("temperature", name) - self.temperature_reference
 
-    def elapsed(self, name: str) -> Float[Array, " ..."]:
+    def elapsed(self, name: str) -> Numbers:
         """Return t − t_ref (s) for the effect called `name`."""
         return self.need("time", name) - self.time_reference
 

@@ -137,7 +137,7 @@ def task(document: Mapping[str, Any], name: str = "specification") -> Task:
         raise InputError(f"{name}: there is no [errors] table; its keys are {', '.join(_ERRORS)}.")
     errors = _errors(document["errors"], name, document.get("environment", {}))
     stated = tuple((str(key), str(value)) for key, value in goals.items())
-    environment = specification.environment_of(Draw(name, specification.seed, 0))
+    environment = specification.environment_of(Draw(specification.seed, 0))
     return Task(specification.case(0), environment, errors, tuple(fitted), stated, name)
 
 

@@ -6,6 +6,7 @@ length can be streamed. They are applied in the order in which they happen: in t
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -13,15 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.ground.errors import InputError
+from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES
 from jaximu.recordings.recording import axis_matrix
 
 __all__ = ["ARTEFACTS", "Artefact", "LoggedRows"]
 
-_COLUMNS = {
-    f"{prefix}_{axis}": (sensor, place)
-    for prefix, sensor in (("accel", "accelerometer"), ("gyro", "gyroscope"))
-    for place, axis in enumerate("xyz")
-}
+_SENSORS = tuple(INERTIAL_QUANTITIES)
+_COLUMNS = {f"{PREFIXES[sensor]}_{axis}": (sensor, index) for sensor in _SENSORS for index, axis in enumerate("xyz")}
 
 
 @dataclass
@@ -54,23 +53,31 @@ class Artefact:
         return None
 
 
-def _column(name: str, artefact: str) -> tuple[str, int]:
-    if name not in _COLUMNS:
-        raise InputError(f"artefact {artefact}: axis must be one of {', '.join(_COLUMNS)}, found {name!r}.")
-    return _COLUMNS[name]
-
-
-def _not_negative(artefact: Artefact, **values: float | None) -> None:
-    for name, value in values.items():
+def _not_negative(artefact: Artefact, *names: str) -> None:
+    for name in names:
+        value = getattr(artefact, name)
         if value is not None and not value >= 0:
             raise InputError(f"artefact {artefact.name}: {name} must not be negative, found {value}.")
 
 
 @dataclass(frozen=True)
-class Periodic(Artefact):
+class _OfAnAxis(Artefact):
+    axis: str
+
+    def __post_init__(self):
+        if self.axis not in _COLUMNS:
+            raise InputError(f"artefact {self.name}: axis must be one of {', '.join(_COLUMNS)}, found {self.axis!r}.")
+
+    def values(self, samples: LoggedRows) -> NDArray[np.float64]:
+        """The axis's values (n,), a view."""
+        sensor, index = _COLUMNS[self.axis]
+        return samples.values[sensor][:, index]
+
+
+@dataclass(frozen=True)
+class Periodic(_OfAnAxis):
     """A line in the spectrum of one axis: amplitude (output unit) and frequency (Hz)."""
 
-    axis: str
     amplitude: float
     frequency: float
 
@@ -78,13 +85,13 @@ class Periodic(Artefact):
     catalogue = "data.periodic"
 
     def __post_init__(self):
-        _column(self.axis, self.name)
-        _not_negative(self, frequency=self.frequency)
+        super().__post_init__()
+        _not_negative(self, "frequency")
 
     def apply(self, samples, rng, kept):
-        sensor, place = _column(self.axis, self.name)
         phase = rng.uniform(0, 2 * np.pi) if kept is None else kept
-        samples.values[sensor][:, place] += self.amplitude * np.sin(2 * np.pi * self.frequency * samples.time + phase)
+        values = self.values(samples)
+        values += self.amplitude * np.sin(2 * np.pi * self.frequency * samples.time + phase)
         return phase
 
 
@@ -99,21 +106,24 @@ class Clipping(Artefact):
     catalogue = "data.clipping"
 
     def __post_init__(self):
-        _not_negative(self, accelerometer=self.accelerometer, gyroscope=self.gyroscope)
+        _not_negative(self, *_SENSORS)
 
     def apply(self, samples, rng, kept):
-        counts = kept or {"accelerometer": 0, "gyroscope": 0}
-        for sensor in counts:
+        counts = Counter(kept)
+        for sensor in _SENSORS:
             limit = getattr(self, sensor)
             if limit is not None and sensor in samples.values:
                 values = samples.values[sensor]
-                counts = counts | {sensor: counts[sensor] + int(np.sum(np.any(np.abs(values) > limit, axis=1)))}
+                counts[sensor] += int(np.sum(np.any(np.abs(values) > limit, axis=1)))
                 np.clip(values, -limit, limit, out=values)
         return counts
 
     def report(self, kept):
-        left = [f"the {sensor} left its range of ±{getattr(self, sensor):g} in {count} samples"
-                for sensor, count in (kept or {}).items() if count]  # fmt: skip
+        left = [
+            f"the {sensor} left its range of ±{getattr(self, sensor):g} in {count} samples"
+            for sensor, count in (kept or {}).items()
+            if count
+        ]
         return "; ".join(left) + " and was clipped." if left else None
 
 
@@ -129,10 +139,10 @@ class QuantisedOutput(Artefact):
     catalogue = "data.quantisation"
 
     def __post_init__(self):
-        _not_negative(self, accelerometer=self.accelerometer, gyroscope=self.gyroscope, temperature=self.temperature)
+        _not_negative(self, *_SENSORS, "temperature")
 
     def apply(self, samples, rng, kept):
-        for signal in ("accelerometer", "gyroscope", "temperature"):
+        for signal in (*_SENSORS, "temperature"):
             step = getattr(self, signal)
             if step and signal in samples.values:
                 samples.values[signal] = np.round(samples.values[signal] / step) * step
@@ -149,7 +159,7 @@ class SwappedAxes(Artefact):
     catalogue = "data.swapped_axes"
 
     def __post_init__(self):
-        if self.sensor not in ("accelerometer", "gyroscope"):
+        if self.sensor not in _SENSORS:
             raise InputError(
                 f"artefact swapped_axes: sensor must be accelerometer or gyroscope, found {self.sensor!r}."
             )
@@ -164,10 +174,9 @@ class SwappedAxes(Artefact):
 
 
 @dataclass(frozen=True)
-class StuckAxis(Artefact):
+class StuckAxis(_OfAnAxis):
     """One axis repeats from `start` to `stop` (s) the last value it had before."""
 
-    axis: str
     start: float
     stop: float = field(default=np.inf)
 
@@ -175,15 +184,13 @@ class StuckAxis(Artefact):
     catalogue = "data.stuck_axis"
 
     def __post_init__(self):
-        _column(self.axis, self.name)
-        if not self.start < self.stop:
-            raise InputError(f"artefact stuck_axis: start must be before stop, found {self.start} and {self.stop}.")
+        super().__post_init__()
+        _in_order(self)
 
     def apply(self, samples, rng, kept):
-        sensor, place = _column(self.axis, self.name)
-        if sensor not in samples.values or not len(samples.time):
+        if _COLUMNS[self.axis][0] not in samples.values or not len(samples.time):
             return kept
-        values = samples.values[sensor][:, place]
+        values = self.values(samples)
         stuck = (samples.time >= self.start) & (samples.time < self.stop)
         before = values[samples.time < self.start]
         held = before[-1] if len(before) else (values[0] if kept is None else kept)
@@ -205,16 +212,13 @@ class Repeated(Artefact):
 
     def apply(self, samples, rng, kept):
         repeat = rng.random(len(samples.time)) < self.share
-        first = kept is None
-        if first and len(repeat):
-            repeat[0] = False
-        source = np.maximum.accumulate(np.where(repeat, -1, np.arange(len(repeat))))
-        last = {}
+        if kept is None:
+            repeat[:1] = False
+            kept = {name: value[:1] for name, value in samples.values.items()}
+        source = np.maximum.accumulate(np.where(repeat, 0, 1 + np.arange(len(repeat))))
         for name, value in samples.values.items():
-            full = value if first else np.concatenate([kept[name], value])
-            samples.values[name] = full[source + (0 if first else 1)]
-            last[name] = samples.values[name][-1:].copy()
-        return last
+            samples.values[name] = np.concatenate([kept[name], value])[source]
+        return {name: value[-1:].copy() for name, value in samples.values.items()}
 
 
 @dataclass(frozen=True)
@@ -244,8 +248,7 @@ class Gap(Artefact):
     catalogue = "data.gap"
 
     def __post_init__(self):
-        if not self.start < self.stop:
-            raise InputError(f"artefact gap: start must be before stop, found {self.start} and {self.stop}.")
+        _in_order(self)
 
     def apply(self, samples, rng, kept):
         samples.keep((samples.time < self.start) | (samples.time >= self.stop))
@@ -261,7 +264,7 @@ class Jitter(Artefact):
     catalogue = "data.jitter"
 
     def __post_init__(self):
-        _not_negative(self, sigma=self.sigma)
+        _not_negative(self, "sigma")
 
     def apply(self, samples, rng, kept):
         if not len(samples.time):
@@ -272,6 +275,13 @@ class Jitter(Artefact):
         scatter = self.sigma * rng.standard_normal(len(samples.time))
         samples.time = samples.time + np.clip(scatter, -0.45 * interval, 0.45 * interval)
         return interval
+
+
+def _in_order(artefact: StuckAxis | Gap) -> None:
+    if not artefact.start < artefact.stop:
+        raise InputError(
+            f"artefact {artefact.name}: start must be before stop, found {artefact.start} and {artefact.stop}."
+        )
 
 
 def _share(artefact: Repeated | Dropped) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
@@ -21,8 +22,11 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
 from jaximu.ground.tracing import is_traced
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model import Noise
-from jaximu.model.sensor import Imu
+from jaximu.model.effects import Effect
+from jaximu.model.sensor import Imu, Triad
+from jaximu.model.state_space import BLOCK
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Recording, Signal
@@ -32,7 +36,6 @@ from jaximu.simulation.protocols import Environment, Interval, Motion, Plan, Pro
 
 __all__ = ["Case", "Stream", "Truth", "simulate", "simulate_cases", "write_case"]
 
-_HALO_STEP = 64
 TRUTH_SCHEMA = "jaximu.truth/1"
 
 
@@ -76,16 +79,16 @@ class Case:
             raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
         seeds = tuple(seed) if isinstance(seed, Sequence) else (seed,)
         plan = protocol.plan(_generator(seeds, "motion", power_on), environment)
-        found = dict(noise or {})
+        noise = dict(noise or {})
         quantities = {name: triad.quantity for name, triad in imu.triads().items()}
-        for name, each in found.items():
-            if quantities.get(name) != each.quantity:
-                raise InputError(f"noise of {name!r} is given for {each.quantity}.")
+        for name, random in noise.items():
+            if quantities.get(name) != random.quantity:
+                raise InputError(f"noise of {name!r} is given for {random.quantity}.")
         if plan.motion.samples(rate) < 2:
             raise InputError(f"the protocol lasts {plan.motion.length:g} s: less than two samples at {rate:g} Hz.")
         order = list(ARTEFACTS.values())
         artefacts = tuple(sorted(artefacts, key=lambda artefact: order.index(type(artefact))))
-        return cls(imu, plan, found, float(rate), seeds, power_on, artefacts, protocol)
+        return cls(imu, plan, noise, float(rate), seeds, power_on, artefacts, protocol)
 
     @property
     def samples(self) -> int:
@@ -114,19 +117,23 @@ class Truth(Document):
     def schedule(self) -> list[Interval]:
         """Rests and turns, on the recording's clock."""
         half = 0.5 / self.case.rate
-        return [replace(each, start=each.start - half, stop=each.stop - half) for each in self.case.plan.intervals]
+        return [
+            replace(interval, start=interval.start - half, stop=interval.stop - half)
+            for interval in self.case.plan.intervals
+        ]
 
     @property
     def intervals(self) -> FloatArray:
         """(P, 2) start and stop of each rest (s, on the recording's clock), at the edges of samples."""
-        return np.array([(each.start, each.stop) for each in self.schedule if each.kind == "pose"]).reshape(-1, 2)
+        poses = [interval for interval in self.schedule if interval.kind == "pose"]
+        return np.array([(pose.start, pose.stop) for pose in poses]).reshape(-1, 2)
 
     def document(self) -> dict[str, Any]:
         """Return the truth as the JSON document of schema `jaximu.truth/1`."""
-        case = self.case
+        case, motion = self.case, self.case.plan.motion
 
-        def effects(found, output_unit: str) -> dict[str, Any]:
-            return {effect.name: effect.document(output_unit) for effect in found}
+        def documents(effects: Iterable[Effect], output_unit: str = "") -> dict[str, Any]:
+            return {effect.name: effect.document(output_unit) for effect in effects}
 
         triads = {
             name: {
@@ -135,11 +142,11 @@ class Truth(Document):
                 "bias": np.asarray(triad.bias).tolist(),
                 "temperature_reference": triad.temperature_reference,
                 "time_reference": triad.time_reference,
-                "effects": effects(triad.effects, triad.output_unit),
+                "effects": documents(triad.effects, triad.output_unit),
                 "noise": [
                     {"process": type(process).__name__}
-                    | {name: np.asarray(value).tolist() for name, value in asdict(process).items()}
-                    for process in (case.noise[name].processes if name in case.noise else ())
+                    | {parameter: np.asarray(value).tolist() for parameter, value in asdict(process).items()}
+                    for process in case.noise.get(name, Noise()).processes
                 ],
             }
             for name, triad in case.imu.triads().items()
@@ -147,19 +154,15 @@ class Truth(Document):
         return {
             "schema": TRUTH_SCHEMA,
             **triads,
-            "setup": {"effects": effects(case.imu.setup, "")},
+            "setup": {"effects": documents(case.imu.setup)},
             "protocol": {"kind": case.protocol.kind, **asdict(case.protocol)} if case.protocol else None,
-            "gravity": float(case.plan.motion.gravity),
-            "earth_rotation": np.asarray(case.plan.motion.earth).tolist(),
-            "magnetic_field": np.asarray(case.plan.motion.field).tolist(),
-            "schedule": [
-                {"start": each.start, "stop": each.stop, "kind": each.kind, "vector": each.vector.tolist(),
-                 "angle": each.angle, "heading": each.heading}
-                for each in self.schedule
-            ],
+            "gravity": float(motion.gravity),
+            "earth_rotation": np.asarray(motion.earth).tolist(),
+            "magnetic_field": np.asarray(motion.field).tolist(),
+            "schedule": [asdict(interval) | {"vector": interval.vector.tolist()} for interval in self.schedule],
             "artefacts": [
-                {"name": each.name} | {k: None if v == np.inf else v for k, v in asdict(each).items()}
-                for each in case.artefacts
+                {"name": artefact.name} | {k: None if v == np.inf else v for k, v in asdict(artefact).items()}
+                for artefact in case.artefacts
             ],
             "rate": case.rate,
             "samples": case.samples,
@@ -167,16 +170,17 @@ class Truth(Document):
             "power_on": case.power_on,
             "notes": list(self.notes),
             "software": SOFTWARE,
-        }  # fmt: skip
+        }
 
     def save_schedule(self, path: str | os.PathLike[str]) -> None:
         """Write rests and turns as a turntable schedule (CSV, angles in degrees), as `--reference` reads it."""
         lines = ["start [s],stop [s],kind,x,y,z,angle [deg],heading [deg]"]
-        for each in self.schedule:
-            x, y, z = each.vector
-            angle, heading = np.degrees(each.angle), np.degrees(each.heading)
-            extra = f"{angle:.12g}," if each.kind == "turn" else f",{heading:.12g}"
-            lines.append(f"{each.start:.9g},{each.stop:.9g},{each.kind},{x:.12g},{y:.12g},{z:.12g},{extra}")
+        for interval in self.schedule:
+            x, y, z = interval.vector
+            angle, heading = np.degrees(interval.angle), np.degrees(interval.heading)
+            extra = f"{angle:.12g}," if interval.kind == "turn" else f",{heading:.12g}"
+            times = f"{interval.start:.9g},{interval.stop:.9g}"
+            lines.append(f"{times},{interval.kind},{x:.12g},{y:.12g},{z:.12g},{extra}")
         with atomic_write(path) as temporary:
             temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -198,15 +202,15 @@ def _respond_batch(length: int, halo: int, columns: tuple[str, ...], imus, motio
             felt = replace(crop(imu.acted(whole, triad.quantity)), memory=memory)
             values[name] = triad.respond(felt)
             kept |= triad.memory(felt)
-        said = crop(whole)
+        intended = crop(whole)
         beside = {
-            "temperature": lambda: said.temperature[:, None],
-            "current": lambda: said.current[:, None],
-            "ambient_temperature": lambda: motion.ambient_at(said.time + 0.5 / rate)[:, None],
-            "attitude": lambda: said.attitude,
-            "table_rate": lambda: rotate(said.attitude, said.angular_rate)[:, 2:] - motion.earth[2],
-        }
-        return values | {name: beside[name]() for name in columns}, kept
+            "temperature": intended.temperature[:, None],
+            "current": intended.current[:, None],
+            "ambient_temperature": motion.ambient_at(intended.time + 0.5 / rate)[:, None],
+            "attitude": intended.attitude,
+            "table_rate": rotate(intended.attitude, intended.angular_rate)[:, 2:] - motion.earth[2],
+        }  # what is not logged is not compiled
+        return values | {name: beside[name] for name in columns}, kept
 
     return jax.vmap(one)(imus, motions, memory)
 
@@ -240,59 +244,65 @@ class Stream:
         self.samples, self.rate = cases[0].samples, cases[0].rate
         self.length = block or block_length(self.samples)
         self.notes: list[tuple[str, ...]] = [() for _ in cases]
-        reach = max(
-            (effect.reach(self.samples / self.rate) for case in cases for effect in case.imu.setup), default=None
-        )
-        self._halo = 0 if reach is None else -(-(round(reach * self.rate) + 3) // _HALO_STEP) * _HALO_STEP
+        margins = [effect.reach(self.samples / self.rate) for case in cases for effect in case.imu.setup]
+        self._halo = -(-(round(max(margins) * self.rate) + 3) // BLOCK) * BLOCK if margins else 0
 
     def __iter__(self) -> Iterator[list[LoggedRows]]:
         cases = self.cases
         imus, motions = _stack([case.imu for case in cases]), _stack([case.plan.motion for case in cases])
-        noises = [
-            {
-                name: case.noise[name].stream(self.rate, case.seed, case.power_on)
-                for name in case.imu.triads()
-                if name in case.noise
-            }
-            for case in cases
-        ]
-        draws = [
-            [_generator(case.seed, f"{place}.{each.name}", case.power_on) for place, each in enumerate(case.artefacts)]
-            for case in cases
-        ]
-        kept: list[list[Any]] = [[None] * len(case.artefacts) for case in cases]
+        loggers = [_Logger(case) for case in cases]
         memory: Any = {
             effect.name: np.full((len(cases), effect.memory), np.nan)
-            for triad in cases[0].imu.triads().values()
-            for effect in triad.effects
+            for effect in cases[0].imu.all_effects().values()
             if effect.memory
         }
         settings = self.length, self._halo, cases[0].plan.columns
         respond, description = partial(_respond_batch, *settings), f"respond {settings}"
         for first in range(0, self.samples, self.length):
-            rows = np.arange(first, min(first + self.length, self.samples))
             columns, memory = stored.call(
                 respond, description, imus, motions, memory, float(first), self.rate, quick=False
             )
-            block = []
-            for unit, case in enumerate(cases):
-                values = {name: np.array(column[unit])[: len(rows)] for name, column in columns.items()}
-                for name, noise in noises[unit].items():
-                    values[name] += _per_output(case.imu, name) * noise.take(self.length)[: len(rows)]
-                samples = LoggedRows(rows, rows / self.rate, values)
-                for place, artefact in enumerate(case.artefacts):
-                    kept[unit][place] = artefact.apply(samples, draws[unit][place], kept[unit][place])
-                block.append(samples)
-            yield block
-        self.notes = [
-            tuple(text for a, state in zip(case.artefacts, states, strict=True) if (text := a.report(state)))
-            for case, states in zip(cases, kept, strict=True)
+            rows = np.arange(first, min(first + self.length, self.samples))
+            yield [
+                logger.logged(rows, {name: column[unit] for name, column in columns.items()})
+                for unit, logger in enumerate(loggers)
+            ]
+        self.notes = [logger.notes() for logger in loggers]
+
+
+class _Logger:
+    """What happens to the outputs of one case, block after block: noise and artefacts."""
+
+    def __init__(self, case: Case):
+        self.case, triads = case, case.imu.triads()
+        self.noise = {
+            name: (_per_output(triad), case.noise[name].stream(case.rate, case.seed, case.power_on))
+            for name, triad in triads.items()
+            if name in case.noise
+        }
+        self.draws = [
+            _generator(case.seed, f"{k}.{artefact.name}", case.power_on) for k, artefact in enumerate(case.artefacts)
         ]
+        self.kept: list[Any] = [None] * len(case.artefacts)
+
+    def logged(self, rows: NDArray[np.int64], columns: Mapping[str, FloatArray]) -> LoggedRows:
+        """Return what is logged in the rows of a block where these are the outputs."""
+        values = {name: np.array(column)[: len(rows)] for name, column in columns.items()}
+        for name, (scale, stream) in self.noise.items():
+            values[name] += scale * stream.take(len(columns[name]))[: len(rows)]
+        samples = LoggedRows(rows, rows / self.case.rate, values)
+        for k, artefact in enumerate(self.case.artefacts):
+            self.kept[k] = artefact.apply(samples, self.draws[k], self.kept[k])
+        return samples
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what the artefacts did."""
+        reports = (artefact.report(kept) for artefact, kept in zip(self.case.artefacts, self.kept, strict=True))
+        return tuple(filter(None, reports))
 
 
-def _per_output(imu: Imu, name: str) -> FloatArray | float:
+def _per_output(triad: Triad) -> FloatArray | float:
     """Noise is in SI: per axis, the output units of one SI unit."""
-    triad = imu.triads()[name]
     return np.linalg.norm(np.asarray(triad.gain), axis=1) if triad.output_unit == "count" else 1.0
 
 
@@ -306,17 +316,12 @@ def _recording(case: Case, parts: Sequence[LoggedRows]) -> Recording:
         if name not in parts[0].values:
             return None
         triad = case.imu.triads().get(name)
-        unit = _UNITS[name] if triad is None else triad.output_unit
+        unit, scale = (_UNITS[name], 1.0) if triad is None else (triad.output_unit, _per_output(triad))
         values = np.concatenate([part.values[name] for part in parts])
-        scale = _per_output(case.imu, name) if triad is not None else 1.0
         return Signal(time, values, unit, np.broadcast_to(scale, values.shape[1]))
 
-    accelerometer = signal("accelerometer")
-    assert accelerometer is not None
-    return Recording(
-        accelerometer,
-        **{name: signal(name) for name in ("gyroscope", "magnetometer", *_UNITS)},  # pyright: ignore[reportArgumentType]
-    )
+    signals: dict[str, Any] = {name: signal(name) for name in (*SENSOR_UNITS, *_UNITS)}
+    return Recording(**signals)
 
 
 def simulate(
@@ -355,11 +360,8 @@ def simulate_cases(cases: Sequence[Case]) -> list[tuple[Recording, Truth]]:
     """Simulate like cases together, in memory."""
     source = Stream(cases)
     blocks = list(source)
-    found = []
-    for unit, case in enumerate(cases):
-        parts = [block[unit] for block in blocks]
-        found.append((_recording(case, parts), Truth(case, source.notes[unit])))
-    return found
+    units = zip(cases, zip(*blocks, strict=True), source.notes, strict=True)
+    return [(_recording(case, parts), Truth(case, notes)) for case, parts, notes in units]
 
 
 def write_case(case: Case, path: str | os.PathLike[str]) -> Truth:

@@ -43,7 +43,7 @@ import inspect
 import os
 import zlib
 from collections.abc import Iterable
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, Field, fields
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,7 @@ from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
 from jaximu.model import Noise, parse_quantity
 from jaximu.model.data_sheet import SI_UNITS
 from jaximu.model.effects import CATALOGUE, Effect
+from jaximu.model.noise import FIGURE_TERMS
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact
@@ -63,9 +64,7 @@ from jaximu.simulation.protocols import PROTOCOLS, Environment, Protocol, Tone
 __all__ = ["Draw", "Specification", "read_specification"]
 
 _TRIAD_KEYS = ("output_unit", "counts", "gain", "scale", "misalignment", "bias", "temperature_reference", "noise")
-_NOISE_KEYS = tuple(
-    name for name, each in inspect.signature(Noise.from_datasheet).parameters.items() if each.kind is each.KEYWORD_ONLY
-)
+_NOISE_KEYS = inspect.getfullargspec(Noise.from_datasheet).kwonlyargs
 _TOP_KEYS = ("seed", "units", "recordings", "rate", "protocol", "environment", *SENSOR_UNITS, "effects", "artefacts")
 
 
@@ -89,14 +88,14 @@ class Specification:
 
     def case(self, unit: int, recording: int = 0) -> Case:
         """Return one recording of one unit, its ranges drawn."""
-        document, draw = self.document, Draw(self.name, self.seed, unit)
+        draw = Draw(self.seed, unit)
         try:
             imu, noise = self._imu(draw)
             return Case.of(
                 imu,
                 self._protocol(draw),
                 noise,
-                draw.number(document.get("rate", 100.0), "rate"),
+                draw.number(self.document.get("rate", 100.0), "rate"),
                 (self.seed, unit),
                 recording,
                 self.environment_of(draw),
@@ -110,10 +109,13 @@ class Specification:
         """Return all cases, by unit and recording."""
         return [[self.case(unit, recording) for recording in range(self.recordings)] for unit in range(self.units)]
 
-    # --- parts ---------------------------------------------------------------------------------------------------
+    # --- parts: `case` puts the name of the specification before what they say is wrong --------------------------
 
     def _known(self, table: Any, known: Iterable[str], where: str) -> dict[str, Any]:
         return only(table, known, self.name, where and f"[{where}]")
+
+    def _table(self, key: str, known: Iterable[str]) -> dict[str, Any]:
+        return self._known(self.document.get(key, {}), known, key)
 
     def _count(self, key: str, default: int, least: int = 1) -> int:
         value = self.document.get(key, default)
@@ -125,169 +127,147 @@ class Specification:
         table = self.document["protocol"]
         kind = table.get("kind") if isinstance(table, dict) else None
         if kind not in PROTOCOLS:
-            raise InputError(f"{self.name}: protocol.kind is {kind!r}; {nearest(kind, PROTOCOLS)}")
+            raise InputError(f"protocol.kind is {kind!r}; {nearest(kind, PROTOCOLS)}")
         return self._build(PROTOCOLS[kind], {k: v for k, v in table.items() if k != "kind"}, "protocol", draw)
 
     def environment_of(self, draw: Draw) -> Environment:
-        table = dict(self._known(self.document.get("environment", {}), _names(Environment), "environment"))
-        values: dict[str, Any] = {}
-        for key, value in table.items():
-            where = f"environment.{key}"
-            if key == "vibration":
-                tones = value if isinstance(value, list) else [value]
-                values[key] = tuple(self._build(Tone, tone, f"{where}[{k}]", draw) for k, tone in enumerate(tones))
-            elif isinstance(value, list):
-                values[key] = draw.nested(value, where)
-            else:
-                values[key] = draw.number(value, where)
-        return Environment(**values)
+        return self._build(Environment, self.document.get("environment", {}), "environment", draw)
 
     def _imu(self, draw: Draw) -> tuple[Imu, dict[str, Noise]]:
-        effects: list[Effect] = []
-        for name, entry in self._known(self.document.get("effects", {}), CATALOGUE, "effects").items():
-            kind, where = CATALOGUE[name], f"effects.{name}"
-            table = self._known(entry, ("coefficients", *kind.inner), where)
-            if "coefficients" not in table:
-                raise InputError(f"{self.name}: [{where}] needs coefficients, {kind.size} or one for all.")
-            coefficients = draw.several(table["coefficients"], kind.size, f"{where}.coefficients")
-            inner = {key: draw.number(value, f"{where}.{key}") for key, value in table.items() if key in kind.inner}
-            for key, value in inner.items():
-                if value < 0 or (value == 0 and kind.inner[key].low > 0):
-                    raise InputError(f"{self.name}: {where}.{key} must be greater than zero, found {value}.")
-            effects.append(kind.make(coefficients, **inner))
-        triads, noise = {}, {}
-        for name in SENSOR_UNITS:
-            if name == "magnetometer" and name not in self.document:
-                continue
-            triads[name], found = self._triad(name, draw)
-            if found.processes:
-                noise[name] = found
-        return Imu(**triads).with_effects(*effects), noise
+        names = [name for name in SENSOR_UNITS if name != "magnetometer" or name in self.document]
+        effects = [self._effect(name, entry, draw) for name, entry in self._table("effects", CATALOGUE).items()]
+        triads: dict[str, Any] = {name: self._triad(name, draw) for name in names}
+        noise = {name: self._noise(name, draw) for name in names}
+        return (
+            Imu(**triads).with_effects(*effects),
+            {name: random for name, random in noise.items() if random.processes},
+        )
 
-    def _triad(self, name: str, draw: Draw) -> tuple[Triad, Noise]:
-        quantity, si = SENSOR_QUANTITIES[name], SENSOR_UNITS[name]
-        table = self._known(self.document.get(name, {}), _TRIAD_KEYS, name)
+    def _effect(self, name: str, entry: Any, draw: Draw) -> Effect:
+        kind, where = CATALOGUE[name], f"effects.{name}"
+        table = self._known(entry, ("coefficients", *kind.inner), where)
+        if "coefficients" not in table:
+            raise InputError(f"[{where}] needs coefficients, {kind.size} or one for all.")
+        coefficients = draw.several(table["coefficients"], kind.size, f"{where}.coefficients")
+        inner = {key: draw.number(value, f"{where}.{key}") for key, value in table.items() if key in kind.inner}
+        for key, value in inner.items():
+            if value < 0 or (value == 0 and kind.inner[key].low > 0):
+                raise InputError(f"{where}.{key} must be greater than zero, found {value}.")
+        return kind.make(coefficients, **inner)
+
+    def _triad(self, name: str, draw: Draw) -> Triad:
+        si, table = SENSOR_UNITS[name], self._table(name, _TRIAD_KEYS)
         unit = table.get("output_unit", si)
         if unit not in (si, "count"):
-            raise InputError(f"{self.name}: {name}.output_unit must be {si!r} or 'count', found {unit!r}.")
+            raise InputError(f"{name}.output_unit must be {si!r} or 'count', found {unit!r}.")
         if (unit == "count") != ("counts" in table):
-            raise InputError(f"{self.name}: {name}: output_unit = 'count' and counts (per {si}) go together.")
+            raise InputError(f"{name}: output_unit = 'count' and counts (per {si}) go together.")
         counts = draw.number(table.get("counts", 1.0), f"{name}.counts")
         if not counts > 0:
-            raise InputError(f"{self.name}: {name}.counts must be greater than zero, found {counts}.")
+            raise InputError(f"{name}.counts must be greater than zero, found {counts}.")
         if "gain" in table:
             if "scale" in table or "misalignment" in table:
-                raise InputError(f"{self.name}: {name}: give either gain or scale and misalignment.")
+                raise InputError(f"{name}: give either gain or scale and misalignment.")
             gain = np.array(draw.nested(table["gain"], f"{name}.gain"), float)
             if gain.shape != (3, 3) or abs(np.linalg.det(gain)) < 1e-12:
-                raise InputError(f"{self.name}: {name}.gain must be an invertible 3×3 matrix.")
+                raise InputError(f"{name}.gain must be an invertible 3×3 matrix.")
         else:
-            places = np.tril_indices(3, -1) if name == "accelerometer" else np.nonzero(1 - np.eye(3))
+            rows, columns = np.tril_indices(3, -1) if name == "accelerometer" else np.nonzero(1 - np.eye(3))
             gain = np.diag(1 + draw.several(table.get("scale", 0.0), 3, f"{name}.scale"))
-            gain[places] = draw.several(table.get("misalignment", 0.0), len(places[0]), f"{name}.misalignment")
+            gain[rows, columns] = draw.several(table.get("misalignment", 0.0), len(rows), f"{name}.misalignment")
             gain = counts * gain
         bias = counts * draw.several(table.get("bias", 0.0), 3, f"{name}.bias", si)
-        reference = draw.number(
-            table.get("temperature_reference", REFERENCE_TEMPERATURE), f"{name}.temperature_reference"
+        reference = table.get("temperature_reference", REFERENCE_TEMPERATURE)
+        return Triad(
+            gain,
+            bias,
+            quantity=SENSOR_QUANTITIES[name],
+            output_unit=unit,
+            temperature_reference=draw.number(reference, f"{name}.temperature_reference"),
         )
-        entry = self._known(table.get("noise", {}), _NOISE_KEYS, f"{name}.noise")
-        terms = {"white": "N", "bias_instability": "B", "rate_random_walk": "K", "quantisation": "Q", "rate_ramp": "R",
-                 "repeatability": "B", "bias": "B"}  # fmt: skip
+
+    def _noise(self, name: str, draw: Draw) -> Noise:
+        quantity, where = SENSOR_QUANTITIES[name], f"{name}.noise"
         figures: dict[str, Any] = {}
-        for key, value in entry.items():
-            where = f"{name}.noise.{key}"
-            ranged = isinstance(value, dict)
-            figures[key] = (
-                draw.number(value, where, SI_UNITS[quantity].get(terms.get(key, ""), "1")) if ranged else value
-            )
+        for key, value in self._known(self._table(name, _TRIAD_KEYS).get("noise", {}), _NOISE_KEYS, where).items():
+            unit = SI_UNITS[quantity].get(FIGURE_TERMS.get(key, ""), "1")
+            figures[key] = draw.number(value, f"{where}.{key}", unit) if isinstance(value, dict) else value
         try:
-            noise = Noise.from_datasheet(quantity, **figures)
+            return Noise.from_datasheet(quantity, **figures)
         except (InputError, TypeError) as error:
-            raise InputError(f"{self.name}: [{name}.noise] {error}") from error
-        triad = Triad(gain, bias, (), quantity, unit, temperature_reference=reference)
-        return triad, noise
+            raise InputError(f"[{where}] {error}") from error
 
     def _artefacts(self, draw: Draw) -> list[Artefact]:
-        found = []
-        for name, entry in self._known(self.document.get("artefacts", {}), ARTEFACTS, "artefacts").items():
-            several = entry if isinstance(entry, list) else [entry]
-            where = f"artefacts.{name}"
-            found += [self._build(ARTEFACTS[name], each, f"{where}[{k}]", draw) for k, each in enumerate(several)]
-        return found
+        return [
+            self._build(ARTEFACTS[name], table, f"artefacts.{name}[{k}]", draw)
+            for name, entry in self._table("artefacts", ARTEFACTS).items()
+            for k, table in enumerate(entry if isinstance(entry, list) else [entry])
+        ]
 
     def _build(self, kind: type, table: Any, where: str, draw: Draw) -> Any:
         """Return a dataclass from a table, its numbers drawn; the kind of each value is that of the field's type."""
-        table = self._known(table, _names(kind), where)
-        values: dict[str, Any] = {}
-        for each in fields(kind):
-            path = f"{where}.{each.name}"
-            if each.name not in table:
-                if each.default is MISSING:
-                    raise InputError(f"{self.name}: {where} needs the key {each.name!r}.")
-                continue
-            value = table[each.name]
-            type_ = each.type.__name__ if isinstance(each.type, type) else str(each.type)
-            if type_ == "str":
-                if not isinstance(value, str):
-                    raise InputError(f"{self.name}: {path} must be text, found {value!r}.")
-                values[each.name] = value
-            elif type_.startswith("tuple"):
-                values[each.name] = tuple(draw.several(value, type_.count("float"), path).tolist())
-            elif "Sequence[" in type_:
-                values[each.name] = tuple(draw.nested(value if isinstance(value, list) else [value], path))
-            elif type_ == "int":
-                number = draw.number(value, path)
-                if number != round(number):
-                    raise InputError(f"{self.name}: {path} must be a whole number, found {value!r}.")
-                values[each.name] = round(number)
-            else:
-                values[each.name] = draw.number(value, path)
-        return kind(**values)
+        keys = {key.name: key for key in fields(kind)}
+        table = self._known(table, keys, where)
+        for name, key in keys.items():
+            if name not in table and key.default is MISSING:
+                raise InputError(f"{where} needs the key {name!r}.")
+        return kind(**{name: self._value(keys[name], value, f"{where}.{name}", draw) for name, value in table.items()})
 
-
-def _names(kind: type) -> tuple[str, ...]:
-    return tuple(each.name for each in fields(kind))
+    def _value(self, key: Field, value: Any, path: str, draw: Draw) -> Any:
+        type_ = key.type.__name__ if isinstance(key.type, type) else str(key.type).removeprefix("collections.abc.")
+        if type_ == "str":
+            if not isinstance(value, str):
+                raise InputError(f"{path} must be text, found {value!r}.")
+            return value
+        if type_.startswith("tuple"):
+            return tuple(draw.several(value, type_.count("float"), path).tolist())
+        if type_ == "Sequence[Tone]":
+            tones = value if isinstance(value, list) else [value]
+            return tuple(self._build(Tone, tone, f"{path}[{k}]", draw) for k, tone in enumerate(tones))
+        if type_.startswith("Sequence[") or ("Sequence[" in type_ and isinstance(value, list)):
+            return tuple(draw.nested(value if isinstance(value, list) else [value], path))
+        number = draw.number(value, path)
+        if type_ != "int":
+            return number
+        if number != round(number):
+            raise InputError(f"{path} must be a whole number, found {value!r}.")
+        return round(number)
 
 
 class Draw:
     """Numbers of a specification, for one unit: as they stand, from text with a unit, or drawn from a range."""
 
-    def __init__(self, name: str, seed: int, unit: int):
-        self.name, self.seed, self.unit = name, seed, unit
+    def __init__(self, seed: int, unit: int):
+        self.seed, self.unit = seed, unit
 
     def number(self, value: Any, where: str, unit: str = "") -> float:
         if isinstance(value, dict):
-            keys = set(value)
-            if keys not in ({"low", "high"}, {"mean", "sigma"}):
-                raise InputError(
-                    f"{self.name}: {where}: a range is {{ low, high }} or {{ mean, sigma }}, found {value!r}."
-                )
+            if set(value) not in ({"low", "high"}, {"mean", "sigma"}):
+                raise InputError(f"{where}: a range is {{ low, high }} or {{ mean, sigma }}, found {value!r}.")
             parts = {key: self.number(part, f"{where}.{key}", unit) for key, part in value.items()}
             rng = np.random.default_rng([self.seed, zlib.crc32(where.encode()), self.unit])
             if "low" in parts:
                 if parts["low"] > parts["high"]:
-                    raise InputError(f"{self.name}: {where}: low is above high in {value!r}.")
+                    raise InputError(f"{where}: low is above high in {value!r}.")
                 return float(rng.uniform(parts["low"], parts["high"]))
             if parts["sigma"] < 0:
-                raise InputError(f"{self.name}: {where}: sigma must not be negative, found {value!r}.")
+                raise InputError(f"{where}: sigma must not be negative, found {value!r}.")
             return float(rng.normal(parts["mean"], parts["sigma"]))
         if isinstance(value, str) and unit:
-            return parse_quantity(value, unit, f"{self.name}: {where}")
+            return parse_quantity(value, unit, where)
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise InputError(
-                f"{self.name}: {where} must be a number{' or text with a unit' if unit else ''}, found {value!r}."
-            )
+            raise InputError(f"{where} must be a number{' or text with a unit' if unit else ''}, found {value!r}.")
         return float(value)
 
     def several(self, value: Any, count: int, where: str, unit: str = "") -> np.ndarray:
         """Return `count` numbers, from as many or from one that stands for all (a range is drawn for each)."""
         entries = value if isinstance(value, list) else [value] * count
         if len(entries) != count:
-            raise InputError(f"{self.name}: {where} must be {count} numbers or one, found {len(entries)}.")
-        return np.array([self.number(each, f"{where}[{k}]", unit) for k, each in enumerate(entries)])
+            raise InputError(f"{where} must be {count} numbers or one, found {len(entries)}.")
+        return np.array([self.number(entry, f"{where}[{k}]", unit) for k, entry in enumerate(entries)])
 
     def nested(self, value: Any, where: str) -> Any:
         """Return lists of numbers, as deep as they are."""
         if isinstance(value, list):
-            return [self.nested(each, f"{where}[{k}]") for k, each in enumerate(value)]
+            return [self.nested(entry, f"{where}[{k}]") for k, entry in enumerate(value)]
         return self.number(value, where)

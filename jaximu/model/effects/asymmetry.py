@@ -2,22 +2,20 @@
 
 import jax.numpy as jnp
 
-from jaximu.model.effects.base import Effect, pair
+from jaximu.model.effects.base import InputEffect, pair
 
 __all__ = ["EFFECTS", "AccelAsymmetry", "GyroAsymmetry"]
 
 
-class _Asymmetry(Effect):
+class _Asymmetry(InputEffect):
     """c_i times the size of each axis's input: the gain is K + c for positive and K − c for negative input."""
 
     formula = "c_i |{u}_i|"
     unit = "output/({SI})"
-    scope = "device"
-    needs = ("{input}",)
     source = "IEEE Std 528-2019, scale factor asymmetry"
 
     def term(self, stimulus):
-        return self.coefficients * jnp.abs(stimulus.need(self.needs[0], self.name))
+        return self.coefficients * jnp.abs(self.input(stimulus))
 
 
 EFFECTS = AccelAsymmetry, GyroAsymmetry = pair(

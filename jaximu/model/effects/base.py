@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -17,12 +18,28 @@ from jaxtyping import Float
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import InputError
+from jaximu.ground.rotation import Vector
 from jaximu.ground.units import SENSORS
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["Effect", "Extent", "Inner", "Place", "SetupEffect", "inner_owners", "on_triad", "pair"]
+__all__ = [
+    "BiasEffect",
+    "Effect",
+    "Extent",
+    "Inner",
+    "InputEffect",
+    "Place",
+    "Scalar",
+    "ScaleEffect",
+    "SetupEffect",
+    "inner_owners",
+    "on_triad",
+    "pair",
+]
 
 Place = TypeVar("Place", bound=Hashable)
+Scalar = Float[Array, "..."] | float
+"""An inner parameter."""
 
 _TRIADS = {
     "accel": {"input": "specific_force", "u": "f", "SI": "m/s^2", "motions": "many orientations"},
@@ -38,11 +55,16 @@ class Extent(NamedTuple):
     boundaries: tuple[float, ...]  # s, between neighbouring observations
     temperature_range: float  # K
 
+    def span(self, unit: str) -> float:
+        """Return the whole of it in s or in K."""
+        return {"s": self.duration, "K": self.temperature_range}[unit]
+
 
 class Inner(NamedTuple):
     """A number inside an effect, such as a time constant: a fit searches it between `low` and `high`.
 
     beginning: it says when the effect begins; no derivative tells it, so it is asked on a grid and then held.
+    shares: of a recording's whole extent in this unit, the values at which a diagnosis asks for the effect.
     """
 
     unit: str
@@ -51,6 +73,7 @@ class Inner(NamedTuple):
     high: float
     meaning: str
     beginning: bool = False
+    shares: tuple[float, ...] = ()
 
 
 class Effect(eqx.Module):
@@ -121,11 +144,14 @@ class Effect(eqx.Module):
         if unknown:
             known = f"its inner parameters are {', '.join(cls.inner)}" if cls.inner else "it has none"
             raise InputError(f"{cls.name} has no inner parameter {unknown[0]!r}; {known}.")
-        values = {name: inner.get(name, each.typical) for name, each in cls.inner.items()}
-        given = jnp.asarray(coefficients, float)
-        if given.shape not in ((), (cls.size,)):
-            raise InputError(f"{cls.name} has {cls.size} coefficients, found an array of shape {given.shape}.")
-        return cls(jnp.broadcast_to(given, (cls.size,)), **values)
+        numbers = jnp.asarray(coefficients, float)
+        if numbers.shape not in ((), (cls.size,)):
+            raise InputError(f"{cls.name} has {cls.size} coefficients, found an array of shape {numbers.shape}.")
+        return cls(jnp.broadcast_to(numbers, (cls.size,)), **cls._typical_inner() | inner)
+
+    @classmethod
+    def _typical_inner(cls) -> dict[str, float]:
+        return {name: parameter.typical for name, parameter in cls.inner.items()}
 
     @classmethod
     def dormant(cls, **inner: float) -> Effect:
@@ -140,12 +166,16 @@ class Effect(eqx.Module):
     @classmethod
     def grid(cls, extent: Extent) -> tuple[dict[str, float], ...]:
         """Return the inner parameters at which a recording of this extent is asked for the effect."""
+        for name, parameter in cls.inner.items():
+            if parameter.shares:
+                whole = extent.span(parameter.unit)
+                return tuple({name: whole * share} for share in parameter.shares)
         return ({},)
 
     @classmethod
     def beginning(cls) -> str:
         """Return the name of the inner parameter that says when the effect begins; empty where it has always been."""
-        return next((name for name, each in cls.inner.items() if each.beginning), "")
+        return next((name for name, parameter in cls.inner.items() if parameter.beginning), "")
 
     def since(self) -> float | None:
         """Return when the effect begins, s, or None where it has always been."""
@@ -163,7 +193,8 @@ class Effect(eqx.Module):
         return {
             "coefficients": np.asarray(self.coefficients).tolist(),
             "inner": {
-                name: {"value": float(getattr(self, name)), "unit": each.unit} for name, each in self.inner.items()
+                name: {"value": float(getattr(self, name)), "unit": parameter.unit}
+                for name, parameter in self.inner.items()
             },
             "unit": self.coefficient_unit(output_unit),
             "scope": self.scope,
@@ -173,10 +204,9 @@ class Effect(eqx.Module):
     def typical_sizes(self, scale: float | Array) -> Effect:
         """Return plausible deviations of every number of this effect, for a triad of so many output units per SI."""
         size = self.typical * (scale if self.unit.startswith("output") else 1.0)
-        like = {name: np.float64(each.typical) for name, each in self.inner.items()}
-        return type(self)(np.ones(self.size) * size, **like)
+        return type(self)(np.ones(self.size) * size, **jax.tree.map(np.float64, self._typical_inner()))
 
-    def term(self, stimulus: Stimulus) -> Float[Array, "... 3"]:
+    def term(self, stimulus: Stimulus) -> Vector:
         """Return the term (..., 3), in output units or SI as `refers_to` says, of stimuli with any leading axes."""
         raise NotImplementedError
 
@@ -192,6 +222,37 @@ def inner_owners(effects: Mapping[Place, Effect]) -> dict[Place, Place]:
     """Return of each effect the place of that whose inner parameters it has: its own, or of the one it `shares`."""
     places = {(effect.owner, effect.plain): key for key, effect in effects.items()}
     return {key: places.get((effect.owner, effect.shares), key) for key, effect in effects.items()}
+
+
+class BiasEffect(Effect):
+    """A bias on each axis in proportion to one number, such as the temperature."""
+
+    scope = "device"
+
+    def factor(self, stimulus: Stimulus) -> Float[Array, " ..."]:
+        """Return the number (...) that each axis's coefficient multiplies."""
+        raise NotImplementedError
+
+    def term(self, stimulus):
+        return self.coefficients * self.factor(stimulus)[..., None]
+
+
+class InputEffect(Effect):
+    """An error that depends on what the triad senses, the last thing that it needs."""
+
+    scope = "device"
+    needs = ("{input}",)
+
+    def input(self, stimulus: Stimulus) -> Vector:
+        """Return what the triad senses."""
+        return stimulus.need(self.needs[-1], self.name)
+
+
+class ScaleEffect(BiasEffect, InputEffect):
+    """A scale factor of each axis that changes in proportion to one number, such as the temperature."""
+
+    def term(self, stimulus):
+        return super().term(stimulus) * self.input(stimulus)
 
 
 class SetupEffect(Effect):
@@ -223,19 +284,23 @@ Shape = TypeVar("Shape", bound=Effect)
 def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequence[str], **changes: Any) -> type[Shape]:
     """Return a class of the catalogue, "accel.…" or "gyro.…", that is `shape` on this triad.
 
-    It is called Accel… or Gyro… as the shape, without underscore, is: under that name the shape's module must keep it.
-    What differs between the triads the shape has in braces: {input}, {u}, {SI} and {motions}.
+    It is called as it is named, AccelBiasRamp for "accel.bias_ramp": under that the shape's module must keep it. What
+    differs between the triads the shape has in braces: {input}, {u}, {SI} and {motions}.
 
     **Arguments:** `typical`: as of an effect; `look_alikes`: names on the same triad, without it; `changes`: other
     attributes of the class that differ from the shape's.
     """
     triad = name.partition(".")[0]
-    differing = _TRIADS.get(triad, {})
-    stated = {each: getattr(shape, each, "").format(**differing) for each in ("formula", "unit", "excited_by")}
-    stated |= {"name": name, "typical": typical, "__module__": shape.__module__, "__doc__": shape.__doc__}
-    stated["needs"] = tuple(each.format(**differing) for each in shape.needs)
-    stated["look_alikes"] = tuple(f"{triad}.{each}" for each in look_alikes)
-    return type(shape)(f"{triad.title()}{shape.__name__.lstrip('_')}", (shape,), {**stated, **changes})
+    words = _TRIADS.get(triad, {})
+    stated = {text: getattr(shape, text, "").format(**words) for text in ("formula", "unit", "excited_by")} | {
+        "name": name,
+        "typical": typical,
+        "needs": tuple(field.format(**words) for field in shape.needs),
+        "look_alikes": tuple(f"{triad}.{alike}" for alike in look_alikes),
+        "__module__": shape.__module__,
+        "__doc__": shape.__doc__,
+    }
+    return type(shape)(name.replace(".", "_").title().replace("_", ""), (shape,), stated | changes)
 
 
 def pair(
@@ -245,8 +310,9 @@ def pair(
 
     `changes`: attributes of the class that the triads have each for itself, such as `excited_by`; `alike`: look-alikes.
     """
-    found = []
-    for place, triad in enumerate(("accel", "gyro")):
-        own = {each: values[place] for each, values in changes.items()}
-        found.append(on_triad(shape, f"{triad}.{name}", typical[place], own.pop("alike", look_alikes), **own))
-    return found[0], found[1]
+
+    def on(triad: str, index: int) -> type[Shape]:
+        differing = {attribute: values[index] for attribute, values in changes.items()}
+        return on_triad(shape, f"{triad}.{name}", typical[index], differing.pop("alike", look_alikes), **differing)
+
+    return on("accel", 0), on("gyro", 1)

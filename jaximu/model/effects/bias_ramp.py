@@ -1,11 +1,11 @@
 """Bias ramp: a bias that drifts in proportion to time."""
 
-from jaximu.model.effects.base import Effect, pair
+from jaximu.model.effects.base import BiasEffect, pair
 
 __all__ = ["EFFECTS", "AccelBiasRamp", "GyroBiasRamp"]
 
 
-class _BiasRamp(Effect):
+class _BiasRamp(BiasEffect):
     """A bias in proportion to time, counted from the reference time: the rate ramp R of an Allan deviation."""
 
     formula = "c_i t"
@@ -15,8 +15,8 @@ class _BiasRamp(Effect):
     excited_by = "time"
     source = "IEEE Std 952-2020, rate ramp"
 
-    def term(self, stimulus):
-        return self.coefficients * stimulus.elapsed(self.name)[..., None]
+    def factor(self, stimulus):
+        return stimulus.elapsed(self.name)
 
 
 EFFECTS = AccelBiasRamp, GyroBiasRamp = pair(_BiasRamp, "bias_ramp", (1e-4, 1e-5), "warm_up", "temperature", "step")

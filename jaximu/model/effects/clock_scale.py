@@ -1,12 +1,11 @@
 """Clock scale: the logger's clock runs fast or slow against the reference's."""
 
-from jaximu.model.effects.base import SetupEffect
-from jaximu.model.shifted_time import at_times
+from jaximu.model.effects.time_offset import ShiftedTime
 
 __all__ = ["EFFECTS", "SetupClockScale"]
 
 
-class SetupClockScale(SetupEffect):
+class SetupClockScale(ShiftedTime):
     """A sample stamped t was taken at t / (1 + c) of the reference's time: positive, and the logger's clock runs fast.
 
     Without a reference on a clock of its own it cannot be seen: rates times stamps are angles, so it is the
@@ -16,8 +15,6 @@ class SetupClockScale(SetupEffect):
     name = "setup.clock_scale"
     formula = "sensors at t / (1 + c) of the reference"
     unit = "1"
-    size = 1
-    needs = ("time",)
     excited_by = "a long recording with a reference on its own clock; blind inside the gyroscope's scale without one"
     look_alikes = ("setup.reference_delay", "setup.table_rate_scale")
     source = "definition; frequency offset of an oscillator, IEEE Std 1139-2022"
@@ -25,12 +22,11 @@ class SetupClockScale(SetupEffect):
     known = 1e-3
     recovery = "not undone: it belongs to the recording, whose time stamps must be corrected"
 
-    def act(self, stimulus, quantity):
-        time = stimulus.need("time", self.name)
-        return at_times(stimulus, time / (1 + self.coefficients[0]), self.name)
+    def taken(self, stamps):
+        return stamps / (1 + self.coefficients[0])
 
     def reach(self, duration):
-        return float(abs(self.coefficients[0])) * duration
+        return super().reach(duration) * duration
 
 
 EFFECTS = (SetupClockScale,)

@@ -2,12 +2,13 @@
 
 import jax.numpy as jnp
 
-from jaximu.model.effects.base import Effect, pair
+from jaximu.ground.rotation import apply_matrix
+from jaximu.model.effects.base import InputEffect, pair
 
 __all__ = ["EFFECTS", "AccelCrossCoupling", "GyroCrossCoupling"]
 
 
-class _CrossCoupling(Effect):
+class _CrossCoupling(InputEffect):
     """Products of two components of the input in every output (not the linear gain from one axis to another).
 
     Coefficients by output axis, each for the products yz, zx, xy.
@@ -16,13 +17,10 @@ class _CrossCoupling(Effect):
     formula = "Σ_jk c_ijk {u}_j {u}_k, j ≠ k"
     unit = "output/({SI})^2"
     size = 9
-    scope = "device"
-    needs = ("{input}",)
 
     def term(self, stimulus):
-        vector, matrix = stimulus.need(self.needs[0], self.name), self.coefficients.reshape(3, 3)
-        products = vector[..., (1, 2, 0)] * vector[..., (2, 0, 1)]
-        return jnp.stack([jnp.sum(matrix[i] * products, axis=-1) for i in range(3)], axis=-1)
+        vector = self.input(stimulus)
+        return apply_matrix(self.coefficients.reshape(3, 3), jnp.roll(vector, -1, -1) * jnp.roll(vector, 1, -1))
 
 
 EFFECTS = AccelCrossCoupling, GyroCrossCoupling = pair(

@@ -1,21 +1,19 @@
 """Odd scale-factor nonlinearity: an output in proportion to the cube of each axis's input."""
 
-from jaximu.model.effects.base import Effect, pair
+from jaximu.model.effects.base import InputEffect, pair
 
 __all__ = ["EFFECTS", "AccelCubic", "GyroCubic"]
 
 
-class _Cubic(Effect):
+class _Cubic(InputEffect):
     """c_i times the cube of each axis's input. With inputs of one size alone it cannot be told from scale."""
 
     common_name = "cubic nonlinearity"
     formula = "c_i {u}_i³"
     unit = "output/({SI})^3"
-    scope = "device"
-    needs = ("{input}",)
 
     def term(self, stimulus):
-        return self.coefficients * stimulus.need(self.needs[0], self.name) ** 3
+        return self.coefficients * self.input(stimulus) ** 3
 
 
 EFFECTS = AccelCubic, GyroCubic = pair(

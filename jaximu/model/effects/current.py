@@ -1,25 +1,24 @@
 """Current: the field of what flows in or beside the unit."""
 
-from jaximu.model.effects.base import Effect
+from jaximu.model.effects.base import BiasEffect
 
 __all__ = ["EFFECTS", "MagCurrent"]
 
 
-class MagCurrent(Effect):
+class MagCurrent(BiasEffect):
     """An output in proportion to a current: by Biot and Savart's law the field of a wire at a fixed place."""
 
     name = "mag.current"
     formula = "c_i I"
     unit = "output/A"
-    scope = "device"
     needs = ("current",)
     excited_by = "a current that changes"
     look_alikes = ("mag.temperature", "mag.hard_iron_step")
     source = "Biot and Savart's law; the current compensation of PX4 (CAL_MAGn_xCOMP) and ArduPilot (COMPASS_MOT_x)"
     typical = 2.0
 
-    def term(self, stimulus):
-        return self.coefficients * stimulus.need("current", self.name)[..., None]
+    def factor(self, stimulus):
+        return stimulus.need("current", self.name)
 
 
 EFFECTS = (MagCurrent,)

@@ -1,6 +1,5 @@
 """Earth rotation: what the gyroscope feels of it, where the motion is told against the ground."""
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,12 +41,11 @@ class GyroEarthRotation(Effect):
         Upwards it is known; the horizontal part lies in any direction.
         """
         up, level = np.sin(np.radians(latitude)), np.abs(np.cos(np.radians(latitude)))
-        spread = np.array([level, level, 0.0]) / np.sqrt(2) + _DEFLECTED
-        return cls.make([0.0, 0.0, EARTH_RATE * up]), EARTH_RATE * spread
+        shares = np.array([level, level, 0.0]) / np.sqrt(2) + _DEFLECTED
+        return cls.make([0.0, 0.0, EARTH_RATE * up]), EARTH_RATE * shares
 
     def term(self, stimulus):
-        attitude = stimulus.need("attitude", self.name)
-        return rotate(conjugate(attitude), jnp.broadcast_to(self.coefficients, (*attitude.shape[:-1], 3)))
+        return rotate(conjugate(stimulus.need("attitude", self.name)), self.coefficients)
 
 
 EFFECTS = (GyroEarthRotation,)

@@ -26,8 +26,7 @@ class GyroLag(Effect):
     plausible = 2.0  # from rest to rest a common lag is open to tens of ms, where this first order of it fails
     refers_to = "input"
     recovery = (
-        "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 "
-        "of the "
+        "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 of the "
         "term at frequency f: 1 % at a twenty-fifth of the sample rate, 7 % at a tenth; noise grows by up to τ/Δt"
     )
 

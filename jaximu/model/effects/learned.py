@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
-from jaximu.model.effects.base import Effect, Inner, on_triad, pair
+from jaximu.model.effects.base import Effect, Inner, Scalar, pair
 
 __all__ = [
     "EFFECTS",
@@ -52,8 +52,8 @@ def splines(share: Float[Array, " ..."]) -> Float[Array, "... 10"]:
 
     b(s) = ((2 − |s|)₊³ − 4 (1 − |s|)₊³) / 6, s counted in knots from the middle of each spline.
     """
-    place = jnp.abs(share[..., None] * (SPLINES - 3) + 1 - np.arange(SPLINES))
-    return (jnp.maximum(2 - place, 0) ** 3 - 4 * jnp.maximum(1 - place, 0) ** 3) / 6
+    distance = jnp.abs(share[..., None] * (SPLINES - 3) + 1 - np.arange(SPLINES))
+    return (jnp.maximum(2 - distance, 0) ** 3 - 4 * jnp.maximum(1 - distance, 0) ** 3) / 6
 
 
 class Learned(Effect):
@@ -73,6 +73,8 @@ class Learned(Effect):
 
     def __init_subclass__(cls, **kwargs):
         cls.common_name = f"curve over {getattr(cls, 'words', '')}"
+        cls.size = 3 * (SPLINES - cls.first)
+        cls.__doc__ = Learned.__doc__
         super().__init_subclass__(**kwargs)
 
     def covariate(self, stimulus) -> Float[Array, "..."]:
@@ -91,9 +93,7 @@ class Learned(Effect):
     @classmethod
     def roughness(cls) -> np.ndarray:
         """Return the sum of squared second differences of each shape (k,); a straight line is taken like the next."""
-        found = ROUGHNESS[cls.first :].copy()
-        found[: 2 - cls.first] = ROUGHNESS[2]
-        return found
+        return np.maximum(ROUGHNESS, ROUGHNESS[2])[cls.first :]
 
     def shapes(self, value: Float[Array, " ..."]) -> Float[Array, "... k"]:
         """Return the curves (..., k) that an axis's coefficients multiply, at values (...) of the covariate."""
@@ -106,10 +106,8 @@ class Learned(Effect):
 
 
 class _Between(Learned):
-    low: Float[Array, "..."] | float
-    high: Float[Array, "..."] | float
-
-    size = 3 * (SPLINES - 1)
+    low: Scalar
+    high: Scalar
 
     def interval(self):
         return self.low, self.high
@@ -120,7 +118,7 @@ class _Between(Learned):
 
 
 class _Around(Learned):
-    reach: Float[Array, "..."] | float
+    reach: Scalar
 
     def interval(self):
         return -self.reach, self.reach
@@ -131,61 +129,63 @@ class _Around(Learned):
 
 
 class _LearnedTemperature(_Between):
-    __doc__ = Learned.__doc__
     formula = "s_i(T), a smooth curve between two temperatures"
     needs = ("temperature",)
     excited_by = "a change of temperature, up and down"
     words, covariate_unit = "temperature", "K"
-    inner = MappingProxyType({
-        "low": Inner("K", 283.15, 200.0, 300.0, "absolute temperature below which the curve is constant"),
-        "high": Inner("K", 313.15, 280.0, 420.0, "absolute temperature above which the curve is constant"),
-    })  # fmt: skip
+    inner = MappingProxyType(
+        {
+            "low": Inner("K", 283.15, 200.0, 300.0, "absolute temperature below which the curve is constant"),
+            "high": Inner("K", 313.15, 280.0, 420.0, "absolute temperature above which the curve is constant"),
+        }
+    )
 
     def covariate(self, stimulus):
         return stimulus.need("temperature", self.name)[..., None] + ZERO_CELSIUS
 
 
 class _LearnedTime(_Between):
-    __doc__ = Learned.__doc__
     formula = "s_i(t), a smooth curve between two times"
     scope = "session"
     needs = ("time",)
     excited_by = "time"
     words, covariate_unit = "time", "s"
-    inner = MappingProxyType({
-        "low": Inner("s", 0.5, 0.0, 1e6, "time, from the reference time, before which the curve is constant"),
-        "high": Inner("s", 300.0, 0.1, 1e7, "time, from the reference time, after which the curve is constant"),
-    })  # fmt: skip
+    inner = MappingProxyType(
+        {
+            "low": Inner("s", 0.5, 0.0, 1e6, "time, from the reference time, before which the curve is constant"),
+            "high": Inner("s", 300.0, 0.1, 1e7, "time, from the reference time, after which the curve is constant"),
+        }
+    )
 
     def covariate(self, stimulus):
         return stimulus.elapsed(self.name)[..., None]
 
 
 class _LearnedTemperatureRate(_Around):
-    __doc__ = Learned.__doc__
     formula = "s_i(dT/dt), a smooth curve"
-    size = 3 * (SPLINES - 1)
     needs = ("temperature_rate",)
     excited_by = "ramps of temperature of several rates, up and down"
     words, covariate_unit = "the rate of temperature", "K/s"
-    inner = MappingProxyType({
-        "reach": Inner("K/s", 0.05, 1e-6, 10.0, "rate of temperature, of either sign, from which the curve is constant")
-    })  # fmt: skip
+    inner = MappingProxyType(
+        {
+            "reach": Inner(
+                "K/s", 0.05, 1e-6, 10.0, "rate of temperature, of either sign, from which the curve is constant"
+            )
+        }
+    )
 
     def covariate(self, stimulus):
         return stimulus.need("temperature_rate", self.name)[..., None]
 
 
 class _LearnedForce(_Around):
-    __doc__ = Learned.__doc__
     formula = "s_i(f_i), a smooth curve of the force along each axis"
-    size = 3 * (SPLINES - 2)
     needs = ("specific_force",)
     excited_by = "many orientations"
     words, covariate_unit, first = "the specific force along each axis", "m/s^2", 2
-    inner = MappingProxyType({
-        "reach": Inner("m/s^2", 10.0, 1.0, 1000.0, "force, of either sign, from which the curve is constant")
-    })  # fmt: skip
+    inner = MappingProxyType(
+        {"reach": Inner("m/s^2", 10.0, 1.0, 1000.0, "force, of either sign, from which the curve is constant")}
+    )
 
     def covariate(self, stimulus):
         return stimulus.need("specific_force", self.name)
@@ -198,37 +198,17 @@ class _ForceAlong(_LearnedForce):
         return stimulus.need("specific_force", self.name)[..., self.axis, None]
 
 
-class _LearnedForceX(_ForceAlong):
-    __doc__ = Learned.__doc__
-    formula = "s_i(f_x), a smooth curve of the force along x, on every axis"
-    words, axis = "the specific force along x", 0
-
-
-class _LearnedForceY(_ForceAlong):
-    __doc__ = Learned.__doc__
-    formula = "s_i(f_y), a smooth curve of the force along y, on every axis"
-    words, axis = "the specific force along y", 1
-
-
-class _LearnedForceZ(_ForceAlong):
-    __doc__ = Learned.__doc__
-    formula = "s_i(f_z), a smooth curve of the force along z, on every axis"
-    words, axis = "the specific force along z", 2
-
-
 class GyroLearnedRate(_Around):
-    __doc__ = Learned.__doc__
     name = "gyro.learned_rate"
     formula = "s_i(ω_i), a smooth curve of the rate about each axis"
-    size = 3 * (SPLINES - 2)
     needs = ("angular_rate",)
     excited_by = "turns at several rates, both ways"
     look_alikes = ("gyro.quadratic", "gyro.cubic", "gyro.asymmetry")
     typical = 1e-4
     words, covariate_unit, first = "the rate about each axis", "rad/s", 2
-    inner = MappingProxyType({
-        "reach": Inner("rad/s", 5.0, 0.01, 1000.0, "rate, of either sign, from which the curve is constant")
-    })  # fmt: skip
+    inner = MappingProxyType(
+        {"reach": Inner("rad/s", 5.0, 0.01, 1000.0, "rate, of either sign, from which the curve is constant")}
+    )
 
     def covariate(self, stimulus):
         return stimulus.need("angular_rate", self.name)
@@ -241,17 +221,31 @@ AccelLearnedTemperatureRate, GyroLearnedTemperatureRate = pair(
     _LearnedTemperatureRate, "learned_temperature_rate", (1e-3, 1e-4), "temperature_rate", "temperature_rate_squared"
 )
 AccelLearnedTime, GyroLearnedTime = pair(_LearnedTime, "learned_time", (1e-3, 1e-4), "bias_ramp", "warm_up", "step")
-AccelLearnedForce = on_triad(_LearnedForce, "accel.learned_force", 1e-3, ("quadratic", "cubic", "asymmetry"))
-AccelLearnedForceX = on_triad(_LearnedForceX, "accel.learned_force_x", 1e-3, ("cross_coupling",))
-AccelLearnedForceY = on_triad(_LearnedForceY, "accel.learned_force_y", 1e-3, ("cross_coupling",))
-AccelLearnedForceZ = on_triad(_LearnedForceZ, "accel.learned_force_z", 1e-3, ("cross_coupling",))
-# the gain of a gyroscope takes no force
-_UNLIKE_GAIN = {"size": 3 * (SPLINES - 1), "first": 1}
-_FORCES = ("g_sensitivity", "g_squared_sensitivity")
-GyroLearnedForce = on_triad(_LearnedForce, "gyro.learned_force", 1e-4, _FORCES, **_UNLIKE_GAIN)
-GyroLearnedForceX = on_triad(_LearnedForceX, "gyro.learned_force_x", 1e-4, _FORCES, **_UNLIKE_GAIN)
-GyroLearnedForceY = on_triad(_LearnedForceY, "gyro.learned_force_y", 1e-4, _FORCES, **_UNLIKE_GAIN)
-GyroLearnedForceZ = on_triad(_LearnedForceZ, "gyro.learned_force_z", 1e-4, _FORCES, **_UNLIKE_GAIN)
+
+
+def _of_force(shape: type[_LearnedForce], name: str, *accelerometer_alike: str, **changes):
+    """An effect on both triads; the gain of a gyroscope takes no force, so that a straight line is not left out."""
+    alike = accelerometer_alike, ("g_sensitivity", "g_squared_sensitivity")
+    both = {attribute: (value, value) for attribute, value in changes.items()}
+    return pair(shape, name, (1e-3, 1e-4), alike=alike, first=(2, 1), **both)
+
+
+def _of_force_along(axis: int):
+    letter = "xyz"[axis]
+    return _of_force(
+        _ForceAlong,
+        f"learned_force_{letter}",
+        "cross_coupling",
+        formula=f"s_i(f_{letter}), a smooth curve of the force along {letter}, on every axis",
+        words=f"the specific force along {letter}",
+        axis=axis,
+    )
+
+
+AccelLearnedForce, GyroLearnedForce = _of_force(_LearnedForce, "learned_force", "quadratic", "cubic", "asymmetry")
+AccelLearnedForceX, GyroLearnedForceX = _of_force_along(0)
+AccelLearnedForceY, GyroLearnedForceY = _of_force_along(1)
+AccelLearnedForceZ, GyroLearnedForceZ = _of_force_along(2)
 
 EFFECTS = (
     AccelLearnedTemperature,

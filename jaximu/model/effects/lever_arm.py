@@ -4,12 +4,16 @@ import jax.numpy as jnp
 
 from jaximu.model.effects.base import Effect
 
-__all__ = ["EFFECTS", "AccelLeverArm", "lever_acceleration"]
+__all__ = ["EFFECTS", "LEVER_RECOVERY", "AccelLeverArm", "lever_acceleration"]
+
+LEVER_RECOVERY = (
+    "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 of its "
+    "part at frequency f: 1 % at a twenty-fifth of the sample rate, 7 % at a tenth"
+)
 
 
 def lever_acceleration(arm, rate, acceleration):
     """Return ω×(ω×r) + ω̇×r (..., 3), m/s²: how a point at r (m) on a rigid body is accelerated against its origin."""
-    arm = jnp.broadcast_to(arm, rate.shape)
     return jnp.cross(rate, jnp.cross(rate, arm)) + jnp.cross(acceleration, arm)
 
 
@@ -27,11 +31,7 @@ class AccelLeverArm(Effect):
     typical = 1e-2
     known = 1.0
     refers_to = "input"
-    recovery = (
-        "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 "
-        "of its "
-        "part at frequency f: 1 % at a twenty-fifth of the sample rate, 7 % at a tenth"
-    )
+    recovery = LEVER_RECOVERY
 
     def term(self, stimulus):
         rate = stimulus.need("angular_rate", self.name)

@@ -33,7 +33,7 @@ class SetupGravity(SetupEffect):
             squared = jnp.sum(force**2, axis=-1, keepdims=True)
             up = force / jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
         else:
-            up = rotate(conjugate(stimulus.attitude), jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), force.shape))
+            up = rotate(conjugate(stimulus.attitude), jnp.array([0.0, 0.0, 1.0]))
         return replace(stimulus, specific_force=force + self.coefficients[0] * up)
 
 

@@ -1,15 +1,15 @@
 """Learned effect: a small neural network of temperature and its rate on each axis, where no simpler term will do."""
 
+from dataclasses import replace
 from types import MappingProxyType
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
-from jaximu.model.effects.base import Effect, Inner, pair
+from jaximu.model.effects.base import Effect, Inner, Scalar, pair
 from jaximu.model.effects.learned import ZERO_CELSIUS
 
 __all__ = ["EFFECTS", "UNITS", "WEIGHTS", "AccelLearnedNetwork", "GyroLearnedNetwork", "network"]
@@ -33,9 +33,9 @@ class _LearnedNetwork(Effect):
     largest one; beyond these the function stays as it is at their bounds.
     """
 
-    low: Float[Array, "..."] | float
-    high: Float[Array, "..."] | float
-    reach: Float[Array, "..."] | float
+    low: Scalar
+    high: Scalar
+    reach: Scalar
 
     cause = False
     formula = "Σ_k v_ik tanh(a_ik x + b_ik r + c_ik), less that at T_ref and dT/dt = 0"
@@ -45,29 +45,33 @@ class _LearnedNetwork(Effect):
     needs = ("temperature", "temperature_rate")
     excited_by = "ramps of temperature of several rates, up and down"
     source = "one hidden layer of tanh units; regularised as MacKay, Neural Computation 4, 1992, 415–472"
-    inner = MappingProxyType({
-        "low": Inner("K", 283.15, 200.0, 300.0, "absolute temperature below which the function stays as it is"),
-        "high": Inner("K", 313.15, 280.0, 420.0, "absolute temperature above which the function stays as it is"),
-        "reach": Inner("K/s", 0.05, 1e-6, 10.0, "rate of temperature, of either sign, from which it stays as it is"),
-    })  # fmt: skip
+    inner = MappingProxyType(
+        {
+            "low": Inner("K", 283.15, 200.0, 300.0, "absolute temperature below which the function stays as it is"),
+            "high": Inner("K", 313.15, 280.0, 420.0, "absolute temperature above which the function stays as it is"),
+            "reach": Inner(
+                "K/s", 0.05, 1e-6, 10.0, "rate of temperature, of either sign, from which it stays as it is"
+            ),
+        }
+    )
 
-    def value(self, kelvin: Float[Array, " ..."] | float, rate: Float[Array, " ..."] | float) -> Float[Array, "... 3"]:
+    def value(self, temperature: Scalar, rate: Scalar) -> Float[Array, "... 3"]:
         """Return the networks' outputs (..., 3) at absolute temperatures, K, and rates, K/s."""
         # the range is where the data was, and not for a fit to move
-        low, high, reach = jax.lax.stop_gradient((self.low, self.high, self.reach))
-        x = jnp.clip((2 * jnp.asarray(kelvin) - low - high) / (high - low), -1.0, 1.0)
-        r = jnp.clip(jnp.asarray(rate) / reach, -1.0, 1.0)
+        low, high, largest = jax.lax.stop_gradient((self.low, self.high, self.reach))
+        x = jnp.clip((2 * jnp.asarray(temperature) - low - high) / (high - low), -1.0, 1.0)
+        r = jnp.clip(jnp.asarray(rate) / largest, -1.0, 1.0)
         return network(self.coefficients.reshape(3, WEIGHTS), x[..., None], r[..., None])
 
     def typical_sizes(self, scale):
         sizes = super().typical_sizes(scale)
-        own = np.arange(self.size) % WEIGHTS < UNITS
-        return eqx.tree_at(lambda each: each.coefficients, sizes, np.where(own, sizes.coefficients, 1.0))
+        of_output = np.arange(self.size) % WEIGHTS < UNITS
+        return replace(sizes, coefficients=np.where(of_output, sizes.coefficients, 1.0))
 
     def term(self, stimulus):
         rate = stimulus.need("temperature_rate", self.name)
-        kelvin = stimulus.need("temperature", self.name) + ZERO_CELSIUS
-        return self.value(kelvin, rate) - self.value(stimulus.temperature_reference + ZERO_CELSIUS, 0.0)
+        temperature = stimulus.need("temperature", self.name) + ZERO_CELSIUS
+        return self.value(temperature, rate) - self.value(stimulus.temperature_reference + ZERO_CELSIUS, 0.0)
 
 
 EFFECTS = AccelLearnedNetwork, GyroLearnedNetwork = pair(

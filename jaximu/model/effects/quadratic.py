@@ -1,21 +1,19 @@
 """Even scale-factor nonlinearity: an output in proportion to the square of each axis's input."""
 
-from jaximu.model.effects.base import Effect, pair
+from jaximu.model.effects.base import InputEffect, pair
 
 __all__ = ["EFFECTS", "AccelQuadratic", "GyroQuadratic"]
 
 
-class _Quadratic(Effect):
+class _Quadratic(InputEffect):
     """c_i times the square of each axis's input: the gain grows with the input on one side, shrinks on the other."""
 
     common_name = "quadratic nonlinearity"
     formula = "c_i {u}_i²"
     unit = "output/({SI})^2"
-    scope = "device"
-    needs = ("{input}",)
 
     def term(self, stimulus):
-        return self.coefficients * stimulus.need(self.needs[0], self.name) ** 2
+        return self.coefficients * self.input(stimulus) ** 2
 
 
 EFFECTS = AccelQuadratic, GyroQuadratic = pair(

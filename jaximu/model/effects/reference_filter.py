@@ -2,8 +2,6 @@
 
 from dataclasses import replace
 
-import jax.numpy as jnp
-
 from jaximu.ground.differences import slopes
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import conjugate, exponential, multiply, rotate
@@ -51,14 +49,11 @@ class SetupReferenceFilter(SetupEffect):
         if time.ndim == 0 or time.shape[-1] < 2:
             raise InputError(f"the effect {self.name} needs a path in time, not one instant.")
         vector = behind(self.coefficients[0], acceleration, slopes(acceleration, time))
-        turned = exponential(vector)
-        true = rotate(conjugate(turned), rate) + slopes(vector, time)
-        fields = {"angular_rate": true, "angular_acceleration": acceleration + slopes(true - rate, time)}
-        if stimulus.specific_force is not None:
-            fields["specific_force"] = rotate(conjugate(turned), stimulus.specific_force)
-        if stimulus.attitude is not None:
-            fields["attitude"] = multiply(stimulus.attitude, jnp.broadcast_to(turned, stimulus.attitude.shape))
-        return replace(stimulus, **fields)
+        turn = exponential(vector)
+        true = rotate(conjugate(turn), rate) + slopes(vector, time)
+        stimulus = stimulus.changed(lambda force: rotate(conjugate(turn), force), "specific_force")
+        stimulus = stimulus.changed(lambda attitude: multiply(attitude, turn), "attitude")
+        return replace(stimulus, angular_rate=true, angular_acceleration=acceleration + slopes(true - rate, time))
 
 
 EFFECTS = (SetupReferenceFilter,)

@@ -1,15 +1,9 @@
 """Reference rotation: the unit is mounted turned against the body whose attitude the reference tells."""
 
-from dataclasses import replace
-
-import jax.numpy as jnp
-
 from jaximu.ground.rotation import conjugate, exponential, multiply, rotate
 from jaximu.model.effects.base import SetupEffect
 
 __all__ = ["EFFECTS", "SetupReferenceRotation"]
-
-_TURNED = ("specific_force", "angular_rate", "angular_acceleration")
 
 
 class SetupReferenceRotation(SetupEffect):
@@ -22,7 +16,7 @@ class SetupReferenceRotation(SetupEffect):
     name = "setup.reference_rotation"
     formula = "u = exp(α)ᵀ u_said"
     unit = "rad"
-    needs = _TURNED[:2]
+    needs = ("specific_force", "angular_rate")
     excited_by = "rotations about two axes, with a reference"
     source = "definition"
     typical = 1e-3
@@ -32,12 +26,11 @@ class SetupReferenceRotation(SetupEffect):
     def act(self, stimulus, quantity):
         for name in self.needs:
             stimulus.need(name, self.name)
-        turned = exponential(self.coefficients)
-        fields = {name: rotate(jnp.broadcast_to(conjugate(turned), (*given.shape[:-1], 4)), given)
-                  for name in _TURNED if (given := getattr(stimulus, name)) is not None}  # fmt: skip
-        if stimulus.attitude is not None:
-            fields["attitude"] = multiply(stimulus.attitude, jnp.broadcast_to(turned, stimulus.attitude.shape))
-        return replace(stimulus, **fields)
+        turn = exponential(self.coefficients)
+        stimulus = stimulus.changed(lambda attitude: multiply(attitude, turn), "attitude")
+        return stimulus.changed(
+            lambda vectors: rotate(conjugate(turn), vectors), "specific_force", "angular_rate", "angular_acceleration"
+        )
 
 
 EFFECTS = (SetupReferenceRotation,)

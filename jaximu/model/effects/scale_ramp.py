@@ -1,11 +1,11 @@
 """Scale ramp: a scale factor that drifts in proportion to time."""
 
-from jaximu.model.effects.base import Effect, pair
+from jaximu.model.effects.base import ScaleEffect, pair
 
 __all__ = ["EFFECTS", "AccelScaleRamp", "GyroScaleRamp"]
 
 
-class _ScaleRamp(Effect):
+class _ScaleRamp(ScaleEffect):
     """A scale factor that changes in proportion to time, counted from the reference time (warming up, ageing)."""
 
     formula = "c_i t {u}_i"
@@ -15,8 +15,8 @@ class _ScaleRamp(Effect):
     excited_by = "{motions}, early and late"
     source = "IEEE Std 528-2019, scale factor stability"
 
-    def term(self, stimulus):
-        return self.coefficients * stimulus.elapsed(self.name)[..., None] * stimulus.need(self.needs[1], self.name)
+    def factor(self, stimulus):
+        return stimulus.elapsed(self.name)
 
 
 EFFECTS = AccelScaleRamp, GyroScaleRamp = pair(

@@ -1,22 +1,21 @@
 """Scale factor over temperature."""
 
-from jaximu.model.effects.base import Effect, pair
+from jaximu.model.effects.base import ScaleEffect, pair
 
 __all__ = ["EFFECTS", "AccelScaleTemperature", "GyroScaleTemperature"]
 
 
-class _ScaleTemperature(Effect):
+class _ScaleTemperature(ScaleEffect):
     """A scale factor that changes in proportion to temperature, counted from the reference temperature."""
 
     common_name = "scale over temperature"
     formula = "c_i (T − T_ref) {u}_i"
     unit = "output/({SI})/K"
-    scope = "device"
     needs = ("temperature", "{input}")
     source = "IEEE Std 528-2019, scale factor temperature sensitivity"
 
-    def term(self, stimulus):
-        return self.coefficients * stimulus.warmth(self.name)[..., None] * stimulus.need(self.needs[1], self.name)
+    def factor(self, stimulus):
+        return stimulus.warmth(self.name)
 
 
 EFFECTS = AccelScaleTemperature, GyroScaleTemperature = pair(

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from jaximu.model.effects.base import Effect
-from jaximu.model.effects.lever_arm import lever_acceleration
+from jaximu.model.effects.lever_arm import LEVER_RECOVERY, lever_acceleration
 
 __all__ = ["EFFECTS", "AccelSizeEffect"]
 
@@ -29,11 +29,7 @@ class AccelSizeEffect(Effect):
     source = "rigid-body kinematics; Rehder et al., ICRA 2016 (kalibr's size effect)"
     typical = 3e-3
     refers_to = "input"
-    recovery = (
-        "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 "
-        "of its "
-        "part at frequency f: 1 % at a twenty-fifth of the sample rate, 7 % at a tenth"
-    )
+    recovery = LEVER_RECOVERY
 
     def term(self, stimulus):
         arms = self.coefficients.reshape(3, 3)

@@ -3,40 +3,45 @@
 from types import MappingProxyType
 
 import jax.numpy as jnp
-from jaxtyping import Float
 
-from jaximu.ground.array_types import Array
-from jaximu.model.effects.base import Effect, Inner, pair
+from jaximu.model.effects.base import BiasEffect, Inner, Scalar, pair
 
-__all__ = ["EFFECTS", "AccelStep", "GyroStep", "MagHardIronStep"]
+__all__ = ["EFFECTS", "AccelStep", "GyroStep", "MagHardIronStep", "OnsetEffect"]
 
 
-class _Step(Effect):
-    """A bias that jumps by c at the onset and stays (a knock, a supply that switched, a popcorn defect).
+class OnsetEffect(BiasEffect):
+    """An error that begins at one instant and stays.
 
     The derivative by the onset is zero nearly everywhere: a fit searches it on a grid.
     """
 
-    onset: Float[Array, "..."] | float
+    onset: Scalar
 
-    common_name = "bias step"
-    formula = "c_i for t ≥ t0, else 0"
-    unit = "output"
     scope = "session"
-    needs = ("time",)
-    excited_by = "time"
-    source = "Heaviside step; IEEE Std 528-2019, bias repeatability within a run"
-    inner = MappingProxyType({
-        "onset": Inner("s", 60.0, 0.0, 1e5, "when the bias jumps, from the reference time",
-                       beginning=True)
-    })  # fmt: skip
+    inner = MappingProxyType(
+        {"onset": Inner("s", 60.0, 0.0, 1e5, "when the bias jumps, from the reference time", beginning=True)}
+    )
 
     @classmethod
     def grid(cls, extent):
         return tuple({"onset": time} for time in extent.boundaries)
 
-    def term(self, stimulus):
-        return self.coefficients * jnp.where(stimulus.elapsed(self.name) >= self.onset, 1.0, 0.0)[..., None]
+    def factor(self, stimulus):
+        return jnp.where(stimulus.elapsed(self.name) >= self.onset, 1.0, 0.0)
+
+
+class _Step(OnsetEffect):
+    """A bias that jumps by c at the onset and stays (a knock, a supply that switched, a popcorn defect).
+
+    The derivative by the onset is zero nearly everywhere: a fit searches it on a grid.
+    """
+
+    common_name = "bias step"
+    formula = "c_i for t ≥ t0, else 0"
+    unit = "output"
+    needs = ("time",)
+    excited_by = "time"
+    source = "Heaviside step; IEEE Std 528-2019, bias repeatability within a run"
 
 
 AccelStep, GyroStep = pair(_Step, "step", (0.03, 0.003), "bias_ramp")

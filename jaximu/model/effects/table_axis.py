@@ -1,7 +1,5 @@
 """Table axis: the table does not turn about the axis that the fixture says."""
 
-from dataclasses import replace
-
 import jax.numpy as jnp
 
 from jaximu.model.effects.base import SetupEffect
@@ -27,12 +25,11 @@ class SetupTableAxis(SetupEffect):
 
     def act(self, stimulus, quantity):
         stimulus.need("angular_rate", self.name)
-        changed = {}
-        for field in ("angular_rate", "angular_acceleration"):
-            value = getattr(stimulus, field)
-            if value is not None:
-                changed[field] = value + jnp.cross(jnp.broadcast_to(self.coefficients, value.shape), value)
-        return replace(stimulus, **changed)
+
+        def turned(vectors):
+            return vectors + jnp.cross(self.coefficients, vectors)
+
+        return stimulus.changed(turned, "angular_rate", "angular_acceleration")
 
 
 EFFECTS = (SetupTableAxis,)

@@ -1,7 +1,5 @@
 """Table rate scale: the table turns quicker or slower than it says."""
 
-from dataclasses import replace
-
 from jaximu.model.effects.base import SetupEffect
 
 __all__ = ["EFFECTS", "SetupTableRateScale"]
@@ -26,9 +24,7 @@ class SetupTableRateScale(SetupEffect):
     def act(self, stimulus, quantity):
         stimulus.need("angular_rate", self.name)
         scale = 1 + self.coefficients[0]
-        fields = ("angular_rate", "angular_acceleration")
-        present = {field: getattr(stimulus, field) for field in fields}
-        return replace(stimulus, **{field: scale * value for field, value in present.items() if value is not None})
+        return stimulus.changed(lambda vectors: scale * vectors, "angular_rate", "angular_acceleration")
 
 
 EFFECTS = (SetupTableRateScale,)

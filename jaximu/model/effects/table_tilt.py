@@ -30,8 +30,7 @@ class SetupTableTilt(SetupEffect):
 
     def act(self, stimulus, quantity):
         attitude = stimulus.need("attitude", self.name)
-        tilt = exponential(jnp.concatenate([self.coefficients, jnp.zeros(1)]))
-        tilted = multiply(jnp.broadcast_to(tilt, attitude.shape), attitude)
+        tilted = multiply(exponential(jnp.append(self.coefficients, 0.0)), attitude)
         force = rotate(conjugate(tilted), rotate(attitude, stimulus.need("specific_force", self.name)))
         return replace(stimulus, specific_force=force, attitude=tilted)
 

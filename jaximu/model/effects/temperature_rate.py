@@ -1,6 +1,6 @@
 """Bias over the rate of temperature: the sensor's parts are not equally warm while it warms."""
 
-from jaximu.model.effects.base import Effect, pair
+from jaximu.model.effects.base import BiasEffect, pair
 
 __all__ = [
     "EFFECTS",
@@ -13,39 +13,33 @@ __all__ = [
 ]
 
 
-class _OverRate(Effect):
-    size = 3
-    scope = "device"
-    needs = ("temperature_rate",)
-
-
-class _TemperatureRate(_OverRate):
+class _TemperatureRate(BiasEffect):
     """A bias in proportion to how quickly the temperature changes."""
 
     common_name = "bias over the rate of temperature"
     formula = "c_i Ṫ"
     unit = "output/(K/s)"
+    needs = ("temperature_rate",)
     excited_by = "ramps of several rates, up and down"
     source = "IEEE Std 952-2020, bias temperature-ramp sensitivity"
 
-    def term(self, stimulus):
-        return self.coefficients * stimulus.need("temperature_rate", self.name)[..., None]
+    def factor(self, stimulus):
+        return stimulus.need("temperature_rate", self.name)
 
 
-class _TemperatureRateSquared(_OverRate):
+class _TemperatureRateSquared(_TemperatureRate):
     """A bias in proportion to the square of how quickly the temperature changes."""
 
     common_name = "bias over the squared rate of temperature"
     formula = "c_i Ṫ²"
     unit = "output/(K/s)^2"
-    excited_by = "ramps of several rates, up and down"
     source = "IEEE Std 952-2020, bias temperature-ramp sensitivity, second order"
 
-    def term(self, stimulus):
-        return self.coefficients * stimulus.need("temperature_rate", self.name)[..., None] ** 2
+    def factor(self, stimulus):
+        return super().factor(stimulus) ** 2
 
 
-class _TemperatureTimesRate(_OverRate):
+class _TemperatureTimesRate(_TemperatureRate):
     """A temperature-rate sensitivity that itself changes with temperature."""
 
     common_name = "bias over temperature times its rate"
@@ -55,16 +49,24 @@ class _TemperatureTimesRate(_OverRate):
     excited_by = "ramps of several rates over a wide range, up and down"
     source = "IEEE Std 952-2020, bias temperature-ramp sensitivity, its change over temperature"
 
-    def term(self, stimulus):
-        rate = stimulus.need("temperature_rate", self.name)
-        return self.coefficients * (stimulus.warmth(self.name) * rate)[..., None]
+    def factor(self, stimulus):
+        return stimulus.warmth(self.name) * super().factor(stimulus)
 
 
+AccelTemperatureRate, GyroTemperatureRate = pair(
+    _TemperatureRate, "temperature_rate", (0.3, 0.03), "thermal_lag", "temperature"
+)
+AccelTemperatureRateSquared, GyroTemperatureRateSquared = pair(
+    _TemperatureRateSquared, "temperature_rate_squared", (10.0, 1.0), "temperature_rate", "thermal_lag"
+)
+AccelTemperatureTimesRate, GyroTemperatureTimesRate = pair(
+    _TemperatureTimesRate, "temperature_times_rate", (0.01, 0.001), "temperature_rate", "thermal_hysteresis"
+)
 EFFECTS = (
-    AccelTemperatureRate, GyroTemperatureRate, AccelTemperatureRateSquared, GyroTemperatureRateSquared,
-    AccelTemperatureTimesRate, GyroTemperatureTimesRate,
-) = (
-    *pair(_TemperatureRate, "temperature_rate", (0.3, 0.03), "thermal_lag", "temperature"),
-    *pair(_TemperatureRateSquared, "temperature_rate_squared", (10.0, 1.0), "temperature_rate", "thermal_lag"),
-    *pair(_TemperatureTimesRate, "temperature_times_rate", (0.01, 0.001), "temperature_rate", "thermal_hysteresis"),
-)  # fmt: skip
+    AccelTemperatureRate,
+    GyroTemperatureRate,
+    AccelTemperatureRateSquared,
+    GyroTemperatureRateSquared,
+    AccelTemperatureTimesRate,
+    GyroTemperatureTimesRate,
+)

@@ -3,38 +3,37 @@
 from types import MappingProxyType
 
 import jax.numpy as jnp
-from jaxtyping import Float
 
-from jaximu.ground.array_types import Array
 from jaximu.ground.prefixes import running
-from jaximu.model.effects.base import Effect, Inner, pair
+from jaximu.model.effects.base import BiasEffect, Inner, Scalar, pair
 
 __all__ = ["EFFECTS", "AccelThermalHysteresis", "GyroThermalHysteresis"]
 
 
-class _ThermalHysteresis(Effect):
+class _ThermalHysteresis(BiasEffect):
     """A bias in proportion to a play of half-width w on T − T_ref: it moves only once the temperature has pushed it.
 
     The play follows p_k = min(max(p_{k−1}, u_k − w), u_k + w), whatever the rate of temperature, and starts in the
     middle. As w → 0 this is a bias in proportion to temperature.
     """
 
-    half_width: Float[Array, "..."] | float
+    half_width: Scalar
 
     formula = "c_i p, p the play of half-width w on T − T_ref"
     unit = "output/K"
-    scope = "device"
     needs = ("temperature",)
     excited_by = "up and down ramps of temperature"
     source = "play operator: Visintin, Differential Models of Hysteresis, 1994; IEEE Std 528-2019, hysteresis error"
     memory = 1
-    inner = MappingProxyType({"half_width": Inner("K", 2.0, 0.1, 20.0, "half of the width of the loop")})
+    inner = MappingProxyType(
+        {
+            "half_width": Inner(
+                "K", 2.0, 0.1, 20.0, "half of the width of the loop", shares=(0.03, 0.06, 0.12, 0.24, 0.4)
+            )
+        }
+    )
 
-    @classmethod
-    def grid(cls, extent):
-        return tuple({"half_width": extent.temperature_range * share} for share in (0.03, 0.06, 0.12, 0.24, 0.4))
-
-    def play(self, stimulus) -> Float[Array, " ..."]:
+    def factor(self, stimulus):
         """Return the play (...), K, along the last axis."""
         warmth = stimulus.warmth(self.name)
         if warmth.ndim == 0:
@@ -47,14 +46,10 @@ class _ThermalHysteresis(Effect):
 
         forward = jnp.moveaxis(warmth, -1, 0)
         bounds = running(after, (forward - self.half_width, forward + self.half_width))
-        low, high = (jnp.moveaxis(each, 0, -1) for each in bounds)
-        return jnp.clip(start, low, high)
-
-    def term(self, stimulus):
-        return self.coefficients * self.play(stimulus)[..., None]
+        return jnp.clip(start, *(jnp.moveaxis(bound, 0, -1) for bound in bounds))
 
     def remember(self, stimulus):
-        return jnp.atleast_1d(self.play(stimulus))[..., -1:]
+        return jnp.atleast_1d(self.factor(stimulus))[..., -1:]
 
 
 EFFECTS = AccelThermalHysteresis, GyroThermalHysteresis = pair(

@@ -3,69 +3,67 @@
 from types import MappingProxyType
 
 import jax.numpy as jnp
-from jaxtyping import Float
 
-from jaximu.ground.array_types import Array
 from jaximu.ground.prefixes import running
-from jaximu.model.effects.base import Effect, Inner, pair
+from jaximu.model.effects.base import BiasEffect, Inner, Scalar, pair
 
 __all__ = ["EFFECTS", "AccelThermalLag", "AccelThermalLagSquared", "GyroThermalLag", "GyroThermalLagSquared"]
 
 
-class _ThermalLag(Effect):
+class _ThermalLag(BiasEffect):
     """A bias in proportion to T_lag, which follows T − T_ref with a time constant: τ dT_lag/dt = (T − T_ref) − T_lag.
 
     The temperature is taken linear between samples, for which the state is exact. A recording starts in equilibrium.
     As τ → 0 this is a bias in proportion to temperature; for ramps it is that and one in proportion to −τ Ṫ.
     """
 
-    time_constant: Float[Array, "..."] | float
+    time_constant: Scalar
 
     formula = "c_i T_lag, τ Ṫ_lag = (T − T_ref) − T_lag"
     unit = "output/K"
-    scope = "device"
     needs = ("temperature", "time")
     excited_by = "up and down ramps of temperature"
     source = "first-order lag of a lumped thermal mass (Newton's law of cooling)"
     memory = 3
-    inner = MappingProxyType({"time_constant": Inner("s", 120.0, 1.0, 1e4, "time the warming part lags behind")})
+    inner = MappingProxyType(
+        {
+            "time_constant": Inner(
+                "s", 120.0, 1.0, 1e4, "time the warming part lags behind", shares=(0.01, 0.03, 0.08, 0.2, 0.5, 1.2)
+            )
+        }
+    )
 
-    @classmethod
-    def grid(cls, extent):
-        return tuple({"time_constant": extent.duration * share} for share in (0.01, 0.03, 0.08, 0.2, 0.5, 1.2))
-
-    def lagged(self, stimulus) -> Float[Array, " ..."]:
+    def lagged(self, stimulus):
         """Return T_lag (...), K, along the last axis."""
         warmth = stimulus.warmth(self.name)
         if warmth.ndim == 0:
             return warmth
         start = (stimulus.memory or {}).get(self.name)
+        time = stimulus.need("time", self.name)
         # what is carried over is (state, temperature, time) of the sample before this path
-        before = jnp.stack([warmth[..., 0], warmth[..., 0], stimulus.need("time", self.name)[..., 0]], axis=-1)
+        before = jnp.stack([warmth[..., 0], warmth[..., 0], time[..., 0]], axis=-1)
         before = before if start is None else jnp.where(jnp.isnan(start), before, start)
         temperature = jnp.concatenate([before[..., 1:2], warmth], axis=-1)
-        time = jnp.concatenate([before[..., 2:3], stimulus.need("time", self.name)], axis=-1)
-        share = jnp.diff(time, axis=-1) / self.time_constant
+        share = jnp.diff(time, axis=-1, prepend=before[..., 2:3]) / self.time_constant
         tiny = share < 1e-6
         safe = jnp.where(tiny, 1.0, share)
         held = jnp.where(tiny, 1 - share / 2, -jnp.expm1(-safe) / safe)  # (1 − e^{−h/τ}) τ/h
         decay = jnp.exp(-share)
-        change = jnp.diff(temperature, axis=-1)
-        drive = (1 - decay) * temperature[..., :-1] + (1 - held) * change
+        drive = (1 - decay) * temperature[..., :-1] + (1 - held) * jnp.diff(temperature, axis=-1)
 
         def after(first, second):
             return first[0] * second[0], second[0] * first[1] + second[1]
 
-        forward = tuple(jnp.moveaxis(each, -1, 0) for each in (decay, drive))
-        total_decay, total_drive = (jnp.moveaxis(each, 0, -1) for each in running(after, forward))
+        results = running(after, (jnp.moveaxis(decay, -1, 0), jnp.moveaxis(drive, -1, 0)))
+        total_decay, total_drive = (jnp.moveaxis(result, 0, -1) for result in results)
         return total_decay * before[..., :1] + total_drive
 
-    def term(self, stimulus):
-        return self.coefficients * self.lagged(stimulus)[..., None]
+    def factor(self, stimulus):
+        return self.lagged(stimulus)
 
     def remember(self, stimulus):
         now = (self.lagged(stimulus), stimulus.warmth(self.name), stimulus.need("time", self.name))
-        return jnp.stack([jnp.atleast_1d(each)[..., -1] for each in now], axis=-1)
+        return jnp.stack([jnp.atleast_1d(path)[..., -1] for path in now], axis=-1)
 
 
 class _ThermalLagSquared(_ThermalLag):
@@ -77,8 +75,8 @@ class _ThermalLagSquared(_ThermalLag):
     cause = False
     shares = "thermal_lag"
 
-    def term(self, stimulus):
-        return self.coefficients * self.lagged(stimulus)[..., None] ** 2
+    def factor(self, stimulus):
+        return self.lagged(stimulus) ** 2
 
 
 AccelThermalLag, GyroThermalLag = pair(_ThermalLag, "thermal_lag", (1e-3, 1e-4), "temperature", "thermal_hysteresis")

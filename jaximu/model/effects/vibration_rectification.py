@@ -1,11 +1,11 @@
 """Vibration rectification: a steady bias under vibration."""
 
-from jaximu.model.effects.base import Effect, pair
+from jaximu.model.effects.base import BiasEffect, pair
 
 __all__ = ["EFFECTS", "AccelVibrationRectification", "GyroVibrationRectification"]
 
 
-class _VibrationRectification(Effect):
+class _VibrationRectification(BiasEffect):
     """A bias in proportion to the mean square of the vibration's acceleration, all directions together.
 
     An even nonlinearity rectifies what is too quick to appear in the samples.
@@ -13,13 +13,12 @@ class _VibrationRectification(Effect):
 
     formula = "c_i P, P the mean square of the vibration's acceleration"
     unit = "output/(m/s^2)^2"
-    scope = "device"
     needs = ("vibration_power",)
     excited_by = "vibration of several strengths"
     source = "IEEE Std 1293-2018, vibration rectification error"
 
-    def term(self, stimulus):
-        return self.coefficients * stimulus.need("vibration_power", self.name)[..., None]
+    def factor(self, stimulus):
+        return stimulus.need("vibration_power", self.name)
 
 
 EFFECTS = AccelVibrationRectification, GyroVibrationRectification = pair(

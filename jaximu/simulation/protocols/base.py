@@ -37,17 +37,15 @@ class Protocol:
     reference: ClassVar[tuple[str, ...]] = ()  # columns that a table tells
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, bool | str):
+        for parameter in fields(self):
+            value = getattr(self, parameter.name)
+            if isinstance(value, str) or "signed" in parameter.metadata:
                 continue
+            zero = "zero" in parameter.metadata
             for number in value if isinstance(value, Sequence) else (value,):
-                low = 0 if each.metadata.get("zero", False) else None
-                if each.metadata.get("signed", False):
-                    continue
-                if not np.isfinite(number) or (number < 0 if low == 0 else number <= 0):
-                    bound = "must not be negative" if low == 0 else "must be greater than zero"
-                    raise InputError(f"protocol {self.kind}: {each.name} {bound}, found {number}.")
+                if not np.isfinite(number) or number < 0 or (number == 0 and not zero):
+                    bound = "must not be negative" if zero else "must be greater than zero"
+                    raise InputError(f"protocol {self.kind}: {parameter.name} {bound}, found {number}.")
 
     def course(self, rng: np.random.Generator) -> Course:
         """Return the motion, segment by segment; `rng` draws what a person would do at will."""
@@ -61,16 +59,13 @@ class Protocol:
         """Return the protocol made out in an environment (standard gravity, 25 °C, no Earth rotation by default)."""
         course = self.course(rng)
         environment = self.environment(environment or Environment())
-        columns = {
-            "temperature": environment.temperature is not None,
-            "ambient_temperature": environment.ambient is not None,
-            "current": environment.current is not None,
-        } | dict.fromkeys(self.reference, True)
-        return Plan(
-            course.motion(environment, rng),
-            tuple(course.intervals),
-            tuple(name for name, there in columns.items() if there),
-        )
+        conditions = {
+            "temperature": environment.temperature,
+            "ambient_temperature": environment.ambient,
+            "current": environment.current,
+        }
+        logged = [name for name, value in conditions.items() if value is not None]
+        return Plan(course.motion(environment, rng), tuple(course.intervals), (*logged, *self.reference))
 
     def stimulus(self, rate: float = 100.0, seed: int = 0, environment: Environment | None = None) -> Stimulus:
         """Return what the sensors go through, at `rate` (Hz); see `Stimulus` for its fields."""

@@ -79,14 +79,15 @@ class Environment:
         if not -90 <= self.dip <= 90:
             raise InputError(f"the dip must lie between -90 and 90 degrees, found {self.dip}.")
         for name in ("temperature", "ambient", "current"):
-            value = getattr(self, name)
-            if value is not None:
-                knots(value, name)
+            knots(getattr(self, name), name)
 
 
-def knots(value: float | Sequence[Sequence[float]], name: str = "temperature") -> tuple[FloatArray, FloatArray]:
+def knots(
+    value: float | Sequence[Sequence[float]] | None, name: str = "temperature", default: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Return times (s) and values (°C or A) of a number or of knots [[s, value], …]. Raises InputError."""
     unit = "A" if name == "current" else "degC"
+    value = default if value is None else value
     if isinstance(value, int | float):
         value = [[0.0, value], [1.0, value]]
     table = np.asarray(value, float)
@@ -115,7 +116,7 @@ def attitude_of(up: ArrayLike, heading: ArrayLike = 0.0) -> Rotation:
 class Course:
     """A motion in the making: rests and turns one after the other, each exactly as long as said."""
 
-    attitude: Rotation
+    attitude: Rotation = field(default_factory=lambda: scipy.spatial.transform.Rotation.identity())
     intervals: list[Interval] = field(default_factory=list)
     time: float = 0.0
     _segments: list[tuple] = field(default_factory=list)
@@ -131,59 +132,84 @@ class Course:
             self.intervals.append(Interval(start, self.time, "pose", up, 0.0, float(heading)))
 
     def turn(
-        self, rotation: ArrayLike, duration: float, ramp: float = 0.5, displacement: ArrayLike = (0.0, 0.0, 0.0),
-        mark: bool = True, bend: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> None:  # fmt: skip
+        self,
+        rotation: ArrayLike,
+        duration: float,
+        ramp: float = 0.5,
+        displacement: ArrayLike = (0.0, 0.0, 0.0),
+        mark: bool = True,
+        bend: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> None:
         """Turn by a rotation vector (body frame, rad; any number of revolutions), moving by `displacement` (m) and
         leaning aside by `bend` (body frame, rad) half way.
         """
         rotation = np.asarray(rotation, float)
         angle = float(np.linalg.norm(rotation))
-        start = self._add(duration, rotation, ramp, np.asarray(displacement, float), np.asarray(bend, float))
+        start = self._add(duration, rotation, ramp, displacement, bend)
         self.attitude = self.attitude * scipy.spatial.transform.Rotation.from_rotvec(rotation)
         if mark and angle > 0:
             self.intervals.append(Interval(start, self.time, "turn", rotation / angle, angle))
 
+    def spin(self, axis: FloatArray, angle: float, rate: float, ramp_duration: float) -> None:
+        """Turn by `angle` (rad) about `axis` at the constant `rate` (rad/s), reached in `ramp_duration` (s).
+
+        Where the angle is too small to reach the rate, the ramps meet.
+        """
+        duration = max(angle / rate + ramp_duration, 2 * ramp_duration)
+        self.turn(angle * axis, duration, ramp_duration / duration)
+
     def to(
-        self, attitude: Rotation, duration: float, displacement: ArrayLike = (0.0, 0.0, 0.0),
+        self,
+        attitude: Rotation,
+        duration: float,
+        displacement: ArrayLike = (0.0, 0.0, 0.0),
         bend: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Turn the shortest way to an attitude, but for `bend`."""
         self.turn((self.attitude.inv() * attitude).as_rotvec(), duration, 0.5, displacement, bend=bend)
         self.attitude = attitude  # exactly
 
-    def _add(self, duration: float, rotation: FloatArray, ramp: float = 0.5, displacement=None, bend=None) -> float:
+    def visit(self, attitude: Rotation, duration: float) -> None:
+        """Turn the shortest way to an attitude, or begin in it."""
+        if self._segments:
+            self.to(attitude, duration)
+        self.attitude = attitude
+
+    def _add(
+        self,
+        duration: float,
+        rotation: FloatArray,
+        ramp: float = 0.5,
+        displacement: ArrayLike = (0.0, 0.0, 0.0),
+        bend: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> float:
         attitude = self.attitude.as_quat(scalar_first=True)
-        moved, aside = (np.zeros(3) if each is None else each for each in (displacement, bend))
-        self._segments.append((self.time, duration, attitude, rotation, ramp, moved, aside))
+        self._segments.append((self.time, duration, attitude, rotation, ramp, displacement, bend))
         start, self.time = self.time, self.time + duration
         return start
 
     def motion(self, environment: Environment, rng: np.random.Generator) -> Motion:
         """Return the motion in an environment; `rng` draws the phases of the vibration."""
-        columns = [np.asarray(column, float) for column in zip(*self._segments, strict=True)]
-        start, duration, attitude, rotation, ramp, displacement, bend = columns
-        bend = bend if bend.any() else bend[:0]
-        temperature = environment.temperature if environment.temperature is not None else 25.0
-        time, sensor = knots(temperature)
-        if environment.ambient is None:
-            ambient = sensor
-        else:
-            around, values = knots(environment.ambient, "ambient")
-            union = np.union1d(time, around)
-            sensor, ambient, time = np.interp(union, time, sensor), np.interp(union, around, values), union
-        tones = list(environment.vibration)
-        table = {
-            "frequency": np.array([tone.frequency for tone in tones]),
-            "acceleration": np.array([tone.acceleration for tone in tones]).reshape(-1, 3),
-            "rocking": np.array([tone.rocking for tone in tones]).reshape(-1, 3),
-            "phase": rng.uniform(0, 2 * np.pi, (len(tones), 2)),
-            "window": np.array([(max(tone.start, -1e9), min(tone.stop, 1e9)) for tone in tones]).reshape(-1, 2),
-        }
-        flowing = knots(0.0 if environment.current is None else environment.current, "current")
-        earth = np.zeros(3) if environment.latitude is None else earth_rate(np.radians(environment.latitude))
+        *columns, bend = (np.asarray(column, float) for column in zip(*self._segments, strict=True))
+        columns.append(bend if bend.any() else bend[:0])
+        time, sensor = knots(environment.temperature, default=25.0)
+        around, ambient = (time, sensor) if environment.ambient is None else knots(environment.ambient)
+        union = np.union1d(time, around)
+        tones = environment.vibration
+        current_time, current = knots(environment.current)
         return Motion(
-            start, duration, attitude, rotation, ramp, displacement, bend, time, sensor, ambient, **table,
-            gravity=np.asarray(environment.gravity, float), earth=earth,
-            field=field_of(environment.field, environment.dip), current_time=flowing[0], current=flowing[1],
-        )  # fmt: skip
+            *columns,
+            temperature_time=union,
+            temperature=np.interp(union, time, sensor),
+            ambient=np.interp(union, around, ambient),
+            frequency=np.array([tone.frequency for tone in tones]),
+            acceleration=np.reshape([tone.acceleration for tone in tones], (-1, 3)),
+            rocking=np.reshape([tone.rocking for tone in tones], (-1, 3)),
+            phase=rng.uniform(0, 2 * np.pi, (len(tones), 2)),
+            window=np.clip(np.reshape([(tone.start, tone.stop) for tone in tones], (-1, 2)), -1e9, 1e9),
+            gravity=np.asarray(environment.gravity, float),
+            earth=np.zeros(3) if environment.latitude is None else earth_rate(np.radians(environment.latitude)),
+            field=field_of(environment.field, environment.dip),
+            current_time=current_time,
+            current=current,
+        )

@@ -28,12 +28,11 @@ class DividingHead(Protocol):
     reference = ("attitude",)
 
     def course(self, rng):
-        course = Course(attitude_of(_POSITIONS[0]))
-        for place, up in enumerate(_POSITIONS):
-            if place:
-                course.to(attitude_of(up), self.turn_duration)
+        course = Course()
+        for index, up in enumerate(_POSITIONS):
+            course.visit(attitude_of(up), self.turn_duration)
             course.rest(self.duration)
-            if place < 3:  # z, x and y are up
+            if index < 3:  # z, x and y are up
                 for sign in (1.0, -1.0):
                     course.turn(sign * np.radians(self.angle) * np.array(up), self.turn_duration, 0.2)
                     course.rest(self.duration)

@@ -25,11 +25,10 @@ class Ferraris(Protocol):
     reference = ("attitude",)
 
     def course(self, rng):
-        course = Course(attitude_of(np.eye(3)[0]))
+        course = Course()
         for axis in np.eye(3):
             for up in (axis, -axis):
-                if course.time:
-                    course.to(attitude_of(up), self.turn_duration)
+                course.visit(attitude_of(up), self.turn_duration)
                 course.rest(self.duration)
                 if up is axis:
                     course.turn(np.radians(self.angle) * axis, self.turn_duration, 0.2)

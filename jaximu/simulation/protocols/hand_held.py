@@ -37,14 +37,14 @@ class HandHeld(Protocol):
     kind = "hand-held"
 
     def course(self, rng):
-        attitudes = self._attitudes(rng)
-        course = Course(attitudes[0])
-        for place in range(self.poses):
-            if place:
-                moved = rng.uniform(-1, 1, 3) * self.displacement / np.sqrt(3)
-                aside = rng.uniform(-1, 1, 3) * np.radians(self.bend) / np.sqrt(3) if self.bend else np.zeros(3)
-                course.to(attitudes[place], self.turn_duration, moved, aside)
-            course.rest(self.pose_duration + (self.initial_rest if place == 0 else 0.0))
+        first, *others = self._attitudes(rng)
+        course = Course(first)
+        course.rest(self.pose_duration + self.initial_rest)
+        for attitude in others:
+            moved = rng.uniform(-1, 1, 3) * self.displacement / np.sqrt(3)
+            aside = rng.uniform(-1, 1, 3) * np.radians(self.bend) / np.sqrt(3) if self.bend else np.zeros(3)
+            course.to(attitude, self.turn_duration, moved, aside)
+            course.rest(self.pose_duration)
         return course
 
     def _attitudes(self, rng) -> Rotation:

@@ -97,12 +97,12 @@ class Motion(eqx.Module):
 
     def attitude_at(self, time: Float[Array, " n"]) -> Float[Array, "n 4"]:
         """Return the attitude (n, 4), body to level frame."""
-        place, x = self._place(time)
-        turned = exponential(smooth_course(x, self.ramp[place])[:, None] * self.rotation[place])
-        attitude = multiply(self.attitude[place], turned)
+        segment, x = self._segment(time)
+        turned = exponential(smooth_course(x, self.ramp[segment])[:, None] * self.rotation[segment])
+        attitude = multiply(self.attitude[segment], turned)
         if self.bend.shape[0]:
             aside = 64 * (x * (1 - x)) ** 3  # with its first two derivatives zero at both ends, and one half way
-            attitude = multiply(attitude, exponential(aside[:, None] * self.bend[place]))
+            attitude = multiply(attitude, exponential(aside[:, None] * self.bend[segment]))
         if self.frequency.shape[0]:
             envelope, phase = self._tone(time)
             rocking = jnp.sum((envelope * jnp.sin(phase + self.phase[:, 1]))[..., None] * self.rocking, axis=1)
@@ -111,8 +111,8 @@ class Motion(eqx.Module):
 
     def displacement_at(self, time: Float[Array, " n"]) -> Float[Array, "n 3"]:
         """Return how far the rotation centre is (level frame, m) from where its segment began."""
-        place, x = self._place(time)
-        return smooth_course(x, self.ramp[place])[:, None] * self.displacement[place]
+        segment, x = self._segment(time)
+        return smooth_course(x, self.ramp[segment])[:, None] * self.displacement[segment]
 
     def at(self, time: Float[Array, " n"], interval: Float[Array, ""] | float) -> Stimulus:
         """Return what the sensor goes through at the stamps `time` of samples `interval` seconds long.
@@ -124,17 +124,13 @@ class Motion(eqx.Module):
         """
         half = interval / 2
         edges = jnp.concatenate([time[:1] - half, time + half])
-        # the barriers keep XLA from computing an attitude anew for every number that depends on it (five times faster)
+        # the barriers keep XLA from recomputing an attitude for every number that depends on it (five times faster)
         attitudes, attitude = jax.lax.optimization_barrier((self.attitude_at(edges), self.attitude_at(time)))
         turning = exponential(self.earth * interval)
-        step = multiply(conjugate(attitudes[:-1]), multiply(jnp.broadcast_to(turning, (len(time), 4)), attitudes[1:]))
+        step = multiply(conjugate(attitudes[:-1]), multiply(turning, attitudes[1:]))
         turned = logarithm(jax.lax.optimization_barrier(step)) / interval
-        _, angular_acceleration = jax.jvp(self._inertial_rate, (time,), (jnp.ones_like(time),))
-
-        def velocity(time):
-            return jax.jvp(self.displacement_at, (time,), (jnp.ones_like(time),))[1]
-
-        _, moving = jax.jvp(velocity, (time,), (jnp.ones_like(time),))
+        angular_acceleration = _rate(self._inertial_rate)(time)
+        moving = _rate(_rate(self.displacement_at))(time)
         upward = jax.lax.optimization_barrier(moving.at[:, 2].add(self.gravity))
         force = rotate(conjugate(attitude), upward)
         power = jnp.zeros_like(time)
@@ -156,7 +152,7 @@ class Motion(eqx.Module):
             time=time,
             attitude=attitude,
             vibration_power=power,
-            magnetic_field=rotate(conjugate(attitude), jnp.broadcast_to(self.field, force.shape)),
+            magnetic_field=rotate(conjugate(attitude), self.field),
             current=jnp.interp(time, self.current_time, self.current),
         )
 
@@ -164,11 +160,10 @@ class Motion(eqx.Module):
         """Return the ambient temperature (n,), °C."""
         return jnp.interp(time, self.temperature_time, self.ambient)
 
-    def _place(self, time):
+    def _segment(self, time):
         """Segment of each instant and how far through it is, in [0, 1]."""
-        place = jnp.clip(jnp.searchsorted(self.start, time, side="right") - 1, 0, len(self.start) - 1)
-        x = (time - self.start[place]) / self.duration[place]
-        return place, jnp.clip(x, 0.0, 1.0)
+        segment = jnp.clip(jnp.searchsorted(self.start, time, side="right") - 1, 0, len(self.start) - 1)
+        return segment, jnp.clip((time - self.start[segment]) / self.duration[segment], 0.0, 1.0)
 
     def _tone(self, time):
         """Envelope and phase (n, v) of the tones: smooth edges, so that rocking has a rate."""
@@ -179,8 +174,12 @@ class Motion(eqx.Module):
     def _inertial_rate(self, time):
         """Angular rate (n, 3) against inertial space, in the body frame, at an instant: 2 q* ⊗ dq/dt + Rᵀ ω_E."""
         attitude, change = jax.jvp(self.attitude_at, (time,), (jnp.ones_like(time),))
-        earth = rotate(conjugate(attitude), jnp.broadcast_to(self.earth, (len(time), 3)))
-        return 2 * multiply(conjugate(attitude), change)[:, 1:] + earth
+        return 2 * multiply(conjugate(attitude), change)[:, 1:] + rotate(conjugate(attitude), self.earth)
+
+
+def _rate(function):
+    """The derivative of a function of instants (n,) by each of them."""
+    return lambda time: jax.jvp(function, (time,), (jnp.ones_like(time),))[1]
 
 
 @eqx.filter_jit

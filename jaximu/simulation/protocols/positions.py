@@ -13,8 +13,11 @@ __all__ = ["Positions", "directions", "spiral"]
 
 _FACES = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
 _CORNERS = [np.array(signs) / np.sqrt(3) for signs in itertools.product((1.0, -1.0), repeat=3)]
-_EDGES = [np.array(signs) / np.sqrt(2) for signs in itertools.product((1.0, -1.0, 0.0), repeat=3)
-          if np.count_nonzero(signs) == 2]  # fmt: skip
+_EDGES = [
+    np.array(signs) / np.sqrt(2)
+    for signs in itertools.product((1.0, -1.0, 0.0), repeat=3)
+    if np.count_nonzero(signs) == 2
+]
 
 
 def directions(count: int) -> list[tuple[np.ndarray, float]]:
@@ -32,8 +35,8 @@ def directions(count: int) -> list[tuple[np.ndarray, float]]:
 
 def spiral(count: int) -> np.ndarray:
     """Return unit vectors (count, 3) spread evenly over the sphere: a spiral that passes equal areas."""
-    place = np.arange(count) + 0.5
-    height, azimuth = 1 - 2 * place / max(count, 1), np.pi * (1 + np.sqrt(5)) * place
+    turn = np.arange(count) + 0.5
+    height, azimuth = 1 - 2 * turn / max(count, 1), np.pi * (1 + np.sqrt(5)) * turn
     across = np.sqrt(1 - height**2)
     return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height], axis=1)
 
@@ -50,10 +53,8 @@ class Positions(Protocol):
     reference = ("attitude",)
 
     def course(self, rng):
-        places = [attitude_of(up, heading) for up, heading in directions(self.count)]
-        course = Course(places[0])
-        for place, attitude in enumerate(places):
-            if place:
-                course.to(attitude, self.turn_duration)
+        course = Course()
+        for up, heading in directions(self.count):
+            course.visit(attitude_of(up, heading), self.turn_duration)
             course.rest(self.duration)
         return course

@@ -29,28 +29,12 @@ class RateTable(Protocol):
     reference = ("attitude", "table_rate")
 
     def course(self, rng):
-        course = Course(attitude_of(np.eye(3)[0]))
-        for axis in range(3):
-            if axis:
-                course.to(attitude_of(np.eye(3)[axis]), self.mounting_duration)
+        course = Course()
+        for axis in np.eye(3):
+            course.visit(attitude_of(axis), self.mounting_duration)
             course.rest(self.rest_duration)
-            for rate in self.rates:
-                for sign in (1.0, -1.0):
-                    turn(
-                        course,
-                        sign * np.eye(3)[axis],
-                        2 * np.pi * self.revolutions,
-                        np.radians(rate),
-                        self.ramp_duration,
-                    )
+            for rate in np.radians(self.rates):
+                for up in (axis, -axis):
+                    course.spin(up, 2 * np.pi * self.revolutions, rate, self.ramp_duration)
                     course.rest(self.rest_duration)
         return course
-
-
-def turn(course: Course, axis: np.ndarray, angle: float, rate: float, ramp_duration: float) -> None:
-    """Turn by `angle` (rad) about `axis` at the constant `rate` (rad/s), coming up to it within `ramp_duration` (s).
-
-    Where the angle is too small to reach the rate, the ramps meet.
-    """
-    duration = max(angle / rate + ramp_duration, 2 * ramp_duration)
-    course.turn(angle * axis, duration, ramp_duration / duration)

@@ -18,10 +18,10 @@ NINETEEN = "y90 y90 y90 y-90 y-90 y-90 z90 x90 x90 x90 x-90 x-90 x-90 z90 z90 z-
 
 def rotation_vector(word: str) -> FloatArray:
     """Return the rotation vector (3,), body frame, rad, of a word such as "x-90". Raises `InputError` for another."""
-    found = re.fullmatch(r"([xyz])([+-]?\d+(?:\.\d+)?)", word)
-    if found is None or not 0 < abs(float(found[2])) <= 360:
+    match = re.fullmatch(r"([xyz])([+-]?\d+(?:\.\d+)?)", word)
+    if match is None or not 0 < abs(float(match[2])) <= 360:
         raise InputError(f"protocol rotations: {word!r} is not an axis and degrees up to 360, such as x-90.")
-    return np.radians(float(found[2])) * np.eye(3)["xyz".index(found[1])]
+    return np.radians(float(match[2])) * np.eye(3)["xyz".index(match[1])]
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,15 @@ class Rotations(Protocol):
         super().__post_init__()
         if not self.rotations.split():
             raise InputError('protocol rotations: there is none; write, say, rotations = "y90 x-90".')
-        for word in self.rotations.split():
-            rotation_vector(word)
+        self._vectors()
+
+    def _vectors(self) -> list[FloatArray]:
+        return [rotation_vector(word) for word in self.rotations.split()]
 
     def course(self, rng):
         course = Course(attitude_of(np.array([0.0, 0.0, 1.0])))
         course.rest(self.duration)
-        for word in self.rotations.split():
-            course.turn(rotation_vector(word), self.turn_duration)
+        for vector in self._vectors():
+            course.turn(vector, self.turn_duration)
             course.rest(self.duration)
         return course

@@ -6,7 +6,6 @@ import numpy as np
 
 from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course, attitude_of
-from jaximu.simulation.protocols.rate_table import turn
 
 __all__ = ["SingleAxisTable"]
 
@@ -28,16 +27,14 @@ class SingleAxisTable(Protocol):
     reference = ("attitude", "table_rate")
 
     def course(self, rng):
-        course = Course(attitude_of(np.eye(3)[0]))
-        for axis in range(3):
-            for sign in (1.0, -1.0):
-                up = sign * np.eye(3)[axis]
-                if course.time:
-                    course.to(attitude_of(up), self.mounting_duration)
+        course = Course()
+        for axis in np.eye(3):
+            for up in (axis, -axis):
+                course.visit(attitude_of(up), self.mounting_duration)
                 course.rest(self.duration)
-                turn(course, up, np.pi, np.radians(self.rate), 1.0)
+                course.spin(up, np.pi, np.radians(self.rate), 1.0)
                 course.rest(self.duration)
-                if sign > 0:
-                    turn(course, up, 2 * np.pi, np.radians(self.rate), 1.0)
+                if up is axis:
+                    course.spin(up, 2 * np.pi, np.radians(self.rate), 1.0)
                     course.rest(self.duration, mark=False)
         return course

@@ -46,17 +46,15 @@ class SoakAndRamp(Protocol):
         time, table = self.soak_duration, [(0.0, self.low), (self.soak_duration, self.low)]
         for rate in self.rates:
             for end in (self.high, self.low):
-                time += (self.high - self.low) / rate * 60
-                table.append((time, end))
-                time += self.soak_duration
-                table.append((time, end))
+                reached = time + (self.high - self.low) / rate * 60
+                time = reached + self.soak_duration
+                table += [(reached, end), (time, end)]
         return np.array(table)
 
     def environment(self, environment):
         ambient = self._knots()
-        sensor = ambient + [0.0, self.self_heating]
-        if self.device_lag > 0:
-            sensor = _lagged(ambient, self.device_lag) + [0.0, self.self_heating]
+        lagged = _lagged(ambient, self.device_lag) if self.device_lag > 0 else ambient
+        sensor = lagged + [0.0, self.self_heating]
         return self._own(environment, temperature=sensor.tolist(), ambient=ambient.tolist())
 
     def course(self, rng):
@@ -66,15 +64,14 @@ class SoakAndRamp(Protocol):
             if self.positions == 1 or not soak:
                 course.rest(stop - start)
                 continue
-            places = [attitude_of(up, heading) for up, heading in directions(self.positions)]
-            rest = (stop - start) / len(places) - self.turn_duration
+            rest = (stop - start) / self.positions - self.turn_duration
             if rest <= 0:
                 raise InputError(
                     f"protocol soak-and-ramp: a soak of {self.soak_duration} s is too short for {self.positions} "
                     "positions."
                 )
-            for attitude in places:
-                course.to(attitude, self.turn_duration)
+            for up, heading in directions(self.positions):
+                course.to(attitude_of(up, heading), self.turn_duration)
                 course.rest(rest)
         return course
 

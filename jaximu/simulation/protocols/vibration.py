@@ -39,9 +39,9 @@ class Vibration(Protocol):
     def environment(self, environment):
         direction = np.array(self.direction) / np.linalg.norm(self.direction)
         tones = []
-        for place, level in enumerate(self.levels):
+        for index, level in enumerate(self.levels):
             amplitude = level * np.sqrt(2 / len(self.frequencies))
-            start = (2 * place + 1) * self.duration
+            start = (2 * index + 1) * self.duration
             for frequency in self.frequencies:
                 rocking = np.radians(self.rocking) * amplitude * direction
                 tones.append(Tone(frequency, amplitude * direction, rocking, start, start + self.duration))
