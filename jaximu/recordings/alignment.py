@@ -58,13 +58,14 @@ class Turning(NamedTuple):
 def signed_permutation(matrix: FloatArray) -> FloatArray:
     """Return the signed permutation (3, 3) that is nearest to a matrix whose columns may have any length."""
     columns = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-    best, found = -np.inf, np.eye(3)
+    best, nearest = -np.inf, np.eye(3)
     for order in permutations(range(3)):
-        own = columns[order, range(3)]
-        if np.sum(np.abs(own)) > best + 1e-12:
-            best, found = float(np.sum(np.abs(own))), np.zeros((3, 3))
-            found[order, range(3)] = np.where(own < 0, -1.0, 1.0)
-    return found
+        entries = columns[order, range(3)]
+        total = float(np.sum(np.abs(entries)))
+        if total > best + 1e-12:
+            best, nearest = total, np.zeros((3, 3))
+            nearest[order, range(3)] = np.where(entries < 0, -1.0, 1.0)
+    return nearest
 
 
 def turning_best(products: FloatArray) -> FloatArray:
@@ -101,11 +102,10 @@ class BlockMeans(NamedTuple):
     time: FloatArray
     angle: FloatArray
 
-    def turned(self, late: FloatArray | float = 0.0) -> FloatArray:
-        """Return the gyroscope's angle (n, 3) from each block to the next, its stamps (n + 1,) `late` s late."""
-        at = self.centre + late
-        angle = np.stack([np.interp(at, self.time, each) for each in self.angle.T], axis=1)
-        return np.asarray(np.diff(angle, axis=0), np.float64)
+    def turned(self, delay: FloatArray | float = 0.0) -> FloatArray:
+        """Return the gyroscope's angle (n, 3) from each block to the next, its stamps (n + 1,) `delay` s late."""
+        stamps = self.centre + delay
+        return np.diff(np.stack([np.interp(stamps, self.time, axis) for axis in self.angle.T], axis=1), axis=0)
 
 
 def gravity_turning(
@@ -134,8 +134,8 @@ def gravity_turning(
     # across a gap nobody knows what the unit did
     apart, step = np.diff(centre), np.diff(rate_time)
     weight[apart > 2 * np.median(apart)] = 0.0
-    for place in np.flatnonzero(step > max(_BLOCK, 2.5 * float(np.median(step)))):
-        first, last = np.searchsorted(centre, rate_time[place : place + 2])
+    for gap in np.flatnonzero(step > max(_BLOCK, 2.5 * float(np.median(step)))):
+        first, last = np.searchsorted(centre, rate_time[gap : gap + 2])
         weight[max(first - 1, 0) : last] = 0.0
     return BlockMeans(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
 

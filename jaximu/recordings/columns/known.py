@@ -184,8 +184,7 @@ def whole_stamps(table: Table) -> Table:
                 continue
             names = [*(table.names or ())]
             names[at] = "time [ns]"
-            columns = [*table.columns]
-            columns[at] = parts[0] * 10**9 + parts[1]
             note = f"time is {name} and {prefix + rest}."
-            return replace(table, names=tuple(names), columns=tuple(columns), notes=(*table.notes, note))
+            stamped = table.with_column(at, parts[0] * 10**9 + parts[1])
+            return replace(stamped, names=tuple(names), notes=(*table.notes, note))
     return table

@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, name_of, readable
+from jaximu.ground.quantities import counted
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.columns import nominal
@@ -301,8 +302,7 @@ def _sigma_of_means(table: Table, sensor: str, base: str) -> FloatArray | None:
     def positive(name: str, factor: float = 1.0) -> FloatArray:
         values = np.asarray(table.numbers(named[name][0]), np.float64) * factor
         if (wrong := ~(values > 0)).any():
-            at = int(np.argmax(wrong))
-            raise InputError(f"{table.path}, row {table.row(at)}: column {name!r} must be greater than zero.")
+            raise InputError(f"{table.where(np.argmax(wrong))}: column {name!r} must be greater than zero.")
         return values
 
     deviations = []
@@ -454,7 +454,7 @@ def _checked(table: Table, source: Source) -> Table:
     """The table with its source and number of rows, in our names where its own show what wrote it."""
     rows = len(table.columns[0]) if table.columns else 0
     if rows < 2:
-        raise InputError(f"{table.path}: holds {rows} row{'s' * (rows != 1)} of data; a recording needs more.")
+        raise InputError(f"{table.path}: holds {counted(rows, 'row')} of data; a recording needs more.")
     table = apart(replace(table, source=replace(source, rows=rows)))
     known = known_names(table)
     return table if known is None else replace(table, names=known[0], notes=(*table.notes, known[1]))
@@ -548,16 +548,15 @@ def _carried_on(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table
     for seconds in _ENDS:
         if seconds / unit.factor < _COUNTED * usual:
             continue
-        full = stamps.dtype.type(round(seconds / unit.factor) if stamps.dtype.kind == "i" else seconds / unit.factor)
+        span = seconds / unit.factor
+        full = stamps.dtype.type(round(span) if stamps.dtype.kind == "i" else span)
         back = np.flatnonzero(steps < -full / 2)
         if not len(back) or not np.all((steps[back] + full > 0) & (steps[back] + full < _CARRIED * usual)):
             continue
-        columns = list(table.columns)
         turns = np.zeros(len(stamps), stamps.dtype)
         turns[back + 1] = full
-        columns[index] = stamps + np.cumsum(turns)
-        places = f"{len(back)} place{'s' * (len(back) != 1)} (row {table.row(int(back[0]) + 1)})"
-        return replace(table, columns=tuple(columns)), [
+        places = f"{counted(len(back), 'place')} (row {table.row(back[0] + 1)})"
+        return table.with_column(index, stamps + np.cumsum(turns)), [
             f"the clock starts again after {seconds:.10g} s in {places}: its time goes on from there."
         ]
     return table, []
@@ -575,10 +574,10 @@ def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, l
         return table, []
     back = float((np.maximum.accumulate(stamps) - stamps).max()) * unit.factor
     if back > _SET_BACK:
-        at = int(np.argmax(steps < 0)) + 1
+        first = np.argmax(steps < 0) + 1
         raise InputError(
-            f"{table.path}, message {table.row(at)}: the clock goes back, by up to {back:.6g} s; cut the log there, or "
-            "use the receive stamps (--stamp receive)."
+            f"{table.path}, message {table.row(first)}: the clock goes back, by up to {back:.6g} s; cut the log there, "
+            "or use the receive stamps (--stamp receive)."
         )
     order = np.argsort(stamps, kind="stable")
     kept = order[np.concatenate([[True], np.diff(stamps[order]) > 0])]
@@ -606,84 +605,80 @@ def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, li
     index, unit = found[TIME]
     stamps = table.numbers(index)
     steps = np.diff(stamps)
-    if not (steps <= 0).any() or (stamps.dtype.kind == "f" and np.isnan(stamps).any()):
+    if not (steps <= 0).any() or np.isnan(stamps).any():
         return table, []
+
+    def listed(rows: np.ndarray) -> str:
+        return ", ".join(str(table.row(row)) for row in rows[:5])
+
     notes: list[str] = []
     usual = float(np.median(np.abs(steps[steps != 0]))) if (steps != 0).any() else 0.0
     count = len(stamps)
     order = np.arange(count)
     late = np.flatnonzero(steps < 0) + 1
+    backwards = len(late) > 0.9 * (count - 1)
     if len(late) and (even := _even_clock(stamps)) is not None:
-        columns = list(table.columns)
-        columns[index] = even
         spread = float(np.std(stamps - even)) * unit.factor
-        return replace(table, columns=tuple(columns)), [Defect(
-            "data.jitter",
-            f"The stamps jitter by {1e3 * spread:.2g} ms and go back in {len(late)} place{'s' * (len(late) != 1)}, and "
-            "the rows are in order: a steady clock fitted to the stamps replaces them.",
-        )]  # fmt: skip
+        text = (
+            f"The stamps jitter by {1e3 * spread:.2g} ms and go back in {counted(len(late), 'place')}, and "
+            "the rows are in order: a steady clock fitted to the stamps replaces them."
+        )
+        return table.with_column(index, even), [Defect("data.jitter", text)]
     if len(late):
         order = np.argsort(stamps, kind="stable")
-        if len(late) > 0.9 * (count - 1):
+        if backwards:
             # rows of one stamp keep the order that they have when the file is read backwards
             order = count - 1 - np.argsort(stamps[::-1], kind="stable")
             text = "The rows run backwards in time. They were sorted by their stamps."
         else:
-            first = ", ".join(str(table.row(int(row))) for row in late[:5])
             back = float(np.max(np.maximum.accumulate(stamps) - stamps)) * unit.factor
             text = (
-                f"The rows are out of order in {len(late)} place{'s' * (len(late) != 1)} (row {first}), by up to "
+                f"The rows are out of order in {counted(len(late), 'place')} (row {listed(late)}), by up to "
                 f"{back:.6g} s. They were sorted by their stamps."
             )
         notes.append(Defect("data.order", text))
     # where two rows have one stamp and are alike, one of them was written twice
-    again = np.flatnonzero(np.diff(stamps[order]) == 0) + 1
-    for column in map(np.asarray, table.columns):
-        here, before = column[order[again]], column[order[again - 1]]
-        again = again[(here == before) | ((here != here) & (before != before))]
-    kept = np.delete(order, again)
-    if len(again):
-        rows = np.sort(order[again])
-        first = ", ".join(str(table.row(int(row))) for row in rows[:5])
+    repeats = np.flatnonzero(np.diff(stamps[order]) == 0) + 1
+    for column in table.columns:
+        values, before = column[order[repeats]], column[order[repeats - 1]]
+        repeats = repeats[(values == before) | ((values != values) & (before != before))]
+    kept = np.delete(order, repeats)
+    if len(repeats):
         block = "" if len(late) else " one after the other"
         text = (
-            f"{len(rows)} row{'s' * (len(rows) != 1)} repeat others with the same stamp{block} (row {first} …). "
-            "They were left out."
+            f"{counted(len(repeats), 'row')} repeat others with the same stamp{block} "
+            f"(row {listed(np.sort(order[repeats]))} …). They were left out."
         )
-        if len(late) <= 0.9 * (count - 1) and (np.diff(stamps[np.sort(kept)]) >= 0).all():
-            notes = []  # what is left is in order
+        if not backwards and (np.diff(stamps[np.sort(kept)]) >= 0).all():
+            notes = []  # the rows that are kept are in order
         notes.append(Defect("data.duplicate", text))
-    left = np.diff(stamps[kept])
-    close, before = int(np.sum(left < 0.4 * usual)), int(np.sum((steps >= 0) & (steps < 0.4 * usual)))
+    kept_steps = np.diff(stamps[kept])
+    close, before = int(np.sum(kept_steps < 0.4 * usual)), int(np.sum((steps >= 0) & (steps < 0.4 * usual)))
     if len(late) and close > max(20, 0.02 * count) + before:
-        at = int(late[np.argmax(stamps[late - 1] - stamps[late])])
+        farthest = late[np.argmin(steps[late - 1])]
         raise InputError(
-            f"{table.path}, row {table.row(at)}: the clock goes back by "
-            f"{(stamps[at - 1] - stamps[at]) * unit.factor:.6g} s, and the rows from there on are not those of the "
-            "same times before: two recordings in one file (data.order). Cut it there."
+            f"{table.where(farthest)}: the clock goes back by {-steps[farthest - 1] * unit.factor:.6g} s, and the rows "
+            "from there on are not those of the same times before: two recordings in one file (data.order). Cut it "
+            "there."
         )
-    shared = left == 0
+    shared = kept_steps == 0
     if len(late) and (shared.any() or close > before):
         return table, []  # sorting does not help: stamps are wrong, and which, the refusal says
-    columns = [np.asarray(column)[kept] for column in table.columns]
+    table, stamps = table.take(kept), stamps[kept]
     if not len(late) and shared.sum() >= _FEW_SHARED and _FEW_SHARES < shared.mean() <= 0.25:
-        even = _even_clock(stamps[kept])
+        even = _even_clock(stamps)
         if even is not None:
-            columns[index] = even
             rate = (len(even) - 1) / (float(even[-1] - even[0]) * unit.factor)
-            return table.take(kept, columns), [
-                *notes,
-                Defect(
-                    "data.jitter",
-                    f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of "
-                    f"{rate:.5g} Hz fitted to the stamps replaces them.",
-                ),
-            ]
+            text = (
+                f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of "
+                f"{rate:.5g} Hz fitted to the stamps replaces them."
+            )
+            return table.with_column(index, even), [*notes, Defect("data.jitter", text)]
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
         number = np.arange(len(kept))
-        place = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
-        columns[index] = stamps[kept].astype(np.float64) + 1e-4 * usual * place
-    return table.take(kept, columns), notes
+        position = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
+        table = table.with_column(index, stamps.astype(np.float64) + 1e-4 * usual * position)
+    return table, notes
 
 
 def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
@@ -723,7 +718,7 @@ def _stamps(
     stamps = table.numbers(index)
     notes = ["--rate not used: the file has a time column."] if options.rate else []
     if np.isnan(stamps[0]):
-        raise InputError(f"{table.path}, row {table.row(0)}: column {table.label(index)} is empty or NaN.")
+        raise InputError(f"{table.where(0)}: column {table.label(index)} is empty or NaN.")
     whole = stamps.dtype.kind == "i"
     exact = int(stamps[0]) * Fraction(unit.factor).limit_denominator(10**9) if whole else float(stamps[0]) * unit.factor
     return (stamps - stamps[0]) * unit.factor, exact, notes
@@ -748,19 +743,17 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
         elif broken.any():
             row = int(np.argmax(broken))
             label = table.label(columns[int(np.argmax(missing[row]))][1])
-            raise InputError(
-                f"{table.path}, row {table.row(row)}: column {label} is empty or NaN beside the sensor's other axes."
-            )
+            raise InputError(f"{table.where(row)}: column {label} is empty or NaN beside the sensor's other axes.")
         kept = np.flatnonzero(~absent)
         stamps, values = stamps[kept], values[kept]
     if (missing := np.isnan(stamps)).any():
-        raise InputError(f"{table.path}, row {table.row(kept[np.argmax(missing)])}: the time stamp is empty or NaN.")
+        raise InputError(f"{table.where(kept[np.argmax(missing)])}: the time stamp is empty or NaN.")
     steps = np.diff(stamps)
     if (steps <= 0.0).any():
         at = int(np.argmax(steps <= 0.0)) + 1
         what = "repeats that of the row before" if steps[at - 1] == 0.0 else f"goes back by {-steps[at - 1]:.6g} s"
         raise InputError(
-            f"{table.path}, row {table.row(kept[at])}: the time stamp {what}; delete such rows, or if the stamps are "
+            f"{table.where(kept[at])}: the time stamp {what}; delete such rows, or if the stamps are "
             "unusable but the rate is steady, ignore the column (_ in --columns) and give --rate."
         )
     if values.shape[1] == 3 and len(values) > 1:
