@@ -153,20 +153,20 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     nothing = Turning(np.eye(3), np.full((3, 3), np.inf), 0.0, 1.0, 0.0)
     if blocks is None:
         return nothing
-    seen = (blocks.weight[:, None] * blocks.change).ravel()
+    changes = (blocks.weight[:, None] * blocks.change).ravel()
     columns = _columns(_levers(blocks), blocks.turned())
     alike = columns @ np.eye(3).ravel()
-    power, product = float(alike @ alike), float(alike @ seen)
-    total = float(seen @ seen)
+    power, product = float(alike @ alike), float(alike @ changes)
+    total = float(changes @ changes)
     if power == 0.0 or total == 0.0:
         return nothing
     normal = columns.T @ columns
     values, vectors = np.linalg.eigh(normal)
     kept = values > 1e-6 * values[-1]
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-    matrix = inverse @ (columns.T @ seen)
-    left = float(np.sum((seen - columns @ matrix) ** 2))
-    variance = np.where(kept.all(), np.diag(inverse), np.inf) * left / max(len(seen) - 9, 1)
+    matrix = inverse @ (columns.T @ changes)
+    left = float(np.sum((changes - columns @ matrix) ** 2))
+    variance = np.where(kept.all(), np.diag(inverse), np.inf) * left / max(len(changes) - 9, 1)
     return Turning(
         matrix.reshape(3, 3), np.sqrt(variance).reshape(3, 3), 1 - left / total, product / power,
         product / float(np.sqrt(power * total)),
@@ -195,7 +195,7 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     if len(starts) < _CLEAR:
         return False
     rows = starts[:, None] + np.arange(span)
-    turn = np.stack([np.interp(force_time[rows], rate_time, each) for each in (rate - np.median(rate, axis=0)).T], 2)
+    turn = np.stack([np.interp(force_time[rows], rate_time, axis) for axis in (rate - np.median(rate, axis=0)).T], 2)
     steps = turn * np.gradient(force_time)[rows][:, :, None]
     turning = np.linalg.norm(steps, axis=2).sum(axis=1) > 0.5
     if turning.sum() < _CLEAR:
@@ -256,12 +256,12 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     middle = float(blocks.centre.mean())
     edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)
     places = np.array([float(blocks.centre[a:b].mean()) for a, b in pairwise(edges)]) - middle
-    seen, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
+    changes, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
 
     def sums(lag: float) -> tuple[FloatArray, FloatArray]:
         """Return the normal matrix (P, 9, 9) and vector (P, 9) of each part."""
         columns = _columns(levers, blocks.turned(lag)).reshape(-1, 3, 9)
-        both = columns.swapaxes(1, 2) @ np.concatenate([columns, seen[:, :, None]], axis=2)
+        both = columns.swapaxes(1, 2) @ np.concatenate([columns, changes[:, :, None]], axis=2)
         both = np.add.reduceat(both, edges[:-1])
         return both[..., :9], both[..., 9]
 
@@ -273,29 +273,29 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     def missed(lag: FloatArray, matrix: FloatArray) -> FloatArray:
         """Return the sum of squares (P,) of each part that a matrix (9,) leaves at a lag (n + 1,)."""
         explained = (_columns(levers, blocks.turned(lag)) @ matrix).reshape(-1, 3)
-        return np.add.reduceat(np.sum((seen - explained) ** 2, axis=1), edges[:-1])
+        return np.add.reduceat(np.sum((changes - explained) ** 2, axis=1), edges[:-1])
 
     line = np.zeros(2)  # of the lag: at the middle, and by time
-    power = np.add.reduceat(np.sum(seen**2, axis=1), edges[:-1])
+    power = np.add.reduceat(np.sum(changes**2, axis=1), edges[:-1])
     whole, enough = float(power.sum()), (1 - _WELL) * float(power.sum())
     normal, product = sums(0.0)
     if left(normal.sum(axis=0), product.sum(axis=0), whole) > enough:
-        normal, product = (np.array(each) for each in zip(*map(sums, _LAGS), strict=True))
+        normal, product = (np.array(sums_at_lags) for sums_at_lags in zip(*map(sums, _LAGS), strict=True))
         common = left(normal.sum(axis=1), product.sum(axis=1), whole)
         line[0] = _LAGS[int(np.argmin(common))]
         if min(common) > enough:
-            found = left(normal, product, power)
-            best = np.argmin(found, axis=0)
-            trusted = found.min(axis=0) < (1 - _WELL) * power
+            residuals = left(normal, product, power)
+            best = np.argmin(residuals, axis=0)
+            trusted = residuals.min(axis=0) < (1 - _WELL) * power
             if trusted.sum() >= 3:
                 line = _robust_line(places[trusted], _LAGS[best[trusted]])
     for step in (0.06, 0.03, 0.01, 0.01, 0.005):
         lag = line[0] + line[1] * (blocks.centre - middle)
         columns = _columns(levers, blocks.turned(lag))
-        matrix = np.asarray(np.linalg.lstsq(columns, seen.ravel(), rcond=1e-6)[0], np.float64)
-        early, there, late = (missed(lag + shift, matrix) for shift in (-step, 0.0, step))
-        bends = np.maximum(early - 2 * there + late, 0.0) / step**2
-        slope = early - late  # of a part: its shift by its curvature, no further than two steps
+        matrix = np.asarray(np.linalg.lstsq(columns, changes.ravel(), rcond=1e-6)[0], np.float64)
+        early, there, later = (missed(lag + shift, matrix) for shift in (-step, 0.0, step))
+        bends = np.maximum(early - 2 * there + later, 0.0) / step**2
+        slope = early - later  # of a part: its shift by its curvature, no further than two steps
         shifts = slope / np.maximum(np.maximum(2 * bends * step, np.abs(slope) / (2 * step)), 1e-300)
         good = bends > 1e-3 * bends.max()
         if good.sum() < 3:
@@ -310,7 +310,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     spread = float(np.sum(weight * rest**2)) / max(int(good.sum()) - 2, 1)
     sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))
     columns = _columns(levers, blocks.turned(line[0] + line[1] * (blocks.centre - middle)))
-    explained = 1 - float(left(columns.T @ columns, columns.T @ seen.ravel(), whole)) / max(whole, 1e-300)
+    explained = 1 - float(left(columns.T @ columns, columns.T @ changes.ravel(), whole)) / max(whole, 1e-300)
     return Clocks(float(line[0]), max(float(sigma), 1e-4), float(line[1]), float(drift_sigma), middle, explained)
 
 

@@ -64,9 +64,9 @@ class Attitude:
     def turned(self) -> FloatArray:
         """Return the rotation vector (n − 1, 3), body frame, from each stamp to the next; NaN over a jump."""
         rotation = self.rotation()
-        found = (rotation[:-1].inv() * rotation[1:]).as_rotvec()
-        found[np.linalg.norm(found, axis=1) > _JUMP] = np.nan
-        return np.asarray(found)
+        turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec()
+        turned[np.linalg.norm(turned, axis=1) > _JUMP] = np.nan
+        return np.asarray(turned)
 
     @property
     def period(self) -> float:

@@ -28,12 +28,12 @@ def without_flagged(recording: Recording, path: str | os.PathLike[str]) -> Recor
     except InputError:  # a format that is no table of columns
         return recording
     notes, bad = [], np.zeros(table.source.rows, bool)
-    for place, name in enumerate(table.names or ()):
-        if not _STATUS.search(name) or table.columns[place].dtype == object:
+    for at, name in enumerate(table.names or ()):
+        if not _STATUS.search(name) or table.columns[at].dtype == object:
             continue
-        values, counts = np.unique(table.columns[place], return_counts=True)
+        values, counts = np.unique(table.columns[at], return_counts=True)
         usual = values[np.argmax(counts)]
-        off = table.columns[place] != usual
+        off = table.columns[at] != usual
         if off.mean() > 0.5:
             notes.append(f"{path}: column {name} has no usual value and was not used.")
         elif off.any():

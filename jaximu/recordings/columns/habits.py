@@ -136,9 +136,9 @@ class Field:
                 if _time(head) and tail in _UNIT_WORDS["time"]:
                     return cls(tuple(head), None, "time", unit or _UNIT_WORDS["time"][tail])
                 short, at = _axis(head)
-                found, reason = sensor_of(short)
-                if tail in _UNIT_WORDS.get(found or "", {}) and (at or found == "temperature"):
-                    return cls(short, at, found, unit or _UNIT_WORDS[found or ""][tail], reason)
+                short_sensor, reason = sensor_of(short)
+                if tail in _UNIT_WORDS.get(short_sensor or "", {}) and (at or short_sensor == "temperature"):
+                    return cls(short, at, short_sensor, unit or _UNIT_WORDS[short_sensor or ""][tail], reason)
         if axis is None and _time(words):
             tail = next((word for word in reversed(words) if word in _UNIT_WORDS["time"] and len(word) > 1), None)
             stated = find_unit(unit or "", "temperature") if words == ["t"] else None
@@ -238,22 +238,22 @@ def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
 
 def sensor_of(stem: tuple[str, ...]) -> tuple[str | None, str | None]:
     """The sensor that the words of a name mean, None for none or more than one, and why it is not its measurement."""
-    found: set[str] = set()
+    sensors: set[str] = set()
     why_not = None
     for word in stem:
         plain = match[1] if (match := _INSTANCE.fullmatch(word)) else word
         if plain in _REFUSED and any(other != "var" and not other.isdigit() for other in stem):  # Var1 says nothing
             why_not = why_not or _REFUSED[plain]
         elif plain in _WORDS or plain in _HELPERS:
-            found.add(_WORDS.get(plain) or _HELPERS[plain])
+            sensors.add(_WORDS.get(plain) or _HELPERS[plain])
         elif plain not in _NEUTRAL and not plain.isdigit():
             return None, None
     if why_not or not any(word in _WORDS or _INSTANCE.sub(r"\1", word) in _WORDS or word in ("angular", "ang")
                           for word in stem):  # fmt: skip
         return None, why_not
-    if "temperature" in found:
-        found = {"ambient_temperature"} if "ambient_temperature" in found else {"temperature"}
-    return (found.pop(), None) if len(found) == 1 else (None, None)
+    if "temperature" in sensors:
+        sensors = {"ambient_temperature"} if "ambient_temperature" in sensors else {"temperature"}
+    return (sensors.pop(), None) if len(sensors) == 1 else (None, None)
 
 
 _RATE = re.compile(
@@ -271,12 +271,12 @@ _INTERVAL = re.compile(
 
 def stated_rate(text: str) -> float | None:
     """The sample rate in Hz that a file's preamble states, None for none or for several that differ."""
-    found = set()
+    rates = set()
     for match in _RATE.finditer(text):
         value = float((match[1] or match[3]).replace(",", "."))
-        found.add(value * (1e3 if (match[2] or "").lower() == "khz" else 1.0))
+        rates.add(value * (1e3 if (match[2] or "").lower() == "khz" else 1.0))
     for match in _INTERVAL.finditer(text):
         unit = find_unit(match[2], "time")
         if unit and float(match[1]) > 0:
-            found.add(round(1.0 / (float(match[1]) * unit.factor), 6))
-    return found.pop() if len(found) == 1 and 0 < min(found) < 1e5 else None
+            rates.add(round(1.0 / (float(match[1]) * unit.factor), 6))
+    return rates.pop() if len(rates) == 1 and 0 < min(rates) < 1e5 else None

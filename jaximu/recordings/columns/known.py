@@ -30,9 +30,9 @@ class _KnownLayout:
         optional: set[str] = set()
         for name, title in (entry.split("=") for entry in text.split(", ")):
             axes = "wxyz" if title.startswith("attitude") else "xyz" if "*" in name else "*"
-            found = {name.lstrip("?").replace("*", axis): title.replace("*", axis) for axis in axes}
-            columns |= found
-            optional |= set(found) if name.startswith("?") else set()
+            names = {name.lstrip("?").replace("*", axis): title.replace("*", axis) for axis in axes}
+            columns |= names
+            optional |= set(names) if name.startswith("?") else set()
         return cls(program, columns, frozenset(optional))
 
     def fits(self, names: list[str]) -> bool:
@@ -64,7 +64,7 @@ _LAYOUTS = [
         ("MAVLink SCALED_IMU (ms, mg, mrad/s, mG)",
          "time_boot_ms=time [ms], *acc=accel_* [mg], *gyro=gyro_* [mrad/s], ?*mag=mag_* [mG]"),
         *(("a table of sensor_msgs/Imu (rad/s, m/s^2), time being the header's stamp",
-           ", ".join(prefix + each for each in (*stamp.split(", "), "angular_velocity.*=gyro_* [rad/s]",
+           ", ".join(prefix + column for column in (*stamp.split(", "), "angular_velocity.*=gyro_* [rad/s]",
                                                 "linear_acceleration.*=accel_* [m/s^2]"))
            + ", ?time=received, ?%time=received")
           for stamp in ("header.stamp.sec=, header.stamp.nanosec=", "header.stamp.secs=, header.stamp.nsecs=",
@@ -88,7 +88,7 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
     prefixes = {match[0] for name in names if (match := re.match(r".*\.(?=fb_x$)", name))}
     if len(prefixes) == 1:  # the structure that holds them all
         names = [name.removeprefix(*prefixes) for name in names]
-    layout = next((each for each in _LAYOUTS if each.fits(names)), None)
+    layout = next((layout for layout in _LAYOUTS if layout.fits(names)), None)
     if layout is None and (ours := _of_message(table, table.names)):
         return ours
     if layout is None and set(_SENSOR_LOGGER) == set(names):  # one file a sensor, named after it
@@ -105,8 +105,10 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
     if layout is None:
         return None
     ours = tuple(
-        title if (title := layout.columns.get(name)) and not (title.startswith("time") and _stated(given)) else given
-        for name, given in zip(names, table.names, strict=True)
+        title
+        if (title := layout.columns.get(name)) and not (title.startswith("time") and _stated(own_name))
+        else own_name
+        for name, own_name in zip(names, table.names, strict=True)
     )
     return ours, f"columns and units as {layout.program} has them."
 
@@ -130,10 +132,10 @@ def _of_message(table: Table, names: tuple[str, ...]) -> tuple[tuple[str, ...], 
     known = [titles[match[1]].format(match[2]) if match else name for match, name in zip(matches, names, strict=True)]
     if sum(match is not None for match in matches) != 6 or len(set(known)) < len(known):
         return None
-    for place, (name, column) in enumerate(zip(names, table.columns, strict=True)):
+    for at, (name, column) in enumerate(zip(names, table.columns, strict=True)):
         since = column.dtype.kind == "f" and _EPOCH[0] < np.nanmin(column) <= np.nanmax(column) < _EPOCH[1]
         if since and name.strip("_").lower() in ("time", "timestamp", "stamp"):
-            known[place] = "time [s]"
+            known[at] = "time [s]"
     return tuple(known), (
         "columns and units as sensor_msgs/Imu has them (rad/s, m/s^2): its linear_acceleration holds gravity."
     )
@@ -148,7 +150,7 @@ def sentence_names(name: str, count: int) -> list[str] | None:
 def _without_header(table: Table) -> tuple[tuple[str, ...], str] | None:
     """The names of rows without a header that show what wrote them: VectorNav's sentences, ROS's own CSV."""
     first = table.columns[0]
-    if len(table.columns) == len(_ECHOED) and [each.dtype.kind for each in table.columns[:3]] == ["i", "i", "O"]:
+    if len(table.columns) == len(_ECHOED) and [column.dtype.kind for column in table.columns[:3]] == ["i", "i", "O"]:
         return _ECHOED, "columns as `ros2 topic echo --csv` writes sensor_msgs/Imu (rad/s, m/s^2)."
     names = _SENTENCES.get(str(first[0])) if first.dtype == object and (first == first[0]).all() else None
     if names is None or len(names) != len(table.columns):
@@ -176,11 +178,11 @@ def whole_stamps(table: Table) -> Table:
     plain = [name.strip('" #').lower() for name in table.names or ()]
     for seconds, rest in _PAIRS:
         for at, name in enumerate(plain):
-            prefix, found, _ = name.rpartition(seconds)
-            if not found or name != prefix + seconds or plain.count(prefix + rest) != 1 or prefix[-1:].isalnum():
+            prefix, separator, _ = name.rpartition(seconds)
+            if not separator or name != prefix + seconds or plain.count(prefix + rest) != 1 or prefix[-1:].isalnum():
                 continue
-            parts = [np.asarray(table.columns[each]) for each in (at, plain.index(prefix + rest))]
-            if any(each.dtype.kind != "i" or (each < 0).any() or (each > _LATEST).any() for each in parts):
+            parts = [np.asarray(table.columns[column]) for column in (at, plain.index(prefix + rest))]
+            if any(part.dtype.kind != "i" or (part < 0).any() or (part > _LATEST).any() for part in parts):
                 continue
             names = [*(table.names or ())]
             names[at] = "time [ns]"

@@ -69,10 +69,10 @@ def scaled_accelerometer(
     determine one. A scale without an offset means offset 0. Raises InputError or NotPossibleError.
     """
     if scale is not None:
-        found = parse_scale(scale, "acceleration", "--accel-scale")
+        counts = parse_scale(scale, "acceleration", "--accel-scale")
         zero = parse_offset(offset, "--accel-offset") if offset is not None else np.zeros(1)
-        return replace(signal, nominal_scale=found, nominal_offset=zero), (
-            _said("accelerometer", found, "m/s²", "--accel-scale"),
+        return replace(signal, nominal_scale=counts, nominal_offset=zero), (
+            _said("accelerometer", counts, "m/s²", "--accel-scale"),
         )
     means = quiet_means(signal)
     sphere = fit_sphere(means)
@@ -86,7 +86,7 @@ def scaled_accelerometer(
             f"{file}: the accelerometer is in raw counts and its still parts do not determine scale and offset: they "
             "must show gravity in directions all around. Give --accel-scale and --accel-offset, or record more poses."
         )
-    listed = "" if offset is not None else f", offset {', '.join(f'{each:.1f}' for each in zero)} count"
+    listed = "" if offset is not None else f", offset {', '.join(f'{value:.1f}' for value in zero)} count"
     return replace(signal, nominal_scale=np.full(3, radius / gravity.value), nominal_offset=zero), (
         f"accelerometer scale found from gravity: {radius / gravity.value:.5g} count per m/s²{listed}.",
     )
@@ -104,21 +104,21 @@ def scaled_gyroscope(
             f"{file}: the gyroscope is in raw counts; give its nominal scale from the data sheet with --gyro-scale, "
             'for example --gyro-scale "131 count/(deg/s)" or --gyro-scale 1/6258 (rad/s per count).'
         )
-    found = parse_scale(scale, "angular rate", "--gyro-scale")
-    notes = [_said("gyroscope", found, "rad/s", "--gyro-scale")]
+    counts = parse_scale(scale, "angular rate", "--gyro-scale")
+    notes = [_said("gyroscope", counts, "rad/s", "--gyro-scale")]
     if offset is not None:
         zero = parse_offset(offset, "--gyro-offset")
     else:
         windows = _windows(signal, 1.0)
         quietest = windows[np.argmin(windows.var(1).sum(1))]
         zero = np.median(quietest, 0)
-        listed = ", ".join(f"{each:.1f}" for each in zero)
+        listed = ", ".join(f"{value:.1f}" for value in zero)
         notes.append(f"gyroscope offset from its quietest second: {listed} count.")
-    return replace(signal, nominal_scale=found, nominal_offset=zero), tuple(notes)
+    return replace(signal, nominal_scale=counts, nominal_offset=zero), tuple(notes)
 
 
 def _said(sensor: str, scale: FloatArray, per: str, option: str) -> str:
-    return f"{sensor} scale from {option}: {', '.join(f'{each:.5g}' for each in scale)} count per {per}."
+    return f"{sensor} scale from {option}: {', '.join(f'{value:.5g}' for value in scale)} count per {per}."
 
 
 def _windows(signal: Signal, seconds: float) -> FloatArray:

@@ -64,9 +64,9 @@ def holds_attitude(path: str | os.PathLike[str]) -> bool:
 
 def _tables(path: str | os.PathLike[str]) -> list[tuple[Table, dict[str, dict[str, int]]]]:
     """Return the tables of a file that hold an attitude, and where their columns are."""
-    found = [(table, _places(table)) for table in read_tables(path)]
+    tables = [(table, _places(table)) for table in read_tables(path)]
     kinds = {"quaternion", "numbered", "euler", "rotation vector", "table angles"}
-    return [(table, places) for table, places in found if kinds & set(places)]
+    return [(table, places) for table, places in tables if kinds & set(places)]
 
 
 def _places(table: Table) -> dict[str, dict[str, int]]:
@@ -76,18 +76,18 @@ def _places(table: Table) -> dict[str, dict[str, int]]:
             return {}
         return {"time": {"": 0}, "position": dict(zip("xyz", (1, 2, 3), strict=True)),
                 "quaternion": dict(zip("xyzw", (4, 5, 6, 7), strict=True))}  # fmt: skip
-    found: dict[str, dict[str, int]] = {}
-    for place, given in enumerate(table.names):
-        plain = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*", "", given.lower())).strip("_")
+    kinds: dict[str, dict[str, int]] = {}
+    for at, name in enumerate(table.names):
+        plain = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*", "", name.lower())).strip("_")
         for kind, patterns in _HABITS.items():
-            match = next(filter(None, (re.fullmatch(each, plain) for each in patterns)), None)
+            match = next(filter(None, (re.fullmatch(pattern, plain) for pattern in patterns)), None)
             if match is not None:
                 axis = match.group(1) if match.groups() else ""
-                found.setdefault(kind, {}).setdefault({"e": "x", "n": "y", "u": "z"}.get(axis, axis), place)
+                kinds.setdefault(kind, {}).setdefault({"e": "x", "n": "y", "u": "z"}.get(axis, axis), at)
                 break
     complete = {"time": {""}, "quaternion": set("wxyz"), "numbered": set("0123"), "euler": {"roll", "pitch", "yaw"}}
     # one angle leaves a body that is mounted anew for each axis: that is a rate table's schedule
-    return {kind: axes for kind, axes in found.items()
+    return {kind: axes for kind, axes in kinds.items()
             if (len(axes) > 1 if kind == "table angles" else set(axes) >= complete.get(kind, set("xyz")))}  # fmt: skip
 
 
@@ -95,8 +95,8 @@ def _columns(table: Table, places: dict[str, int], axes: Sequence[str], quantity
     """Return the columns (n, k) of some axes in SI; a column without a unit is in SI."""
     columns = []
     for axis in axes:
-        place = places[axis]
-        title = table.names[place] if table.names else ""
+        at = places[axis]
+        title = table.names[at] if table.names else ""
         stated, factor = parse_column(title)[1], 1.0
         if stated and quantity == "angle":
             factor = unit(stated, (quantity,), file=table.path, column=title).factor
@@ -104,7 +104,7 @@ def _columns(table: Table, places: dict[str, int], axes: Sequence[str], quantity
             if stated not in _FACTORS:
                 raise InputError(f"{table.path}, column {title!r}: unknown unit; known are {', '.join(_FACTORS)}.")
             factor = _FACTORS[stated]
-        columns.append(np.asarray(table.numbers(place), np.float64) * factor)
+        columns.append(np.asarray(table.numbers(at), np.float64) * factor)
     return np.stack(columns, axis=1)
 
 
@@ -159,12 +159,14 @@ def _time(table: Table, places: dict[str, dict[str, int]], name: str, notes: lis
         if table.rate is None:
             raise InputError(f"{name}: has no time column: name it time [s].")
         return np.arange(len(table.columns[0])) / table.rate, 0.0
-    place = places["time"][""]
-    stamps = np.asarray(table.numbers(place))
-    stated = parse_column(table.names[place])[1] if table.names else "s"
+    at = places["time"][""]
+    stamps = np.asarray(table.numbers(at))
+    stated = parse_column(table.names[at])[1] if table.names else "s"
     if stated is None:
-        factor, said = next(((factor, said) for least, factor, said in _EPOCHS if stamps[0] > least), (1.0, "s"))
-        notes.append(f"{name}: the stamps state no unit and are taken as {said}.")
+        factor, unit_name = next(
+            ((factor, unit_name) for least, factor, unit_name in _EPOCHS if stamps[0] > least), (1.0, "s")
+        )
+        notes.append(f"{name}: the stamps state no unit and are taken as {unit_name}.")
     else:
         factor = unit(stated, ("time",), file=table.path, column="time").factor
     first = stamps[0]

@@ -56,15 +56,15 @@ def read(path: Path, source: Source) -> Table:
         )
     layout = _layout(_lines(head), source.path)
     rows: np.ndarray | int = layout.first + 1
-    found = None if layout.delimiter == " " or wide or whole is not None else _read_straight(path, layout)
-    if found is None:
+    parsed = None if layout.delimiter == " " or wide or whole is not None else _read_straight(path, layout)
+    if parsed is None:
         data = head if wide else path.read_bytes() if whole is None else whole
         table, rows = _read_cleaned(_lines(data), layout, source.path)
-        found = [from_arrow(column) for column in table.columns], table.schema
-    (columns, schema), names = found, layout.names or None
+        parsed = [from_arrow(column) for column in table.columns], table.schema
+    (columns, schema), names = parsed, layout.names or None
     if names:  # a column of dates states its own unit
-        names = tuple(f"{name} [{each.type.unit}]" if pa.types.is_timestamp(each.type) and "[" not in name else name
-                      for name, each in zip(names, schema, strict=True))  # fmt: skip
+        names = tuple(f"{name} [{kind.type.unit}]" if pa.types.is_timestamp(kind.type) and "[" not in name else name
+                      for name, kind in zip(names, schema, strict=True))  # fmt: skip
     for at, column in enumerate(columns):
         if at == len(columns) - 1 and column.dtype == object and str(columns[0][0]).startswith("$"):
             columns[at] = np.array([str(cell).partition("*")[0] for cell in column], object)  # NMEA's checksum
@@ -109,19 +109,19 @@ def _read_straight(path: Path, layout: _Layout) -> tuple[list[np.ndarray], pa.Sc
             schemas.append(table.schema)
             parts.append([from_arrow(column) for column in table.columns])
         fields = [_common(kinds) for kinds in zip(*schemas, strict=True)]
-        texts = any(pa.types.is_string(each.type) for each in fields if each)
+        texts = any(pa.types.is_string(schema_field.type) for schema_field in fields if schema_field)
         if fields and all(fields) and not (texts and _comments(path)):
             # one after the other, so that a long file is not held twice
             columns = [np.concatenate([part.pop(0) for part in parts]) for _ in fields]
-            return columns, pa.schema([each for each in fields if each])
+            return columns, pa.schema([schema_field for schema_field in fields if schema_field])
     return None
 
 
 def _common(fields: Sequence[pa.Field]) -> pa.Field | None:
     """The field whose type a column's pieces share, all numbers being alike; None for more than one."""
-    filled = [each for each in fields if not pa.types.is_null(each.type)] or [*fields]
-    numbers = [pa.types.is_integer(each.type) or pa.types.is_floating(each.type) for each in filled]
-    return filled[0] if all(numbers) or all(each.type == filled[0].type for each in filled) else None
+    filled = [kind for kind in fields if not pa.types.is_null(kind.type)] or [*fields]
+    numbers = [pa.types.is_integer(kind.type) or pa.types.is_floating(kind.type) for kind in filled]
+    return filled[0] if all(numbers) or all(kind.type == filled[0].type for kind in filled) else None
 
 
 def _comments(path: Path) -> bool:
