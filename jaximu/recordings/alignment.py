@@ -80,7 +80,7 @@ def turning_best(products: FloatArray) -> FloatArray:
 def rotation_of(matrix: FloatArray) -> FloatArray:
     """Return the orthogonal matrix (3, 3) nearest to one whose columns may have any length."""
     u, _, v = np.linalg.svd(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
-    return np.asarray(u @ v, np.float64)
+    return u @ v
 
 
 def angle_of(rotation: FloatArray) -> float:
@@ -114,7 +114,7 @@ def gravity_turning(
     """Return how the specific force (n, 3) turns in blocks, beside the rate (m, 3); None in a short recording."""
     if min(len(force), len(rate)) < 2:
         return None
-    span = max(1, round(_BLOCK / float(np.median(np.diff(force_time)))))
+    span = max(1, round(_BLOCK / np.median(np.diff(force_time))))
     count = len(force) // span
     if count < _FEWEST:
         return None
@@ -124,7 +124,7 @@ def gravity_turning(
     steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(rate_time)[:, None]
     angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     length = np.linalg.norm(mean, axis=1)
-    usual = float(np.median(length))
+    usual = np.median(length)
     off = np.abs(length - usual) / max(usual, 1e-300)
     off = np.maximum(off[1:], off[:-1])
     change = np.diff(mean, axis=0)
@@ -134,7 +134,7 @@ def gravity_turning(
     # across a gap nobody knows what the unit did
     apart, step = np.diff(centre), np.diff(rate_time)
     weight[apart > 2 * np.median(apart)] = 0.0
-    for gap in np.flatnonzero(step > max(_BLOCK, 2.5 * float(np.median(step)))):
+    for gap in np.flatnonzero(step > max(_BLOCK, 2.5 * np.median(step))):
         first, last = np.searchsorted(centre, rate_time[gap : gap + 2])
         weight[max(first - 1, 0) : last] = 0.0
     return BlockMeans(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
@@ -168,9 +168,12 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     left = float(np.sum((changes - columns @ matrix) ** 2))
     variance = np.where(kept.all(), np.diag(inverse), np.inf) * left / max(len(changes) - 9, 1)
     return Turning(
-        matrix.reshape(3, 3), np.sqrt(variance).reshape(3, 3), 1 - left / total, product / power,
+        matrix.reshape(3, 3),
+        np.sqrt(variance).reshape(3, 3),
+        1 - left / total,
+        product / power,
         product / float(np.sqrt(power * total)),
-    )  # fmt: skip
+    )
 
 
 _CARRIED = 2.0
@@ -189,7 +192,7 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     """
     from scipy.spatial.transform import Rotation
 
-    span = max(2, round(_CARRIED / float(np.median(np.diff(force_time)))))
+    span = max(2, round(_CARRIED / np.median(np.diff(force_time))))
     starts = np.arange(0, len(force) - span + 1, span)
     starts = starts[:: max(1, len(starts) // _WINDOWS)]
     if len(starts) < _CLEAR:
@@ -215,7 +218,7 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
 def _levers(blocks: BlockMeans) -> FloatArray:
     """The weighted f × e_k (n, 3, 3), k the last index."""
     weighted = blocks.weight[:, None] * blocks.force
-    return np.asarray(np.cross(weighted[:, None], np.eye(3)).swapaxes(1, 2), np.float64)
+    return np.cross(weighted[:, None], np.eye(3)).swapaxes(1, 2)
 
 
 def _columns(levers: FloatArray, turned: FloatArray) -> FloatArray:
@@ -255,7 +258,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         return None
     middle = float(blocks.centre.mean())
     edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)
-    places = np.array([float(blocks.centre[a:b].mean()) for a, b in pairwise(edges)]) - middle
+    places = np.array([blocks.centre[a:b].mean() for a, b in pairwise(edges)]) - middle
     changes, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
 
     def sums(lag: float) -> tuple[FloatArray, FloatArray]:
@@ -277,12 +280,12 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
 
     line = np.zeros(2)  # of the lag: at the middle, and by time
     power = np.add.reduceat(np.sum(changes**2, axis=1), edges[:-1])
-    whole, enough = float(power.sum()), (1 - _WELL) * float(power.sum())
+    whole, enough = power.sum(), (1 - _WELL) * power.sum()
     normal, product = sums(0.0)
     if left(normal.sum(axis=0), product.sum(axis=0), whole) > enough:
         normal, product = (np.array(sums_at_lags) for sums_at_lags in zip(*map(sums, _LAGS), strict=True))
         common = left(normal.sum(axis=1), product.sum(axis=1), whole)
-        line[0] = _LAGS[int(np.argmin(common))]
+        line[0] = _LAGS[np.argmin(common)]
         if min(common) > enough:
             residuals = left(normal, product, power)
             best = np.argmin(residuals, axis=0)
@@ -317,5 +320,5 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
 def _robust_line(x: FloatArray, y: FloatArray) -> FloatArray:
     """Return offset and slope (2,) by the median of all pairs' slopes (Theil and Sen)."""
     first, second = np.triu_indices(len(x), 1)
-    slope = float(np.median((y[second] - y[first]) / (x[second] - x[first])))
-    return np.array([float(np.median(y - slope * x)), slope])
+    slope = np.median((y[second] - y[first]) / (x[second] - x[first]))
+    return np.array([np.median(y - slope * x), slope])

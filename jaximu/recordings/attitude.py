@@ -48,14 +48,14 @@ class Attitude:
         """Return the rows whose quaternion is one, of length one and without jumps of sign."""
         length = np.linalg.norm(self.quaternion, axis=1)
         kept = np.isfinite(length) & (np.abs(length - 1) < _LENGTH)
-        rows = {name: None if (values := getattr(self, name)) is None else values[kept]
-                for name in ("velocity", "position")}  # fmt: skip
+        vectors = {"velocity": self.velocity, "position": self.position}
+        vectors = {name: values[kept] for name, values in vectors.items() if values is not None}
         notes = self.notes
         if not kept.all():
             notes += (f"{self.name}: {int(np.sum(~kept))} of {len(kept)} rows hold no attitude and are left out.",)
         unit = self.quaternion[kept] / length[kept, None]
         flips = np.concatenate([[1.0], np.cumprod(np.sign(np.sum(unit[1:] * unit[:-1], axis=1) + 1e-12))])
-        return replace(self, time=self.time[kept], quaternion=unit * flips[:, None], notes=notes, **rows)
+        return replace(self, time=self.time[kept], quaternion=unit * flips[:, None], notes=notes, **vectors)
 
     def rotation(self) -> scipy.spatial.transform.Rotation:
         """Return the rotations from the body to the upright frame."""
@@ -66,7 +66,7 @@ class Attitude:
         rotation = self.rotation()
         turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec()
         turned[np.linalg.norm(turned, axis=1) > _JUMP] = np.nan
-        return np.asarray(turned)
+        return turned
 
     @property
     def period(self) -> float:
@@ -77,4 +77,4 @@ class Attitude:
         """Return the velocity (n, 3), differentiated where only positions are known; None without either."""
         if self.velocity is not None:
             return self.velocity
-        return None if self.position is None else np.asarray(np.gradient(self.position, self.time, axis=0))
+        return None if self.position is None else np.gradient(self.position, self.time, axis=0)

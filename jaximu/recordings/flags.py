@@ -39,11 +39,9 @@ def without_flagged(recording: Recording, path: str | os.PathLike[str]) -> Recor
         elif off.any():
             bad |= off
             notes.append(f"{path}: {int(off.sum())} rows whose {name} is not {usual:g} were left out.")
-    if not bad.any():
-        return replace(recording, notes=(*recording.notes, *notes))
     changed = {
         name: replace(signal, time=signal.time[~bad], values=signal.values[~bad])
         for name, signal in recording.signals.items()
-        if len(signal) == len(bad)
+        if bad.any() and len(signal) == len(bad)
     }
     return replace(recording, **changed, notes=(*recording.notes, *notes))

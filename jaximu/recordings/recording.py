@@ -95,8 +95,8 @@ class Signal(Comparable):
         One over the median interval would be the rate at which stamps are rounded, or a logger polls.
         """
         interval = np.diff(self.time)
-        usual = float(np.median(interval))
-        longest = _GAP * max(usual, float(np.mean(np.minimum(interval, 3 * usual))))
+        usual = np.median(interval)
+        longest = _GAP * max(usual, np.mean(np.minimum(interval, 3 * usual)))
         return float(1.0 / np.mean(interval[interval <= longest]))
 
     @property
@@ -115,8 +115,8 @@ class Signal(Comparable):
         steps = []
         for axis in self.si()[:20000].T:
             difference = np.asarray(np.diff(np.unique(axis)), np.float64)
-            difference = difference[difference > 1e-10 * float(np.ptp(axis))]  # rounding of the computer's
-            steps.append(float(difference.min()) ** 2 / 12 if len(difference) else 0.0)
+            difference = difference[difference > 1e-10 * np.ptp(axis)]  # rounding of the computer's
+            steps.append(difference.min() ** 2 / 12 if len(difference) else 0.0)
         return max(float(np.sum(steps)), 1e-24)
 
 
@@ -510,7 +510,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     above absolute zero.
     """
     where, accelerometer, gyroscope = recording.name, recording.accelerometer, recording.gyroscope
-    level = float(np.median(np.linalg.norm(accelerometer.si(), axis=1))) / gravity.value if len(accelerometer) else 1.0
+    level = np.median(np.linalg.norm(accelerometer.si(), axis=1)) / gravity.value if len(accelerometer) else 1.0
     plausible = 0.5 < level < 2.0
     if not plausible:
         _require_own_columns(recording, gravity)
@@ -531,7 +531,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
             raise InputError(f"{where}: column {name} falls to {signal.values.min():.4g} °C, below absolute zero.")
     if gyroscope is None or len(gyroscope) < 2 or len(accelerometer) < 2:
         return ()
-    peak = float(np.percentile(np.linalg.norm(gyroscope.si(), axis=1), 99.0))
+    peak = np.percentile(np.linalg.norm(gyroscope.si(), axis=1), 99.0)
     assert recording.turning is not None
     slope, correlation = recording.turning.slope, recording.turning.correlation
     if abs(correlation) > _CORRELATED and not 1.0 / 3.0 < abs(slope) < 3.0:
@@ -564,7 +564,7 @@ def _require_own_columns(recording: Recording, gravity: LocalGravity) -> None:
     gyroscope = recording.gyroscope
     if gyroscope is None or not len(gyroscope) or _no_gravity(gyroscope):
         return
-    level = float(np.median(np.linalg.norm(gyroscope.values, axis=1)))
+    level = np.median(np.linalg.norm(gyroscope.values, axis=1))
     if any(abs(level / size - 1) < 0.1 for size in (gravity.value, 1.0, 1000.0)):  # m/s², g, mg
         raise InputError(
             f"{recording.name}: the magnitude of gyro_x, gyro_y, gyro_z stays at {level:.4g} as gravity's does, and "
@@ -583,7 +583,7 @@ def _require_one_unit(recording: Recording) -> None:
     force, parts = accelerometer.si(), np.array_split(np.arange(len(accelerometer)), _PARTS)
     if len(parts[-1]) < 2:  # means of poses: nothing to compare
         return
-    levels = {"accel_x, accel_y, accel_z": [float(np.median(np.linalg.norm(force[part], axis=1))) for part in parts]}
+    levels = {"accel_x, accel_y, accel_z": [np.median(np.linalg.norm(force[part], axis=1)) for part in parts]}
     if gyroscope is not None:
         rates, ratios = gyroscope.si(), []
         for part in parts:
@@ -609,7 +609,7 @@ def _step(logarithms: FloatArray) -> tuple[int, float]:
         before, after = (side[np.isfinite(side)] for side in (logarithms[:part], logarithms[part + 1 :]))
         if len(before) < 2 or len(after) < 2:
             continue
-        step, spread = float(np.median(after) - np.median(before)), max(np.ptp(before), np.ptp(after))
+        step, spread = np.median(after) - np.median(before), max(np.ptp(before), np.ptp(after))
         if spread < abs(step) / 2 and abs(step) - spread > clearest:
             changed = abs(logarithms[part] - np.median(after)) < abs(step) / 2
             clearest, result = abs(step) - spread, (part if changed else part + 1, float(np.exp(step)))

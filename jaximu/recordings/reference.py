@@ -132,7 +132,7 @@ def _turned(entry: Entry, rate: Integral, bias: FloatArray) -> FloatArray:
 def _with_sense(entry: Entry, rate: Integral, bias: FloatArray, notes: list[str]) -> Entry:
     if entry.kind == "pose" or not math.isnan(entry.angle):
         return entry
-    sense = math.copysign(2 * math.pi, float(_turned(entry, rate, bias) @ entry.vector))
+    sense = math.copysign(2 * math.pi, _turned(entry, rate, bias) @ entry.vector)
     notes.append("turns whose angle is not stated are taken as 360° in the sense that the gyroscope shows.")
     assert isinstance(entry, ScheduleEntry)
     return replace(entry, angle=sense)
@@ -140,7 +140,7 @@ def _with_sense(entry: Entry, rate: Integral, bias: FloatArray, notes: list[str]
 
 def _require_units(turns: Sequence[tuple[Entry, FloatArray]], where: str) -> None:
     """Refuse angles in another unit than the gyroscope's; `turns`: with the angle (3,) that the gyroscope shows."""
-    ratio = float(np.median([abs(turned @ entry.vector / entry.angle) for entry, turned in turns] or [1.0]))
+    ratio = np.median([abs(turned @ entry.vector / entry.angle) for entry, turned in turns] or [1.0])
     for slip, unit, other in ((57.29578, "rad", "deg"), (1 / 57.29578, "deg", "rad")):
         if abs(math.log(max(ratio, 1e-9) / slip)) < math.log(1.4):
             raise InputError(
@@ -173,7 +173,7 @@ def _require_clock(entries: Sequence[Entry], rate: Integral, bias: FloatArray, w
         return float(np.sum(weight * np.abs(turned - shifted_bias * duration - stated).sum(axis=1)))
 
     misfits = [misfit(shift) for shift in _SHIFTS]
-    best = float(_SHIFTS[int(np.argmin(misfits))])
+    best = _SHIFTS[np.argmin(misfits)]
     text = f"{where}: the unit moves in {len(moving)} of the poses, first in {_label(moving[0])}"
     if min(misfits) < 0.5 * misfit(0.0) and abs(best) > 0.1:
         raise InputError(
@@ -184,8 +184,8 @@ def _require_clock(entries: Sequence[Entry], rate: Integral, bias: FloatArray, w
 
 
 def _require_turn(entry: Entry, turned: FloatArray, where: str) -> None:
-    along = float(turned @ entry.vector)
-    across = float(np.linalg.norm(turned - along * entry.vector))
+    along = turned @ entry.vector
+    across = np.linalg.norm(turned - along * entry.vector)
     if 0.7 < along / entry.angle < 1.4 and across < 0.3 * abs(entry.angle):
         return
     text = f"{where}: {_label(entry)} says {math.degrees(entry.angle):.4g}° about its axis; the gyroscope shows "
@@ -257,8 +257,8 @@ def entries_of_columns(recording: Recording) -> list[Entry]:
 
 def _rests(time: FloatArray, moved: FloatArray, where: str) -> FloatArray:
     """Intervals (n, 2) over which the reference rests; `moved` (n,) is its rate at each stamp, its noise included."""
-    lowest = float(np.percentile(moved, 5))
-    limit = float(np.clip(_NOISY * np.median(moved[moved <= 3 * lowest]), _STILL, _MOVING))
+    lowest = np.percentile(moved, 5)
+    limit = np.clip(_NOISY * np.median(moved[moved <= 3 * lowest]), _STILL, _MOVING)
     runs = runs_of(moved < limit)
     spans = np.stack([time[runs[:, 0]] + _WINDOW, time[runs[:, 1] - 1] - _WINDOW], axis=1)
     spans = spans[spans[:, 1] - spans[:, 0] >= _SHORTEST]
@@ -276,7 +276,7 @@ def _neighbours(count: int, samples: float) -> tuple[NDArray[np.intp], NDArray[n
 def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[Entry]:
     length = np.linalg.norm(attitude.values, axis=1)
     if (np.abs(length - 1) > 0.01).any():
-        worst = int(np.argmax(np.abs(length - 1)))
+        worst = np.argmax(np.abs(length - 1))
         raise InputError(
             f"{recording.name}: the attitude at {attitude.time[worst]:.6g} s has the length {length[worst]:.4g}; a "
             "unit quaternion has the length 1."

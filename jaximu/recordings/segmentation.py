@@ -111,11 +111,11 @@ def _floor(variance: FloatArray, moments: _Moments) -> float:
     """The variance of windows at rest: the median of those near the lowest."""
     finite = variance[np.isfinite(variance)]
     lowest = np.percentile(finite, 5)
-    floor = float(np.median(finite[finite <= 3 * lowest]))
+    floor = np.median(finite[finite <= 3 * lowest])
     # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
     # simulated output without noise is constant but for the rounding of the running sums.
     total = float(moments.between(np.array([-np.inf]), np.array([np.inf]))[1].sum())
-    rounding = float(np.finfo(np.float64).eps) * len(moments.signal) * total
+    rounding = np.finfo(np.float64).eps * len(moments.signal) * total
     return max(floor, moments.signal.rounding_variance, rounding)
 
 
@@ -126,7 +126,7 @@ def _angles(vectors: FloatArray) -> FloatArray:
 
 
 def _samples(signal: Signal, start: float, stop: float) -> slice:
-    return slice(int(np.searchsorted(signal.time, start)), int(np.searchsorted(signal.time, stop)))
+    return slice(np.searchsorted(signal.time, start), np.searchsorted(signal.time, stop))
 
 
 def segment(recording: Recording, options: SegmentationOptions | None = None) -> Segmentation:
@@ -218,7 +218,7 @@ def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:
         return np.zeros(len(rate))
     bias = np.median(rate[quiet], axis=0)
     deviation = np.linalg.norm(rate - bias, axis=1)
-    return deviation / max(limit, 6 * float(np.median(deviation[quiet])))
+    return deviation / max(limit, 6 * np.median(deviation[quiet]))
 
 
 def _drop_rotating(moments: Sequence[_Moments], intervals: FloatArray) -> tuple[FloatArray, list[str]]:
@@ -236,7 +236,7 @@ def _drop_rotating(moments: Sequence[_Moments], intervals: FloatArray) -> tuple[
     if len(moments) > 1 and keep.sum() > 2:
         means = moments[1].between(start, stop)[0]
         deviation = np.linalg.norm(means - np.median(means[keep], axis=0), axis=1)
-        keep &= deviation < max(np.radians(0.1), 8 * float(np.median(deviation[keep])))
+        keep &= deviation < max(np.radians(0.1), 8 * np.median(deviation[keep]))
     dropped = intervals[~keep]
     if not len(dropped):
         return intervals, []
@@ -271,7 +271,7 @@ def rest_statistics(
     squares = np.add.reduceat(np.square(values - np.repeat(mean, counts, axis=1)), first, axis=1)
     variances = (squares / counts).T / np.square(signal.nominal_scale)
     total = np.sum(variances, axis=1)
-    share = total / max(float(np.median(total)), signal.rounding_variance)  # coarse steps may leave no scatter at all
+    share = total / max(np.median(total), signal.rounding_variance)  # coarse steps may leave no scatter at all
     density = _density(signal, [column for column, size in zip(columns, share, strict=True) if size < 2] or columns)
     factor = np.where(share > 1.5, share, 1.0)
     duration = counts / signal.rate
@@ -291,7 +291,7 @@ def _density(signal: Signal, columns: Sequence[FloatArray]) -> FloatArray:
     density, _ = _of_blocks(signal, columns, size)
     for factor in (2, 4):
         longer, freedom = _of_blocks(signal, columns, factor * size)
-        ratio = float(np.mean(np.diagonal(longer) / np.maximum(np.diagonal(density), 1e-300)))  # noise-free: no scatter
+        ratio = np.mean(np.diagonal(longer) / np.maximum(np.diagonal(density), 1e-300))  # noise-free: no scatter
         if freedom and ratio < 1 - _CHANCE * np.sqrt(2 / (3 * freedom)):
             density = longer
     return density
@@ -333,8 +333,8 @@ def _rounding_of_means(signal: Signal, variances: FloatArray) -> FloatArray:
 def require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
     if noise is None:
         raise InputError(f"the recording at rest has no {name}, but the one to calibrate has one.")
-    quantum = float(np.sqrt(signal.rounding_variance))
-    sigma = float(np.sqrt(np.median(noise.covariance([0.0], [1.0])) * signal.rate))
+    quantum = np.sqrt(signal.rounding_variance)
+    sigma = np.sqrt(np.median(noise.covariance([0.0], [1.0])) * signal.rate)
     if sigma < 1e-3 * quantum:
         raise InputError(
             f"the recording at rest has a {name} noise of {sigma:.2g} SI units a sample, a thousandth of the step to "

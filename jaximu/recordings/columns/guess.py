@@ -126,7 +126,7 @@ class _Triad:
         count = len(self.values) // size
         cut = self.values[: count * size].reshape(count, size, 3) if count else self.values[None]
         scatter = cut.var(axis=1).sum(axis=1)
-        low = float(np.percentile(scatter, 10))
+        low = np.percentile(scatter, 10)
         every_mean = cut.mean(axis=1)
         means = every_mean[scatter <= max(4 * low, 1e-12)]
         norm = np.linalg.norm(means, axis=1)
@@ -266,7 +266,7 @@ class _Guess:
             if not _plain(field) and not find_unit(field.unit or "", "time"):
                 continue  # a name that says something else: a counter, a tick, an angle
             steps = np.diff(values)
-            usual = float(np.median(steps))
+            usual = np.median(steps)
             if np.mean(steps == 1.0) > 0.9 or not np.mean(np.abs(steps - usual) < 0.5 * abs(usual)) > 0.8:
                 continue  # a counter, or a sum of something
             self.reasons.append(f"column {self.table.label(at)} rises steadily, by {usual:.4g} a row: time")
@@ -497,7 +497,7 @@ class _Guess:
         for name, factor in names.items():
             if self.table.rate and abs(rates[name] / self.table.rate - 1) < 0.1:
                 return [(name, factor)]
-        first = float(np.nanmin(np.asarray(self.numbers[self.time or 0])))
+        first = np.nanmin(np.asarray(self.numbers[self.time or 0]))
         for name, factor in names.items():
             if name != "100 us" and 1e9 < first * factor < 2.2e9 and 0.5 < rates[name] < 2e4:
                 return [(name, factor)]
@@ -606,8 +606,8 @@ class _Guess:
     def _gyro_unit(self, gyro: _Triad, accel: _Triad | None, slope: float | None, per_sample: float | None) -> None:
         """Decide the gyroscope's unit; `per_sample`: the slope at 100 Hz where the rate is not known."""
         unit = _fitting(gyro.unit, "gyro")
-        peak = float(np.abs(gyro.values).max())
-        rest = float(np.abs(np.median(gyro.values, axis=0)).max())
+        peak = np.abs(gyro.values).max()
+        rest = np.abs(np.median(gyro.values, axis=0)).max()
         resting = accel is not None and accel.still and not accel.posed and not gyro.turns
         accel_unit = next((column.unit for column in self.chosen.values() if column.name == "accel_x"), None)
         if unit is None and slope is not None:

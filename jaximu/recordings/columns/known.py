@@ -21,57 +21,80 @@ class _KnownLayout:
 
     program: str
     columns: Mapping[str, str]
-    optional: frozenset[str] = frozenset()
+    needed: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, program: str, text: str) -> _KnownLayout:
         """Read "name=what it is, …": * stands for x, y, z (and w of an attitude), ? says that it may be missing."""
         columns: dict[str, str] = {}
-        optional: set[str] = set()
+        needed: set[str] = set()
         for name, title in (entry.split("=") for entry in text.split(", ")):
             axes = "wxyz" if title.startswith("attitude") else "xyz" if "*" in name else "*"
             names = {name.lstrip("?").replace("*", axis): title.replace("*", axis) for axis in axes}
             columns |= names
-            optional |= set(names) if name.startswith("?") else set()
-        return cls(program, columns, frozenset(optional))
-
-    def fits(self, names: list[str]) -> bool:
-        return set(self.columns) - self.optional <= set(names)
+            needed |= set() if name.startswith("?") else set(names)
+        return cls(program, columns, frozenset(needed))
 
 
 _LAYOUTS = [
     _KnownLayout.of(program, columns)
     for program, columns in (
-        ("EuRoC (ASL dataset format: ns, rad/s, m/s^2)",
-         "timestamp=time [ns], w_rs_s_*=gyro_* [rad/s], a_rs_s_*=accel_* [m/s^2]"),
-        ("Kalibr's bag extractor (ns, rad/s, m/s^2)",
-         "timestamp=time [ns], omega_*=gyro_* [rad/s], alpha_*=accel_* [m/s^2]"),
-        ("the BROAD data set (m/s^2, rad/s, uT; opt_quat is the sensor's attitude)",
-         "imu_acc_*=accel_* [m/s^2], imu_gyr_*=gyro_* [rad/s], ?imu_mag_*=mag_* [uT], ?opt_quat_*=attitude_* [1]"),
-        ("the MARS logger (ns, rad/s, m/s^2)",
-         "timestamp=time [ns], g*=gyro_* [rad/s], a*=accel_* [m/s^2], unix time="),
-        ("Physics Toolbox (gF is the specific force in g; a without gravity is not used)",
-         "?time=time [s], gf*=accel_* [g], ?w*=gyro_* [rad/s], ?b*=mag_* [uT], ?a*=without_gravity_*"),
-        ("MicroStrain's SensorConnect (g, rad/s, G)",
-         "?time=time [ns], scaledaccel*=accel_* [g], ?scaledgyro*=gyro_* [rad/s], ?scaledmag*=mag_* [G]"),
-        ("MicroStrain's MIP Monitor (s, g, rad/s, G)",
-         "?gps tow=time [s], * accel=accel_* [g], ?* gyro=gyro_* [rad/s], ?* mag=mag_* [G]"),
-        ("VectorNav (ns, m/s^2, rad/s, G)",
-         "timestartup=time [ns], uncompacc*=accel_* [m/s^2], uncompgyro*=gyro_* [rad/s], ?uncompmag*=mag_* [G]"),
-        ("VectorNav (ns, m/s^2, rad/s, G)",
-         "timestartup=time [ns], accel*=accel_* [m/s^2], gyro*=gyro_* [rad/s], ?mag*=mag_* [G]"),
+        (
+            "EuRoC (ASL dataset format: ns, rad/s, m/s^2)",
+            "timestamp=time [ns], w_rs_s_*=gyro_* [rad/s], a_rs_s_*=accel_* [m/s^2]",
+        ),
+        (
+            "Kalibr's bag extractor (ns, rad/s, m/s^2)",
+            "timestamp=time [ns], omega_*=gyro_* [rad/s], alpha_*=accel_* [m/s^2]",
+        ),
+        (
+            "the BROAD data set (m/s^2, rad/s, uT; opt_quat is the sensor's attitude)",
+            "imu_acc_*=accel_* [m/s^2], imu_gyr_*=gyro_* [rad/s], ?imu_mag_*=mag_* [uT], ?opt_quat_*=attitude_* [1]",
+        ),
+        (
+            "the MARS logger (ns, rad/s, m/s^2)",
+            "timestamp=time [ns], g*=gyro_* [rad/s], a*=accel_* [m/s^2], unix time=",
+        ),
+        (
+            "Physics Toolbox (gF is the specific force in g; a without gravity is not used)",
+            "?time=time [s], gf*=accel_* [g], ?w*=gyro_* [rad/s], ?b*=mag_* [uT], ?a*=without_gravity_*",
+        ),
+        (
+            "MicroStrain's SensorConnect (g, rad/s, G)",
+            "?time=time [ns], scaledaccel*=accel_* [g], ?scaledgyro*=gyro_* [rad/s], ?scaledmag*=mag_* [G]",
+        ),
+        (
+            "MicroStrain's MIP Monitor (s, g, rad/s, G)",
+            "?gps tow=time [s], * accel=accel_* [g], ?* gyro=gyro_* [rad/s], ?* mag=mag_* [G]",
+        ),
+        (
+            "VectorNav (ns, m/s^2, rad/s, G)",
+            "timestartup=time [ns], uncompacc*=accel_* [m/s^2], uncompgyro*=gyro_* [rad/s], ?uncompmag*=mag_* [G]",
+        ),
+        (
+            "VectorNav (ns, m/s^2, rad/s, G)",
+            "timestartup=time [ns], accel*=accel_* [m/s^2], gyro*=gyro_* [rad/s], ?mag*=mag_* [G]",
+        ),
         ("NaveGo (s, m/s^2, rad/s)", "t=time [s], fb_*=accel_* [m/s^2], wb_*=gyro_* [rad/s]"),
-        ("MAVLink SCALED_IMU (ms, mg, mrad/s, mG)",
-         "time_boot_ms=time [ms], *acc=accel_* [mg], *gyro=gyro_* [mrad/s], ?*mag=mag_* [mG]"),
-        *(("a table of sensor_msgs/Imu (rad/s, m/s^2), time being the header's stamp",
-           ", ".join(prefix + column for column in (*stamp.split(", "), "angular_velocity.*=gyro_* [rad/s]",
-                                                "linear_acceleration.*=accel_* [m/s^2]"))
-           + ", ?time=received, ?%time=received")
-          for stamp in ("header.stamp.sec=, header.stamp.nanosec=", "header.stamp.secs=, header.stamp.nsecs=",
-                        "header.stamp=time [ns]")
-          for prefix in ("", "field.", "msg.")),
+        (
+            "MAVLink SCALED_IMU (ms, mg, mrad/s, mG)",
+            "time_boot_ms=time [ms], *acc=accel_* [mg], *gyro=gyro_* [mrad/s], ?*mag=mag_* [mG]",
+        ),
+        *(
+            (
+                "a table of sensor_msgs/Imu (rad/s, m/s^2), time being the header's stamp",
+                f"{stamp.format(prefix)}, {prefix}angular_velocity.*=gyro_* [rad/s], "
+                f"{prefix}linear_acceleration.*=accel_* [m/s^2], ?time=received, ?%time=received",
+            )
+            for stamp in (
+                "{0}header.stamp.sec=, {0}header.stamp.nanosec=",
+                "{0}header.stamp.secs=, {0}header.stamp.nsecs=",
+                "{0}header.stamp=time [ns]",
+            )
+            for prefix in ("", "field.", "msg.")
+        ),
     )
-]  # fmt: skip
+]
 _LATEST = 2**33  # s
 _PAIRS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanoseconds"), ("sec", "nsec"))
 _SENSOR_LOGGER = {"time": "time [ns]", "seconds_elapsed": "", "x": "", "y": "", "z": ""}
@@ -88,7 +111,7 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
     prefixes = {match[0] for name in names if (match := re.match(r".*\.(?=fb_x$)", name))}
     if len(prefixes) == 1:  # the structure that holds them all
         names = [name.removeprefix(*prefixes) for name in names]
-    layout = next((layout for layout in _LAYOUTS if layout.fits(names)), None)
+    layout = next((layout for layout in _LAYOUTS if layout.needed <= set(names)), None)
     if layout is None and (ours := _of_message(table, table.names)):
         return ours
     if layout is None and set(_SENSOR_LOGGER) == set(names):  # one file a sensor, named after it
@@ -113,8 +136,8 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
     return ours, f"columns and units as {layout.program} has them."
 
 
-_XYZ = [f"{name}_{axis} [{unit}]" for name, unit in (("mag", "G"), ("accel", "m/s^2"), ("gyro", "rad/s"))
-        for axis in "xyz"]  # fmt: skip
+_TRIADS = (("mag", "G"), ("accel", "m/s^2"), ("gyro", "rad/s"))
+_XYZ = [f"{name}_{axis} [{unit}]" for name, unit in _TRIADS for axis in "xyz"]
 _SENTENCES = {
     "$VNIMU": ("", *_XYZ, "temperature [degC]", "pressure"),
     "$VNYMR": ("", "yaw", "pitch", "roll", *_XYZ),
@@ -158,11 +181,13 @@ def _without_header(table: Table) -> tuple[tuple[str, ...], str] | None:
     return names, f"columns and units as VectorNav's {first[0]} has them (G, m/s^2, rad/s)."
 
 
-_NINE = tuple(f"covariance_{number}" for number in range(9))
+_NINE = [f"covariance_{number}" for number in range(9)]
 _ECHOED = (
-    "header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *(f"orientation.{axis}" for axis in "xyzw"), *_NINE,
-    *(f"gyro_{axis} [rad/s]" for axis in "xyz"), *_NINE, *(f"accel_{axis} [m/s^2]" for axis in "xyz"), *_NINE,
-)  # fmt: skip
+    *("header.stamp.sec", "header.stamp.nanosec", "header.frame_id"),
+    *(*(f"orientation.{axis}" for axis in "xyzw"), *_NINE),
+    *(*(f"gyro_{axis} [rad/s]" for axis in "xyz"), *_NINE),
+    *(*(f"accel_{axis} [m/s^2]" for axis in "xyz"), *_NINE),
+)
 
 
 def _stated(name: str) -> bool:
@@ -181,7 +206,7 @@ def whole_stamps(table: Table) -> Table:
             prefix, separator, _ = name.rpartition(seconds)
             if not separator or name != prefix + seconds or plain.count(prefix + rest) != 1 or prefix[-1:].isalnum():
                 continue
-            parts = [np.asarray(table.columns[column]) for column in (at, plain.index(prefix + rest))]
+            parts = [table.columns[column] for column in (at, plain.index(prefix + rest))]
             if any(part.dtype.kind != "i" or (part < 0).any() or (part > _LATEST).any() for part in parts):
                 continue
             names = [*(table.names or ())]

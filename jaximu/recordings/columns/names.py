@@ -25,8 +25,13 @@ def _axes(pattern: str, axes: str = "xyz") -> tuple[str, ...]:
     return tuple(map(pattern.format, axes))
 
 
-_SINGLE = {"temperature": "temperature", "ambient_temperature": "temperature", "current": "electric current",
-           "table_angle": "angle", "table_rate": "angular rate"}  # fmt: skip
+_SINGLE = {
+    "temperature": "temperature",
+    "ambient_temperature": "temperature",
+    "current": "electric current",
+    "table_angle": "angle",
+    "table_rate": "angular rate",
+}
 TIME = "time"
 GROUPS = {  # a triad may be in counts, and in increments over each sampling interval
     "accel": Group("accelerometer", _axes("accel_{}"), ("acceleration", "raw count", "velocity increment")),

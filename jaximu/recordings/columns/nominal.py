@@ -78,7 +78,7 @@ def scaled_accelerometer(
     sphere = fit_sphere(means)
     if offset is not None:
         zero = np.array(np.broadcast_to(parse_offset(offset, "--accel-offset"), 3))
-        radius = sphere[1] if sphere else float(np.median(np.linalg.norm(means - zero, axis=1)))
+        radius = sphere[1] if sphere else np.median(np.linalg.norm(means - zero, axis=1))
     elif sphere:
         zero, radius = sphere
     else:
@@ -152,7 +152,7 @@ def fit_sphere(points: FloatArray) -> tuple[FloatArray, float] | None:
     fitted, miss = np.ones(len(points), bool), np.zeros(len(points))
     solution, radius = np.zeros(4), 1.0
     for _ in range(5):
-        fitted = miss <= max(4.0 * float(np.median(miss)), 1e-6 * radius)
+        fitted = miss <= max(4.0 * np.median(miss), 1e-6 * radius)
         solution = np.linalg.lstsq(design[fitted], target[fitted], rcond=None)[0]
         radius = float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-12)))
         miss = np.abs(np.linalg.norm(scaled - solution[:3], axis=1) - radius)

@@ -67,9 +67,7 @@ def _opened(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[st
         if name.startswith("__") or (name == "units" and isinstance(value, Mapping)):
             continue
         if isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
-            value = {
-                str(entry.get("label") or entry.get("name") or at) or str(at): entry for at, entry in enumerate(value)
-            }
+            value = {str(entry.get("label") or entry.get("name") or at): entry for at, entry in enumerate(value)}
         fields = getattr(getattr(value, "dtype", None), "names", None)
         if fields:
             value = {field: value[field] for field in fields}

@@ -47,8 +47,8 @@ def read(path: Path, source: Source) -> Table:
     if wide:
         with suppress(UnicodeDecodeError):
             head = path.read_bytes().decode("utf-16").encode()
-    whole = None if wide else _without_zeros(path)  # where the file ends in them
-    head = head if whole is None else whole[:_SAMPLE]
+    whole = head if wide else _without_zeros(path)  # None where the file stands as it is read
+    head = head if wide or whole is None else whole[:_SAMPLE]
     if len(head) != len(head.translate(None, _CONTROL)):
         raise InputError(
             f"{source.path}: holds binary data of no known format; expected CSV, TSV, blank-separated text, "
@@ -56,25 +56,32 @@ def read(path: Path, source: Source) -> Table:
         )
     layout = _layout(_lines(head), source.path)
     rows: np.ndarray | int = layout.first + 1
-    parsed = None if layout.delimiter == " " or wide or whole is not None else _read_straight(path, layout)
+    parsed = _read_straight(path, layout) if whole is None and layout.delimiter != " " else None
     if parsed is None:
-        data = head if wide else path.read_bytes() if whole is None else whole
-        table, rows = _read_cleaned(_lines(data), layout, source.path)
+        table, rows = _read_cleaned(_lines(path.read_bytes() if whole is None else whole), layout, source.path)
         parsed = [from_arrow(column) for column in table.columns], table.schema
     (columns, schema), names = parsed, layout.names or None
     if names:  # a column of dates states its own unit
-        names = tuple(f"{name} [{kind.type.unit}]" if pa.types.is_timestamp(kind.type) and "[" not in name else name
-                      for name, kind in zip(names, schema, strict=True))  # fmt: skip
+        names = tuple(
+            f"{name} [{kind.type.unit}]" if pa.types.is_timestamp(kind.type) and "[" not in name else name
+            for name, kind in zip(names, schema, strict=True)
+        )
     for at, column in enumerate(columns):
-        if at == len(columns) - 1 and column.dtype == object and str(columns[0][0]).startswith("$"):
+        if column.dtype != object:
+            continue
+        if at == len(columns) - 1 and str(columns[0][0]).startswith("$"):
             columns[at] = np.array([str(cell).partition("*")[0] for cell in column], object)  # NMEA's checksum
-        elif column.dtype == object and all(str(cell).endswith(";") for cell in column):
+        elif all(str(cell).endswith(";") for cell in column):
             columns[at] = np.array([cell[:-1] for cell in column], object)
-        elif column.dtype == object and (stamps := seconds_of(column)) is not None:
+        elif (stamps := seconds_of(column)) is not None:
             columns[at] = stamps
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [ns]", *names[at + 1 :])
-    notes = () if whole is None else ("the file ends in zero bytes, as after a power loss: its last row is left out.",)
+    notes = (
+        ()
+        if wide or whole is None
+        else ("the file ends in zero bytes, as after a power loss: its last row is left out.",)
+    )
     return Table(source, names, tuple(columns), rows, layout.rate, notes=notes)
 
 
@@ -185,9 +192,12 @@ def _layout(data: bytes, path: str) -> _Layout:
         width, rows = max(widths.items(), key=lambda item: (item[1] * (item[0] > 1), item[0]), default=(0, 0))
         if width < 2:
             continue
-        filled_in = [count + sum(not cell.strip() for cell in cells)
-                     for cells, count in zip(split, numbers, strict=True) if len(cells) == width and count]  # fmt: skip
-        score = rows * max(0.1, sum(filled_in) / (width * rows))
+        filled_in = sum(
+            count + sum(not cell.strip() for cell in cells)
+            for cells, count in zip(split, numbers, strict=True)
+            if len(cells) == width and count
+        )
+        score = rows * max(0.1, filled_in / (width * rows))
         if best is None or score > 1.05 * best[0]:
             best = score, delimiter, decimal, width
     if best is None:

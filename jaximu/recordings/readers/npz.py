@@ -20,8 +20,9 @@ def read(data: bytes, source: Source) -> Table:
         members = archive.infolist()
         if not any(member.filename.endswith(".npy") for member in members):
             inside = [member.filename for member in members if not member.is_dir()]
-            what = "an Excel workbook; save its sheet as CSV" if "xl/workbook.xml" in inside else (
-                f"an archive of {', '.join(inside[:4])}; unpack it and read the files in it")  # fmt: skip
+            what = f"an archive of {', '.join(inside[:4])}; unpack it and read the files in it"
+            if "xl/workbook.xml" in inside:
+                what = "an Excel workbook; save its sheet as CSV"
             raise InputError(f"{source.path}: is {what}.")
         Unpacking(source, len(data)).take(sum(member.file_size for member in members))
         return table_of(

@@ -193,7 +193,7 @@ def _read_as(
     # a gyroscope's offset changes with every power-on: where it is not stated, each log shows its own
     zeros = [name for name in counts if name == "accelerometer" or _counts(options, name)[1] is not None]
     columns, of_gyroscope = (
-        ",".join(text.split(",") if isinstance(text, str) else text) if text else None
+        (text if isinstance(text, str) else ",".join(text or ())) or None
         for text in (options.columns, options.gyro_columns)
     )
     return Reading(
@@ -535,7 +535,7 @@ _INCREMENTS = {("accel", "velocity increment"): "acceleration", ("gyro", "angle"
 def _per_second(unit: Unit, sensor: str, stamps: FloatArray) -> Unit:
     """The unit of a rate for increments over the sampling interval, any other unit as it is."""
     quantity = _INCREMENTS.get((sensor, unit.quantity))
-    return Unit(unit.name, quantity, unit.factor / float(np.median(np.diff(stamps)))) if quantity else unit
+    return Unit(unit.name, quantity, unit.factor / np.median(np.diff(stamps))) if quantity else unit
 
 
 def _carried_on(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
@@ -545,7 +545,7 @@ def _carried_on(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table,
     steps = np.diff(stamps)
     if not (steps < 0).any() or not (steps > 0).any():  # NaN is neither
         return table, []
-    usual = float(np.median(steps[steps > 0]))
+    usual = np.median(steps[steps > 0])
     for seconds in _ENDS:
         if seconds / unit.factor < _COUNTED * usual:
             continue
@@ -573,7 +573,7 @@ def _ordered(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, li
     steps = np.diff(stamps)
     if not (steps <= 0).any():
         return table, []
-    back = float((np.maximum.accumulate(stamps) - stamps).max()) * unit.factor
+    back = (np.maximum.accumulate(stamps) - stamps).max() * unit.factor
     if back > _SET_BACK:
         first = np.argmax(steps < 0) + 1
         raise InputError(
@@ -615,13 +615,13 @@ def _rising(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, lis
         return ", ".join(str(table.row(row)) for row in rows[:5])
 
     notes: list[str] = []
-    usual = float(np.median(np.abs(steps[steps != 0]))) if (steps != 0).any() else 0.0
+    usual = np.median(np.abs(steps[steps != 0])) if (steps != 0).any() else 0.0
     count = len(stamps)
     order = np.arange(count)
     back = np.flatnonzero(steps < 0) + 1
     backwards = len(back) > 0.9 * (count - 1)
     if len(back) and (even := _even_clock(stamps)) is not None:
-        spread = float(np.std(stamps - even)) * unit.factor
+        spread = np.std(stamps - even) * unit.factor
         text = (
             f"The stamps jitter by {1e3 * spread:.2g} ms and go back in {counted(len(back), 'place')}, and "
             "the rows are in order: a steady clock fitted to the stamps replaces them."
@@ -634,7 +634,7 @@ def _rising(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, lis
             order = count - 1 - np.argsort(stamps[::-1], kind="stable")
             text = "The rows run backwards in time. They were sorted by their stamps."
         else:
-            farthest = float(np.max(np.maximum.accumulate(stamps) - stamps)) * unit.factor
+            farthest = np.max(np.maximum.accumulate(stamps) - stamps) * unit.factor
             text = (
                 f"The rows are out of order in {counted(len(back), 'place')} (row {listed(back)}), by up to "
                 f"{farthest:.6g} s. They were sorted by their stamps."
@@ -671,7 +671,7 @@ def _rising(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, lis
     if not len(back) and shared.sum() >= _FEW_SHARED and _FEW_SHARES < shared.mean() <= 0.25:
         even = _even_clock(stamps)
         if even is not None:
-            rate = (len(even) - 1) / (float(even[-1] - even[0]) * unit.factor)
+            rate = (len(even) - 1) / ((even[-1] - even[0]) * unit.factor)
             text = (
                 f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of "
                 f"{rate:.5g} Hz fitted to the stamps replaces them."
@@ -695,7 +695,7 @@ def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
     whole = stamps.dtype.kind != "f"
     if period <= (2.0 if whole else 0.0) or np.max(np.abs(since - start - period * number)) > _JITTER * period:
         return None
-    if float(np.diff(np.sort(since)).std()) < _UNEVEN * period:
+    if np.diff(np.sort(since)).std() < _UNEVEN * period:
         return None
     even = start + period * number
     return stamps[0] + (np.round(even).astype(stamps.dtype) if whole else even)
@@ -744,7 +744,7 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
         if 0 < broken.mean() <= FEW:
             absent |= broken
         elif broken.any():
-            row = int(np.argmax(broken))
+            row = np.argmax(broken)
             label = table.label(columns[int(np.argmax(missing[row]))][1])
             raise InputError(f"{table.where(row)}: column {label} is empty or NaN beside the sensor's other axes.")
         kept = np.flatnonzero(~absent)
@@ -753,7 +753,7 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
         raise InputError(f"{table.where(kept[np.argmax(missing)])}: the time stamp is empty or NaN.")
     steps = np.diff(stamps)
     if (steps <= 0.0).any():
-        at = int(np.argmax(steps <= 0.0)) + 1
+        at = np.argmax(steps <= 0.0) + 1
         what = "repeats that of the row before" if steps[at - 1] == 0.0 else f"goes back by {-steps[at - 1]:.6g} s"
         raise InputError(
             f"{table.where(kept[at])}: the time stamp {what}; delete such rows, or if the stamps are "

@@ -93,8 +93,8 @@ def read_schedule(path: str | os.PathLike[str]) -> tuple[ScheduleEntry, ...]:
     without units.
     """
     name = os.fspath(path)
-    lines = [(row, cells) for row, cells in enumerate(csv.reader(_text(name).splitlines()), 1)
-             if any(cell.strip() for cell in cells)]  # fmt: skip
+    rows = enumerate(csv.reader(_text(name).splitlines()), 1)
+    lines = [(row, cells) for row, cells in rows if any(cell.strip() for cell in cells)]
     if len(lines) < 2:
         raise InputError(f"{name}: holds no poses or turns.")
     columns = _columns(lines[0][1], name)
@@ -114,8 +114,10 @@ def _columns(header: Sequence[str], name: str) -> dict[str, tuple[int, float]]:
             raise InputError(f"{name}, row 1: the column {cell.strip()!r} {what}.")
         quantity = _QUANTITIES.get(title)
         if quantity and not stated:
-            raise InputError(f"{name}, row 1: the column {title} states no unit; write for example "
-                             f"{title} [{'s' if quantity == 'time' else 'deg'}].")  # fmt: skip
+            example = "s" if quantity == "time" else "deg"
+            raise InputError(
+                f"{name}, row 1: the column {title} states no unit; write for example {title} [{example}]."
+            )
         columns[title] = at, unit(stated or "1", quantity, file=name, column=title).factor if quantity else 1.0
     missing = [title for title in _FIELDS[:6] if title not in columns]
     if missing:
@@ -163,8 +165,10 @@ def _entry(cells: Sequence[str], columns: dict[str, tuple[int, float]], where: s
 def _require_apart(entries: Sequence[ScheduleEntry]) -> None:
     for before, after in pairwise(entries):
         if (before.start, before.stop) == (after.start, after.stop):
-            raise InputError(f"{after.label}: says of the same time ({after.start:g} to {after.stop:g} s) what "
-                             f"{before.label} says otherwise: one interval stands under two names.")  # fmt: skip
+            raise InputError(
+                f"{after.label}: says of the same time ({after.start:g} to {after.stop:g} s) what {before.label} says "
+                "otherwise: one interval stands under two names."
+            )
         if after.start < before.stop - 1e-6:
             raise InputError(
                 f"{after.label}: begins at {after.start:g} s, before {before.label} ends ({before.stop:g} s)."
@@ -191,8 +195,10 @@ def _json_sections(text: str, name: str, count: int) -> _Sections:
         angle = fields.get("angle [deg]")
         unknown = sorted(set(fields) - {"start", "end", "angle [deg]"})
         if unknown or not isinstance(angle, int | float | None):
-            raise InputError(f'{where}: {unknown[0] if unknown else "angle [deg]"!r} is not understood; a section has '
-                             '"start", "end" and, of a turn, "angle [deg]".')  # fmt: skip
+            key = unknown[0] if unknown else "angle [deg]"
+            raise InputError(
+                f'{where}: {key!r} is not understood; a section has "start", "end" and, of a turn, "angle [deg]".'
+            )
         first, last = fields["start"], fields["end"]
         if not 0 <= first < last <= count:
             raise InputError(f"{where}: {first} to {last} is no part of the log's {count} samples.")
