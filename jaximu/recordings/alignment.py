@@ -15,6 +15,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 
 __all__ = [
+    "CORRELATED",
     "BlockMeans",
     "Clocks",
     "Turning",
@@ -38,6 +39,8 @@ _FEWEST = 20
 _LAGS = np.arange(-8.0, 8.05, 0.1)  # s
 _PARTS = 12
 """Parts of a recording from whose scatter the uncertainty of a time offset is taken."""
+CORRELATED = 0.6
+"""Correlation from which on the gyroscope turns as gravity does in the accelerometer."""
 _WELL = 0.8
 """Share of the turning that the gyroscope must explain for its stamps to be sought close to where they are."""
 

@@ -10,9 +10,9 @@ import scipy
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 
-__all__ = ["Attitude"]
+__all__ = ["UNIT_LENGTH", "Attitude"]
 
-_LENGTH = 0.01  # off one, of a quaternion that is one
+UNIT_LENGTH = 0.01  # off one, of a quaternion that is one
 _JUMP = 2.0  # rad; between neighbouring stamps nothing turns so far
 
 
@@ -35,7 +35,7 @@ class Attitude:
 
     def __post_init__(self) -> None:
         length = np.linalg.norm(self.quaternion, axis=1)
-        bad = ~np.isfinite(length) | (np.abs(length - 1) > _LENGTH)
+        bad = ~np.isfinite(length) | (np.abs(length - 1) > UNIT_LENGTH)
         if bad.mean() > 0.5:
             raise InputError(
                 f"{self.name}: its quaternions have the length {np.median(length):.4g} and not 1: the columns are "
@@ -47,7 +47,7 @@ class Attitude:
     def usable(self) -> Attitude:
         """Return the rows whose quaternion is one, of length one and without jumps of sign."""
         length = np.linalg.norm(self.quaternion, axis=1)
-        kept = np.isfinite(length) & (np.abs(length - 1) < _LENGTH)
+        kept = np.isfinite(length) & (np.abs(length - 1) < UNIT_LENGTH)
         vectors = {"velocity": self.velocity, "position": self.position}
         vectors = {name: values[kept] for name, values in vectors.items() if values is not None}
         notes = self.notes

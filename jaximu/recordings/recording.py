@@ -23,8 +23,8 @@ from jaximu.ground.quantities import unit_text
 from jaximu.ground.reexport import later
 from jaximu.ground.summary import Block, Described, Summary, data_frame, sentence
 from jaximu.ground.tracing import is_traced
-from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS
-from jaximu.recordings.alignment import Turning, turning, turns_backwards
+from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, STANDARD_GRAVITY
+from jaximu.recordings.alignment import CORRELATED, Turning, turning, turns_backwards
 
 if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]
@@ -534,7 +534,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     peak = np.percentile(np.linalg.norm(gyroscope.si(), axis=1), 99.0)
     assert recording.turning is not None
     slope, correlation = recording.turning.slope, recording.turning.correlation
-    if abs(correlation) > _CORRELATED and not 1.0 / 3.0 < abs(slope) < 3.0:
+    if abs(correlation) > CORRELATED and not 1.0 / 3.0 < abs(slope) < 3.0:
         raise InputError(
             f"{where}: gyro_x, gyro_y, gyro_z read {1.0 / abs(slope):.3g} times the rate at which gravity turns "
             f"in the accelerometer; {_time_advice(gyroscope) or _gyro_advice(gyroscope, abs(slope))}."
@@ -546,7 +546,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
             f"{where}: gyro_x, gyro_y, gyro_z reach {peak:.4g} rad/s, faster than any such sensor measures; "
             f"{_gyro_advice(gyroscope, 1.0 / 57.3)}."
         )
-    if correlation < -_CORRELATED and turns_backwards(
+    if correlation < -CORRELATED and turns_backwards(
         accelerometer.time, accelerometer.si(), gyroscope.time, gyroscope.si()
     ):
         return (
@@ -555,7 +555,12 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     return ()
 
 
-_ACCEL_SLIPS = {9.80665: "g", 9.80665e-3: "mg", 1 / 9.80665: "m/s², stated as g", 1e-3: "mg, stated as g"}
+_ACCEL_SLIPS = {
+    STANDARD_GRAVITY: "g",
+    STANDARD_GRAVITY * 1e-3: "mg",
+    1 / STANDARD_GRAVITY: "m/s², stated as g",
+    1e-3: "mg, stated as g",
+}
 _GYRO_SLIPS = {1 / 57.29578: "deg/s", 57.29578: "rad/s, stated as deg/s", 1 / 57295.78: "mdeg/s", 1e-3: "mdeg/s"}
 
 
@@ -572,9 +577,8 @@ def _require_own_columns(recording: Recording, gravity: LocalGravity) -> None:
         )
 
 
-_PARTS, _ANOTHER_UNIT, _CORRELATED = 10, 5.0, 0.6
-"""Parts of a recording that are compared, by what factor its beginning and its end must differ to be in two units, and
-how closely a part's gyroscope must follow what turns in the accelerometer."""
+_PARTS, _ANOTHER_UNIT = 10, 5.0
+"""Parts of a recording that are compared, and by what factor its beginning and its end differ in two units."""
 
 
 def _require_one_unit(recording: Recording) -> None:
@@ -590,7 +594,7 @@ def _require_one_unit(recording: Recording) -> None:
             time = accelerometer.time[part]
             inside = slice(*np.searchsorted(gyroscope.time, time[[0, -1]]))
             turned = turning(time, force[part], gyroscope.time[inside], rates[inside])
-            ratios.append(1 / abs(turned.slope) if abs(turned.correlation) > _CORRELATED else np.nan)
+            ratios.append(1 / abs(turned.slope) if abs(turned.correlation) > CORRELATED else np.nan)
         levels["gyro_x, gyro_y, gyro_z"] = ratios
     for columns, level in levels.items():
         step_part, factor = _step(np.log(np.maximum(level, 1e-9)))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.recordings.attitude import UNIT_LENGTH
 from jaximu.recordings.readers.schedule import ScheduleEntry
 from jaximu.recordings.recording import Recording, Signal, runs_of
 
@@ -275,7 +276,7 @@ def _neighbours(count: int, samples: float) -> tuple[NDArray[np.intp], NDArray[n
 
 def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[Entry]:
     length = np.linalg.norm(attitude.values, axis=1)
-    if (np.abs(length - 1) > 0.01).any():
+    if (np.abs(length - 1) > UNIT_LENGTH).any():
         worst = np.argmax(np.abs(length - 1))
         raise InputError(
             f"{recording.name}: the attitude at {attitude.time[worst]:.6g} s has the length {length[worst]:.4g}; a "

@@ -17,6 +17,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
 from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.stimulus import REFERENCE_TEMPERATURE
 from jaximu.recordings.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
 from jaximu.recordings.recording import PoseMeans, Recording, Signal, runs_of
 
@@ -56,7 +57,6 @@ class SegmentationOptions:
     threshold: float | None = None
     fewest: int = 2
     rate_limit: float = float(np.radians(0.3))
-    temperature_reference: float = 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +119,10 @@ def _floor(variance: FloatArray, moments: _Moments) -> float:
     return max(floor, moments.signal.rounding_variance, rounding)
 
 
-def _angles(vectors: FloatArray) -> FloatArray:
-    """Angle (rad) between each vector and the next."""
-    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return 2 * np.arcsin(np.clip(np.linalg.norm(np.diff(unit, axis=0), axis=1) / 2, 0, 1))
+def _angles(vectors: FloatArray, others: FloatArray) -> FloatArray:
+    """Angle (rad) between each vector and the other of its row."""
+    units, other_units = (rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (vectors, others))
+    return 2 * np.arcsin(np.clip(np.linalg.norm(other_units - units, axis=1) / 2, 0, 1))
 
 
 def _samples(signal: Signal, start: float, stop: float) -> slice:
@@ -175,7 +175,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
         intervals = np.stack([centres[first] - margin, centres[last - 1] + margin], axis=1)
         long = np.diff(intervals)[:, 0] >= options.minimum_duration
         directions = (sums[last[long]] - sums[first[long]]) / (last - first)[long, None]
-        distinct = 1 + int(np.sum(_angles(directions) > _DISTINCT)) if len(directions) > 1 else len(directions)
+        distinct = int(len(directions) > 0) + int(np.sum(_angles(directions[:-1], directions[1:]) > _DISTINCT))
         return intervals[long], distinct
 
     factors = THRESHOLDS if options.threshold is None else (options.threshold,)
@@ -201,7 +201,8 @@ def _why_no_poses(intervals: FloatArray, duration: float, force: FloatArray, not
         "it between them."
     )
     middle = np.median(force, axis=0)
-    off = _angles(np.insert(force, np.arange(1, len(force)), middle, axis=0)) if len(force) > 1 else np.zeros(1)
+    alternating = np.insert(force, np.arange(1, len(force)), middle, axis=0)
+    off = _angles(alternating[:-1], alternating[1:]) if len(force) > 1 else np.zeros(1)
     if np.quantile(off, 0.99) < _DISTINCT and np.sum(np.diff(intervals)) > 0.5 * duration:
         return (
             "1 static pose found: the unit lay in one orientation throughout. That shows its noise (jaximu allan) and, "
@@ -229,9 +230,8 @@ def _drop_rotating(moments: Sequence[_Moments], intervals: FloatArray) -> tuple[
     middle = (start + stop) / 2
     (before, *spread), (after, *later) = moments[0].between(start, middle), moments[0].between(middle, stop)
     length = np.linalg.norm(before, axis=1)
-    chord = np.linalg.norm(before / length[:, None] - after / np.linalg.norm(after, axis=1)[:, None], axis=1)
     noise = np.sqrt(sum(variance.sum(axis=1) / np.maximum(count, 1) for variance, count in (spread, later))) / length
-    keep = 2 * np.arcsin(np.clip(chord / 2, 0, 1)) < np.maximum(np.radians(0.2), 6 * noise)
+    keep = _angles(before, after) < np.maximum(np.radians(0.2), 6 * noise)
     keep &= np.minimum(spread[1], later[1]) >= 3
     if len(moments) > 1 and keep.sum() > 2:
         means = moments[1].between(start, stop)[0]
@@ -366,7 +366,6 @@ _NO_TURN: _Turn = np.zeros((0, 3)), np.zeros(0)
 def observed_poses(
     segmentations: Segmentation | Sequence[Segmentation],
     gravity: float,
-    temperature_reference: float = 25.0,
     bucket: tuple[int, int] | None = None,
     noise: NoiseModel | None = None,
 ) -> Observations:
@@ -404,7 +403,7 @@ def observed_poses(
                 "gyroscope_covariance": rate_covariance,
                 "start": intervals[:, 0],
                 "stop": intervals[:, 1],
-                "temperature": _temperature(recording, intervals, temperature_reference),
+                "temperature": _temperature(recording, intervals),
                 "force": (force - accelerometer.nominal_offset) / accelerometer.nominal_scale,
             }
         )
@@ -414,7 +413,7 @@ def observed_poses(
     columns = {name: np.concatenate([rest[name] for rest in rests]) for name in rests[0]}
     offset = parts[0].recording.accelerometer.nominal_offset
     density = np.mean(densities, axis=0)
-    observations = _padded(columns, turns[:-1], density, offset, gravity, temperature_reference, bucket)
+    observations = _padded(columns, turns[:-1], density, offset, gravity, bucket)
     return observations if noise is None else _with_noise(observations, parts, noise, np.concatenate(spans)[:-1])
 
 
@@ -423,7 +422,7 @@ def _no_means(count: int) -> tuple[FloatArray, FloatArray]:
     return np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
 
 
-def observe_means(means: PoseMeans, gravity: float, temperature_reference: float = 25.0) -> Observations:
+def observe_means(means: PoseMeans, gravity: float) -> Observations:
     """Return a table of pose means as padded `Observations` without turns.
 
     Where no deviations are stated, digits alone tell how far a mean is off, which is the least it can be.
@@ -433,7 +432,7 @@ def observe_means(means: PoseMeans, gravity: float, temperature_reference: float
     columns = {
         "start": np.arange(count, dtype=np.float64),
         "stop": np.arange(1.0, count + 1),
-        "temperature": np.full(count, temperature_reference),
+        "temperature": np.full(count, REFERENCE_TEMPERATURE),
         "force": accelerometer.si(),
     }
     for name in INERTIAL_QUANTITIES:
@@ -444,7 +443,7 @@ def observe_means(means: PoseMeans, gravity: float, temperature_reference: float
                 sigma = np.tile(signal.nominal_scale * np.sqrt(signal.rounding_variance / 3), (count, 1))
             values, covariance = signal.values, sigma[:, :, None] ** 2 * np.eye(3)
         columns |= {f"{name}_mean": values, f"{name}_covariance": covariance}
-    return _padded(columns, [], np.eye(3), accelerometer.nominal_offset, gravity, temperature_reference)
+    return _padded(columns, [], np.eye(3), accelerometer.nominal_offset, gravity)
 
 
 def _padded(
@@ -453,7 +452,6 @@ def _padded(
     density: FloatArray,
     offset: FloatArray,
     gravity: float,
-    temperature_reference: float,
     bucket: tuple[int, int] | None = None,
 ) -> Observations:
     """Pad the fields of poses, nominal specific `force` (P, 3) among them, and the turns between them to a bucket."""
@@ -470,7 +468,7 @@ def _padded(
         "accelerometer_mean": offset + up,
         "accelerometer_covariance": np.eye(3),
         "gyroscope_covariance": np.eye(3),
-        "temperature": temperature_reference,
+        "temperature": REFERENCE_TEMPERATURE,
         "force": up,
     }
     columns = {name: _pad(values, padded, fills.get(name, 0.0)) for name, values in columns.items()}
@@ -544,10 +542,10 @@ def _with_noise(
     return Observations(poses, turns, observations.gravity, SlowNoise(forces, rates, part_of_turn))
 
 
-def _temperature(recording: Recording, intervals: FloatArray, reference: float) -> FloatArray:
+def _temperature(recording: Recording, intervals: FloatArray) -> FloatArray:
     signal = recording.temperature
     if signal is None:
-        return np.full(len(intervals), reference)
+        return np.full(len(intervals), REFERENCE_TEMPERATURE)
     return np.interp(intervals.mean(axis=1), signal.time, signal.values[:, 0])
 
 

@@ -20,8 +20,10 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit, parse_column
-from jaximu.recordings.alignment import Turning, turning
+from jaximu.ground.units import unit as unit_named
+from jaximu.recordings.alignment import CORRELATED, Turning, turning
 from jaximu.recordings.columns.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
+from jaximu.recordings.columns.known import EPOCH
 from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import Table
@@ -29,21 +31,19 @@ from jaximu.recordings.recording import Signal
 
 __all__ = ["Advice", "advise", "without_gravity"]
 
-_GRAVITY_IN = {"m/s^2": STANDARD_GRAVITY, "g": 1.0, "mg": 1000.0, "cm/s^2": 980.665}
+_GRAVITY_IN = {name: STANDARD_GRAVITY / unit_named(name).factor for name in ("m/s^2", "g", "mg", "cm/s^2")}
 _PLAUSIBLE = 0.5, 8000.0
 _LIKELY = 5.0, 4000.0
 """Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
 _STEADY = 0.12
 """Scatter of the norm over poses, of its mean, below which a triad holds something constant."""
-_TURNS = 0.6
-"""Correlation from which a triad's integral turns gravity as the accelerometer says."""
 _PER_G = (16384, 8192, 4096, 2048, 1024, 512, 256)
 _PER_DEGREE = (131, 65.5, 32.8, 16.4, 114.2857, 57.1429, 28.5714, 14.2857, 14.375, 262)
 _COUNTERS = set(
     "counter count packet index sample frame seq number id row line n no iteration loop samples packetcounter "
     "status".split()
 )
-_ANGLES = {"rad/s": 1.0, "deg/s": math.pi / 180, "mdeg/s": math.pi / 180e3, "mrad/s": 1e-3}
+_ANGLES = {name: unit_named(name).factor for name in ("rad/s", "deg/s", "mdeg/s", "mrad/s")}
 _PLAIN = set("var column col field data channel ch ans unnamed imu c v x y out simout".split())
 """Words that say nothing of a column."""
 _SHOWN = 3
@@ -441,7 +441,7 @@ class _Guess:
         """The triad whose rates turn gravity as the accelerometer says."""
         fits = [(abs(fit.correlation), triad) for triad in free if (fit := self._turning(accel, triad))]
         correlation, best = max(fits, key=lambda pair: pair[0], default=(0.0, None))
-        if best is not None and correlation > _TURNS:
+        if best is not None and correlation > CORRELATED:
             self.reasons.append(f"columns {best.label}, integrated, {_TURN}: the gyroscope")
             return best
         unclear = [
@@ -499,7 +499,7 @@ class _Guess:
                 return [(name, factor)]
         first = np.nanmin(np.asarray(self.numbers[self.time or 0]))
         for name, factor in names.items():
-            if name != "100 us" and 1e9 < first * factor < 2.2e9 and 0.5 < rates[name] < 2e4:
+            if name != "100 us" and EPOCH[0] < first * factor < EPOCH[1] and 0.5 < rates[name] < 2e4:
                 return [(name, factor)]
         if "fine" not in self.fields[self.time or 0].stem:
             rates.pop("100 us")
@@ -518,7 +518,7 @@ class _Guess:
                     tried.append((abs(fit.correlation), self.assumed, fit))
             if tried:
                 _, self.assumed, turned = max(tried, key=lambda trial: trial[0])
-        slope = abs(turned.slope) if turned and abs(turned.correlation) > _TURNS else None
+        slope = abs(turned.slope) if turned and abs(turned.correlation) > CORRELATED else None
         if self.time is not None:
             slope = self._time_unit(self.time, gyro, slope)
         elif not self.table.rate:

@@ -12,7 +12,7 @@ import numpy as np
 from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.table import Table
 
-__all__ = ["known_names", "sentence_names", "whole_stamps"]
+__all__ = ["EPOCH", "known_names", "sentence_names", "whole_stamps"]
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ _SENTENCES = {
 
 
 _MESSAGE = re.compile(r"(?:.*[./_])?(angular_velocity|linear_acceleration)[./_]([xyz])")
-_EPOCH = 1e9, 2.2e9  # s since 1970 that a log's stamps lie between
+EPOCH = 1e9, 2.2e9  # s since 1970 that a log's stamps lie between
 
 
 def _of_message(table: Table, names: tuple[str, ...]) -> tuple[tuple[str, ...], str] | None:
@@ -156,7 +156,7 @@ def _of_message(table: Table, names: tuple[str, ...]) -> tuple[tuple[str, ...], 
     if sum(match is not None for match in matches) != 6 or len(set(known)) < len(known):
         return None
     for at, (name, column) in enumerate(zip(names, table.columns, strict=True)):
-        since = column.dtype.kind == "f" and _EPOCH[0] < np.nanmin(column) <= np.nanmax(column) < _EPOCH[1]
+        since = column.dtype.kind == "f" and EPOCH[0] < np.nanmin(column) <= np.nanmax(column) < EPOCH[1]
         if since and name.strip("_").lower() in ("time", "timestamp", "stamp"):
             known[at] = "time [s]"
     return tuple(known), (

@@ -128,9 +128,9 @@ def _windows(signal: Signal, seconds: float) -> FloatArray:
     return signal.values[: count * span].reshape(count, span, -1)
 
 
-def quiet_means(signal: Signal, seconds: float = 0.5) -> FloatArray:
+def quiet_means(signal: Signal) -> FloatArray:
     """(windows, 3) means of the windows with the least variance; quantisation alone counts as quiet."""
-    windows = _windows(signal, seconds)
+    windows = _windows(signal, 0.5)
     variance = windows.var(1).sum(1)
     return windows[variance <= max(4.0 * np.percentile(variance, 10.0), 1.0)].mean(1)
 

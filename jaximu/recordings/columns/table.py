@@ -11,6 +11,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.recordings.recording import Source
 
+HEAD = 1 << 18
+"""Bytes in which a format shows."""
 UNPACKED, RATIO = 128 << 20, 200
 """A compressed file may unpack to so many bytes, or to so many times its own size: no recording compresses better."""
 AXES = b"jaximu.axes"

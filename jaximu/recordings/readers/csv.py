@@ -18,12 +18,11 @@ import pyarrow.csv as pc
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, stated_rate
-from jaximu.recordings.columns.table import Table, from_arrow, parse_name
+from jaximu.recordings.columns.table import HEAD, Table, from_arrow, parse_name
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
-_SAMPLE = 1 << 18  # bytes in which binary data shows
 _PIECE = 1 << 22  # bytes parsed at once
 _LOOKED_AT = 200  # lines in which the layout is looked for
 _SINGLE_BLOCK = 2**31 - 2
@@ -42,13 +41,13 @@ class _Layout:
 def read(path: Path, source: Source) -> Table:
     """The table in a text file. Raises InputError for what is not a table of numbers, naming the row where it can."""
     with path.open("rb") as file:
-        head = file.read(_SAMPLE)
+        head = file.read(HEAD)
     wide = head[:2] in (b"\xff\xfe", b"\xfe\xff")  # UTF-16, as Excel's "Unicode text"
     if wide:
         with suppress(UnicodeDecodeError):
             head = path.read_bytes().decode("utf-16").encode()
     whole = head if wide else _without_zeros(path)  # None where the file stands as it is read
-    head = head if wide or whole is None else whole[:_SAMPLE]
+    head = head if wide or whole is None else whole[:HEAD]
     if len(head) != len(head.translate(None, _CONTROL)):
         raise InputError(
             f"{source.path}: holds binary data of no known format; expected CSV, TSV, blank-separated text, "
@@ -133,7 +132,7 @@ def _common(fields: Sequence[pa.Field]) -> pa.Field | None:
 
 def _comments(path: Path) -> bool:
     with path.open("rb") as file:
-        return any(b"#" in block for block in iter(partial(file.read, _SAMPLE), b""))
+        return any(b"#" in block for block in iter(partial(file.read, HEAD), b""))
 
 
 def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np.ndarray]:
@@ -179,7 +178,7 @@ _STYLES = (("\t", "."), (",", "."), (";", "."), (" ", "."), (";", ","), ("\t", "
 
 def _layout(data: bytes, path: str) -> _Layout:
     """Delimiter, decimal sign, header and first line of data: data is what most of the first lines look like."""
-    raw = data[:_SAMPLE].split(b"\n", _LOOKED_AT)
+    raw = data[:HEAD].split(b"\n", _LOOKED_AT)
     lines = [_text(line) for line in raw[:_LOOKED_AT]]
     filled = [(at, line) for at, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(_MARKS)]
     if not filled:

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit
-from jaximu.recordings.columns.table import Table
+from jaximu.recordings.columns.table import HEAD, Table
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
@@ -193,7 +193,7 @@ def read(data: bytes, source: Source) -> Table:
     declared = _DECLARED.search(data)
     if declared is not None:
         return _declared(data, source, declared)
-    sample = _of(data[: 1 << 18])
+    sample = _of(data[:HEAD])
     rows = [] if sample is None else list(_rows(_text(data), sample))
     if sample is None or len(rows) < 2:
         raise InputError(f"{source.path}: holds no whole samples of text with labels.")

@@ -32,7 +32,15 @@ from jaximu.recordings.columns.names import (
     header_columns,
     parse_columns,
 )
-from jaximu.recordings.columns.table import FEW, MessageSelection, Table, from_arrow, mapped_axes, named_with_units
+from jaximu.recordings.columns.table import (
+    FEW,
+    HEAD,
+    MessageSelection,
+    Table,
+    from_arrow,
+    mapped_axes,
+    named_with_units,
+)
 from jaximu.recordings.readers.records import apart, of_device
 from jaximu.recordings.recording import (
     Defect,
@@ -49,16 +57,15 @@ from jaximu.recordings.recording import (
     plausibility,
 )
 
-_HEAD = 1 << 18  # bytes in which a format shows
 _SMALL = 1 << 24  # bytes
 _TABLE = 200  # rows, up to which a file without time may be a table of pose means
 _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
 _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their rows to be in order
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
 _ENDS = sorted({2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-9, 1e-6, 1e-3)} | {86400.0, 604800.0})
-"""Seconds after which clocks begin anew: counters of 16, 24 and 32 bits, a day, a week of GPS."""
+"""Seconds after which clocks start again: counters of 16, 24 and 32 bits, a day, a week of GPS."""
 _COUNTED = 64.0  # samples that a counter tells apart at the least
-_CARRIED = 10.0  # sample intervals between the last stamp before a clock began anew and the first after
+_CARRIED = 10.0  # sample intervals between the last stamp before a clock started again and the first after
 _FEW_SHARED, _FEW_SHARES = 10, 0.02  # rows, and share of them, from which on repeated stamps are a habit
 _SHARED = 0.1  # of the messages may share a stamp
 
@@ -373,7 +380,7 @@ def _recognise(path: Path) -> _Format:
             f"calibrate all: jaximu fleet {path} -o fleet.parquet."
         )
     with path.open("rb") as file:
-        head = file.read(_HEAD)
+        head = file.read(HEAD)
     if not head or head.isspace():
         raise InputError(f"{path}: is empty.")
     kind = next((kind for at, magic, kind in _MAGIC if head[at : at + len(magic)] == magic), _TEXT)
@@ -603,7 +610,7 @@ def _rising(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, lis
     """The rows of a table in the order of their stamps, each row once, and what was put right.
 
     Rows that share a stamp but differ keep it, unless so many do that the stamps are times of arrival in bursts: then
-    they follow each other by nothing. Raises InputError where the clock starts anew within the file.
+    they follow each other by nothing. Raises InputError where the clock starts again within the file.
     """
     index, unit = used[TIME]
     stamps = table.numbers(index)

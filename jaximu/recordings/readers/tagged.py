@@ -13,10 +13,8 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import MessageSelection, Table, from_arrow
+from jaximu.recordings.columns.table import HEAD, MessageSelection, Table, from_arrow
 from jaximu.recordings.recording import Source
-
-_LOOKED_AT = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ _DIALECTS = (
 
 def dialect(data: bytes) -> _Dialect | None:
     """The program that wrote a text, by the header of its rows."""
-    return next((dialect_of for dialect_of in _DIALECTS if dialect_of.sign.search(data[:_LOOKED_AT])), None)
+    return next((dialect_of for dialect_of in _DIALECTS if dialect_of.sign.search(data[:HEAD])), None)
 
 
 def read(data: bytes, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
@@ -61,7 +59,7 @@ def read(data: bytes, source: Source, selection: MessageSelection) -> tuple[Tabl
     log = dialect(data)
     assert log is not None
     tables: list[Table] = []
-    shift = 0 if b"Stream Type,F#" not in data[:_LOOKED_AT] else -1  # older versions write no index
+    shift = 0 if b"Stream Type,F#" not in data[:HEAD] else -1  # older versions write no index
     stamp = selection.stamp if selection.stamp in log.notes else "header"
     for tag, (name, first) in log.tags.items():
         rows = re.findall(rb"^" + tag.encode() + rb",.*$", data, re.MULTILINE)
