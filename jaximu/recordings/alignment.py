@@ -283,7 +283,8 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
 
     line = np.zeros(2)  # of the lag: at the middle, and by time
     power = np.add.reduceat(np.sum(changes**2, axis=1), edges[:-1])
-    whole, enough = power.sum(), (1 - _WELL) * power.sum()
+    whole = float(power.sum())
+    enough = (1 - _WELL) * whole
     normal, product = sums(0.0)
     if left(normal.sum(axis=0), product.sum(axis=0), whole) > enough:
         normal, product = (np.array(sums_at_lags) for sums_at_lags in zip(*map(sums, _LAGS), strict=True))
