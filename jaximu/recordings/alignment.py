@@ -15,6 +15,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 
 __all__ = [
+    "CORRELATED",
     "BlockMeans",
     "Clocks",
     "Turning",
@@ -38,6 +39,8 @@ _FEWEST = 20
 _LAGS = np.arange(-8.0, 8.05, 0.1)  # s
 _PARTS = 12
 """Parts of a recording from whose scatter the uncertainty of a time offset is taken."""
+CORRELATED = 0.6
+"""Correlation from which on the gyroscope turns as gravity does in the accelerometer."""
 _WELL = 0.8
 """Share of the turning that the gyroscope must explain for its stamps to be sought close to where they are."""
 
@@ -58,13 +61,14 @@ class Turning(NamedTuple):
 def signed_permutation(matrix: FloatArray) -> FloatArray:
     """Return the signed permutation (3, 3) that is nearest to a matrix whose columns may have any length."""
     columns = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-    best, found = -np.inf, np.eye(3)
+    best, nearest = -np.inf, np.eye(3)
     for order in permutations(range(3)):
-        own = columns[order, range(3)]
-        if np.sum(np.abs(own)) > best + 1e-12:
-            best, found = float(np.sum(np.abs(own))), np.zeros((3, 3))
-            found[order, range(3)] = np.where(own < 0, -1.0, 1.0)
-    return found
+        entries = columns[order, range(3)]
+        total = float(np.sum(np.abs(entries)))
+        if total > best + 1e-12:
+            best, nearest = total, np.zeros((3, 3))
+            nearest[order, range(3)] = np.where(entries < 0, -1.0, 1.0)
+    return nearest
 
 
 def turning_best(products: FloatArray) -> FloatArray:
@@ -79,7 +83,7 @@ def turning_best(products: FloatArray) -> FloatArray:
 def rotation_of(matrix: FloatArray) -> FloatArray:
     """Return the orthogonal matrix (3, 3) nearest to one whose columns may have any length."""
     u, _, v = np.linalg.svd(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
-    return np.asarray(u @ v, np.float64)
+    return u @ v
 
 
 def angle_of(rotation: FloatArray) -> float:
@@ -101,11 +105,10 @@ class BlockMeans(NamedTuple):
     time: FloatArray
     angle: FloatArray
 
-    def turned(self, late: FloatArray | float = 0.0) -> FloatArray:
-        """Return the gyroscope's angle (n, 3) from each block to the next, its stamps (n + 1,) `late` s late."""
-        at = self.centre + late
-        angle = np.stack([np.interp(at, self.time, each) for each in self.angle.T], axis=1)
-        return np.asarray(np.diff(angle, axis=0), np.float64)
+    def turned(self, delay: FloatArray | float = 0.0) -> FloatArray:
+        """Return the gyroscope's angle (n, 3) from each block to the next, its stamps (n + 1,) `delay` s late."""
+        stamps = self.centre + delay
+        return np.diff(np.stack([np.interp(stamps, self.time, axis) for axis in self.angle.T], axis=1), axis=0)
 
 
 def gravity_turning(
@@ -114,7 +117,7 @@ def gravity_turning(
     """Return how the specific force (n, 3) turns in blocks, beside the rate (m, 3); None in a short recording."""
     if min(len(force), len(rate)) < 2:
         return None
-    span = max(1, round(_BLOCK / float(np.median(np.diff(force_time)))))
+    span = max(1, round(_BLOCK / np.median(np.diff(force_time))))
     count = len(force) // span
     if count < _FEWEST:
         return None
@@ -124,7 +127,7 @@ def gravity_turning(
     steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(rate_time)[:, None]
     angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     length = np.linalg.norm(mean, axis=1)
-    usual = float(np.median(length))
+    usual = np.median(length)
     off = np.abs(length - usual) / max(usual, 1e-300)
     off = np.maximum(off[1:], off[:-1])
     change = np.diff(mean, axis=0)
@@ -134,8 +137,8 @@ def gravity_turning(
     # across a gap nobody knows what the unit did
     apart, step = np.diff(centre), np.diff(rate_time)
     weight[apart > 2 * np.median(apart)] = 0.0
-    for place in np.flatnonzero(step > max(_BLOCK, 2.5 * float(np.median(step)))):
-        first, last = np.searchsorted(centre, rate_time[place : place + 2])
+    for gap in np.flatnonzero(step > max(_BLOCK, 2.5 * np.median(step))):
+        first, last = np.searchsorted(centre, rate_time[gap : gap + 2])
         weight[max(first - 1, 0) : last] = 0.0
     return BlockMeans(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
 
@@ -153,24 +156,27 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     nothing = Turning(np.eye(3), np.full((3, 3), np.inf), 0.0, 1.0, 0.0)
     if blocks is None:
         return nothing
-    seen = (blocks.weight[:, None] * blocks.change).ravel()
+    changes = (blocks.weight[:, None] * blocks.change).ravel()
     columns = _columns(_levers(blocks), blocks.turned())
     alike = columns @ np.eye(3).ravel()
-    power, product = float(alike @ alike), float(alike @ seen)
-    total = float(seen @ seen)
+    power, product = float(alike @ alike), float(alike @ changes)
+    total = float(changes @ changes)
     if power == 0.0 or total == 0.0:
         return nothing
     normal = columns.T @ columns
     values, vectors = np.linalg.eigh(normal)
     kept = values > 1e-6 * values[-1]
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-    matrix = inverse @ (columns.T @ seen)
-    left = float(np.sum((seen - columns @ matrix) ** 2))
-    variance = np.where(kept.all(), np.diag(inverse), np.inf) * left / max(len(seen) - 9, 1)
+    matrix = inverse @ (columns.T @ changes)
+    left = float(np.sum((changes - columns @ matrix) ** 2))
+    variance = np.where(kept.all(), np.diag(inverse), np.inf) * left / max(len(changes) - 9, 1)
     return Turning(
-        matrix.reshape(3, 3), np.sqrt(variance).reshape(3, 3), 1 - left / total, product / power,
+        matrix.reshape(3, 3),
+        np.sqrt(variance).reshape(3, 3),
+        1 - left / total,
+        product / power,
         product / float(np.sqrt(power * total)),
-    )  # fmt: skip
+    )
 
 
 _CARRIED = 2.0
@@ -189,13 +195,13 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     """
     from scipy.spatial.transform import Rotation
 
-    span = max(2, round(_CARRIED / float(np.median(np.diff(force_time)))))
+    span = max(2, round(_CARRIED / np.median(np.diff(force_time))))
     starts = np.arange(0, len(force) - span + 1, span)
     starts = starts[:: max(1, len(starts) // _WINDOWS)]
     if len(starts) < _CLEAR:
         return False
     rows = starts[:, None] + np.arange(span)
-    turn = np.stack([np.interp(force_time[rows], rate_time, each) for each in (rate - np.median(rate, axis=0)).T], 2)
+    turn = np.stack([np.interp(force_time[rows], rate_time, axis) for axis in (rate - np.median(rate, axis=0)).T], 2)
     steps = turn * np.gradient(force_time)[rows][:, :, None]
     turning = np.linalg.norm(steps, axis=2).sum(axis=1) > 0.5
     if turning.sum() < _CLEAR:
@@ -215,7 +221,7 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
 def _levers(blocks: BlockMeans) -> FloatArray:
     """The weighted f × e_k (n, 3, 3), k the last index."""
     weighted = blocks.weight[:, None] * blocks.force
-    return np.asarray(np.cross(weighted[:, None], np.eye(3)).swapaxes(1, 2), np.float64)
+    return np.cross(weighted[:, None], np.eye(3)).swapaxes(1, 2)
 
 
 def _columns(levers: FloatArray, turned: FloatArray) -> FloatArray:
@@ -255,13 +261,13 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         return None
     middle = float(blocks.centre.mean())
     edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)
-    places = np.array([float(blocks.centre[a:b].mean()) for a, b in pairwise(edges)]) - middle
-    seen, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
+    places = np.array([blocks.centre[a:b].mean() for a, b in pairwise(edges)]) - middle
+    changes, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
 
     def sums(lag: float) -> tuple[FloatArray, FloatArray]:
         """Return the normal matrix (P, 9, 9) and vector (P, 9) of each part."""
         columns = _columns(levers, blocks.turned(lag)).reshape(-1, 3, 9)
-        both = columns.swapaxes(1, 2) @ np.concatenate([columns, seen[:, :, None]], axis=2)
+        both = columns.swapaxes(1, 2) @ np.concatenate([columns, changes[:, :, None]], axis=2)
         both = np.add.reduceat(both, edges[:-1])
         return both[..., :9], both[..., 9]
 
@@ -273,29 +279,30 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     def missed(lag: FloatArray, matrix: FloatArray) -> FloatArray:
         """Return the sum of squares (P,) of each part that a matrix (9,) leaves at a lag (n + 1,)."""
         explained = (_columns(levers, blocks.turned(lag)) @ matrix).reshape(-1, 3)
-        return np.add.reduceat(np.sum((seen - explained) ** 2, axis=1), edges[:-1])
+        return np.add.reduceat(np.sum((changes - explained) ** 2, axis=1), edges[:-1])
 
     line = np.zeros(2)  # of the lag: at the middle, and by time
-    power = np.add.reduceat(np.sum(seen**2, axis=1), edges[:-1])
-    whole, enough = float(power.sum()), (1 - _WELL) * float(power.sum())
+    power = np.add.reduceat(np.sum(changes**2, axis=1), edges[:-1])
+    whole = float(power.sum())
+    enough = (1 - _WELL) * whole
     normal, product = sums(0.0)
     if left(normal.sum(axis=0), product.sum(axis=0), whole) > enough:
-        normal, product = (np.array(each) for each in zip(*map(sums, _LAGS), strict=True))
+        normal, product = (np.array(sums_at_lags) for sums_at_lags in zip(*map(sums, _LAGS), strict=True))
         common = left(normal.sum(axis=1), product.sum(axis=1), whole)
-        line[0] = _LAGS[int(np.argmin(common))]
+        line[0] = _LAGS[np.argmin(common)]
         if min(common) > enough:
-            found = left(normal, product, power)
-            best = np.argmin(found, axis=0)
-            trusted = found.min(axis=0) < (1 - _WELL) * power
+            residuals = left(normal, product, power)
+            best = np.argmin(residuals, axis=0)
+            trusted = residuals.min(axis=0) < (1 - _WELL) * power
             if trusted.sum() >= 3:
                 line = _robust_line(places[trusted], _LAGS[best[trusted]])
     for step in (0.06, 0.03, 0.01, 0.01, 0.005):
         lag = line[0] + line[1] * (blocks.centre - middle)
         columns = _columns(levers, blocks.turned(lag))
-        matrix = np.asarray(np.linalg.lstsq(columns, seen.ravel(), rcond=1e-6)[0], np.float64)
-        early, there, late = (missed(lag + shift, matrix) for shift in (-step, 0.0, step))
-        bends = np.maximum(early - 2 * there + late, 0.0) / step**2
-        slope = early - late  # of a part: its shift by its curvature, no further than two steps
+        matrix = np.asarray(np.linalg.lstsq(columns, changes.ravel(), rcond=1e-6)[0], np.float64)
+        early, there, later = (missed(lag + shift, matrix) for shift in (-step, 0.0, step))
+        bends = np.maximum(early - 2 * there + later, 0.0) / step**2
+        slope = early - later  # of a part: its shift by its curvature, no further than two steps
         shifts = slope / np.maximum(np.maximum(2 * bends * step, np.abs(slope) / (2 * step)), 1e-300)
         good = bends > 1e-3 * bends.max()
         if good.sum() < 3:
@@ -310,12 +317,12 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     spread = float(np.sum(weight * rest**2)) / max(int(good.sum()) - 2, 1)
     sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))
     columns = _columns(levers, blocks.turned(line[0] + line[1] * (blocks.centre - middle)))
-    explained = 1 - float(left(columns.T @ columns, columns.T @ seen.ravel(), whole)) / max(whole, 1e-300)
+    explained = 1 - float(left(columns.T @ columns, columns.T @ changes.ravel(), whole)) / max(whole, 1e-300)
     return Clocks(float(line[0]), max(float(sigma), 1e-4), float(line[1]), float(drift_sigma), middle, explained)
 
 
 def _robust_line(x: FloatArray, y: FloatArray) -> FloatArray:
     """Return offset and slope (2,) by the median of all pairs' slopes (Theil and Sen)."""
     first, second = np.triu_indices(len(x), 1)
-    slope = float(np.median((y[second] - y[first]) / (x[second] - x[first])))
-    return np.array([float(np.median(y - slope * x)), slope])
+    slope = np.median((y[second] - y[first]) / (x[second] - x[first]))
+    return np.array([np.median(y - slope * x), slope])

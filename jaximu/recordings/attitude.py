@@ -10,9 +10,9 @@ import scipy
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 
-__all__ = ["Attitude"]
+__all__ = ["UNIT_LENGTH", "Attitude"]
 
-_LENGTH = 0.01  # off one, of a quaternion that is one
+UNIT_LENGTH = 0.01  # off one, of a quaternion that is one
 _JUMP = 2.0  # rad; between neighbouring stamps nothing turns so far
 
 
@@ -35,7 +35,7 @@ class Attitude:
 
     def __post_init__(self) -> None:
         length = np.linalg.norm(self.quaternion, axis=1)
-        bad = ~np.isfinite(length) | (np.abs(length - 1) > _LENGTH)
+        bad = ~np.isfinite(length) | (np.abs(length - 1) > UNIT_LENGTH)
         if bad.mean() > 0.5:
             raise InputError(
                 f"{self.name}: its quaternions have the length {np.median(length):.4g} and not 1: the columns are "
@@ -47,15 +47,15 @@ class Attitude:
     def usable(self) -> Attitude:
         """Return the rows whose quaternion is one, of length one and without jumps of sign."""
         length = np.linalg.norm(self.quaternion, axis=1)
-        kept = np.isfinite(length) & (np.abs(length - 1) < _LENGTH)
-        rows = {name: None if (values := getattr(self, name)) is None else values[kept]
-                for name in ("velocity", "position")}  # fmt: skip
+        kept = np.isfinite(length) & (np.abs(length - 1) < UNIT_LENGTH)
+        vectors = {"velocity": self.velocity, "position": self.position}
+        vectors = {name: values[kept] for name, values in vectors.items() if values is not None}
         notes = self.notes
         if not kept.all():
             notes += (f"{self.name}: {int(np.sum(~kept))} of {len(kept)} rows hold no attitude and are left out.",)
         unit = self.quaternion[kept] / length[kept, None]
         flips = np.concatenate([[1.0], np.cumprod(np.sign(np.sum(unit[1:] * unit[:-1], axis=1) + 1e-12))])
-        return replace(self, time=self.time[kept], quaternion=unit * flips[:, None], notes=notes, **rows)
+        return replace(self, time=self.time[kept], quaternion=unit * flips[:, None], notes=notes, **vectors)
 
     def rotation(self) -> scipy.spatial.transform.Rotation:
         """Return the rotations from the body to the upright frame."""
@@ -64,9 +64,9 @@ class Attitude:
     def turned(self) -> FloatArray:
         """Return the rotation vector (n − 1, 3), body frame, from each stamp to the next; NaN over a jump."""
         rotation = self.rotation()
-        found = (rotation[:-1].inv() * rotation[1:]).as_rotvec()
-        found[np.linalg.norm(found, axis=1) > _JUMP] = np.nan
-        return np.asarray(found)
+        turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec()
+        turned[np.linalg.norm(turned, axis=1) > _JUMP] = np.nan
+        return turned
 
     @property
     def period(self) -> float:
@@ -77,4 +77,4 @@ class Attitude:
         """Return the velocity (n, 3), differentiated where only positions are known; None without either."""
         if self.velocity is not None:
             return self.velocity
-        return None if self.position is None else np.asarray(np.gradient(self.position, self.time, axis=0))
+        return None if self.position is None else np.gradient(self.position, self.time, axis=0)

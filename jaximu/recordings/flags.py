@@ -28,22 +28,20 @@ def without_flagged(recording: Recording, path: str | os.PathLike[str]) -> Recor
     except InputError:  # a format that is no table of columns
         return recording
     notes, bad = [], np.zeros(table.source.rows, bool)
-    for place, name in enumerate(table.names or ()):
-        if not _STATUS.search(name) or table.columns[place].dtype == object:
+    for at, name in enumerate(table.names or ()):
+        if not _STATUS.search(name) or table.columns[at].dtype == object:
             continue
-        values, counts = np.unique(table.columns[place], return_counts=True)
+        values, counts = np.unique(table.columns[at], return_counts=True)
         usual = values[np.argmax(counts)]
-        off = table.columns[place] != usual
+        off = table.columns[at] != usual
         if off.mean() > 0.5:
             notes.append(f"{path}: column {name} has no usual value and was not used.")
         elif off.any():
             bad |= off
             notes.append(f"{path}: {int(off.sum())} rows whose {name} is not {usual:g} were left out.")
-    if not bad.any():
-        return replace(recording, notes=(*recording.notes, *notes))
     changed = {
         name: replace(signal, time=signal.time[~bad], values=signal.values[~bad])
         for name, signal in recording.signals.items()
-        if len(signal) == len(bad)
+        if bad.any() and len(signal) == len(bad)
     }
     return replace(recording, **changed, notes=(*recording.notes, *notes))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.equality import Comparable
@@ -22,8 +23,8 @@ from jaximu.ground.quantities import unit_text
 from jaximu.ground.reexport import later
 from jaximu.ground.summary import Block, Described, Summary, data_frame, sentence
 from jaximu.ground.tracing import is_traced
-from jaximu.ground.units import PREFIXES, SENSORS
-from jaximu.recordings.alignment import Turning, turning, turns_backwards
+from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, STANDARD_GRAVITY
+from jaximu.recordings.alignment import CORRELATED, Turning, turning, turns_backwards
 
 if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]
@@ -73,8 +74,8 @@ class Signal(Comparable):
         fill(self, "time", np.asarray(self.time, np.float64))
         fill(self, "values", values)
         for name, default in (("nominal_scale", 1.0), ("nominal_offset", 0.0)):
-            given = np.asarray(getattr(self, name), np.float64)
-            fill(self, name, np.array(np.broadcast_to(given if given.size else default, (axes,)), np.float64))
+            nominal = np.asarray(getattr(self, name), np.float64)
+            fill(self, name, np.array(np.broadcast_to(nominal if nominal.size else default, (axes,))))
         if self.time.shape != (len(values),):
             raise ValueError(f"{self.time.shape[0]} time stamps for {len(values)} samples")
 
@@ -94,9 +95,15 @@ class Signal(Comparable):
         One over the median interval would be the rate at which stamps are rounded, or a logger polls.
         """
         interval = np.diff(self.time)
-        usual = float(np.median(interval))
-        longest = _GAP * max(usual, float(np.mean(np.minimum(interval, 3 * usual))))
+        usual = np.median(interval)
+        longest = _GAP * max(usual, np.mean(np.minimum(interval, 3 * usual)))
         return float(1.0 / np.mean(interval[interval <= longest]))
+
+    @property
+    def edges(self) -> FloatArray:
+        """(n + 1,) where samples begin and end: half way between neighbours, half a period beyond the outer two."""
+        middle, half = (self.time[1:] + self.time[:-1]) / 2, 0.5 / self.rate
+        return np.concatenate([[self.time[0] - half], middle, [self.time[-1] + half]])
 
     def samples(self, seconds: float) -> int:
         """Return how many samples so many seconds are; of a half, rounding of the rate does not decide."""
@@ -108,8 +115,8 @@ class Signal(Comparable):
         steps = []
         for axis in self.si()[:20000].T:
             difference = np.asarray(np.diff(np.unique(axis)), np.float64)
-            difference = difference[difference > 1e-10 * float(np.ptp(axis))]  # rounding of the computer's
-            steps.append(float(difference.min()) ** 2 / 12 if len(difference) else 0.0)
+            difference = difference[difference > 1e-10 * np.ptp(axis)]  # rounding of the computer's
+            steps.append(difference.min() ** 2 / 12 if len(difference) else 0.0)
         return max(float(np.sum(steps)), 1e-24)
 
 
@@ -287,10 +294,9 @@ class Recording(Described, Comparable):
     @property
     def signals(self) -> dict[str, Signal]:
         """The signals that are there, by field name."""
-        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return {
             name: value
-            for name, value in fields.items()
+            for name, value in vars(self).items()
             if isinstance(value, Signal) and (len(value) or name != "accelerometer")
         }
 
@@ -342,33 +348,40 @@ class Recording(Described, Comparable):
     def summary(self) -> Summary:
         """Return which sensors are in it, their units, rates and durations, and what reading it had to assume."""
         rows = [
-            (name.replace("_", " "), str(len(signal)), f"{signal.rate:.5g}" if len(signal) > 1 else "",
-             f"{signal.time[-1] - signal.time[0]:.5g}" if len(signal) else "", unit_text(signal.unit))
+            (
+                name.replace("_", " "),
+                str(len(signal)),
+                f"{signal.rate:.5g}" if len(signal) > 1 else "",
+                f"{signal.time[-1] - signal.time[0]:.5g}" if len(signal) else "",
+                unit_text(signal.unit),
+            )
             for name, signal in self.signals.items()
-        ]  # fmt: skip
+        ]
         names = ", ".join(Path(source.path).name for source in self.sources)
         longest = max(self.signals.values(), key=len)
-        said = f"{' and '.join(name for name in self.signals if name in SENSORS.values())}, " + (
-            f"{longest.time[-1] - longest.time[0]:.5g} s at {longest.rate:.5g} Hz."
-            if len(longest) > 1
-            else "one sample."
+        lasting = (
+            f"{longest.time[-1] - longest.time[0]:.5g} s at {longest.rate:.5g} Hz" if len(longest) > 1 else "one sample"
         )
+        sensors = " and ".join(name for name in self.signals if name in SENSORS.values())
         headers = ("signal", "samples", "rate [Hz]", "duration [s]", "unit")
         table = Block(headers, tuple(rows))
-        return Summary(names or "recording", (sentence(said),), table, tuple(map(sentence, self.notes)))
+        return Summary(
+            names or "recording", (sentence(f"{sensors}, {lasting}."),), table, tuple(map(sentence, self.notes))
+        )
 
 
-def recordings_of(given: "Recording | Sequence[Any]") -> list[Recording]:
+def recordings_of(recordings: "Recording | Sequence[Any]") -> list[Recording]:
     """Return one recording or several as a list. Raises InputError for anything else, saying how to read a file."""
-    found = [given] if isinstance(given, Recording) else list(given) if isinstance(given, (list, tuple)) else None
-    wrong = [given] if found is None else [each for each in found if not isinstance(each, Recording)]
-    if found is None or wrong:
-        is_path = isinstance(wrong[0], (str, PathLike))
-        what = f"the path {str(wrong[0])!r}" if is_path else f"a value of type {type(wrong[0]).__name__}"
-        how = f"jaximu.read_recording({str(wrong[0])!r})" if is_path else "jaximu.read_recording(path)"
+    several: list[Any] = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
+    for value in several:
+        if isinstance(value, Recording):
+            continue
+        is_path = isinstance(value, (str, PathLike))
+        what = f"the path {str(value)!r}" if is_path else f"a value of type {type(value).__name__}"
+        how = f"jaximu.read_recording({str(value)!r})" if is_path else "jaximu.read_recording(path)"
         frame = "" if is_path else ", or jaximu.Recording.from_dataframe(frame)"
         raise InputError(f"expected a recording, found {what}: read it with {how}{frame}.")
-    return found
+    return several
 
 
 def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[str, ...]:
@@ -381,12 +394,12 @@ def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[
     if not recordings:
         raise InputError("no recording was given.")
     first = recordings[0]
-    lacking = [each for each in recordings if not len(each.accelerometer)]
+    lacking = [recording for recording in recordings if not len(recording.accelerometer)]
     if lacking and (not alone or len(lacking) < len(recordings)):
         needed = "the other recording has one" if alone else "one is needed"
         raise InputError(f"{lacking[0].name} has no accelerometer, but {needed}.")
     for other in recordings[1:]:
-        for name in ("accelerometer", "gyroscope"):
+        for name in INERTIAL_QUANTITIES:
             a, b = getattr(first, name), getattr(other, name)
             if (a is None) != (b is None):
                 raise InputError(
@@ -464,8 +477,8 @@ def parse_axes(spec: str) -> dict[str, FloatArray]:
 
 def spelled_axes(matrix: FloatArray) -> str:
     """The text of a signed permutation (3, 3) as `axis_matrix` reads it: "x,-z,y"."""
-    places = np.argmax(np.abs(matrix), axis=1)
-    return ",".join("-" * bool(row[place] < 0) + "xyz"[place] for row, place in zip(matrix, places, strict=True))
+    columns = np.argmax(np.abs(matrix), axis=1)
+    return ",".join("-" * bool(row[column] < 0) + "xyz"[column] for row, column in zip(matrix, columns, strict=True))
 
 
 def map_signal(signal: Signal, matrix: FloatArray) -> Signal:
@@ -497,8 +510,9 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     above absolute zero.
     """
     where, accelerometer, gyroscope = recording.name, recording.accelerometer, recording.gyroscope
-    level = float(np.median(np.linalg.norm(accelerometer.si(), axis=1))) / gravity.value if len(accelerometer) else 1.0
-    if not 0.5 < level < 2.0:
+    level = np.median(np.linalg.norm(accelerometer.si(), axis=1)) / gravity.value if len(accelerometer) else 1.0
+    plausible = 0.5 < level < 2.0
+    if not plausible:
         _require_own_columns(recording, gravity)
     if 0.0 < level < 0.06 and accelerometer.unit != "count" and _no_gravity(accelerometer):
         raise InputError(
@@ -507,22 +521,20 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
             "accelerometer."
         )
     _require_one_unit(recording)
-    if not 0.5 < level < 2.0:
+    if not plausible:
         text = f"{where}: the median magnitude of accel_x, accel_y, accel_z is {level * gravity.value:.4g} m/s²"
         if accelerometer.unit == "count":
             raise InputError(f"{text} at this scale, not {gravity.value:.4g}; check --accel-scale and --accel-offset.")
         raise InputError(f"{text}, not {gravity.value:.4g} as gravity is; {_unit_advice(1.0 / level, _ACCEL_SLIPS)}.")
-    for name in ("temperature", "ambient_temperature"):
-        signal: Signal | None = getattr(recording, name)
-        if signal is not None and len(signal) and signal.values.min() < -273.15:
+    for name, signal in recording.signals.items():
+        if "temperature" in name and len(signal) and signal.values.min() < -273.15:
             raise InputError(f"{where}: column {name} falls to {signal.values.min():.4g} °C, below absolute zero.")
     if gyroscope is None or len(gyroscope) < 2 or len(accelerometer) < 2:
         return ()
-    peak = float(np.percentile(np.linalg.norm(gyroscope.si(), axis=1), 99.0))
-    found = recording.turning
-    assert found is not None
-    slope, correlation = found.slope, found.correlation
-    if abs(correlation) > 0.6 and not 1.0 / 3.0 < abs(slope) < 3.0:
+    peak = np.percentile(np.linalg.norm(gyroscope.si(), axis=1), 99.0)
+    assert recording.turning is not None
+    slope, correlation = recording.turning.slope, recording.turning.correlation
+    if abs(correlation) > CORRELATED and not 1.0 / 3.0 < abs(slope) < 3.0:
         raise InputError(
             f"{where}: gyro_x, gyro_y, gyro_z read {1.0 / abs(slope):.3g} times the rate at which gravity turns "
             f"in the accelerometer; {_time_advice(gyroscope) or _gyro_advice(gyroscope, abs(slope))}."
@@ -534,14 +546,21 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
             f"{where}: gyro_x, gyro_y, gyro_z reach {peak:.4g} rad/s, faster than any such sensor measures; "
             f"{_gyro_advice(gyroscope, 1.0 / 57.3)}."
         )
-    if correlation < -0.6 and turns_backwards(accelerometer.time, accelerometer.si(), gyroscope.time, gyroscope.si()):
+    if correlation < -CORRELATED and turns_backwards(
+        accelerometer.time, accelerometer.si(), gyroscope.time, gyroscope.si()
+    ):
         return (
             "the gyroscope turns against the accelerometer: one of them is in mirrored or opposite axes; check --axes.",
         )
     return ()
 
 
-_ACCEL_SLIPS = {9.80665: "g", 9.80665e-3: "mg", 1 / 9.80665: "m/s², stated as g", 1e-3: "mg, stated as g"}
+_ACCEL_SLIPS = {
+    STANDARD_GRAVITY: "g",
+    STANDARD_GRAVITY * 1e-3: "mg",
+    1 / STANDARD_GRAVITY: "m/s², stated as g",
+    1e-3: "mg, stated as g",
+}
 _GYRO_SLIPS = {1 / 57.29578: "deg/s", 57.29578: "rad/s, stated as deg/s", 1 / 57295.78: "mdeg/s", 1e-3: "mdeg/s"}
 
 
@@ -550,17 +569,16 @@ def _require_own_columns(recording: Recording, gravity: LocalGravity) -> None:
     gyroscope = recording.gyroscope
     if gyroscope is None or not len(gyroscope) or _no_gravity(gyroscope):
         return
-    level = float(np.median(np.linalg.norm(gyroscope.values, axis=1)))
-    if any(abs(level / each - 1) < 0.1 for each in (gravity.value, 1.0, 1000.0)):  # m/s², g, mg
+    level = np.median(np.linalg.norm(gyroscope.values, axis=1))
+    if any(abs(level / size - 1) < 0.1 for size in (gravity.value, 1.0, 1000.0)):  # m/s², g, mg
         raise InputError(
             f"{recording.name}: the magnitude of gyro_x, gyro_y, gyro_z stays at {level:.4g} as gravity's does, and "
             "that of accel_x, accel_y, accel_z does not: these columns are exchanged; change the header or --columns."
         )
 
 
-_PARTS, _ANOTHER_UNIT, _CORRELATED = 10, 5.0, 0.6
-"""Parts of a recording that are compared, by what factor its beginning and its end must differ to be in two units, and
-how closely a part's gyroscope must follow what turns in the accelerometer."""
+_PARTS, _ANOTHER_UNIT = 10, 5.0
+"""Parts of a recording that are compared, and by what factor its beginning and its end differ in two units."""
 
 
 def _require_one_unit(recording: Recording) -> None:
@@ -569,20 +587,20 @@ def _require_one_unit(recording: Recording) -> None:
     force, parts = accelerometer.si(), np.array_split(np.arange(len(accelerometer)), _PARTS)
     if len(parts[-1]) < 2:  # means of poses: nothing to compare
         return
-    levels = {"accel_x, accel_y, accel_z": [float(np.median(np.linalg.norm(force[part], axis=1))) for part in parts]}
+    levels = {"accel_x, accel_y, accel_z": [np.median(np.linalg.norm(force[part], axis=1)) for part in parts]}
     if gyroscope is not None:
-        rates, read = gyroscope.si(), []
+        rates, ratios = gyroscope.si(), []
         for part in parts:
             time = accelerometer.time[part]
-            own = slice(*np.searchsorted(gyroscope.time, time[[0, -1]]))
-            found = turning(time, force[part], gyroscope.time[own], rates[own])
-            read.append(1 / abs(found.slope) if abs(found.correlation) > _CORRELATED else np.nan)
-        levels["gyro_x, gyro_y, gyro_z"] = read
+            inside = slice(*np.searchsorted(gyroscope.time, time[[0, -1]]))
+            turned = turning(time, force[part], gyroscope.time[inside], rates[inside])
+            ratios.append(1 / abs(turned.slope) if abs(turned.correlation) > CORRELATED else np.nan)
+        levels["gyro_x, gyro_y, gyro_z"] = ratios
     for columns, level in levels.items():
-        place, factor = _step(np.log(np.maximum(level, 1e-9)))
-        if factor > _ANOTHER_UNIT or factor < 1 / _ANOTHER_UNIT:
+        step_part, factor = _step(np.log(np.maximum(level, 1e-9)))
+        if not 1 / _ANOTHER_UNIT <= factor <= _ANOTHER_UNIT:
             raise InputError(
-                f"{recording.name}: from about {accelerometer.time[parts[place][0]]:.3g} s on, {columns} read "
+                f"{recording.name}: from about {accelerometer.time[parts[step_part][0]]:.3g} s on, {columns} read "
                 f"{factor:.3g} times what they read before: the unit changes within the file (data.units). Cut the "
                 "file there, or bring its rows to one unit."
             )
@@ -590,16 +608,16 @@ def _require_one_unit(recording: Recording) -> None:
 
 def _step(logarithms: FloatArray) -> tuple[int, float]:
     """Return the part at which a step lies, and its factor: 1 unless all before it and all after it are much alike."""
-    best, found = 0.0, (0, 1.0)
-    for place in range(1, len(logarithms) - 1):  # which may hold the step itself
-        before, after = (side[np.isfinite(side)] for side in (logarithms[:place], logarithms[place + 1 :]))
+    clearest, result = 0.0, (0, 1.0)
+    for part in range(1, len(logarithms) - 1):  # which may hold the step itself
+        before, after = (side[np.isfinite(side)] for side in (logarithms[:part], logarithms[part + 1 :]))
         if len(before) < 2 or len(after) < 2:
             continue
-        step, spread = float(np.median(after) - np.median(before)), max(np.ptp(before), np.ptp(after))
-        if spread < abs(step) / 2 and abs(step) - spread > best:
-            changed = abs(logarithms[place] - np.median(after)) < abs(step) / 2
-            best, found = abs(step) - spread, (place if changed else place + 1, float(np.exp(step)))
-    return found
+        step, spread = np.median(after) - np.median(before), max(np.ptp(before), np.ptp(after))
+        if spread < abs(step) / 2 and abs(step) - spread > clearest:
+            changed = abs(logarithms[part] - np.median(after)) < abs(step) / 2
+            clearest, result = abs(step) - spread, (part if changed else part + 1, float(np.exp(step)))
+    return result
 
 
 _SLOWEST, _FASTEST = 2.0, 50e3
@@ -639,6 +657,11 @@ def _unit_advice(ratio: float, slips: dict[float, str]) -> str:
     if abs(np.log(ratio / nearest)) > np.log(1.6):
         return "check the unit in the column name or in --columns"
     return f"these columns look like {slips[nearest]}: change the unit in the header or with --columns"
+
+
+def runs_of(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """(k, 2) first and last + 1 of every run of True."""
+    return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
 
 
 def smoothed_slope(time: FloatArray, values: FloatArray, window: float) -> FloatArray:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 from typing import Protocol as Interface
 
 import numpy as np
@@ -18,11 +17,9 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.recordings.attitude import UNIT_LENGTH
 from jaximu.recordings.readers.schedule import ScheduleEntry
-from jaximu.recordings.recording import Recording, Signal
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
+from jaximu.recordings.recording import Recording, Signal, runs_of
 
 __all__ = ["Entry", "Integral", "entries_of_columns", "match_reference", "rest_rate"]
 
@@ -33,6 +30,7 @@ _STILL = np.radians(0.5)  # rad/s, of a reference at rest
 _NOISY = 6.0  # times the usual rate of a reference at rest, which its noise alone does not reach
 _WINDOW = 0.25  # s, over which a reference's rate is taken
 _SHORTEST, _LONGEST_TURN = 1.0, 120.0  # s
+_SMALLEST_TURN = np.radians(5)
 
 
 class Entry(Interface):
@@ -59,8 +57,7 @@ class Integral:
     """The running integral of a signal, each sample holding from half way to the one before to half way to the next."""
 
     def __init__(self, signal: Signal, values: FloatArray):
-        middle, period = (signal.time[1:] + signal.time[:-1]) / 2, 1 / signal.rate
-        self.edges = np.concatenate([[signal.time[0] - period / 2], middle, [signal.time[-1] + period / 2]])
+        self.edges = signal.edges
         self.origin = values.mean(axis=0)  # the sums of what is left lose fewer digits
         steps = (values - self.origin) * np.diff(self.edges)[:, None]
         self.sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
@@ -74,7 +71,7 @@ class Integral:
 
 def rest_rate(integral: Integral, entries: Sequence[Entry]) -> FloatArray:
     """The median of the mean outputs in poses: the gyroscope's bias, for purposes that do not ask for more."""
-    rests = np.array([(each.start, each.stop) for each in entries if each.kind == "pose"])
+    rests = np.array([(entry.start, entry.stop) for entry in entries if entry.kind == "pose"])
     if not len(rests):
         return np.zeros(3)
     return np.median(integral.over(*rests.T) / np.diff(rests), axis=0)
@@ -86,28 +83,28 @@ def match_reference(recording: Recording, entries: Sequence[Entry]) -> tuple[lis
     Raises `InputError` where the reference does not fit the recording, `NotPossibleError` where nothing is left.
     """
     notes: list[str] = []
-    found = [each for each in entries if _inside(recording, each, notes)]
-    if not found:
-        raise NotPossibleError(f"{recording.name}: the reference names no pose or turn that can be used.")
-    gyroscope, where = recording.gyroscope, recording.name
-    rate = None if gyroscope is None else Integral(gyroscope, gyroscope.si())
-    if rate is not None:
-        bias = rest_rate(rate, found)
-        found = [_with_sense(each, rate, bias, notes) for each in found]
-        _require_units(found, rate, bias, where)
-        _require_clock(found, rate, bias, where)
-        for each in found:
-            if each.kind == "turn":
-                _require_turn(each, _turned(each, rate, bias), where)
-    _require_poses(recording, [each for each in found if each.kind == "pose"], where)
-    return found, tuple(notes)
+    usable = [entry for entry in entries if _inside(recording, entry, notes)]
+    where, gyroscope = recording.name, recording.gyroscope
+    if not usable:
+        raise NotPossibleError(f"{where}: the reference names no pose or turn that can be used.")
+    if gyroscope is not None:
+        rate = Integral(gyroscope, gyroscope.si())
+        bias = rest_rate(rate, usable)
+        usable = [_with_sense(entry, rate, bias, notes) for entry in usable]
+        turns = [(entry, _turned(entry, rate, bias)) for entry in usable if entry.kind == "turn"]
+        _require_units(turns, where)
+        _require_clock(usable, rate, bias, where)
+        for entry, turned in turns:
+            _require_turn(entry, turned, where)
+    _require_poses(recording, [entry for entry in usable if entry.kind == "pose"], where)
+    return usable, tuple(notes)
 
 
-def _label(each: Entry) -> str:
-    return f"{getattr(each, 'label', 'the ' + each.kind)} ({each.start:.6g} to {each.stop:.6g} s)"
+def _label(entry: Entry) -> str:
+    return f"{getattr(entry, 'label', 'the ' + entry.kind)} ({entry.start:.6g} to {entry.stop:.6g} s)"
 
 
-def _inside(recording: Recording, each: Entry, notes: list[str]) -> bool:
+def _inside(recording: Recording, entry: Entry, notes: list[str]) -> bool:
     """Whether the log holds an entry without a gap."""
     there = [signal for signal in recording.signals.values() if len(signal) > 1]
     first, last = min(signal.time[0] for signal in there), max(signal.time[-1] for signal in there)
@@ -115,78 +112,71 @@ def _inside(recording: Recording, each: Entry, notes: list[str]) -> bool:
         if signal is None or not len(signal):
             continue
         slack = 1.5 / signal.rate
-        if each.start < first - slack or each.stop > last + slack:
+        if entry.start < first - slack or entry.stop > last + slack:
             raise InputError(
-                f"{_label(each)} lies outside of the log ({first:.6g} to {last:.6g} s): the reference is not on the "
+                f"{_label(entry)} lies outside of the log ({first:.6g} to {last:.6g} s): the reference is not on the "
                 "log's clock, or belongs to another log."
             )
-        inside = signal.time[(signal.time > each.start) & (signal.time < each.stop)]
-        stamps = np.concatenate([[each.start], inside, [each.stop]])
+        inside = signal.time[(signal.time > entry.start) & (signal.time < entry.stop)]
+        stamps = np.concatenate([[entry.start], inside, [entry.stop]])
         if len(inside) < 3 or np.diff(stamps).max() > max(5 / signal.rate, 0.05):
-            notes.append(f"{_label(each)} is left out: samples are missing there.")
+            notes.append(f"{_label(entry)} is left out: samples are missing there.")
             return False
     return True
 
 
-def _turned(each: Entry, rate: Integral, bias: FloatArray) -> FloatArray:
+def _turned(entry: Entry, rate: Integral, bias: FloatArray) -> FloatArray:
     """The angle (3,), rad, that the gyroscope shows."""
-    return rate.over(each.start, each.stop) - bias * (each.stop - each.start)
+    return rate.over(entry.start, entry.stop) - bias * (entry.stop - entry.start)
 
 
-def _with_sense(each: Entry, rate: Integral, bias: FloatArray, notes: list[str]) -> Entry:
-    if each.kind == "pose" or not math.isnan(each.angle):
-        return each
-    sense = math.copysign(2 * math.pi, float(_turned(each, rate, bias) @ each.vector))
+def _with_sense(entry: Entry, rate: Integral, bias: FloatArray, notes: list[str]) -> Entry:
+    if entry.kind == "pose" or not math.isnan(entry.angle):
+        return entry
+    sense = math.copysign(2 * math.pi, _turned(entry, rate, bias) @ entry.vector)
     notes.append("turns whose angle is not stated are taken as 360° in the sense that the gyroscope shows.")
-    assert isinstance(each, ScheduleEntry)
-    return replace(each, angle=sense)
+    assert isinstance(entry, ScheduleEntry)
+    return replace(entry, angle=sense)
 
 
-def _require_units(entries: Sequence[Entry], rate: Integral, bias: FloatArray, where: str) -> None:
-    ratios = [float(_turned(e, rate, bias) @ e.vector) / e.angle for e in entries if e.kind == "turn"]
-    if not ratios:
-        return
-    ratio = float(np.median(np.abs(ratios)))
-    for slip, text in (
-        (57.29578, "its angles are in rad though its header says deg, or the gyroscope is in deg/s though its columns "
-                   "say rad/s"),
-        (1 / 57.29578, "its angles are in deg though its header says rad, or the gyroscope is in rad/s though its "
-                       "columns say deg/s"),
-    ):  # fmt: skip
+def _require_units(turns: Sequence[tuple[Entry, FloatArray]], where: str) -> None:
+    """Refuse angles in another unit than the gyroscope's; `turns`: with the angle (3,) that the gyroscope shows."""
+    ratio = np.median([abs(turned @ entry.vector / entry.angle) for entry, turned in turns] or [1.0])
+    for slip, unit, other in ((57.29578, "rad", "deg"), (1 / 57.29578, "deg", "rad")):
         if abs(math.log(max(ratio, 1e-9) / slip)) < math.log(1.4):
             raise InputError(
-                f"{where}: the gyroscope turns {ratio:.3g} times as far as the reference says: {text}; correct the "
-                "unit."
+                f"{where}: the gyroscope turns {ratio:.3g} times as far as the reference says: its angles are in "
+                f"{unit} though its header says {other}, or the gyroscope is in {other}/s though its columns say "
+                f"{unit}/s; correct the unit."
             )
 
 
 def _require_clock(entries: Sequence[Entry], rate: Integral, bias: FloatArray, where: str) -> None:
     """Refuse a reference whose poses hold motion, and say which shift would suit better."""
     moving = []
-    for each in entries:
-        if each.kind == "pose":
-            edges = np.linspace(each.start, each.stop, max(2, math.ceil(each.stop - each.start) + 1))
+    for entry in entries:
+        if entry.kind == "pose":
+            edges = np.linspace(entry.start, entry.stop, max(2, math.ceil(entry.stop - entry.start) + 1))
             mean = rate.over(edges[:-1], edges[1:]) / np.diff(edges)[:, None] - bias
             if np.linalg.norm(mean, axis=1).max() > _MOVING:
-                moving.append(each)
+                moving.append(entry)
     if not moving:
         return
-    span = np.array([(each.start, each.stop) for each in entries])
-    said = np.array([each.angle * each.vector if each.kind == "turn" else np.zeros(3) for each in entries])
-
-    rest = ~said.any(axis=1)
+    span = np.array([(entry.start, entry.stop) for entry in entries])
+    stated = np.array([entry.angle * entry.vector if entry.kind == "turn" else np.zeros(3) for entry in entries])
+    rest = ~stated.any(axis=1)
     weight = np.where(rest, 100.0, 1.0)  # turns are off by the scale's error, rests by next to nothing
 
     def misfit(shift: float) -> float:
         start, stop = (np.clip(edge + shift, rate.edges[0], rate.edges[-1] - 1e-3) for edge in span.T)
         turned, duration = rate.over(start, stop), np.maximum(stop - start, 1e-3)[:, None]
-        own = np.median(turned[rest] / duration[rest], axis=0)  # the bias, were this the right shift
-        return float(np.sum(weight * np.abs(turned - own * duration - said).sum(axis=1)))
+        shifted_bias = np.median(turned[rest] / duration[rest], axis=0)
+        return float(np.sum(weight * np.abs(turned - shifted_bias * duration - stated).sum(axis=1)))
 
-    found = [misfit(shift) for shift in _SHIFTS]
-    best = float(_SHIFTS[int(np.argmin(found))])
+    misfits = [misfit(shift) for shift in _SHIFTS]
+    best = _SHIFTS[np.argmin(misfits)]
     text = f"{where}: the unit moves in {len(moving)} of the poses, first in {_label(moving[0])}"
-    if min(found) < 0.5 * misfit(0.0) and abs(best) > 0.1:
+    if min(misfits) < 0.5 * misfit(0.0) and abs(best) > 0.1:
         raise InputError(
             f"{text}: the reference does not match the log in time. It would, were it about {abs(best):.1f} s "
             f"{'later' if best > 0 else 'earlier'}: add {best:+.1f} s to its times."
@@ -194,30 +184,29 @@ def _require_clock(entries: Sequence[Entry], rate: Integral, bias: FloatArray, w
     raise InputError(f"{text}: the reference does not match the log in time, or belongs to another log.")
 
 
-def _require_turn(each: Entry, turned: FloatArray, where: str) -> None:
-    along = float(turned @ each.vector)
-    across = float(np.linalg.norm(turned - along * each.vector))
-    if 0.7 < along / each.angle < 1.4 and across < 0.3 * abs(each.angle):
+def _require_turn(entry: Entry, turned: FloatArray, where: str) -> None:
+    along = turned @ entry.vector
+    across = np.linalg.norm(turned - along * entry.vector)
+    if 0.7 < along / entry.angle < 1.4 and across < 0.3 * abs(entry.angle):
         return
-    said = f"{where}: {_label(each)} says {math.degrees(each.angle):.4g}° about its axis; the gyroscope shows "
-    if 0.7 < -along / each.angle < 1.4:
+    text = f"{where}: {_label(entry)} says {math.degrees(entry.angle):.4g}° about its axis; the gyroscope shows "
+    if 0.7 < -along / entry.angle < 1.4:
         raise InputError(
-            f"{said}{math.degrees(along):.4g}°: the sense is turned round in the reference, or the gyroscope's axis "
+            f"{text}{math.degrees(along):.4g}°: the sense is turned round in the reference, or the gyroscope's axis "
             "(see --axes)."
         )
     shown = ", ".join(f"{value:.4g}°" for value in np.degrees(turned))
-    raise InputError(f"{said}{shown} about x, y, z: the reference does not describe this turn, or not at this time.")
+    raise InputError(f"{text}{shown} about x, y, z: the reference does not describe this turn, or not at this time.")
 
 
 def _require_poses(recording: Recording, poses: Sequence[Entry], where: str) -> None:
     if not poses or not len(recording.accelerometer):
         return
     force = Integral(recording.accelerometer, recording.accelerometer.si())
-    span = np.array([(each.start, each.stop) for each in poses])
-    read = force.over(*span.T)
+    read = force.over(*np.array([(pose.start, pose.stop) for pose in poses]).T)
     read = read / np.linalg.norm(read, axis=1, keepdims=True)
-    said = np.stack([each.vector for each in poses])
-    off = np.degrees(np.arccos(np.clip(np.sum(read * said, axis=1), -1, 1)))
+    stated = np.stack([pose.vector for pose in poses])
+    off = np.degrees(np.arccos(np.clip(np.sum(read * stated, axis=1), -1, 1)))
     if not (off > _OFF).any():
         return
     if (off > 180 - _OFF).all():
@@ -226,10 +215,10 @@ def _require_poses(recording: Recording, poses: Sequence[Entry], where: str) -> 
             "force; say so with --axes=-f."
         )
     worst = int(np.argmax(off))
-    alike = [k for k in range(len(poses)) if k != worst and read[k] @ read[worst] > math.cos(math.radians(5))
-             and said[k] @ said[worst] < math.cos(math.radians(_OFF))]  # fmt: skip
+    same = (read @ read[worst] > math.cos(math.radians(5))) & (stated @ stated[worst] < math.cos(math.radians(_OFF)))
+    alike = np.flatnonzero(same)
     text = f"{where}: {_label(poses[worst])}: the accelerometer reads "
-    if alike:
+    if len(alike):
         raise InputError(
             f"{text}the same pose as in {_label(poses[alike[0]])}, which has another name: one pose stands under two "
             "names."
@@ -269,56 +258,53 @@ def entries_of_columns(recording: Recording) -> list[Entry]:
 
 def _rests(time: FloatArray, moved: FloatArray, where: str) -> FloatArray:
     """Intervals (n, 2) over which the reference rests; `moved` (n,) is its rate at each stamp, its noise included."""
-    lowest = float(np.percentile(moved, 5))
-    limit = float(np.clip(_NOISY * np.median(moved[moved <= 3 * lowest]), _STILL, _MOVING))
-    still = np.concatenate([[False], moved < limit, [False]])
-    edges = np.flatnonzero(np.diff(still.astype(int)))
-    spans = np.stack([time[edges[::2]] + _WINDOW, time[edges[1::2] - 1] - _WINDOW], axis=1)
+    lowest = np.percentile(moved, 5)
+    limit = np.clip(_NOISY * np.median(moved[moved <= 3 * lowest]), _STILL, _MOVING)
+    runs = runs_of(moved < limit)
+    spans = np.stack([time[runs[:, 0]] + _WINDOW, time[runs[:, 1] - 1] - _WINDOW], axis=1)
     spans = spans[spans[:, 1] - spans[:, 0] >= _SHORTEST]
     if not len(spans):
         raise NotPossibleError(f"{where}: the reference never rests for {_SHORTEST:g} s: record rests between turns.")
     return spans
 
 
+def _neighbours(count: int, samples: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The samples so many before and after each of `count`, as far as there are any."""
+    step, index = max(1, round(samples)), np.arange(count)
+    return np.maximum(index - step, 0), np.minimum(index + step, count - 1)
+
+
 def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[Entry]:
     length = np.linalg.norm(attitude.values, axis=1)
-    if (np.abs(length - 1) > 0.01).any():
-        place = int(np.argmax(np.abs(length - 1)))
+    if (np.abs(length - 1) > UNIT_LENGTH).any():
+        worst = np.argmax(np.abs(length - 1))
         raise InputError(
-            f"{recording.name}: the attitude at {attitude.time[place]:.6g} s has the length {length[place]:.4g}; a "
+            f"{recording.name}: the attitude at {attitude.time[worst]:.6g} s has the length {length[worst]:.4g}; a "
             "unit quaternion has the length 1."
         )
 
-    def at(places: NDArray[Any]) -> Rotation:
-        return scipy.spatial.transform.Rotation.from_quat(attitude.values[places], scalar_first=True)
-
-    step = max(1, round(_WINDOW * attitude.rate / 2))
-    here = np.arange(len(attitude))
-    before, after = np.maximum(here - step, 0), np.minimum(here + step, len(attitude) - 1)
-    angle = (at(before).inv() * at(after)).magnitude()
+    rotation = scipy.spatial.transform.Rotation.from_quat(attitude.values, scalar_first=True)
+    before, after = _neighbours(len(attitude), _WINDOW * attitude.rate / 2)
+    angle = (rotation[before].inv() * rotation[after]).magnitude()
     spans = _rests(attitude.time, angle / (attitude.time[after] - attitude.time[before]), recording.name)
     entries: list[Entry] = []
-    for place, (start, stop) in enumerate(spans):
+    for index, (start, stop) in enumerate(spans):
         inside = (attitude.time >= start) & (attitude.time <= stop)
-        up = at(inside).inv().apply([0.0, 0.0, 1.0]).mean(axis=0)
+        up = rotation[inside].inv().apply([0.0, 0.0, 1.0]).mean(axis=0)
         entries.append(ScheduleEntry(start, stop, "pose", up / np.linalg.norm(up), label="the pose"))
-        if place + 1 < len(spans) and spans[place + 1, 0] - stop < _LONGEST_TURN:
-            during = np.flatnonzero((attitude.time >= stop) & (attitude.time <= spans[place + 1, 0]))
-            total = (at(during[:-1]).inv() * at(during[1:])).as_rotvec().sum(axis=0)
+        if index + 1 < len(spans) and (following := spans[index + 1, 0]) - stop < _LONGEST_TURN:
+            during = rotation[(attitude.time >= stop) & (attitude.time <= following)]
+            total = (during[:-1].inv() * during[1:]).as_rotvec().sum(axis=0)
             turned = float(np.linalg.norm(total))
-            if turned > np.radians(5):
-                entries.append(
-                    ScheduleEntry(stop, spans[place + 1, 0], "turn", total / turned, turned, label="the turn")
-                )
+            if turned > _SMALLEST_TURN:
+                entries.append(ScheduleEntry(stop, following, "turn", total / turned, turned, label="the turn"))
     return entries
 
 
 def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray) -> list[Entry]:
-    step = max(1, round(_WINDOW / np.median(np.diff(time)) / 2))
-    here = np.arange(len(time))
-    before, after = np.maximum(here - step, 0), np.minimum(here + step, len(time) - 1)
+    before, after = _neighbours(len(time), _WINDOW / np.median(np.diff(time)) / 2)
     moved = np.abs(angle[after] - angle[before]) / (time[after] - time[before])
-    if recording.gyroscope is not None:  # a unit is mounted anew while the table stands
+    if recording.gyroscope is not None:  # a unit is mounted again while the table stands
         rate = Integral(recording.gyroscope, recording.gyroscope.si())
         mean = rate.over(time[before], time[after]) / (time[after] - time[before])[:, None]
         off = np.linalg.norm(mean - np.median(mean[moved < _STILL], axis=0), axis=1)
@@ -330,25 +316,25 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
             "table turns; write a schedule."
         )
     force = Integral(recording.accelerometer, recording.accelerometer.si())
+    read = force.over(*spans.T)
+    size = np.abs(read)
+    axis = np.argmax(size, axis=1)
+    ups = np.sign(np.take_along_axis(read, axis[:, None], 1)) * np.eye(3)[axis]
+    off = np.degrees(np.arccos(np.minimum(1.0, size.max(axis=1) / np.linalg.norm(read, axis=1))))
+    if len(tilted := np.flatnonzero(off > _OFF)):
+        first = tilted[0]
+        start, stop = spans[first]
+        raise NotPossibleError(
+            f"{recording.name}: from {start:.6g} to {stop:.6g} s no axis of the body is vertical ({off[first]:.0f}° "
+            "off): table columns describe only turns about a vertical body axis; write a schedule for other poses."
+        )
     entries: list[Entry] = []
-    ups = []
-    for start, stop in spans:
-        read = force.over(start, stop)
-        place = int(np.argmax(np.abs(read)))
-        up = np.sign(read[place]) * np.eye(3)[place]
-        off = math.degrees(math.acos(min(1.0, abs(read[place]) / float(np.linalg.norm(read)))))
-        if off > _OFF:
-            raise NotPossibleError(
-                f"{recording.name}: from {start:.6g} to {stop:.6g} s no axis of the body is vertical ({off:.0f}° off): "
-                "table columns describe only turns about a vertical body axis; write a schedule for other poses."
-            )
-        ups.append(up)
-    for place, ((start, stop), up) in enumerate(zip(spans, ups, strict=True)):
+    for index, ((start, stop), up) in enumerate(zip(spans, ups, strict=True)):
         heading = float(np.interp((start + stop) / 2, time, angle)) if recording.table_angle is not None else None
         entries.append(ScheduleEntry(start, stop, "pose", up, heading=heading, label="the pose"))
-        if place + 1 < len(spans) and up @ ups[place + 1] > 0.5:
-            following = spans[place + 1, 0]
+        if index + 1 < len(spans) and up @ ups[index + 1] > 0.5:
+            following = spans[index + 1, 0]
             turned = float(np.interp(following, time, angle) - np.interp(stop, time, angle))
-            if abs(turned) > np.radians(5) and following - stop < _LONGEST_TURN:
+            if abs(turned) > _SMALLEST_TURN and following - stop < _LONGEST_TURN:
                 entries.append(ScheduleEntry(stop, following, "turn", up, turned, label="the turn"))
     return entries

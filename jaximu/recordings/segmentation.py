@@ -15,9 +15,11 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
+from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.stimulus import REFERENCE_TEMPERATURE
 from jaximu.recordings.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
-from jaximu.recordings.recording import PoseMeans, Recording, Signal
+from jaximu.recordings.recording import PoseMeans, Recording, Signal, runs_of
 
 __all__ = [
     "Segmentation",
@@ -55,7 +57,6 @@ class SegmentationOptions:
     threshold: float | None = None
     fewest: int = 2
     rate_limit: float = float(np.radians(0.3))
-    temperature_reference: float = 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +75,7 @@ class Segmentation(Comparable):
 
     def table(self) -> str:
         """Say in one line how many intervals each threshold gave."""
-        return _table(self.tried)
-
-
-def _table(tried: Sequence[tuple[float, int, int, float]]) -> str:
-    return ", ".join(f"{count} at {factor:g}x" for factor, count, _, _ in tried)
+        return ", ".join(f"{count} at {factor:g}x" for factor, count, _, _ in self.tried)
 
 
 class _Moments:
@@ -96,13 +93,6 @@ class _Moments:
     def between(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
         """Mean (W, 3) and unbiased variance (W, 3) of the samples from `start` to before `stop`, and their number."""
         first, last = np.searchsorted(self.signal.time, start), np.searchsorted(self.signal.time, stop)
-        return self._over(first, last)
-
-    def total_variance(self) -> float:
-        """Variance of all samples, summed over the axes."""
-        return float(self._over(np.array([0]), np.array([len(self.signal)]))[1].sum())
-
-    def _over(self, first, last):
         count = last - first
         safe = np.maximum(count, 2)
         mean, square = ((sums[:, last] - sums[:, first]) / safe for sums in (self._sums, self._squares))
@@ -121,26 +111,22 @@ def _floor(variance: FloatArray, moments: _Moments) -> float:
     """The variance of windows at rest: the median of those near the lowest."""
     finite = variance[np.isfinite(variance)]
     lowest = np.percentile(finite, 5)
-    floor = float(np.median(finite[finite <= 3 * lowest]))
+    floor = np.median(finite[finite <= 3 * lowest])
     # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
     # simulated output without noise is constant but for the rounding of the running sums.
-    rounding = float(np.finfo(np.float64).eps) * len(moments.signal) * moments.total_variance()
+    total = float(moments.between(np.array([-np.inf]), np.array([np.inf]))[1].sum())
+    rounding = np.finfo(np.float64).eps * len(moments.signal) * total
     return max(floor, moments.signal.rounding_variance, rounding)
 
 
-def _runs(still: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
-    return edges[::2], edges[1::2]
-
-
-def _angles(vectors: FloatArray) -> FloatArray:
-    """Angle (rad) between each vector and the next."""
-    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return 2 * np.arcsin(np.clip(np.linalg.norm(np.diff(unit, axis=0), axis=1) / 2, 0, 1))
+def _angles(vectors: FloatArray, others: FloatArray) -> FloatArray:
+    """Angle (rad) between each vector and the other of its row."""
+    units, other_units = (rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (vectors, others))
+    return 2 * np.arcsin(np.clip(np.linalg.norm(other_units - units, axis=1) / 2, 0, 1))
 
 
 def _samples(signal: Signal, start: float, stop: float) -> slice:
-    return slice(int(np.searchsorted(signal.time, start)), int(np.searchsorted(signal.time, stop)))
+    return slice(np.searchsorted(signal.time, start), np.searchsorted(signal.time, stop))
 
 
 def segment(recording: Recording, options: SegmentationOptions | None = None) -> Segmentation:
@@ -154,57 +140,49 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     signals = [accelerometer] if gyroscope is None else [accelerometer, gyroscope]
     # A slow logger needs a longer window to hold enough samples for a variance.
     width = max(options.window, 10 / min(signal.rate for signal in signals))
-    begin = max(signal.time[0] for signal in signals) + width / 2
+    start = max(signal.time[0] for signal in signals) + width / 2
     end = min(signal.time[-1] for signal in signals) - width / 2
-    if end - begin < width:
+    if end - start < width:
         raise NotPossibleError(
-            f"{recording.name}: the recording lasts {end - begin + width:.2f} s, too short to find poses: record at "
+            f"{recording.name}: the recording lasts {end - start + width:.2f} s, too short to find poses: record at "
             "least nine orientations at rest for two seconds or more each, with turns between them."
         )
     step = width / 8
-    centres = np.arange(begin, end + step / 2, step)
+    centres = np.arange(start, end + step / 2, step)
 
-    means: list[FloatArray] = []
-    ratios: list[FloatArray] = []
-    floors: list[float] = []
     moments = [_Moments(signal) for signal in signals]
-    for signal, running in zip(signals, moments, strict=True):
-        mean, variance = _windows(running, centres, width)
+    means, variances = zip(*(_windows(running, centres, width) for running in moments), strict=True)
+    for signal, variance, name in zip(signals, variances, INERTIAL_QUANTITIES, strict=False):
         if not np.isfinite(variance).any():
-            name = "accelerometer" if signal is accelerometer else "gyroscope"
             raise NotPossibleError(
                 f"{recording.name}: the {name} has too many gaps: nowhere does it keep its rate of {signal.rate:.4g} "
                 "Hz for long enough to separate rest from motion."
             )
-        means.append(mean)
-        floors.append(_floor(variance, running))
-        ratios.append(variance / floors[-1])
-    ratio: FloatArray = np.max(np.stack(ratios), axis=0)
-
+    floors = [_floor(variance, running) for variance, running in zip(variances, moments, strict=True)]
+    ratio = np.max([variance / floor for variance, floor in zip(variances, floors, strict=True)], axis=0)
     turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
-
     sums = np.vstack([np.zeros(3), np.cumsum(means[0], axis=0)])
 
     def runs(factor: float) -> tuple[FloatArray, int]:
         # A unit held by hand trembles: where much variance must pass as still, so must the mean rate it brings along.
-        first, last = _runs((ratio < factor) & (turning < max(1.0, np.sqrt(factor / 12))))
+        first, last = runs_of((ratio < factor) & (turning < max(1.0, np.sqrt(factor / 12)))).T
         # Every window of a run passed as a whole. What motion it may hold at its outer end, where motion sets in
         # gently, grows with the variance that passes: so does what is cut off there, from 1/8 to 3/4 of a window.
         cut = width * min(np.log2(factor) / 8, 0.75)
         if gyroscope is not None:  # a rate of c t² over a part x of a window adds c² x⁵ / 5 w to its variance
             cut = max(cut, min((5 * width * factor * floors[-1] / _ONSET**2) ** 0.2, width))
-        reach = width / 2 - cut
-        found = np.stack([centres[first] - reach, centres[last - 1] + reach], axis=1)
-        long = found[:, 1] - found[:, 0] >= options.minimum_duration
+        margin = width / 2 - cut
+        intervals = np.stack([centres[first] - margin, centres[last - 1] + margin], axis=1)
+        long = np.diff(intervals)[:, 0] >= options.minimum_duration
         directions = (sums[last[long]] - sums[first[long]]) / (last - first)[long, None]
-        distinct = 1 + int(np.sum(_angles(directions) > _DISTINCT)) if len(directions) > 1 else len(directions)
-        return found[long], distinct
+        distinct = int(len(directions) > 0) + int(np.sum(_angles(directions[:-1], directions[1:]) > _DISTINCT))
+        return intervals[long], distinct
 
     factors = THRESHOLDS if options.threshold is None else (options.threshold,)
     results = [runs(factor) for factor in factors]
     tried = tuple(
-        (float(factor), len(found), distinct, float(np.sum(found[:, 1] - found[:, 0])))
-        for factor, (found, distinct) in zip(factors, results, strict=True)
+        (float(factor), len(intervals), distinct, float(np.sum(np.diff(intervals))))
+        for factor, (intervals, distinct) in zip(factors, results, strict=True)
     )
     # The lowest threshold that finds about all orientations there are without breaking poses in two.
     score = np.array([distinct - 0.5 * (count - distinct) for _, count, distinct, _ in tried])
@@ -212,7 +190,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     chosen = int(np.flatnonzero(score >= best - 0.05 * abs(best))[0])
     intervals, notes = _drop_rotating(moments, results[chosen][0])
     if len(intervals) < options.fewest:
-        raise NotPossibleError(f"{recording.name}: {_why_no_poses(results[chosen][0], end - begin, means[0], notes)}")
+        raise NotPossibleError(f"{recording.name}: {_why_no_poses(results[chosen][0], end - start, means[0], notes)}")
     return Segmentation(recording, intervals, tried[chosen][0], tried, tuple(notes))
 
 
@@ -223,14 +201,15 @@ def _why_no_poses(intervals: FloatArray, duration: float, force: FloatArray, not
         "it between them."
     )
     middle = np.median(force, axis=0)
-    off = _angles(np.insert(force, np.arange(1, len(force)), middle, axis=0)) if len(force) > 1 else np.zeros(1)
+    alternating = np.insert(force, np.arange(1, len(force)), middle, axis=0)
+    off = _angles(alternating[:-1], alternating[1:]) if len(force) > 1 else np.zeros(1)
     if np.quantile(off, 0.99) < _DISTINCT and np.sum(np.diff(intervals)) > 0.5 * duration:
         return (
             "1 static pose found: the unit lay in one orientation throughout. That shows its noise (jaximu allan) and, "
             f"with a temperature beside it, its drift (jaximu thermal). {record}"
         )
-    count = 0 if notes else len(intervals)
-    return f"{count} static pose{'s' * (count != 1)} found. {' '.join([*notes[:1], record])}"
+    poses = counted(0 if notes else len(intervals), "static pose")
+    return f"{poses} found. {' '.join([*notes[:1], record])}"
 
 
 def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:
@@ -240,7 +219,7 @@ def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:
         return np.zeros(len(rate))
     bias = np.median(rate[quiet], axis=0)
     deviation = np.linalg.norm(rate - bias, axis=1)
-    return deviation / max(limit, 6 * float(np.median(deviation[quiet])))
+    return deviation / max(limit, 6 * np.median(deviation[quiet]))
 
 
 def _drop_rotating(moments: Sequence[_Moments], intervals: FloatArray) -> tuple[FloatArray, list[str]]:
@@ -251,14 +230,13 @@ def _drop_rotating(moments: Sequence[_Moments], intervals: FloatArray) -> tuple[
     middle = (start + stop) / 2
     (before, *spread), (after, *later) = moments[0].between(start, middle), moments[0].between(middle, stop)
     length = np.linalg.norm(before, axis=1)
-    chord = np.linalg.norm(before / length[:, None] - after / np.linalg.norm(after, axis=1)[:, None], axis=1)
     noise = np.sqrt(sum(variance.sum(axis=1) / np.maximum(count, 1) for variance, count in (spread, later))) / length
-    keep = 2 * np.arcsin(np.clip(chord / 2, 0, 1)) < np.maximum(np.radians(0.2), 6 * noise)
+    keep = _angles(before, after) < np.maximum(np.radians(0.2), 6 * noise)
     keep &= np.minimum(spread[1], later[1]) >= 3
     if len(moments) > 1 and keep.sum() > 2:
         means = moments[1].between(start, stop)[0]
         deviation = np.linalg.norm(means - np.median(means[keep], axis=0), axis=1)
-        keep &= deviation < max(np.radians(0.1), 8 * float(np.median(deviation[keep])))
+        keep &= deviation < max(np.radians(0.1), 8 * np.median(deviation[keep]))
     dropped = intervals[~keep]
     if not len(dropped):
         return intervals, []
@@ -286,15 +264,15 @@ def rest_statistics(
     gets its own share. Steps coarser than the noise shift means, those of a gyroscope (`turning`) all alike.
     """
     columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
-    counts = np.array([each.shape[1] for each in columns])
+    counts = np.array([column.shape[1] for column in columns])
     first = np.cumsum(counts) - counts
     values = np.concatenate(columns, axis=1)
     mean = np.add.reduceat(values, first, axis=1) / counts
     squares = np.add.reduceat(np.square(values - np.repeat(mean, counts, axis=1)), first, axis=1)
     variances = (squares / counts).T / np.square(signal.nominal_scale)
     total = np.sum(variances, axis=1)
-    share = total / max(float(np.median(total)), signal.rounding_variance)  # coarse steps may leave no scatter at all
-    density = _density(signal, [each for each, own in zip(columns, share, strict=True) if own < 2] or columns)
+    share = total / max(np.median(total), signal.rounding_variance)  # coarse steps may leave no scatter at all
+    density = _density(signal, [column for column, size in zip(columns, share, strict=True) if size < 2] or columns)
     factor = np.where(share > 1.5, share, 1.0)
     duration = counts / signal.rate
     rounding = np.diag(np.square(signal.nominal_scale)) * _rounding_of_means(signal, variances)[:, None, None]
@@ -310,35 +288,34 @@ def _density(signal: Signal, columns: Sequence[FloatArray]) -> FloatArray:
     times too much of it for the mean of a pose. `columns`: the samples (3, n) of each interval at rest.
     """
     size = max(1, signal.samples(_SHORTEST))
-    found, _ = _of_blocks(signal, columns, size)
-    for longer in (2, 4):
-        density, freedom = _of_blocks(signal, columns, longer * size)
-        ratio = float(np.mean(np.diagonal(density) / np.maximum(np.diagonal(found), 1e-300)))  # noise-free: no scatter
+    density, _ = _of_blocks(signal, columns, size)
+    for factor in (2, 4):
+        longer, freedom = _of_blocks(signal, columns, factor * size)
+        ratio = np.mean(np.diagonal(longer) / np.maximum(np.diagonal(density), 1e-300))  # noise-free: no scatter
         if freedom and ratio < 1 - _CHANCE * np.sqrt(2 / (3 * freedom)):
-            found = density
-    return found
+            density = longer
+    return density
 
 
 def _of_blocks(signal: Signal, columns: Sequence[FloatArray], size: int) -> tuple[FloatArray, int]:
     """Return the density (3, 3) by means of `size` samples, and its degrees of freedom for each axis."""
     quantum = np.diag(np.square(signal.nominal_scale) * signal.rounding_variance / 3 / size)
-    number = np.array([each.shape[1] // size for each in columns])
+    number = np.array([column.shape[1] // size for column in columns])
     if np.any(number > 1):
-        kept = [each[:, : count * size] for each, count in zip(columns, number, strict=True) if count > 1]
+        kept = [column[:, : count * size] for column, count in zip(columns, number, strict=True) if count > 1]
         number = number[number > 1]
         blocks = np.concatenate(kept, axis=1).reshape(3, -1, size).mean(axis=2)
         means = np.add.reduceat(blocks, np.cumsum(number) - number, axis=1) / number
         deviations = (blocks - np.repeat(means, number, axis=1)) * np.sqrt(np.repeat(number / (number - 1), number))
         scatter = deviations @ deviations.T / deviations.shape[1]
     else:  # no interval holds two blocks
-        scatter = np.diag(np.median([np.var(each, axis=1) for each in columns], axis=0)) / size
+        scatter = np.diag(np.median([np.var(column, axis=1) for column in columns], axis=0)) / size
     return (scatter + 1e-3 * quantum) * size / signal.rate, int(np.sum(np.maximum(number - 1, 0)))
 
 
 def _rounding(signal: Signal, part: Segmentation) -> FloatArray:
     """(3, P) variance, in output units, by which rounding shifts the means of a recording's poses."""
-    moments = _Moments(signal)
-    variances = moments.between(*part.intervals.T)[1]
+    variances = _Moments(signal).between(*part.intervals.T)[1]
     return np.square(signal.nominal_scale)[:, None] * _rounding_of_means(signal, variances)
 
 
@@ -356,8 +333,8 @@ def _rounding_of_means(signal: Signal, variances: FloatArray) -> FloatArray:
 def require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoise:
     if noise is None:
         raise InputError(f"the recording at rest has no {name}, but the one to calibrate has one.")
-    quantum = float(np.sqrt(signal.rounding_variance))
-    sigma = float(np.sqrt(np.median(noise.covariance([0.0], [1.0])) * signal.rate))
+    quantum = np.sqrt(signal.rounding_variance)
+    sigma = np.sqrt(np.median(noise.covariance([0.0], [1.0])) * signal.rate)
     if sigma < 1e-3 * quantum:
         raise InputError(
             f"the recording at rest has a {name} noise of {sigma:.2g} SI units a sample, a thousandth of the step to "
@@ -377,17 +354,18 @@ def noise_by_model(
     return np.diag(white * scale), slow.covariance(start, stop) * scale[:, None, None] * same
 
 
-def _pad(array: FloatArray, length: int, fill: float | FloatArray = 0.0) -> FloatArray:
-    padded = np.empty((length, *array.shape[1:]))
-    padded[: len(array)] = array
-    padded[len(array) :] = fill
-    return padded
+def _pad(array: FloatArray, length: int, fill: float | FloatArray) -> FloatArray:
+    return np.concatenate([array, np.broadcast_to(fill, (length - len(array), *array.shape[1:]))])
+
+
+_Turn = tuple[FloatArray, FloatArray]
+"""Gyroscope output (n, 3) and the seconds (n,) over which each sample holds."""
+_NO_TURN: _Turn = np.zeros((0, 3)), np.zeros(0)
 
 
 def observed_poses(
     segmentations: Segmentation | Sequence[Segmentation],
     gravity: float,
-    temperature_reference: float = 25.0,
     bucket: tuple[int, int] | None = None,
     noise: NoiseModel | None = None,
 ) -> Observations:
@@ -399,82 +377,85 @@ def observed_poses(
     overrides the padded numbers of poses and of samples in a turn, to stack units of a fleet.
     """
     parts = [segmentations] if isinstance(segmentations, Segmentation) else list(segmentations)
-    columns: dict[str, list[FloatArray]] = {
-        name: [] for name in ("am", "ac", "gm", "gc", "start", "stop", "temperature")
-    }
+    rests: list[dict[str, FloatArray]] = []
     spans: list[FloatArray] = []  # start and stop of the turn after each pose
-    turns: list[tuple[FloatArray, FloatArray]] = []
+    turns: list[_Turn] = []
     densities: list[FloatArray] = []
     first_rest: FloatArray | None = None
-    nominal: list[FloatArray] = []
-    for index, part in enumerate(parts):
+    for part in parts:
         recording, intervals = part.recording, part.intervals
-        accelerometer = recording.accelerometer
-        _, means, covariance = rest_statistics(accelerometer, intervals)
-        columns["am"].append(means)
-        columns["ac"].append(covariance)
-        nominal.append((means - accelerometer.nominal_offset) / accelerometer.nominal_scale)
-        columns["start"].append(intervals[:, 0])
-        columns["stop"].append(intervals[:, 1])
-        columns["temperature"].append(_temperature(recording, intervals, temperature_reference))
-        spans += [np.stack([intervals[:-1, 1], intervals[1:, 0]], axis=1), intervals[-1:, ::-1]]
-        if index:
-            turns.append((np.zeros((0, 3)), np.zeros(0)))  # from the last recording's end to this one's start
-        gyroscope = recording.gyroscope
-        if gyroscope is None:
-            columns["gm"].append(np.zeros((len(intervals), 3)))
-            columns["gc"].append(np.tile(np.eye(3), (len(intervals), 1, 1)))
-            turns += [(np.zeros((0, 3)), np.zeros(0))] * (len(intervals) - 1)
-            densities.append(np.eye(3))
-            continue
-        density, rest, covariance = rest_statistics(gyroscope, intervals, turning=True)
-        middle = np.median(rest, axis=0)
-        first_rest = middle if first_rest is None else first_rest
-        shift = middle - first_rest
-        columns["gm"].append(rest - shift)
-        columns["gc"].append(covariance)
+        accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
+        _, force, force_covariance = rest_statistics(accelerometer, intervals)
+        density, rate, rate_covariance = np.eye(3), *_no_means(len(intervals))
+        between = [_NO_TURN] * (len(intervals) - 1)
+        if gyroscope is not None:
+            density, rate, rate_covariance = rest_statistics(gyroscope, intervals, turning=True)
+            middle = np.median(rate, axis=0)
+            first_rest = middle if first_rest is None else first_rest
+            shift = middle - first_rest
+            rate = rate - shift
+            between = _turns(gyroscope, intervals, shift)
+        rests.append(
+            {
+                "accelerometer_mean": force,
+                "accelerometer_covariance": force_covariance,
+                "gyroscope_mean": rate,
+                "gyroscope_covariance": rate_covariance,
+                "start": intervals[:, 0],
+                "stop": intervals[:, 1],
+                "temperature": _temperature(recording, intervals),
+                "force": (force - accelerometer.nominal_offset) / accelerometer.nominal_scale,
+            }
+        )
         densities.append(density)
-        turns += _turns(gyroscope, intervals, shift)
-
+        turns += [*between, _NO_TURN]  # from the recording's end to the start of the next one
+        spans += [np.stack([intervals[:-1, 1], intervals[1:, 0]], axis=1), intervals[-1:, ::-1]]
+    columns = {name: np.concatenate([rest[name] for rest in rests]) for name in rests[0]}
     offset = parts[0].recording.accelerometer.nominal_offset
-    observations = _padded(
-        {name: np.concatenate(found) for name, found in columns.items()}, turns, np.mean(densities, axis=0),
-        np.concatenate(nominal), offset, gravity, temperature_reference, bucket,
-    )  # fmt: skip
+    density = np.mean(densities, axis=0)
+    observations = _padded(columns, turns[:-1], density, offset, gravity, bucket)
     return observations if noise is None else _with_noise(observations, parts, noise, np.concatenate(spans)[:-1])
 
 
-def observe_means(means: PoseMeans, gravity: float, temperature_reference: float = 25.0) -> Observations:
+def _no_means(count: int) -> tuple[FloatArray, FloatArray]:
+    """Means (P, 3) and covariances (P, 3, 3) of a sensor that is not there."""
+    return np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
+
+
+def observe_means(means: PoseMeans, gravity: float) -> Observations:
     """Return a table of pose means as padded `Observations` without turns.
 
     Where no deviations are stated, digits alone tell how far a mean is off, which is the least it can be.
     """
-    recording = means.recording
-    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
+    accelerometer = means.recording.accelerometer
     count = len(accelerometer)
-
-    def known(signal: Signal | None, sigma: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-        if signal is None:
-            return np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1))
-        if sigma is None:
-            sigma = np.tile(signal.nominal_scale * np.sqrt(signal.rounding_variance / 3), (count, 1))
-        return signal.values, sigma[:, :, None] ** 2 * np.eye(3)
-
-    columns = dict(zip(("am", "ac"), known(accelerometer, means.accelerometer_sigma), strict=True))
-    columns |= dict(zip(("gm", "gc"), known(gyroscope, means.gyroscope_sigma), strict=True))
-    columns |= {"start": np.arange(count, dtype=np.float64), "stop": np.arange(1.0, count + 1),
-                "temperature": np.full(count, temperature_reference)}  # fmt: skip
-    return _padded(columns, [], np.eye(3), accelerometer.si(), accelerometer.nominal_offset, gravity,
-                   temperature_reference)  # fmt: skip
+    columns = {
+        "start": np.arange(count, dtype=np.float64),
+        "stop": np.arange(1.0, count + 1),
+        "temperature": np.full(count, REFERENCE_TEMPERATURE),
+        "force": accelerometer.si(),
+    }
+    for name in INERTIAL_QUANTITIES:
+        signal, sigma = getattr(means.recording, name), getattr(means, f"{name}_sigma")
+        values, covariance = _no_means(count)
+        if signal is not None:
+            if sigma is None:
+                sigma = np.tile(signal.nominal_scale * np.sqrt(signal.rounding_variance / 3), (count, 1))
+            values, covariance = signal.values, sigma[:, :, None] ** 2 * np.eye(3)
+        columns |= {f"{name}_mean": values, f"{name}_covariance": covariance}
+    return _padded(columns, [], np.eye(3), accelerometer.nominal_offset, gravity)
 
 
 def _padded(
-    columns: dict[str, FloatArray], turns: Sequence[tuple[FloatArray, FloatArray]], density: FloatArray,
-    force: FloatArray, offset: FloatArray, gravity: float, temperature_reference: float,
+    columns: dict[str, FloatArray],
+    turns: Sequence[_Turn],
+    density: FloatArray,
+    offset: FloatArray,
+    gravity: float,
     bucket: tuple[int, int] | None = None,
-) -> Observations:  # fmt: skip
-    """Return what was found of poses and of the turns between them, padded to a bucket; `force` (P, 3) is nominal."""
-    poses = len(columns["am"])
+) -> Observations:
+    """Pad the fields of poses, nominal specific `force` (P, 3) among them, and the turns between them to a bucket."""
+    poses = len(columns["force"])
     longest = max((len(interval) for _, interval in turns), default=1)
     padded, samples = bucket or (_bucket(poses), _bucket(max(longest, 16)))
     output, interval = np.zeros((padded - 1, samples, 3)), np.zeros((padded - 1, samples))
@@ -482,29 +463,25 @@ def _padded(
     for index, (values, durations) in enumerate(turns):
         output[index, : len(values)], interval[index, : len(values)] = values, durations
         used[index] = len(values) > 0
-    force = _pad(force, padded, np.array([0.0, 0.0, gravity]))
-
-    def column(name: str, fill: float | FloatArray = 0.0) -> FloatArray:
-        return np.asarray(_pad(columns[name], padded, fill))
-
+    up = np.array([0.0, 0.0, gravity])
+    fills = {
+        "accelerometer_mean": offset + up,
+        "accelerometer_covariance": np.eye(3),
+        "gyroscope_covariance": np.eye(3),
+        "temperature": REFERENCE_TEMPERATURE,
+        "force": up,
+    }
+    columns = {name: _pad(values, padded, fills.get(name, 0.0)) for name, values in columns.items()}
+    across = columns.pop("force")[1:, None, :]
     return Observations(
-        poses=Poses(
-            accelerometer_mean=column("am", offset + gravity * np.array([0.0, 0.0, 1.0])),
-            accelerometer_covariance=column("ac", np.eye(3)),
-            gyroscope_mean=column("gm"),
-            gyroscope_covariance=column("gc", np.eye(3)),
-            start=column("start"),
-            stop=column("stop"),
-            temperature=column("temperature", temperature_reference),
-            mask=np.asarray(np.arange(padded) < poses),
-        ),
+        poses=Poses(**columns, mask=np.arange(padded) < poses),
         turns=Turns(
-            output=np.asarray(output),
-            interval=np.asarray(interval),
-            noise=np.asarray(density),
+            output=output,
+            interval=interval,
+            noise=density,
             # the right singular vectors of a direction: itself, and two that span the plane across it
-            basis=np.asarray(np.linalg.svd(force[1:, None, :])[2][:, 1:, :]),
-            mask=np.asarray(used),
+            basis=np.linalg.svd(across)[2][:, 1:, :],
+            mask=used,
         ),
         gravity=np.asarray(gravity),
     )
@@ -515,59 +492,60 @@ def _with_noise(
 ) -> Observations:
     """Replace what the poses' scatter tells of the noise by what the model says; `spans` (turns, 2) start and stop."""
     poses, turns = observations.poses, observations.turns
-    padded, steps = len(poses.mask), len(turns.mask)
-    count = int(np.sum(poses.mask))
-    which = np.repeat(np.arange(len(parts)), [len(part.intervals) for part in parts])
-    start, stop = (np.asarray(each)[:count] for each in (poses.start, poses.stop))
+    padded, count = len(poses.mask), int(np.sum(poses.mask))
+    start, stop = poses.start[:count], poses.stop[:count]
+    at_rest = np.arange(count)
+    power_on = np.repeat(np.arange(len(parts)), [len(part.intervals) for part in parts])
+    together = power_on[:, None] == power_on
 
-    def spread(matrix: FloatArray, places: NDArray[np.int64], size: int) -> FloatArray:
+    def among(rows: NDArray[np.int64], covariance: FloatArray, size: int) -> FloatArray:
+        """The covariance of these rows among so many, each of which has a variance of one else."""
         whole = np.tile(np.eye(size), (3, 1, 1))
-        whole[:, places[:, None], places] = matrix
+        whole[:, rows[:, None], rows] = covariance
         return whole
 
+    def of_poses(covariance: FloatArray) -> FloatArray:
+        return np.diagonal(covariance, axis1=1, axis2=2)[:, :padded].T[:, :, None] * np.eye(3)
+
     accelerometer, gyroscope = parts[0].recording.accelerometer, parts[0].recording.gyroscope
-    known = require_model(accelerometer, noise.accelerometer, "accelerometer")
-    white, own = noise_by_model(accelerometer, known, start, stop, which[:, None] == which)
-    at_rest = np.arange(count)
-    own[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
-    own[:, at_rest, at_rest] += np.concatenate([_rounding(part.recording.accelerometer, part) for part in parts], 1)
-    whole = spread(own, at_rest, padded)
-    diagonal = np.arange(padded)
-    changed = replace(poses, accelerometer_covariance=whole[:, diagonal, diagonal].T[:, :, None] * np.eye(3))
-    intervals = padded + _PARTS * steps
+    model = require_model(accelerometer, noise.accelerometer, "accelerometer")
+    white, slow = noise_by_model(accelerometer, model, start, stop, together)
+    slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
+    slow[:, at_rest, at_rest] += np.concatenate([_rounding(part.recording.accelerometer, part) for part in parts], 1)
+    forces = among(at_rest, slow, padded)
+    poses = replace(poses, accelerometer_covariance=of_poses(forces))
+    intervals = padded + _PARTS * len(turns.mask)
     rates = np.tile(np.eye(intervals), (3, 1, 1))
-    part = np.zeros(turns.interval.shape, np.int64)
+    part_of_turn = np.zeros(turns.interval.shape, np.int64)
     if gyroscope is not None:
-        known = require_model(gyroscope, noise.gyroscope, "gyroscope")
+        model = require_model(gyroscope, noise.gyroscope, "gyroscope")
         used = np.flatnonzero(turns.mask[: count - 1])
-        elapsed = np.cumsum(turns.interval, axis=1) - np.asarray(turns.interval) / 2
+        elapsed = np.cumsum(turns.interval, axis=1) - turns.interval / 2
         total = np.maximum(np.sum(turns.interval, axis=1, keepdims=True), 1e-9)
-        part = np.minimum(_PARTS - 1, (_PARTS * elapsed / total).astype(np.int64))
+        part_of_turn = np.minimum(_PARTS - 1, (_PARTS * elapsed / total).astype(np.int64))
         edges = spans[used, :1] + np.diff(spans[used]) * np.arange(_PARTS + 1) / _PARTS
-        begin = np.concatenate([start, edges[:, :-1].ravel()])
-        end = np.concatenate([stop, edges[:, 1:].ravel()])
-        owner = np.concatenate([which, np.repeat(which[used], _PARTS)])
-        white, slow = noise_by_model(gyroscope, known, begin, end, owner[:, None] == owner)
-        places = np.concatenate([np.arange(count), (padded + _PARTS * used[:, None] + np.arange(_PARTS)).ravel()])
+        first = np.concatenate([start, edges[:, :-1].ravel()])
+        last = np.concatenate([stop, edges[:, 1:].ravel()])
+        owner = np.concatenate([power_on, np.repeat(power_on[used], _PARTS)])
+        alike = owner[:, None] == owner
+        white, slow = noise_by_model(gyroscope, model, first, last, alike)
         # a later power-on has another bias: what its means at rest have in common tells nothing of the first one's
-        anew = (owner[:, None] == owner) & (owner > 0)
-        slow += anew * np.square(POWER_ON["gyroscope"] * gyroscope.nominal_scale)[:, None, None]
+        slow += (alike & (owner > 0)) * np.square(POWER_ON["gyroscope"] * gyroscope.nominal_scale)[:, None, None]
         slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
-        signals = [(part.recording.gyroscope or gyroscope, part) for part in parts]
-        shift = np.sqrt(np.concatenate([_rounding(*each) for each in signals], 1))
+        shift = np.sqrt(np.concatenate([_rounding(part.recording.gyroscope or gyroscope, part) for part in parts], 1))
         # every pose of a recording reads the same rate, and rounds it the same way
-        slow[:, :count, :count] += shift[:, :, None] * shift[:, None, :] * (which[:, None] == which)
-        rates = spread(slow, places, intervals)
-        own = rates[:, diagonal, diagonal]
-        changed = replace(changed, gyroscope_covariance=own.T[:, :, None] * np.eye(3))
+        slow[:, :count, :count] += shift[:, :, None] * shift[:, None, :] * together
+        rows = np.concatenate([at_rest, (padded + _PARTS * used[:, None] + np.arange(_PARTS)).ravel()])
+        rates = among(rows, slow, intervals)
+        poses = replace(poses, gyroscope_covariance=of_poses(rates))
         turns = replace(turns, noise=white)
-    return Observations(changed, turns, observations.gravity, SlowNoise(whole, rates, part))
+    return Observations(poses, turns, observations.gravity, SlowNoise(forces, rates, part_of_turn))
 
 
-def _temperature(recording: Recording, intervals: FloatArray, reference: float) -> FloatArray:
+def _temperature(recording: Recording, intervals: FloatArray) -> FloatArray:
     signal = recording.temperature
     if signal is None:
-        return np.full(len(intervals), reference)
+        return np.full(len(intervals), REFERENCE_TEMPERATURE)
     return np.interp(intervals.mean(axis=1), signal.time, signal.values[:, 0])
 
 
@@ -590,27 +568,20 @@ def _across_gaps(gyroscope: Signal) -> FloatArray:
     return error
 
 
-def _turns(gyroscope: Signal, intervals: FloatArray, shift: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+def _turns(gyroscope: Signal, intervals: FloatArray, shift: FloatArray) -> list[_Turn]:
     """Samples and their durations between neighbouring poses; empty where a turn is too long or has a gap.
 
     Every sample holds from half way to its neighbour before to half way to the one after. Across a gap of a few samples
     that leaves out what the rate's curvature adds: where this may be more than a little, the turn is left out, too.
     """
     unsure = _across_gaps(gyroscope)
-    middle = (gyroscope.time[1:] + gyroscope.time[:-1]) / 2
-    period = 1 / gyroscope.rate
-    edges = np.concatenate([[gyroscope.time[0] - period / 2], middle, [gyroscope.time[-1] + period / 2]])
-    durations = np.diff(edges)
-    found = []
+    durations, period = np.diff(gyroscope.edges), 1 / gyroscope.rate
+    turns = []
     for start, stop in zip(intervals[:-1, 1], intervals[1:, 0], strict=True):
         used = _samples(gyroscope, start, stop)
         inside = durations[used]
         # differences of turns that the noise cannot hide
-        if (
-            stop - start > _LONGEST_TURN or not len(inside) or inside.max() > max(5 * period, 0.05)
-            or unsure[used].max() > _BRIDGED
-        ):  # fmt: skip
-            found.append((np.zeros((0, 3)), np.zeros(0)))
-        else:
-            found.append((gyroscope.values[used] - shift, inside))
-    return found
+        gapless = len(inside) and inside.max() <= max(5 * period, 0.05) and unsure[used].max() <= _BRIDGED
+        whole = gapless and stop - start <= _LONGEST_TURN
+        turns.append((gyroscope.values[used] - shift, inside) if whole else _NO_TURN)
+    return turns

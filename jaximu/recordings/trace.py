@@ -47,7 +47,7 @@ _REFERENCE = ("name", "certificate", "expires", "file", "value", "uncertainty")
 _CERTIFICATE = ("number", "laboratory", "address", "customer", "authorised_by")
 NEEDED = (
     *("serial", "model", "operator", "date", "environment", "reference"),
-    *(f"certificate.{each}" for each in _CERTIFICATE),
+    *(f"certificate.{key}" for key in _CERTIFICATE),
 )
 """What ISO/IEC 17025, 7.8.2 and 7.8.4, asks of a certificate and the recording does not say."""
 
@@ -65,25 +65,25 @@ def read_trace(path: str | os.PathLike[str] | None, stated: Mapping[str, str | N
     expired on the day of the calibration.
     """
     name, document = ("the options", {}) if path is None else (os.fspath(path), read_toml(path))
-    found: dict[str, Any] = {}
+    trace: dict[str, Any] = {}
     for key, value in document.items():
         where = f"{name}, {key}"
         if key in _TEXT:
-            found[key] = _text(value, where)
+            trace[key] = _text(value, where)
         elif key in _DATES:
-            found[key] = _date(value, where).isoformat()
+            trace[key] = _date(value, where).isoformat()
         elif key in ("environment", "certificate") and isinstance(value, dict):
             only(value, _CERTIFICATE if key == "certificate" else value, where)
-            found[key] = {each: _text(text, f"{where}.{each}") for each, text in value.items()}
+            trace[key] = {name: _text(text, f"{where}.{name}") for name, text in value.items()}
         elif key == "reference" and isinstance(value, list):
-            found[key] = [_reference(each, f"{where} {place}", name) for place, each in enumerate(value, 1)]
+            trace[key] = [_reference(reference, f"{where} {number}", name) for number, reference in enumerate(value, 1)]
         else:
             only({key: value}, (*_TEXT, *_DATES, "[environment]", "[[reference]]", "[certificate]"), name)
     for key, value in (stated or {}).items():
         if value is not None:
-            found[key] = _date(value, f"--{key}").isoformat() if key in _DATES else _text(value, f"--{key}")
-    _refuse_expired(found, name)
-    return found
+            trace[key] = _date(value, f"--{key}").isoformat() if key in _DATES else _text(value, f"--{key}")
+    _refuse_expired(trace, name)
+    return trace
 
 
 def missing(trace: Mapping[str, Any] | None) -> list[str]:
@@ -113,25 +113,26 @@ def _reference(entry: Any, where: str, name: str) -> dict[str, str]:
     for key in ("name", "certificate"):
         if key not in entry:
             raise InputError(f"{where}: the {key} is missing.")
-    found = {key: _text(value, f"{where}.{key}") for key, value in entry.items() if key != "expires"}
+    reference = {key: _text(value, f"{where}.{key}") for key, value in entry.items() if key != "expires"}
     if "expires" in entry:
-        found["expires"] = _date(entry["expires"], f"{where}.expires").isoformat()
+        reference["expires"] = _date(entry["expires"], f"{where}.expires").isoformat()
     if "file" in entry:
-        path = Path(name).parent / found["file"]
-        found |= {"file": str(path), "sha256": file_digest(path)}
-    return found
+        path = Path(name).parent / reference["file"]
+        reference |= {"file": str(path), "sha256": file_digest(path)}
+    return reference
 
 
 def _refuse_expired(trace: Mapping[str, Any], name: str) -> None:
-    for each in trace.get("reference", ()):
-        if "expires" not in each:
+    for reference in trace.get("reference", ()):
+        if "expires" not in reference:
             continue
+        holder, expires = reference["name"], reference["expires"]
         if "date" not in trace:
             raise InputError(
-                f"{name}: state the date of the calibration (date = …), as the certificate of {each['name']} expires."
+                f"{name}: state the date of the calibration (date = …), as the certificate of {holder} expires."
             )
-        if each["expires"] < trace["date"]:
+        if expires < trace["date"]:
             raise InputError(
-                f"{name}: the certificate {each['certificate']} of {each['name']} expired on {each['expires']}, before "
+                f"{name}: the certificate {reference['certificate']} of {holder} expired on {expires}, before "
                 f"the calibration of {trace['date']}. Have it calibrated again, or name the certificate that holds."
             )

@@ -43,7 +43,7 @@ def arrow_table(recording: Recording) -> "pa.Table":
 
     from jaximu.recordings.columns.table import AXES, to_arrow
 
-    table = pa.table({name: to_arrow(each) for name, each in _columns(recording).items()})
+    table = pa.table({name: to_arrow(values) for name, values in _columns(recording).items()})
     axes = None if recording.reading is None else recording.reading.axes
     return table if axes is None else table.replace_schema_metadata({AXES: axes})
 
@@ -115,7 +115,7 @@ def _text(delimiter: str) -> Callable[[Recording, Path], None]:
 
         columns = _columns(recording)
         blanks = delimiter == " "  # there an empty cell cannot be told: it becomes nan
-        table = pa.table({name: to_arrow(each, nulls=not blanks) for name, each in columns.items()})
+        table = pa.table({name: to_arrow(values, nulls=not blanks) for name, values in columns.items()})
         header = delimiter.join(name.replace(" ", "") if blanks else name for name in columns)
         with path.open("wb") as file:
             file.write((f"# {header}\n" if blanks else f"{header}\n").encode())

@@ -21,12 +21,12 @@ def column_units(
     Raises InputError for a doubled name, a triad without one of its axes, a unit that is missing (with a line to
     copy), unknown, or one of another quantity. `sensor`: the one that the file must hold, where it is for one alone.
     """
-    found: dict[str, tuple[int, Unit]] = {}
+    used: dict[str, tuple[int, Unit]] = {}
     for index, column in enumerate(columns):
         if column.name is None:
             continue
-        if column.name in found:
-            first = table.label(found[column.name][0])
+        if column.name in used:
+            first = table.label(used[column.name][0])
             raise InputError(
                 f"{table.path}: the columns {first} and {table.label(index)} are both {column.name}; "
                 f"ignore one of them: {advise(table).sentence(option)}"
@@ -38,16 +38,16 @@ def column_units(
                 f"{table.path}: column {table.label(index)} states no unit. State the units with {option}, after "
                 f"checking those guessed here: {advise(table, sensor).sentence(option)}"
             )
-        found[column.name] = index, unit(stated, wanted, file=table.path, column=column.name)
+        used[column.name] = index, unit(stated, wanted, file=table.path, column=column.name)
     for group in GROUPS.values():
-        missing = [name for name in group.columns if name not in found]
+        missing = [name for name in group.columns if name not in used]
         if missing and len(missing) < len(group.columns):
-            present = ", ".join(name for name in group.columns if name in found)
+            present = ", ".join(name for name in group.columns if name in used)
             raise InputError(f"{table.path}: column {missing[0]} is missing beside {present}.")
-        units = {found[name][1].quantity for name in group.columns} if not missing else set()
+        units = {used[name][1].quantity for name in group.columns} if not missing else set()
         if len(units) > 1:
             raise InputError(f"{table.path}: columns {', '.join(group.columns)} mix raw counts with physical units.")
-    return found
+    return used
 
 
 def choose_columns(
@@ -65,9 +65,9 @@ def choose_columns(
     return named
 
 
-def _wrong_count(table: Table, given: int, option: str) -> InputError:
+def _wrong_count(table: Table, count: int, option: str) -> InputError:
     return InputError(
-        f"{table.path}: {option} names {given} columns, the file has {len(table.columns)}; "
+        f"{table.path}: {option} names {count} columns, the file has {len(table.columns)}; "
         f"name each one, for example {advise(table).sentence(option)}"
     )
 
@@ -76,9 +76,11 @@ def _unnamed(table: Table, sensor: str, option: str) -> InputError:
     """The error for a file in which nobody has named the columns of a sensor that it must hold."""
     needed = ", ".join(GROUPS[sensor].columns)
     if table.names:
-        found = ", ".join(table.label(index) for index in range(min(len(table.names), _LISTED)))
+        present = ", ".join(table.label(index) for index in range(min(len(table.names), _LISTED)))
         more = f" and {len(table.names) - _LISTED} more" if len(table.names) > _LISTED else ""
-        text = f"{table.path}: columns {needed} are missing; it has {found}{more}. If these hold them, name all columns"
+        text = (
+            f"{table.path}: columns {needed} are missing; it has {present}{more}. If these hold them, name all columns"
+        )
     else:
         text = f"{table.path}: has no column names ({len(table.columns)} columns). Name them all"
     guess = advise(table, "gyro" if sensor == "gyro" else None).sentence(option)
@@ -94,19 +96,19 @@ def choose_pair(
     the other's sensor. A list without a gyroscope, in raw counts, is used for the gyroscope's file as well.
     `gyro_columns` names those of the second file alone. Columns not given are read from the headers.
     """
-    given = parse_columns(columns) if columns is not None else ()
-    first = choose_columns(accel, None) if not given else _fit(accel, given, _without(given, "gyro"))
+    named = parse_columns(columns) if columns is not None else ()
+    first = choose_columns(accel, None) if not named else _fit(accel, named, _without(named, "gyro"))
     if gyro_columns is not None:
         return first, choose_columns(gyro, gyro_columns, "gyro", "--gyro-columns")
-    if not given or (not any(_is(column, "gyro") for column in given) and header_columns(gyro)):
+    if not named or (not any(_is(column, "gyro") for column in named) and header_columns(gyro)):
         return first, choose_columns(gyro, None, "gyro", "--gyro-columns")
-    if any(_is(column, "gyro") for column in given):
-        only = tuple(column for column in given if column.name == TIME or _is(column, "gyro"))
-        return first, _fit(gyro, given, _without(given, "accel"), only)
-    swapped = tuple(Column((column.name or "").replace("accel_", "gyro_") or None, column.unit) for column in given)
+    if any(_is(column, "gyro") for column in named):
+        only = tuple(column for column in named if column.name == TIME or _is(column, "gyro"))
+        return first, _fit(gyro, named, _without(named, "accel"), only)
+    swapped = tuple(Column((column.name or "").replace("accel_", "gyro_") or None, column.unit) for column in named)
     counts = all(
-        (found := find_unit(column.unit or "")) and found.quantity == "raw count"
-        for column in given
+        (stated := find_unit(column.unit or "")) and stated.quantity == "raw count"
+        for column in named
         if _is(column, "accel")
     )
     if not counts or len(swapped) != len(gyro.columns):

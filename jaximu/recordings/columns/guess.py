@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 
@@ -20,27 +20,30 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit, parse_column
-from jaximu.recordings.alignment import Turning, turning
+from jaximu.ground.units import unit as unit_named
+from jaximu.recordings.alignment import CORRELATED, Turning, turning
 from jaximu.recordings.columns.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
+from jaximu.recordings.columns.known import EPOCH
 from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import Table
+from jaximu.recordings.recording import Signal
 
 __all__ = ["Advice", "advise", "without_gravity"]
 
-_GRAVITY_IN = {"m/s^2": STANDARD_GRAVITY, "g": 1.0, "mg": 1000.0, "cm/s^2": 980.665}
+_GRAVITY_IN = {name: STANDARD_GRAVITY / unit_named(name).factor for name in ("m/s^2", "g", "mg", "cm/s^2")}
 _PLAUSIBLE = 0.5, 8000.0
 _LIKELY = 5.0, 4000.0
 """Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
 _STEADY = 0.12
 """Scatter of the norm over poses, of its mean, below which a triad holds something constant."""
-_TURNS = 0.6
-"""Correlation from which a triad's integral turns gravity as the accelerometer says."""
 _PER_G = (16384, 8192, 4096, 2048, 1024, 512, 256)
 _PER_DEGREE = (131, 65.5, 32.8, 16.4, 114.2857, 57.1429, 28.5714, 14.2857, 14.375, 262)
-_COUNTERS = {"counter", "count", "packet", "index", "sample", "frame", "seq", "number", "id", "row", "line", "n", "no",
-             "iteration", "loop", "samples", "packetcounter", "status"}  # fmt: skip
-_ANGLES = {"rad/s": 1.0, "deg/s": math.pi / 180, "mdeg/s": math.pi / 180e3, "mrad/s": 1e-3}
+_COUNTERS = set(
+    "counter count packet index sample frame seq number id row line n no iteration loop samples packetcounter "
+    "status".split()
+)
+_ANGLES = {name: unit_named(name).factor for name in ("rad/s", "deg/s", "mdeg/s", "mrad/s")}
 _PLAIN = set("var column col field data channel ch ans unnamed imu c v x y out simout".split())
 """Words that say nothing of a column."""
 _SHOWN = 3
@@ -84,8 +87,12 @@ class Advice:
 
     def line(self, option: str = "--columns") -> str:
         """The options as one types them."""
-        named = {option: self.columns, "--rate": self.rate, "--accel-scale": self.accel_scale,
-                 "--gyro-scale": self.gyro_scale}  # fmt: skip
+        named = {
+            option: self.columns,
+            "--rate": self.rate,
+            "--accel-scale": self.accel_scale,
+            "--gyro-scale": self.gyro_scale,
+        }
         return " ".join(
             f'{name} "{value}"' if name == option or " " in value else f"{name} {value}"
             for name, value in named.items()
@@ -94,9 +101,10 @@ class Advice:
 
     def sentence(self, option: str = "--columns") -> str:
         """The line, what is asked, and why, in one line of text."""
-        asked = f" Answer first: {' '.join(self.questions)}" if self.questions else ""
+        questions = f" Answer first: {' '.join(self.questions)}" if self.questions else ""
         why = f" Why: {'; '.join(self.reasons)}." if self.reasons else ""
-        return f"{self.line(option)}.{asked}{why}" if self.line(option) else f"{asked}{why}".strip()
+        line = self.line(option)
+        return f"{line}.{questions}{why}" if line else f"{questions}{why}".strip()
 
 
 @dataclass(eq=False)
@@ -113,34 +121,37 @@ class _Triad:
     loose: bool = False  # one of several ways to take three of some columns side by side
     plain: int = 0  # words of the name that say more than the sensor: filtered, low, noise
 
-    level: float = field(init=False)
-    steady: bool = field(init=False)
-    posed: bool = field(init=False)
-    whole: bool = field(init=False)
-    still: bool = field(init=False)  # its quiet windows are rest, seen from the size of what it holds
-    noise: float = field(init=False)  # rms of an axis in its quiet windows
-    round: bool = field(init=False)  # its quiet means lie on a sphere
-    lively: bool = field(init=False)  # the norm changes where it moves, as a magnetometer's does not
-
     def __post_init__(self) -> None:
         size = max(5, min(50, len(self.values) // 20))
         count = len(self.values) // size
         cut = self.values[: count * size].reshape(count, size, 3) if count else self.values[None]
         scatter = cut.var(axis=1).sum(axis=1)
-        means = cut.mean(axis=1)[scatter <= max(4 * np.percentile(scatter, 10), 1e-12)]
+        low = np.percentile(scatter, 10)
+        every_mean = cut.mean(axis=1)
+        means = every_mean[scatter <= max(4 * low, 1e-12)]
         norm = np.linalg.norm(means, axis=1)
         self.level = float(np.median(norm))
+        # rms of an axis in its quiet windows
         self.noise = float(np.sqrt(np.median(np.sort(scatter)[: max(1, len(scatter) // 4)]) / 3))
+        # its quiet windows are rest, seen from the size of what it holds
         self.still = self.noise < 0.03 * self.level
         self.steady = bool(self.level > 0 and np.std(norm) < _STEADY * self.level)
         directions = means / np.maximum(norm[:, None], 1e-300)
         self.posed = bool(len(means) > 3 and np.linalg.norm(directions.mean(axis=0)) < 0.9)
-        jitter = np.diff(np.linalg.norm(cut, axis=2), axis=1).std(axis=1) if size > 1 else scatter
-        moving = scatter > 30 * max(float(np.percentile(scatter, 10)), 1e-12)
+        # the norm changes where it moves, as a magnetometer's does not
+        jitter = np.diff(np.linalg.norm(cut, axis=2), axis=1).std(axis=1)
+        moving = scatter > 30 * max(low, 1e-12)
         self.lively = bool(moving.sum() > 2 and np.median(jitter[moving]) > 3 * np.median(jitter[~moving]))
         some = self.values[:20000]
         self.whole = bool(np.all(some == np.round(some)) and np.ptp(some) > 20)
-        self.round = self.whole and fit_sphere(quiet_means_of(self)) is not None
+        # its quiet means lie on a sphere
+        self.round = self.whole and self.sphere(np.arange(len(self.values)) / 100.0) is not None
+        # its means change by more than noise: a gyroscope turns, if only about the vertical
+        self.turns = bool(count > 3 and np.std(every_mean, axis=0).max() > _TURNING * self.noise)
+
+    def sphere(self, time: FloatArray) -> tuple[FloatArray, float] | None:
+        """Centre and radius of the sphere on which the means of its quiet windows lie, if any; `time`: s."""
+        return fit_sphere(quiet_means(Signal(time, self.values, "count")))
 
     @property
     def gravity_unit(self) -> str | None:
@@ -197,16 +208,26 @@ class _Guess:
         return values if np.isfinite(values).sum() > 1 else None
 
     def _triad(self, places: tuple[int, int, int], **more) -> _Triad | None:
-        columns = [self.numbers[at] for at in places]
-        if any(each is None for each in columns):
+        columns = [values for at in places if (values := self.numbers[at]) is not None]
+        if len(columns) < 3:
             return None
-        values = np.stack([each for each in columns if each is not None], axis=1)
+        values = np.stack(columns, axis=1)
         rows = np.flatnonzero(np.isfinite(values).all(axis=1))
         if len(rows) < 2:
             return None
-        labels = [self.table.label(at) for at in places]
-        label = f"{labels[0]} … {labels[2].removeprefix('number ')}"
-        return _Triad(places, label, values[rows], rows, **more)
+        first, _, last = (self.table.label(at) for at in places)
+        return _Triad(places, f"{first} … {last.removeprefix('number ')}", values[rows], rows, **more)
+
+    def _off_unit(self, places: Collection[int]) -> FloatArray:
+        """How far the length of the numbers in some columns is off one, by row."""
+        return np.abs(np.linalg.norm([np.asarray(self.numbers[at]) for at in places], axis=0) - 1)
+
+    def _has(self, name: str) -> bool:
+        return any(column.name == name for column in self.chosen.values())
+
+    @property
+    def columns(self) -> list[Column]:
+        return [self.chosen.get(at, Column(None)) for at in range(self.width)]
 
     # --- the steps
 
@@ -226,25 +247,26 @@ class _Guess:
         if accel is None and role != "gyro":
             accel = self._by_gravity(free, gyro)
         if accel is not None and gyro is None:
-            rest = [each for each in free if not set(each.places) & set(accel.places)]
-            gyro = self._by_turning(rest, accel)
+            gyro = self._by_turning([triad for triad in free if not set(triad.places) & set(accel.places)], accel)
         self._units(accel, gyro)
         self._others(triads)
         return self._result(accel, gyro)
 
     def _time_column(self) -> int | None:
-        named = [at for at, each in enumerate(self.fields)
-                 if each.sensor == TIME and self.numbers[at] is not None and rises(self.table.columns[at])]  # fmt: skip
+        named = [
+            at
+            for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True))
+            if field.sensor == TIME and values is not None and rises(self.table.columns[at])
+        ]
         if named:
             return min(named, key=lambda at: find_unit(self.fields[at].unit or "", "time") is None)
-        for at, values in enumerate(self.numbers):
-            each = self.fields[at]
-            if values is None or each.sensor or not rises(values):
+        for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
+            if values is None or field.sensor or not rises(values):
                 continue
-            if not _plain(each) and not find_unit(each.unit or "", "time"):
+            if not _plain(field) and not find_unit(field.unit or "", "time"):
                 continue  # a name that says something else: a counter, a tick, an angle
             steps = np.diff(values)
-            usual = float(np.median(steps))
+            usual = np.median(steps)
             if np.mean(steps == 1.0) > 0.9 or not np.mean(np.abs(steps - usual) < 0.5 * abs(usual)) > 0.8:
                 continue  # a counter, or a sum of something
             self.reasons.append(f"column {self.table.label(at)} rises steadily, by {usual:.4g} a row: time")
@@ -255,17 +277,17 @@ class _Guess:
         """The triads that names show, of whatever sensor."""
         groups: dict[tuple, dict[str, int]] = {}
         refused: dict[tuple, dict[str, int]] = {}
-        for at, each in enumerate(self.fields):
-            if each.axis and each.axis in "xyz":
-                kept = refused if each.why_not else groups
-                kept.setdefault((each.stem, each.why_not or each.sensor, each.unit), {}).setdefault(each.axis, at)
+        for at, field in enumerate(self.fields):
+            if field.axis and field.axis in "xyz":
+                kept = refused if field.why_not else groups
+                kept.setdefault((field.stem, field.why_not or field.sensor, field.unit), {}).setdefault(field.axis, at)
         for (stem, why, unit), axes in refused.items():
             triad = self._triad((axes["x"], axes["y"], axes["z"]), unit=unit) if len(axes) == 3 else None
             if triad is not None:
                 triad.label = " ".join(stem)
                 self.refused.append((triad, why))
-        quaternions = {each.stem for each in self.fields if "w" in each.stem[-1:]}
-        found = []
+        quaternions = {field.stem for field in self.fields if "w" in field.stem[-1:]}
+        triads = []
         for (stem, sensor, unit), axes in groups.items():
             if len(axes) != 3 or (*stem, "w") in quaternions:
                 continue
@@ -281,9 +303,9 @@ class _Guess:
                 (axes["x"], axes["y"], axes["z"]), sensor=sensor, unit=unit, plain=len(stem), named=named
             )
             if triad is not None:
-                triad.label = f"{' '.join(stem) or 'x, y, z'}"
-                found.append(triad)
-        return found
+                triad.label = " ".join(stem) or "x, y, z"
+                triads.append(triad)
+        return triads
 
     def _with_gravity(self) -> _Triad | None:
         """The triad whose name says that gravity is gone, and which holds it all the same."""
@@ -303,70 +325,62 @@ class _Guess:
                 f"The accelerometer stands apart in {moved!r} and {alone!r}: their sum is what it measured, gravity "
                 "with it. Write a file with the sum as accel_x, accel_y, accel_z."
             )
+        if moved is None:
+            return ""
         return (
-            ""
-            if moved is None
-            else (
-                f"By its name {moved!r} has gravity taken out, and it holds {self.refused[0][0].level:.2g} at rest; a "
-                "calibration needs the accelerometer with gravity: record that in its place."
-            )
+            f"By its name {moved!r} has gravity taken out, and it holds {self.refused[0][0].level:.2g} at rest; a "
+            "calibration needs the accelerometer with gravity: record that in its place."
         )
 
     def _best(self, triads: list[_Triad], sensor: str) -> _Triad | None:
         """The triad that is named after a sensor; of several the one that behaves like it, told with the others."""
-        named = [each for each in triads if each.sensor == sensor]
+        named = [triad for triad in triads if triad.sensor == sensor]
         if not named:
             return None
-        named.sort(key=lambda each: (sensor == "accel" and each.gravity_unit is None, each.plain, each.places))
+        named.sort(key=lambda triad: (sensor == "accel" and triad.gravity_unit is None, triad.plain, triad.places))
+        first, name = named[0], GROUPS[sensor].field
         if len(named) > 1:
-            others = ", ".join(repr(each.label) for each in named[1:])
-            what = "accelerometers" if sensor == "accel" else f"{GROUPS[sensor].field}s"
-            self.reasons.append(f"there are {len(named)} {what}; this is {named[0].label!r}, not {others}")
-        first = named[0]
+            others = ", ".join(repr(triad.label) for triad in named[1:])
+            self.reasons.append(f"there are {len(named)} {name}s; this is {first.label!r}, not {others}")
         if self.table.names:
-            said = "name" if first.named else "unit"
-            self.reasons.append(f"{first.label!r} is the {GROUPS[sensor].field} by its {said}")
+            self.reasons.append(f"{first.label!r} is the {name} by its {'name' if first.named else 'unit'}")
         return first
 
     def _free(self, triads: list[_Triad]) -> list[_Triad]:
         """Triads that nobody has named: by stems, or, in a table without names, three columns side by side."""
-        unknown = self.unknown = [each for each in triads if each.sensor is None]
-        taken = {at for each in triads for at in each.places} | {self.time}
-        open_places = []
-        for at, values in enumerate(self.numbers):
-            each = self.fields[at]
-            if at in taken or values is None or each.sensor or each.why_not or set(each.stem) & _COUNTERS:
+        unknown = self.unknown = [triad for triad in triads if triad.sensor is None]
+        taken = {at for triad in triads for at in triad.places} | {self.time}
+        free: list[int] = []
+        for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
+            if at in taken or values is None or field.sensor or field.why_not or set(field.stem) & _COUNTERS:
                 continue
             finite = values[np.isfinite(values)]
             steps = np.diff(finite)
             counter = rises(values) and (np.mean(steps == 1.0) > 0.9 or np.mean(steps > 0) > 0.98)
             if np.ptp(finite) > 0 and not counter:
-                open_places.append(at)
+                free.append(at)
         quaternion: set[int] = set()
-        for at in open_places:
+        for at in free:
             four = range(at, at + 4)
-            if set(four) <= set(open_places) - quaternion:
-                stacked = np.stack([np.asarray(self.numbers[each]) for each in four], axis=1)
-                norm = np.linalg.norm(stacked, axis=1)
-                if np.nanmax(np.abs(norm - 1)) < _UNIT_LENGTH and np.abs(stacked).max() <= 1.002:
-                    quaternion |= set(four)
-                    self.attitude = True
-                    self.reasons.append(
-                        f"columns {self.table.label(at)} and the three after it have norm 1: a quaternion"
-                    )
+            if set(four) <= set(free) - quaternion and self._off_unit(four).max() < _UNIT_LENGTH:
+                quaternion |= set(four)
+                self.attitude = True
+                self.reasons.append(f"columns {self.table.label(at)} and the three after it have norm 1: a quaternion")
         if self.table.names and unknown:
             return unknown
-        places = [at for at in open_places if at not in quaternion]
-        runs, windows = [[-2]], []
-        for at in places:
-            if runs[-1][-1] == at - 1 and _alike(self.fields[at], self.fields[at - 1]):
+        runs: list[list[int]] = []
+        for at in free:
+            if at in quaternion:
+                continue
+            if runs and runs[-1][-1] == at - 1 and _alike(self.fields[at], self.fields[at - 1]):
                 runs[-1].append(at)
             else:
                 runs.append([at])
         for run in runs:
             step = 3 if len(run) % 3 == 0 else 1
-            windows += [((run[k], run[k + 1], run[k + 2]), step == 1) for k in range(0, len(run) - 2, step)]
-        return [*unknown, *(each for at, loose in windows if (each := self._triad(at, loose=loose)) is not None)]
+            three = ((run[k], run[k + 1], run[k + 2]) for k in range(0, len(run) - 2, step))
+            unknown = [*unknown, *filter(None, (self._triad(places, loose=step == 1) for places in three))]
+        return unknown
 
     def _only(self, free: list[_Triad]) -> _Triad | None:
         if len(free) != 1:
@@ -377,64 +391,69 @@ class _Guess:
 
     def _by_gravity(self, free: list[_Triad], gyro: _Triad | None) -> _Triad | None:
         """The one triad among the unnamed that holds 1 g at rest."""
-        free = [each for each in free if each.posed or not each.loose]
-        holding = [each for each in free if each.gravity_unit not in (None, "count")]
+        free = [triad for triad in free if triad.posed or not triad.loose]
+        holding = [triad for triad in free if triad.gravity_unit not in (None, "count")]
         if not holding:
-            holding = [each for each in free if self._increment(each)]
-        whole = [each for each in free if each.whole and ((each.posed and each.steady) or each.round)]
+            holding = [triad for triad in free if self._increment(triad)]
+        whole = [triad for triad in free if triad.whole and ((triad.posed and triad.steady) or triad.round)]
         sure = [  # many things have norm 1
-            each
-            for each in holding
-            if each.gravity_unit != "g"
-            or (each not in self.unknown and (len(free) > 1 or gyro or (each.lively and not self.attitude)))
+            triad
+            for triad in holding
+            if triad.gravity_unit != "g"
+            or (triad not in self.unknown and (len(free) > 1 or gyro or (triad.lively and not self.attitude)))
         ]
         if len(holding) > 1:
-            posed = [each for each in holding if each.posed]
-            physical = [each for each in holding if each.gravity_unit == "m/s^2"]
+            posed = [triad for triad in holding if triad.posed]
+            physical = [triad for triad in holding if triad.gravity_unit == "m/s^2"]
             holding = posed if len(posed) == 1 else physical if len(physical) == 1 and not posed else holding
         if len(holding) == 1 and holding[0] in sure:
             one = holding[0]
             poses = "in all its poses" if one.posed else "at rest"
             if one.gravity_unit:
-                self.reasons.append(f"columns {one.label} hold {one.level:.4g} {poses}, 1 g in "
-                                    f"{unit_text(one.gravity_unit)}: the accelerometer")  # fmt: skip
+                self.reasons.append(
+                    f"columns {one.label} hold {one.level:.4g} {poses}, 1 g in {unit_text(one.gravity_unit)}: the "
+                    "accelerometer"
+                )
             return one
         if not holding and len(whole) == 1 and len(free) > 1:
-            self.reasons.append(f"columns {whole[0].label} alone keep their norm in all poses, in counts: the "
-                                "accelerometer")  # fmt: skip
+            self.reasons.append(
+                f"columns {whole[0].label} alone keep their norm in all poses, in counts: the accelerometer"
+            )
             return whole[0]
         candidates = holding or whole
         if len(candidates) == 1:
             one = candidates[0]
             one.unit = "?"
-            said = f"1 g in {unit_text(one.gravity_unit or '')}" if holding else "the same norm in all poses, in counts"
-            self.questions.append(f"Are columns {one.label} the accelerometer? They hold {said}, but a magnetometer in "
-                                  "some unit would look the same; write the unit if they are.")  # fmt: skip
+            size = f"1 g in {unit_text(one.gravity_unit or '')}" if holding else "the same norm in all poses, in counts"
+            self.questions.append(
+                f"Are columns {one.label} the accelerometer? They hold {size}, but a magnetometer in some unit would "
+                "look the same; write the unit if they are."
+            )
             return one
         if candidates:
-            told = " or ".join(f"{each.label} (norm {each.level:.4g})" for each in candidates[:4])
-            self.questions.append(f"Which columns are the accelerometer? {told} could be, or could be a magnetometer.")
+            shown = " or ".join(f"{triad.label} (norm {triad.level:.4g})" for triad in candidates[:4])
+            self.questions.append(f"Which columns are the accelerometer? {shown} could be, or could be a magnetometer.")
         else:
             self.questions.append("Which columns are the accelerometer? No three unnamed columns hold 1 g at rest.")
         return None
 
     def _by_turning(self, free: list[_Triad], accel: _Triad) -> _Triad | None:
         """The triad whose rates turn gravity as the accelerometer says."""
-        found = [(abs(each.correlation), triad) for triad in free if (each := self._turning(accel, triad))]
-        found = sorted((each for each in found if each[0] > _TURNS), key=lambda each: -each[0])
-        if found:
-            best = found[0][1]
+        fits = [(abs(fit.correlation), triad) for triad in free if (fit := self._turning(accel, triad))]
+        correlation, best = max(fits, key=lambda pair: pair[0], default=(0.0, None))
+        if best is not None and correlation > CORRELATED:
             self.reasons.append(f"columns {best.label}, integrated, {_TURN}: the gyroscope")
             return best
-        unclear = [each for each in free if not self.table.names or each in self.unknown
-                   or all(_plain(self.fields[at]) for at in each.places)]  # fmt: skip
-        told = " or ".join(each.label for each in unclear[:3])
-        if len(unclear) == 1:
-            self.questions.append(f"Are columns {told} the gyroscope? Too little turns for physics to say.")
-            return unclear[0]
+        unclear = [
+            triad
+            for triad in free
+            if not self.table.names or triad in self.unknown or all(_plain(self.fields[at]) for at in triad.places)
+        ]
+        shown = " or ".join(triad.label for triad in unclear[:3])
         if unclear:
-            self.questions.append(f"Are columns {told} the gyroscope, or none? Too little turns for physics to say.")
-        return None
+            none = "" if len(unclear) == 1 else ", or none"
+            self.questions.append(f"Are columns {shown} the gyroscope{none}? Too little turns for physics to say.")
+        return unclear[0] if len(unclear) == 1 else None
 
     # --- units
 
@@ -460,10 +479,10 @@ class _Guess:
         if not (np.median(np.diff(force_time)) > 0 and np.median(np.diff(rate_time)) > 0):
             return None
         force = accel.values
-        if accel.gravity_unit == "count" and (sphere := fit_sphere(quiet_means_of(accel, force_time))):
+        if accel.gravity_unit == "count" and (sphere := accel.sphere(force_time)):
             force = force - sphere[0]
-        found = turning(force_time, force, rate_time, gyro.values)
-        return found if np.isfinite(found.sigma).any() else None
+        fit = turning(force_time, force, rate_time, gyro.values)
+        return fit if np.isfinite(fit.sigma).any() else None
 
     def _step(self) -> float:
         """How far the time column rises a row."""
@@ -478,9 +497,9 @@ class _Guess:
         for name, factor in names.items():
             if self.table.rate and abs(rates[name] / self.table.rate - 1) < 0.1:
                 return [(name, factor)]
-        first = float(np.nanmin(np.asarray(self.numbers[self.time or 0])))
+        first = np.nanmin(np.asarray(self.numbers[self.time or 0]))
         for name, factor in names.items():
-            if name != "100 us" and 1e9 < first * factor < 2.2e9 and 0.5 < rates[name] < 2e4:
+            if name != "100 us" and EPOCH[0] < first * factor < EPOCH[1] and 0.5 < rates[name] < 2e4:
                 return [(name, factor)]
         if "fine" not in self.fields[self.time or 0].stem:
             rates.pop("100 us")
@@ -495,11 +514,11 @@ class _Guess:
             tried = []
             for factor in [factor for _, factor in self._time_units()] if unclear else [None]:
                 self.assumed = factor
-                if found := self._turning(accel, gyro):
-                    tried.append((abs(found.correlation), self.assumed, found))
+                if fit := self._turning(accel, gyro):
+                    tried.append((abs(fit.correlation), self.assumed, fit))
             if tried:
-                _, self.assumed, turned = max(tried, key=lambda each: each[0])
-        slope = abs(turned.slope) if turned and abs(turned.correlation) > _TURNS else None
+                _, self.assumed, turned = max(tried, key=lambda trial: trial[0])
+        slope = abs(turned.slope) if turned and abs(turned.correlation) > CORRELATED else None
         if self.time is not None:
             slope = self._time_unit(self.time, gyro, slope)
         elif not self.table.rate:
@@ -513,13 +532,15 @@ class _Guess:
         if accel.unit == "?":
             self._take(accel, "accel", None)
             return
-        unit = accel.unit if find_unit(accel.unit or "", GROUPS["accel"].quantities) else None
+        unit = _fitting(accel.unit, "accel")
         if unit is None:
             unit = accel.gravity_unit
             if unit == "?":
                 unit = None
-                self.questions.append(f"Is the accelerometer ({accel.label}) in mg, in cm/s^2, or in counts? Its norm "
-                                      f"at rest is {accel.level:.5g}, near 1 g in each.")  # fmt: skip
+                self.questions.append(
+                    f"Is the accelerometer ({accel.label}) in mg, in cm/s^2, or in counts? Its norm at rest is "
+                    f"{accel.level:.5g}, near 1 g in each."
+                )
             elif unit and unit != "count":
                 self.reasons.append(
                     f"the accelerometer holds {accel.level:.4g} at rest, which is 1 g in {unit_text(unit)}"
@@ -547,11 +568,11 @@ class _Guess:
     def _increment(self, accel: _Triad) -> bool:
         """Whether the triad is g times the sampling interval: velocity increments."""
         rate = self.table.rate or (1.0 / self._step() if self.time is not None else None)
-        found = bool(rate and accel.steady and abs(accel.level * rate / STANDARD_GRAVITY - 1) < 0.1)
-        if found and rate:
-            reason = f"{accel.label} hold {accel.level:.4g} at rest, g over an interval of {1 / rate:.4g} s: increments"
-            self.reasons += [] if reason in self.reasons else [reason]
-        return found
+        if not rate or not accel.steady or abs(accel.level * rate / STANDARD_GRAVITY - 1) >= 0.1:
+            return False
+        reason = f"{accel.label} hold {accel.level:.4g} at rest, g over an interval of {1 / rate:.4g} s: increments"
+        self.reasons += [] if reason in self.reasons else [reason]
+        return True
 
     def _time_unit(self, time: int, gyro: _Triad | None, slope: float | None) -> float | None:
         """Decide the unit of the stamps; returns the slope of the gyroscope with these stamps."""
@@ -563,34 +584,32 @@ class _Guess:
         if len(options) == 1 and np.all(np.diff(values) == 1.0) and not self.table.rate:
             options = []  # rows counted from the first on
         if len(options) > 1 and slope is not None and gyro is not None:
-            given = find_unit(gyro.unit or "", "angular rate")
-            angles = [given.factor] if given else [_ANGLES["rad/s"], _ANGLES["deg/s"]]
+            stated = find_unit(gyro.unit or "", "angular rate")
+            angles = [stated.factor] if stated else [_ANGLES["rad/s"], _ANGLES["deg/s"]]
             raw = slope * self._factor()
-            fits = [(name, factor) for name, factor in options
-                    for angle in angles if abs(math.log(raw / factor / angle)) < 0.25]  # fmt: skip
+            fits = [option for option in options for angle in angles if abs(math.log(raw / option[1] / angle)) < 0.25]
             if len(set(fits)) == 1:
                 slope, options = raw / fits[0][1], fits[:1]
                 self.reasons.append(f"with stamps in {fits[0][0]} the integrated rates {_TURN}")
         if len(options) == 1:
             unit, factor = options[0]
-            said = ", as the file states" if self.table.rate else ""
-            rate = 1.0 / (step * factor)
-            self.reasons.append(f"{label} rises by {step:.5g} a row, {rate:.4g} Hz in {unit}{said}")
+            source = ", as the file states" if self.table.rate else ""
+            self.reasons.append(f"{label} rises by {step:.5g} a row, {1.0 / (step * factor):.4g} Hz in {unit}{source}")
             self.chosen[time] = Column(TIME, unit)
             return slope
-        told = ", ".join(f"{1 / (step * factor):.4g} Hz in {unit}" for unit, factor in options)
-        said = f": {told}" if told else ", a rate of no IMU in any unit; is it a counter?"
-        self.questions.append(f"In which unit is {label}? It rises by {step:.5g} a row{said}.")
+        rates = ", ".join(f"{1 / (step * factor):.4g} Hz in {unit}" for unit, factor in options)
+        meaning = f": {rates}" if rates else ", a rate of no IMU in any unit; is it a counter?"
+        self.questions.append(f"In which unit is {label}? It rises by {step:.5g} a row{meaning}.")
         self.chosen[time] = Column(TIME, "?")
         return None
 
     def _gyro_unit(self, gyro: _Triad, accel: _Triad | None, slope: float | None, per_sample: float | None) -> None:
         """Decide the gyroscope's unit; `per_sample`: the slope at 100 Hz where the rate is not known."""
-        unit = gyro.unit if find_unit(gyro.unit or "", GROUPS["gyro"].quantities) else None
-        peak = float(np.abs(gyro.values).max())
-        rest = float(np.abs(np.median(gyro.values, axis=0)).max())
-        resting = accel is not None and accel.still and not accel.posed and not _turns_steadily(gyro)
-        accel_unit = next((each.unit for each in self.chosen.values() if (each.name or "").startswith("accel")), None)
+        unit = _fitting(gyro.unit, "gyro")
+        peak = np.abs(gyro.values).max()
+        rest = np.abs(np.median(gyro.values, axis=0)).max()
+        resting = accel is not None and accel.still and not accel.posed and not gyro.turns
+        accel_unit = next((column.unit for column in self.chosen.values() if column.name == "accel_x"), None)
         if unit is None and slope is not None:
             near = {name: abs(math.log(slope / factor)) for name, factor in _ANGLES.items()}
             best = min(near, key=lambda name: near[name])
@@ -604,11 +623,14 @@ class _Guess:
                 self.reasons.append(f"in {unit} the integrated rates {_TURN} (factor {slope / _ANGLES[best]:.3f})")
         if unit is None and per_sample is not None and not gyro.whole:
             rates = {name: 100 * _ANGLES[name] / per_sample for name in ("rad/s", "deg/s", "mdeg/s")}
-            fits = [name for name, rate in rates.items()
-                    if _LIKELY[0] < rate < _LIKELY[1] and name in _plausible(peak, rest, None)]  # fmt: skip
-            said = " or ".join(f"{rates[name]:.3g} Hz if it is in {name}" for name in fits)
+            fits = [
+                name
+                for name, rate in rates.items()
+                if _LIKELY[0] < rate < _LIKELY[1] and name in _plausible(peak, rest, None)
+            ]
             if fits:
-                self.questions.append(f"The rates {_TURN} at about {said}.")
+                shown = " or ".join(f"{rates[name]:.3g} Hz if it is in {name}" for name in fits)
+                self.questions.append(f"The rates {_TURN} at about {shown}.")
             if len(fits) == 1:
                 unit = fits[0]
                 self.reasons.append(f"at a usual sample rate the integrated rates {_TURN} only in {unit}")
@@ -620,8 +642,8 @@ class _Guess:
                 fits = [name for name in ("rad/s", "deg/s") if name in fits]
             if len(fits) == 1:
                 unit = fits[0]
-                said = f", and at rest {rest:.3g} with a scatter of {gyro.noise:.2g}" if resting else ""
-                self.reasons.append(f"the gyroscope reads up to {peak:.4g}{said}: of a sensor only in {unit}")
+                at_rest = f", and at rest {rest:.3g} with a scatter of {gyro.noise:.2g}" if resting else ""
+                self.reasons.append(f"the gyroscope reads up to {peak:.4g}{at_rest}: of a sensor only in {unit}")
         if unit is None:
             self.questions.append(
                 f"Is the gyroscope ({gyro.label}) in deg/s or rad/s? It reads up to {peak:.3g}, and "
@@ -640,20 +662,20 @@ class _Guess:
         return None
 
     def _gyro_counts(self, slope: float | None) -> None:
+        fitting: list[str] = []
         if slope:
             per_degree = math.pi / 180 / slope
-            near, *others = sorted(_PER_DEGREE, key=lambda scale: abs(math.log(per_degree / scale)))
-            off = abs(math.log(per_degree / near))
-            apart = min(abs(math.log(per_degree / each)) for each in others if abs(each / near - 1) > 0.01)
-            if off < 0.06 and apart > 2 * off:
-                self.gyro_scale = f"{near:g} count/(deg/s)"
-                self.reasons.append(f"{per_degree:.4g} counts to 1 deg/s {_TURN}; nominal are {near:g}")
+            off = {scale: abs(math.log(per_degree / scale)) for scale in _PER_DEGREE}
+            best = min(_PER_DEGREE, key=lambda scale: off[scale])
+            apart = min(off[scale] for scale in _PER_DEGREE if abs(scale / best - 1) > 0.01)
+            if off[best] < 0.06 and apart > 2 * off[best]:
+                self.gyro_scale = f"{best:g} count/(deg/s)"
+                self.reasons.append(f"{per_degree:.4g} counts to 1 deg/s {_TURN}; nominal are {best:g}")
                 return
-        near = [] if not slope else [f"{scale:g}" for scale in _PER_DEGREE
-                                     if abs(math.log(math.pi / 180 / slope / scale)) < _ROUGH]  # fmt: skip
-        known = f" Of the usual ones {listed(near, 'or')} would fit." if near else ""
+            fitting = [f"{scale:g}" for scale in _PER_DEGREE if off[scale] < _ROUGH]
+        usual = f" Of the usual ones {listed(fitting, 'or')} would fit." if fitting else ""
         self.gyro_scale = "?"
-        self.questions.append(f"How many counts are 1 deg/s (--gyro-scale)? The data sheet says.{known}")
+        self.questions.append(f"How many counts are 1 deg/s (--gyro-scale)? The data sheet says.{usual}")
 
     def _take(self, triad: _Triad, sensor: str, unit: str | None) -> None:
         for at, name in zip(triad.places, GROUPS[sensor].columns, strict=True):
@@ -662,8 +684,8 @@ class _Guess:
     def _others(self, triads: list[_Triad]) -> None:
         """Magnetometer and temperature, where name and unit are clear; what is not clear is left out."""
         for triad in triads:
-            if triad.sensor == "mag" and not any(each.name == "mag_x" for each in self.chosen.values()):
-                unit = triad.unit if find_unit(triad.unit or "", GROUPS["mag"].quantities) else None
+            if triad.sensor == "mag" and not self._has("mag_x"):
+                unit = _fitting(triad.unit, "mag")
                 sizes = {"uT": 50.0, "G": 0.5, "mG": 500.0, "nT": 5e4, "T": 5e-5}
                 unit = unit or next((name for name, size in sizes.items() if 0.5 < triad.level / size < 1.4), None)
                 if triad.whole and not triad.unit:
@@ -671,13 +693,13 @@ class _Guess:
                 if unit:
                     self._take(triad, "mag", unit)
         self._quaternion()
-        for at, each in enumerate(self.fields):
-            values, name = self.numbers[at], each.sensor or ""
+        for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
+            name = field.sensor or ""
             if name.startswith("attitude_"):
-                self.chosen[at] = Column(name, each.unit)
-            if name not in _SINGLE or values is None or any(other.name == name for other in self.chosen.values()):
+                self.chosen[at] = Column(name, field.unit)
+            if name not in _SINGLE or values is None or self._has(name):
                 continue
-            unit = each.unit if find_unit(each.unit or "", GROUPS[name].quantities) else None
+            unit = _fitting(field.unit, name)
             if unit is None and "temperature" in name and -60 < np.nanmin(values) <= np.nanmax(values) < _HOTTEST:
                 unit = "degC"
             elif unit is None and "temperature" in name and np.ptp(values[np.isfinite(values)]) > 0:
@@ -696,11 +718,10 @@ class _Guess:
             if match := re.fullmatch(r"(.*?)[\W_]*([wxyz])", parse_column(name)[0].strip().lower()):
                 named.setdefault(match[1], {})[match[2]] = at
         for head, places in named.items():
-            columns = [self.numbers[at] for at in places.values()]
-            if len(places) < 4 or not set(words_of(head)) & _ATTITUDES or any(each is None for each in columns):
+            missing = any(self.numbers[at] is None for at in places.values())
+            if len(places) < 4 or missing or not set(words_of(head)) & _ATTITUDES:
                 continue
-            norm = np.linalg.norm(np.stack([each for each in columns if each is not None]), axis=0)
-            if np.nanmax(np.abs(norm - 1)) < _UNIT_LENGTH:
+            if np.nanmax(self._off_unit(places.values())) < _UNIT_LENGTH:
                 self.reasons.append(f"{head!r} is a quaternion of norm 1: an attitude")
                 for axis, at in places.items():
                     self.chosen[at] = Column(f"attitude_{axis}")
@@ -709,16 +730,15 @@ class _Guess:
     # --- the result
 
     def _lone_magnetometer(self) -> str:
-        columns = [self.chosen.get(at, Column(None)) for at in range(self.width)]
-        mine = [each if (each.name or "").startswith(("mag_", "time")) else Column(None) for each in columns]
+        columns = [c if (c.name or "").startswith(("mag_", "time")) else Column(None) for c in self.columns]
         stated = header_columns(self.table) or ()
-        known = any(each.name == "mag_x" and each.unit for each in stated)
-        option = "" if known else f" --columns '{column_text(mine)}'"
+        known = any(column.name == "mag_x" and column.unit for column in stated)
+        option = "" if known else f" --columns '{column_text(columns)}'"
         return f"This file holds a magnetometer alone: jaximu magnetometer {self.table.path}{option} calibrates it."
 
     def _result(self, accel: _Triad | None, gyro: _Triad | None) -> Advice:
-        if accel is None and self.role != "gyro" and (said := self._without_gravity()):
-            self.questions = [said]
+        if accel is None and self.role != "gyro" and (sentence := self._without_gravity()):
+            self.questions = [sentence]
         elif accel is None and gyro is not None and self.role != "gyro":
             self.questions.append(_lone_gyroscope(self.table))
         elif accel is None and self.role != "gyro" and not self.questions:
@@ -731,7 +751,7 @@ class _Guess:
                     f"This is a trajectory (attitude, and position or biases beside it), no sensor's log: give it as "
                     f"--reference {self.table.path} to `jaximu reference` with the log of the same motion."
                 ]
-            if any(each.name == "mag_x" for each in self.chosen.values()):
+            if self._has("mag_x"):
                 self.questions = [self._lone_magnetometer()]
             elif self.table.names is None and self.width == len("xyz") + (self.time is not None):
                 self.questions[:1] = [
@@ -739,41 +759,38 @@ class _Guess:
                     f"{self.table.path} --columns calibrates it, with its columns named (mag [uT], or mag [count])."
                 ]
             self.questions = self.questions[:1]
-            return Advice(None, None, None, None, tuple(self.reasons), tuple(self.questions))
-        columns = [self.chosen.get(at, Column(None)) for at in range(self.width)]
+            return Advice(reasons=tuple(self.reasons), questions=tuple(self.questions))
         stated = header_columns(self.table)
-        said = stated is not None and all(
-            a == b if a.name else not b.name for a, b in zip(columns, stated, strict=True)
+        same = stated is not None and all(
+            chosen == named if chosen.name else not named.name
+            for chosen, named in zip(self.columns, stated, strict=True)
         )
         order = sorted(self.chosen)
         rows = [tuple(column_text([self.chosen[at]]) for at in order)]
         for row in range(min(_SHOWN, len(self.table.columns[0]))):
             cells = [self.table.columns[at][row] for at in order]
             rows.append(tuple(f"{cell:.6g}" if isinstance(cell, float | np.floating) else str(cell) for cell in cells))
-        text = None if said else column_text(columns)
         return Advice(
-            text, self.rate, self.accel_scale, self.gyro_scale, tuple(self.reasons), tuple(self.questions),
-            tuple(rows) if order else (), accel is not None,
-        )  # fmt: skip
-
-
-def quiet_means_of(triad: _Triad, time: FloatArray | None = None) -> FloatArray:
-    """The means of a triad's quiet windows, for its sphere."""
-    from jaximu.recordings.recording import Signal
-
-    stamps = np.arange(len(triad.values)) / 100.0 if time is None else time
-    return quiet_means(Signal(stamps, triad.values, "count"))
+            None if same else column_text(self.columns),
+            self.rate,
+            self.accel_scale,
+            self.gyro_scale,
+            tuple(self.reasons),
+            tuple(self.questions),
+            tuple(rows) if order else (),
+            accel is not None,
+        )
 
 
 def column_text(columns: Sequence[Column]) -> str:
     """The columns as `--columns` takes them, as short as can be."""
     entries: list[str] = []
     names, at = [column.name for column in columns], 0
-    triads: dict[tuple, str] = {each.columns: key for key, each in GROUPS.items() if len(each.columns) == 3}
+    triads: dict[tuple, str] = {group.columns: key for key, group in GROUPS.items() if len(group.columns) == 3}
     while at < len(columns):
         unit = f" [{columns[at].unit}]" if columns[at].unit else ""
         triad = triads.get(tuple(names[at : at + 3]))
-        skipped = sum(1 for _ in takewhile(lambda name: name is None, names[at:]))
+        skipped = len(list(takewhile(lambda name: name is None, names[at:])))
         if skipped:
             entries += [f"_*{skipped}"] if skipped > 3 else ["_"] * skipped
         else:
@@ -782,25 +799,20 @@ def column_text(columns: Sequence[Column]) -> str:
     return ",".join(entries)
 
 
-def _turns_steadily(gyro: _Triad) -> bool:
-    """Whether a gyroscope's means change by more than its noise: it turns, if only about the vertical."""
-    size = max(5, min(50, len(gyro.values) // 20))
-    count = len(gyro.values) // size
-    if count < 4:
-        return False
-    means = gyro.values[: count * size].reshape(count, size, 3).mean(axis=1)
-    return bool(np.std(means, axis=0).max() > _TURNING * gyro.noise)
-
-
 def _plausible(peak: float, bias: float, noise: float | None) -> list[str]:
     """The units in which a sensor may read so much: 2300 °/s at most, and at rest 25 °/s of bias, 3 °/s of scatter."""
-    found = []
+    units: list[str] = []
     for unit in ("rad/s", "deg/s", "mdeg/s"):
         degree = math.degrees(_ANGLES[unit])
         at_rest = noise is None or (bias * degree < 25 and 1e-4 < noise * degree < (1.0 if unit == "deg/s" else 3.0))
-        if peak * degree < 2300 and at_rest and not (unit == "mdeg/s" and "deg/s" in found):
-            found.append(unit)
-    return found
+        if peak * degree < 2300 and at_rest and not (unit == "mdeg/s" and "deg/s" in units):
+            units.append(unit)
+    return units
+
+
+def _fitting(unit: str | None, group: str) -> str | None:
+    """A stated unit, if it is one of what the group's columns measure."""
+    return unit if find_unit(unit or "", GROUPS[group].quantities) else None
 
 
 def _plain(field: Field) -> bool:
@@ -810,14 +822,14 @@ def _plain(field: Field) -> bool:
 
 def _alike(one: Field, other: Field) -> bool:
     """Whether two names differ by a number alone, or are none: columns of one matrix."""
-    words = [[word.rstrip("0123456789") for word in each.stem if not word.isdigit()] for each in (one, other)]
+    words = [[word.rstrip("0123456789") for word in field.stem if not word.isdigit()] for field in (one, other)]
     return words[0] == words[1] and one.unit == other.unit
 
 
 def _lone_gyroscope(table: Table) -> str:
     path = Path(table.path)
     others = sorted(path.parent.glob(f"*{path.suffix}")) if path.is_file() else []
-    names = [each.name for each in others if "acc" in each.name.lower() and "linear" not in each.name.lower()]
+    names = [log.name for log in others if "acc" in log.name.lower() and "linear" not in log.name.lower()]
     where = f"read both: {names[0]} --gyro-log {path.name}" if names else "give its file, and this one as --gyro-log"
     return (
         f"Where is the accelerometer? This file holds a gyroscope alone; {where}. Alone it can be calibrated on a "

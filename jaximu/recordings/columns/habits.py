@@ -33,19 +33,23 @@ _NEUTRAL = set(
     "payload buffer atti corrected compensated "
     "sensordata android".split()
 )
-_REFUSED = {
-    "linear": "gravity is taken out", "lin": "gravity is taken out", "user": "gravity is taken out",
-    "free": "gravity is taken out", "dynamic": "gravity is taken out", "gravity": "gravity alone",
-    "grav": "gravity alone", "bias": "an estimated bias", "offset": "an offset", "std": "a standard deviation",
-    "sd": "a standard deviation",
-    "sigma": "a standard deviation", "var": "a variance", "variance": "a variance", "cov": "a covariance",
-    "covariance": "a covariance", "delta": "an increment", "norm": "a magnitude", "magnitude": "a magnitude",
-    "total": "a magnitude", "absolute": "a magnitude", "abs": "a magnitude", "earth": "in the world's axes",
-    "world": "in the world's axes", "ned": "in the world's axes", "enu": "in the world's axes",
-    "global": "in the world's axes", "nav": "in the world's axes", "error": "an error", "err": "an error",
-    "quat": "a quaternion", "q": "a quaternion", "quaternion": "a quaternion",
-    "euler": "angles", "setpoint": "a set point",
-}  # fmt: skip
+_REFUSALS = {
+    "gravity is taken out": "linear lin user free dynamic",
+    "gravity alone": "gravity grav",
+    "an estimated bias": "bias",
+    "an offset": "offset",
+    "a standard deviation": "std sd sigma",
+    "a variance": "var variance",
+    "a covariance": "cov covariance",
+    "an increment": "delta",
+    "a magnitude": "norm magnitude total absolute abs",
+    "in the world's axes": "earth world ned enu global nav",
+    "an error": "error err",
+    "a quaternion": "quat q quaternion",
+    "angles": "euler",
+    "a set point": "setpoint",
+}
+_REFUSED = {word: reason for reason, words in _REFUSALS.items() for word in words.split()}
 """Words beside a sensor's by which a column is not its measurement, and what it is."""
 _ESTIMATED = {("b", "w"), ("b", "a"), ("b", "g")}
 """How the names of an estimated state's biases begin, as in EuRoC's b_w_RS_S_x."""
@@ -62,18 +66,26 @@ _TIME_BESIDE = _NEUTRAL | set(
     "acc gyro gyroscope logging "
     "absolute relative and date txt".split()
 )
+_UNIT_NAMES = {
+    "time": {
+        "s": "s, sec, secs, seconds",
+        "ms": "ms, msec, msecs, millis, milliseconds",
+        "us": "us, usec, micros, microseconds",
+        "ns": "ns, nsec, nanos, nanosec, nanoseconds",
+    },
+    "accel": {"g": "g, gs", "mg": "mg", "m/s^2": "ms2, mps2, mss, m s 2, m s2, m s s, m per s2, m s"},
+    "gyro": {
+        "deg/s": "dps, degs, deg s, deg sec, deg per s",
+        "rad/s": "rads, rad s, radps, rps, rad sec, rad per s",
+        "mdeg/s": "mdps",
+    },
+    "mag": {"uT": "ut", "G": "gauss", "mG": "mgauss", "nT": "nt"},
+    "temperature": {"degC": "c, degc, celsius, deg c", "K": "k", "degF": "f"},
+}
 _UNIT_WORDS = {
-    "time": {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "msecs": "ms", "millis": "ms",
-             "milliseconds": "ms", "us": "us", "usec": "us", "micros": "us", "microseconds": "us", "ns": "ns",
-             "nsec": "ns", "nanos": "ns", "nanosec": "ns", "nanoseconds": "ns"},
-    "accel": {"g": "g", "gs": "g", "mg": "mg", "ms2": "m/s^2", "mps2": "m/s^2", "mss": "m/s^2", "m s 2": "m/s^2",
-              "m s2": "m/s^2", "m s s": "m/s^2", "m per s2": "m/s^2", "m s": "m/s^2"},
-    "gyro": {"dps": "deg/s", "degs": "deg/s", "deg s": "deg/s", "deg sec": "deg/s", "deg per s": "deg/s",
-             "rads": "rad/s", "rad s": "rad/s", "radps": "rad/s", "rps": "rad/s", "rad sec": "rad/s",
-             "rad per s": "rad/s", "mdps": "mdeg/s"},
-    "mag": {"ut": "uT", "gauss": "G", "mgauss": "mG", "nt": "nT"},
-    "temperature": {"c": "degC", "degc": "degC", "celsius": "degC", "deg c": "degC", "k": "K", "f": "degF"},
-}  # fmt: skip
+    sensor: {words: unit for unit, names in units.items() for words in names.split(", ")}
+    for sensor, units in _UNIT_NAMES.items()
+}
 _GLUED = re.compile(
     r"(a|ac|acc|accel|accl|acceleration|accelerometer|g|gy|gyr|gyro|gyroscope|gf|w|om|omega|rot|rotation|m|mag|b|f|fb|wb)"
     r"([xyz])"
@@ -136,9 +148,9 @@ class Field:
                 if _time(head) and tail in _UNIT_WORDS["time"]:
                     return cls(tuple(head), None, "time", unit or _UNIT_WORDS["time"][tail])
                 short, at = _axis(head)
-                found, reason = sensor_of(short)
-                if tail in _UNIT_WORDS.get(found or "", {}) and (at or found == "temperature"):
-                    return cls(short, at, found, unit or _UNIT_WORDS[found or ""][tail], reason)
+                short_sensor, reason = sensor_of(short)
+                if tail in _UNIT_WORDS.get(short_sensor or "", {}) and (at or short_sensor == "temperature"):
+                    return cls(short, at, short_sensor, unit or _UNIT_WORDS[short_sensor or ""][tail], reason)
         if axis is None and _time(words):
             tail = next((word for word in reversed(words) if word in _UNIT_WORDS["time"] and len(word) > 1), None)
             stated = find_unit(unit or "", "temperature") if words == ["t"] else None
@@ -219,13 +231,12 @@ def _time(words: list[str]) -> bool:
 def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
     """The words without the axis among them, and the axis."""
     letters = [at for at, word in enumerate(words) if word in ("x", "y", "z")]
-    if len(letters) == 1:
-        at = letters[0]
-        return (*words[:at], *words[at + 1 :]), words[at]
     turns = [at for at, word in enumerate(words) if word in _TURNS]
-    if len(turns) == 1 and len(words) > 1 and any(word in _WORDS or word in _HELPERS for word in words):
-        at = turns[0]
-        return (*words[:at], *words[at + 1 :]), _TURNS[words[at]]
+    of_sensor = len(words) > 1 and any(word in _WORDS or word in _HELPERS for word in words)
+    for places in (letters, turns if of_sensor else []):
+        if len(places) == 1:
+            at = places[0]
+            return (*words[:at], *words[at + 1 :]), _TURNS.get(words[at], words[at])
     for at, word in enumerate(words):
         if match := _GLUED.fullmatch(word):
             return (*words[:at], match[1], *words[at + 1 :]), match[2]
@@ -238,22 +249,24 @@ def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
 
 def sensor_of(stem: tuple[str, ...]) -> tuple[str | None, str | None]:
     """The sensor that the words of a name mean, None for none or more than one, and why it is not its measurement."""
-    found: set[str] = set()
+    sensors: set[str] = set()
     why_not = None
     for word in stem:
         plain = match[1] if (match := _INSTANCE.fullmatch(word)) else word
         if plain in _REFUSED and any(other != "var" and not other.isdigit() for other in stem):  # Var1 says nothing
             why_not = why_not or _REFUSED[plain]
         elif plain in _WORDS or plain in _HELPERS:
-            found.add(_WORDS.get(plain) or _HELPERS[plain])
+            sensors.add(_WORDS.get(plain) or _HELPERS[plain])
         elif plain not in _NEUTRAL and not plain.isdigit():
             return None, None
-    if why_not or not any(word in _WORDS or _INSTANCE.sub(r"\1", word) in _WORDS or word in ("angular", "ang")
-                          for word in stem):  # fmt: skip
+    names_one = any(
+        word in _WORDS or _INSTANCE.sub(r"\1", word) in _WORDS or word in ("angular", "ang") for word in stem
+    )
+    if why_not or not names_one:
         return None, why_not
-    if "temperature" in found:
-        found = {"ambient_temperature"} if "ambient_temperature" in found else {"temperature"}
-    return (found.pop(), None) if len(found) == 1 else (None, None)
+    if "temperature" in sensors:
+        sensors = {"ambient_temperature"} if "ambient_temperature" in sensors else {"temperature"}
+    return (sensors.pop(), None) if len(sensors) == 1 else (None, None)
 
 
 _RATE = re.compile(
@@ -261,7 +274,7 @@ _RATE = re.compile(
     r"\bfrequency|\brate|\bfreq)\b[\s\"'=:,;\t(]*(?:\(?\[?hz\]?\)?)?[\s\"'=:,;\t]*([0-9]+(?:[.,][0-9]+)?)\s*(k?hz)?|"
     r"\bat ([0-9]+(?:\.[0-9]+)?) *(hz)\b",
     re.IGNORECASE,
-)  # fmt: skip
+)
 _INTERVAL = re.compile(
     r"(?:sampl\w*[ _-]*(?:interval|period|time)|\bdt|interval)\b[\s\"'=:,;\t(]*([0-9]+(?:\.[0-9]+)?(?:e-?\d+)?)\s*"
     r"\)?(s|ms|us|sec|msec)\b",
@@ -271,12 +284,12 @@ _INTERVAL = re.compile(
 
 def stated_rate(text: str) -> float | None:
     """The sample rate in Hz that a file's preamble states, None for none or for several that differ."""
-    found = set()
+    rates = set()
     for match in _RATE.finditer(text):
         value = float((match[1] or match[3]).replace(",", "."))
-        found.add(value * (1e3 if (match[2] or "").lower() == "khz" else 1.0))
+        rates.add(value * (1e3 if (match[2] or "").lower() == "khz" else 1.0))
     for match in _INTERVAL.finditer(text):
         unit = find_unit(match[2], "time")
         if unit and float(match[1]) > 0:
-            found.add(round(1.0 / (float(match[1]) * unit.factor), 6))
-    return found.pop() if len(found) == 1 and 0 < min(found) < 1e5 else None
+            rates.add(round(1.0 / (float(match[1]) * unit.factor), 6))
+    return rates.pop() if len(rates) == 1 and 0 < min(rates) < 1e5 else None

@@ -12,7 +12,7 @@ import numpy as np
 from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.table import Table
 
-__all__ = ["known_names", "sentence_names", "whole_stamps"]
+__all__ = ["EPOCH", "known_names", "sentence_names", "whole_stamps"]
 
 
 @dataclass(frozen=True)
@@ -21,57 +21,80 @@ class _KnownLayout:
 
     program: str
     columns: Mapping[str, str]
-    optional: frozenset[str] = frozenset()
+    needed: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, program: str, text: str) -> _KnownLayout:
         """Read "name=what it is, …": * stands for x, y, z (and w of an attitude), ? says that it may be missing."""
         columns: dict[str, str] = {}
-        optional: set[str] = set()
+        needed: set[str] = set()
         for name, title in (entry.split("=") for entry in text.split(", ")):
             axes = "wxyz" if title.startswith("attitude") else "xyz" if "*" in name else "*"
-            found = {name.lstrip("?").replace("*", axis): title.replace("*", axis) for axis in axes}
-            columns |= found
-            optional |= set(found) if name.startswith("?") else set()
-        return cls(program, columns, frozenset(optional))
-
-    def fits(self, names: list[str]) -> bool:
-        return set(self.columns) - self.optional <= set(names)
+            names = {name.lstrip("?").replace("*", axis): title.replace("*", axis) for axis in axes}
+            columns |= names
+            needed |= set() if name.startswith("?") else set(names)
+        return cls(program, columns, frozenset(needed))
 
 
 _LAYOUTS = [
     _KnownLayout.of(program, columns)
     for program, columns in (
-        ("EuRoC (ASL dataset format: ns, rad/s, m/s^2)",
-         "timestamp=time [ns], w_rs_s_*=gyro_* [rad/s], a_rs_s_*=accel_* [m/s^2]"),
-        ("Kalibr's bag extractor (ns, rad/s, m/s^2)",
-         "timestamp=time [ns], omega_*=gyro_* [rad/s], alpha_*=accel_* [m/s^2]"),
-        ("the BROAD data set (m/s^2, rad/s, uT; opt_quat is the sensor's attitude)",
-         "imu_acc_*=accel_* [m/s^2], imu_gyr_*=gyro_* [rad/s], ?imu_mag_*=mag_* [uT], ?opt_quat_*=attitude_* [1]"),
-        ("the MARS logger (ns, rad/s, m/s^2)",
-         "timestamp=time [ns], g*=gyro_* [rad/s], a*=accel_* [m/s^2], unix time="),
-        ("Physics Toolbox (gF is the specific force in g; a without gravity is not used)",
-         "?time=time [s], gf*=accel_* [g], ?w*=gyro_* [rad/s], ?b*=mag_* [uT], ?a*=without_gravity_*"),
-        ("MicroStrain's SensorConnect (g, rad/s, G)",
-         "?time=time [ns], scaledaccel*=accel_* [g], ?scaledgyro*=gyro_* [rad/s], ?scaledmag*=mag_* [G]"),
-        ("MicroStrain's MIP Monitor (s, g, rad/s, G)",
-         "?gps tow=time [s], * accel=accel_* [g], ?* gyro=gyro_* [rad/s], ?* mag=mag_* [G]"),
-        ("VectorNav (ns, m/s^2, rad/s, G)",
-         "timestartup=time [ns], uncompacc*=accel_* [m/s^2], uncompgyro*=gyro_* [rad/s], ?uncompmag*=mag_* [G]"),
-        ("VectorNav (ns, m/s^2, rad/s, G)",
-         "timestartup=time [ns], accel*=accel_* [m/s^2], gyro*=gyro_* [rad/s], ?mag*=mag_* [G]"),
+        (
+            "EuRoC (ASL dataset format: ns, rad/s, m/s^2)",
+            "timestamp=time [ns], w_rs_s_*=gyro_* [rad/s], a_rs_s_*=accel_* [m/s^2]",
+        ),
+        (
+            "Kalibr's bag extractor (ns, rad/s, m/s^2)",
+            "timestamp=time [ns], omega_*=gyro_* [rad/s], alpha_*=accel_* [m/s^2]",
+        ),
+        (
+            "the BROAD data set (m/s^2, rad/s, uT; opt_quat is the sensor's attitude)",
+            "imu_acc_*=accel_* [m/s^2], imu_gyr_*=gyro_* [rad/s], ?imu_mag_*=mag_* [uT], ?opt_quat_*=attitude_* [1]",
+        ),
+        (
+            "the MARS logger (ns, rad/s, m/s^2)",
+            "timestamp=time [ns], g*=gyro_* [rad/s], a*=accel_* [m/s^2], unix time=",
+        ),
+        (
+            "Physics Toolbox (gF is the specific force in g; a without gravity is not used)",
+            "?time=time [s], gf*=accel_* [g], ?w*=gyro_* [rad/s], ?b*=mag_* [uT], ?a*=without_gravity_*",
+        ),
+        (
+            "MicroStrain's SensorConnect (g, rad/s, G)",
+            "?time=time [ns], scaledaccel*=accel_* [g], ?scaledgyro*=gyro_* [rad/s], ?scaledmag*=mag_* [G]",
+        ),
+        (
+            "MicroStrain's MIP Monitor (s, g, rad/s, G)",
+            "?gps tow=time [s], * accel=accel_* [g], ?* gyro=gyro_* [rad/s], ?* mag=mag_* [G]",
+        ),
+        (
+            "VectorNav (ns, m/s^2, rad/s, G)",
+            "timestartup=time [ns], uncompacc*=accel_* [m/s^2], uncompgyro*=gyro_* [rad/s], ?uncompmag*=mag_* [G]",
+        ),
+        (
+            "VectorNav (ns, m/s^2, rad/s, G)",
+            "timestartup=time [ns], accel*=accel_* [m/s^2], gyro*=gyro_* [rad/s], ?mag*=mag_* [G]",
+        ),
         ("NaveGo (s, m/s^2, rad/s)", "t=time [s], fb_*=accel_* [m/s^2], wb_*=gyro_* [rad/s]"),
-        ("MAVLink SCALED_IMU (ms, mg, mrad/s, mG)",
-         "time_boot_ms=time [ms], *acc=accel_* [mg], *gyro=gyro_* [mrad/s], ?*mag=mag_* [mG]"),
-        *(("a table of sensor_msgs/Imu (rad/s, m/s^2), time being the header's stamp",
-           ", ".join(prefix + each for each in (*stamp.split(", "), "angular_velocity.*=gyro_* [rad/s]",
-                                                "linear_acceleration.*=accel_* [m/s^2]"))
-           + ", ?time=received, ?%time=received")
-          for stamp in ("header.stamp.sec=, header.stamp.nanosec=", "header.stamp.secs=, header.stamp.nsecs=",
-                        "header.stamp=time [ns]")
-          for prefix in ("", "field.", "msg.")),
+        (
+            "MAVLink SCALED_IMU (ms, mg, mrad/s, mG)",
+            "time_boot_ms=time [ms], *acc=accel_* [mg], *gyro=gyro_* [mrad/s], ?*mag=mag_* [mG]",
+        ),
+        *(
+            (
+                "a table of sensor_msgs/Imu (rad/s, m/s^2), time being the header's stamp",
+                f"{stamp.format(prefix)}, {prefix}angular_velocity.*=gyro_* [rad/s], "
+                f"{prefix}linear_acceleration.*=accel_* [m/s^2], ?time=received, ?%time=received",
+            )
+            for stamp in (
+                "{0}header.stamp.sec=, {0}header.stamp.nanosec=",
+                "{0}header.stamp.secs=, {0}header.stamp.nsecs=",
+                "{0}header.stamp=time [ns]",
+            )
+            for prefix in ("", "field.", "msg.")
+        ),
     )
-]  # fmt: skip
+]
 _LATEST = 2**33  # s
 _PAIRS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanoseconds"), ("sec", "nsec"))
 _SENSOR_LOGGER = {"time": "time [ns]", "seconds_elapsed": "", "x": "", "y": "", "z": ""}
@@ -88,7 +111,7 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
     prefixes = {match[0] for name in names if (match := re.match(r".*\.(?=fb_x$)", name))}
     if len(prefixes) == 1:  # the structure that holds them all
         names = [name.removeprefix(*prefixes) for name in names]
-    layout = next((each for each in _LAYOUTS if each.fits(names)), None)
+    layout = next((layout for layout in _LAYOUTS if layout.needed <= set(names)), None)
     if layout is None and (ours := _of_message(table, table.names)):
         return ours
     if layout is None and set(_SENSOR_LOGGER) == set(names):  # one file a sensor, named after it
@@ -105,14 +128,16 @@ def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
     if layout is None:
         return None
     ours = tuple(
-        title if (title := layout.columns.get(name)) and not (title.startswith("time") and _stated(given)) else given
-        for name, given in zip(names, table.names, strict=True)
+        title
+        if (title := layout.columns.get(name)) and not (title.startswith("time") and _stated(own_name))
+        else own_name
+        for name, own_name in zip(names, table.names, strict=True)
     )
     return ours, f"columns and units as {layout.program} has them."
 
 
-_XYZ = [f"{name}_{axis} [{unit}]" for name, unit in (("mag", "G"), ("accel", "m/s^2"), ("gyro", "rad/s"))
-        for axis in "xyz"]  # fmt: skip
+_TRIADS = (("mag", "G"), ("accel", "m/s^2"), ("gyro", "rad/s"))
+_XYZ = [f"{name}_{axis} [{unit}]" for name, unit in _TRIADS for axis in "xyz"]
 _SENTENCES = {
     "$VNIMU": ("", *_XYZ, "temperature [degC]", "pressure"),
     "$VNYMR": ("", "yaw", "pitch", "roll", *_XYZ),
@@ -120,7 +145,7 @@ _SENTENCES = {
 
 
 _MESSAGE = re.compile(r"(?:.*[./_])?(angular_velocity|linear_acceleration)[./_]([xyz])")
-_EPOCH = 1e9, 2.2e9  # s since 1970 that a log's stamps lie between
+EPOCH = 1e9, 2.2e9  # s since 1970 that a log's stamps lie between
 
 
 def _of_message(table: Table, names: tuple[str, ...]) -> tuple[tuple[str, ...], str] | None:
@@ -130,10 +155,10 @@ def _of_message(table: Table, names: tuple[str, ...]) -> tuple[tuple[str, ...], 
     known = [titles[match[1]].format(match[2]) if match else name for match, name in zip(matches, names, strict=True)]
     if sum(match is not None for match in matches) != 6 or len(set(known)) < len(known):
         return None
-    for place, (name, column) in enumerate(zip(names, table.columns, strict=True)):
-        since = column.dtype.kind == "f" and _EPOCH[0] < np.nanmin(column) <= np.nanmax(column) < _EPOCH[1]
+    for at, (name, column) in enumerate(zip(names, table.columns, strict=True)):
+        since = column.dtype.kind == "f" and EPOCH[0] < np.nanmin(column) <= np.nanmax(column) < EPOCH[1]
         if since and name.strip("_").lower() in ("time", "timestamp", "stamp"):
-            known[place] = "time [s]"
+            known[at] = "time [s]"
     return tuple(known), (
         "columns and units as sensor_msgs/Imu has them (rad/s, m/s^2): its linear_acceleration holds gravity."
     )
@@ -148,7 +173,7 @@ def sentence_names(name: str, count: int) -> list[str] | None:
 def _without_header(table: Table) -> tuple[tuple[str, ...], str] | None:
     """The names of rows without a header that show what wrote them: VectorNav's sentences, ROS's own CSV."""
     first = table.columns[0]
-    if len(table.columns) == len(_ECHOED) and [each.dtype.kind for each in table.columns[:3]] == ["i", "i", "O"]:
+    if len(table.columns) == len(_ECHOED) and [column.dtype.kind for column in table.columns[:3]] == ["i", "i", "O"]:
         return _ECHOED, "columns as `ros2 topic echo --csv` writes sensor_msgs/Imu (rad/s, m/s^2)."
     names = _SENTENCES.get(str(first[0])) if first.dtype == object and (first == first[0]).all() else None
     if names is None or len(names) != len(table.columns):
@@ -156,11 +181,13 @@ def _without_header(table: Table) -> tuple[tuple[str, ...], str] | None:
     return names, f"columns and units as VectorNav's {first[0]} has them (G, m/s^2, rad/s)."
 
 
-_NINE = tuple(f"covariance_{number}" for number in range(9))
+_NINE = [f"covariance_{number}" for number in range(9)]
 _ECHOED = (
-    "header.stamp.sec", "header.stamp.nanosec", "header.frame_id", *(f"orientation.{axis}" for axis in "xyzw"), *_NINE,
-    *(f"gyro_{axis} [rad/s]" for axis in "xyz"), *_NINE, *(f"accel_{axis} [m/s^2]" for axis in "xyz"), *_NINE,
-)  # fmt: skip
+    *("header.stamp.sec", "header.stamp.nanosec", "header.frame_id"),
+    *(*(f"orientation.{axis}" for axis in "xyzw"), *_NINE),
+    *(*(f"gyro_{axis} [rad/s]" for axis in "xyz"), *_NINE),
+    *(*(f"accel_{axis} [m/s^2]" for axis in "xyz"), *_NINE),
+)
 
 
 def _stated(name: str) -> bool:
@@ -176,16 +203,15 @@ def whole_stamps(table: Table) -> Table:
     plain = [name.strip('" #').lower() for name in table.names or ()]
     for seconds, rest in _PAIRS:
         for at, name in enumerate(plain):
-            prefix, found, _ = name.rpartition(seconds)
-            if not found or name != prefix + seconds or plain.count(prefix + rest) != 1 or prefix[-1:].isalnum():
+            prefix, separator, _ = name.rpartition(seconds)
+            if not separator or name != prefix + seconds or plain.count(prefix + rest) != 1 or prefix[-1:].isalnum():
                 continue
-            parts = [np.asarray(table.columns[each]) for each in (at, plain.index(prefix + rest))]
-            if any(each.dtype.kind != "i" or (each < 0).any() or (each > _LATEST).any() for each in parts):
+            parts = [table.columns[column] for column in (at, plain.index(prefix + rest))]
+            if any(part.dtype.kind != "i" or (part < 0).any() or (part > _LATEST).any() for part in parts):
                 continue
             names = [*(table.names or ())]
             names[at] = "time [ns]"
-            columns = [*table.columns]
-            columns[at] = parts[0] * 10**9 + parts[1]
             note = f"time is {name} and {prefix + rest}."
-            return replace(table, names=tuple(names), columns=tuple(columns), notes=(*table.notes, note))
+            stamped = table.with_column(at, parts[0] * 10**9 + parts[1])
+            return replace(stamped, names=tuple(names), notes=(*table.notes, note))
     return table

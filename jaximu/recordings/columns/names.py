@@ -25,8 +25,13 @@ def _axes(pattern: str, axes: str = "xyz") -> tuple[str, ...]:
     return tuple(map(pattern.format, axes))
 
 
-_SINGLE = {"temperature": "temperature", "ambient_temperature": "temperature", "current": "electric current",
-           "table_angle": "angle", "table_rate": "angular rate"}  # fmt: skip
+_SINGLE = {
+    "temperature": "temperature",
+    "ambient_temperature": "temperature",
+    "current": "electric current",
+    "table_angle": "angle",
+    "table_rate": "angular rate",
+}
 TIME = "time"
 GROUPS = {  # a triad may be in counts, and in increments over each sampling interval
     "accel": Group("accelerometer", _axes("accel_{}"), ("acceleration", "raw count", "velocity increment")),
@@ -65,22 +70,22 @@ def parse_columns(text: str | Sequence[str]) -> tuple[Column, ...]:
     "_", "-" or "skip" ignores a column, "_*5" five of them; a bare triad ("accel [g]", "gyro [dps]", "mag [uT]",
     "attitude") stands for its three (four) columns. Raises InputError for a name that is not known.
     """
-    found: list[Column] = []
+    columns: list[Column] = []
     for entry in text.split(",") if isinstance(text, str) else text:
         name, stated = parse_column(entry)
         if match := _SKIPPED.fullmatch(name.lower()):
-            found += [Column(None)] * int(match[1] or 1)
+            columns += [Column(None)] * int(match[1] or 1)
         elif stated is not None and "?" in stated:
             raise InputError(f"--columns: the unit of {name} is for you to fill in; write it in place of the ?.")
         elif name in GROUPS and len(GROUPS[name].columns) > 1:
-            found.extend(Column(each, stated) for each in GROUPS[name].columns)
+            columns.extend(Column(title, stated) for title in GROUPS[name].columns)
         elif title := canonical(name):
-            found.append(Column(title, stated))
+            columns.append(Column(title, stated))
         else:
             raise InputError(
                 f"--columns: {name!r} is not known; known are {', '.join(QUANTITIES)}, and _ to ignore a column."
             )
-    return tuple(found)
+    return tuple(columns)
 
 
 def header_columns(table: Table) -> tuple[Column, ...] | None:

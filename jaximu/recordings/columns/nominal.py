@@ -69,16 +69,16 @@ def scaled_accelerometer(
     determine one. A scale without an offset means offset 0. Raises InputError or NotPossibleError.
     """
     if scale is not None:
-        found = parse_scale(scale, "acceleration", "--accel-scale")
+        counts = parse_scale(scale, "acceleration", "--accel-scale")
         zero = parse_offset(offset, "--accel-offset") if offset is not None else np.zeros(1)
-        return replace(signal, nominal_scale=found, nominal_offset=zero), (
-            _said("accelerometer", found, "m/s²", "--accel-scale"),
+        return replace(signal, nominal_scale=counts, nominal_offset=zero), (
+            _said("accelerometer", counts, "m/s²", "--accel-scale"),
         )
     means = quiet_means(signal)
     sphere = fit_sphere(means)
     if offset is not None:
         zero = np.array(np.broadcast_to(parse_offset(offset, "--accel-offset"), 3))
-        radius = sphere[1] if sphere else float(np.median(np.linalg.norm(means - zero, axis=1)))
+        radius = sphere[1] if sphere else np.median(np.linalg.norm(means - zero, axis=1))
     elif sphere:
         zero, radius = sphere
     else:
@@ -86,7 +86,7 @@ def scaled_accelerometer(
             f"{file}: the accelerometer is in raw counts and its still parts do not determine scale and offset: they "
             "must show gravity in directions all around. Give --accel-scale and --accel-offset, or record more poses."
         )
-    listed = "" if offset is not None else f", offset {', '.join(f'{each:.1f}' for each in zero)} count"
+    listed = "" if offset is not None else f", offset {', '.join(f'{value:.1f}' for value in zero)} count"
     return replace(signal, nominal_scale=np.full(3, radius / gravity.value), nominal_offset=zero), (
         f"accelerometer scale found from gravity: {radius / gravity.value:.5g} count per m/s²{listed}.",
     )
@@ -104,21 +104,21 @@ def scaled_gyroscope(
             f"{file}: the gyroscope is in raw counts; give its nominal scale from the data sheet with --gyro-scale, "
             'for example --gyro-scale "131 count/(deg/s)" or --gyro-scale 1/6258 (rad/s per count).'
         )
-    found = parse_scale(scale, "angular rate", "--gyro-scale")
-    notes = [_said("gyroscope", found, "rad/s", "--gyro-scale")]
+    counts = parse_scale(scale, "angular rate", "--gyro-scale")
+    notes = [_said("gyroscope", counts, "rad/s", "--gyro-scale")]
     if offset is not None:
         zero = parse_offset(offset, "--gyro-offset")
     else:
         windows = _windows(signal, 1.0)
         quietest = windows[np.argmin(windows.var(1).sum(1))]
         zero = np.median(quietest, 0)
-        listed = ", ".join(f"{each:.1f}" for each in zero)
+        listed = ", ".join(f"{value:.1f}" for value in zero)
         notes.append(f"gyroscope offset from its quietest second: {listed} count.")
-    return replace(signal, nominal_scale=found, nominal_offset=zero), tuple(notes)
+    return replace(signal, nominal_scale=counts, nominal_offset=zero), tuple(notes)
 
 
 def _said(sensor: str, scale: FloatArray, per: str, option: str) -> str:
-    return f"{sensor} scale from {option}: {', '.join(f'{each:.5g}' for each in scale)} count per {per}."
+    return f"{sensor} scale from {option}: {', '.join(f'{value:.5g}' for value in scale)} count per {per}."
 
 
 def _windows(signal: Signal, seconds: float) -> FloatArray:
@@ -128,9 +128,9 @@ def _windows(signal: Signal, seconds: float) -> FloatArray:
     return signal.values[: count * span].reshape(count, span, -1)
 
 
-def quiet_means(signal: Signal, seconds: float = 0.5) -> FloatArray:
+def quiet_means(signal: Signal) -> FloatArray:
     """(windows, 3) means of the windows with the least variance; quantisation alone counts as quiet."""
-    windows = _windows(signal, seconds)
+    windows = _windows(signal, 0.5)
     variance = windows.var(1).sum(1)
     return windows[variance <= max(4.0 * np.percentile(variance, 10.0), 1.0)].mean(1)
 
@@ -152,7 +152,7 @@ def fit_sphere(points: FloatArray) -> tuple[FloatArray, float] | None:
     fitted, miss = np.ones(len(points), bool), np.zeros(len(points))
     solution, radius = np.zeros(4), 1.0
     for _ in range(5):
-        fitted = miss <= max(4.0 * float(np.median(miss)), 1e-6 * radius)
+        fitted = miss <= max(4.0 * np.median(miss), 1e-6 * radius)
         solution = np.linalg.lstsq(design[fitted], target[fitted], rcond=None)[0]
         radius = float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-12)))
         miss = np.abs(np.linalg.norm(scaled - solution[:3], axis=1) - radius)

@@ -11,6 +11,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.recordings.recording import Source
 
+HEAD = 1 << 18
+"""Bytes in which a format shows."""
 UNPACKED, RATIO = 128 << 20, 200
 """A compressed file may unpack to so many bytes, or to so many times its own size: no recording compresses better."""
 AXES = b"jaximu.axes"
@@ -72,15 +74,23 @@ class Table:
         """The names in the file, a text a column: empty ones where it has no header."""
         return self.names or ("",) * len(self.columns)
 
-    def row(self, index: int) -> int:
+    def row(self, index: int | np.integer) -> int:
         """The number in the file, 1-based, of the row at `index`."""
         return self.rows + int(index) if isinstance(self.rows, int) else int(self.rows[index])
 
-    def take(self, kept: np.ndarray, columns: Sequence[np.ndarray] | None = None) -> "Table":
-        """The rows of these indices; `columns` instead of the table's own, where they are given."""
+    def where(self, index: int | np.integer) -> str:
+        """The file and the number of a row, for messages."""
+        return f"{self.path}, row {self.row(index)}"
+
+    def take(self, kept: np.ndarray) -> "Table":
+        """The rows of these indices."""
         rows = np.arange(self.source.rows) + self.rows if isinstance(self.rows, int) else self.rows
-        taken = tuple(columns or (each[kept] for each in self.columns))
-        return replace(self, columns=taken, rows=rows[kept], source=replace(self.source, rows=len(kept)))
+        columns = tuple(column[kept] for column in self.columns)
+        return replace(self, columns=columns, rows=rows[kept], source=replace(self.source, rows=len(kept)))
+
+    def with_column(self, index: int, values: np.ndarray) -> "Table":
+        """The table with other values in one column."""
+        return replace(self, columns=(*self.columns[:index], values, *self.columns[index + 1 :]))
 
     def label(self, index: int) -> str:
         """The column's name in the file, or its 1-based number."""
@@ -99,9 +109,8 @@ class Table:
         if column.dtype.kind == "f" and (absurd := np.abs(column) > _LARGEST).any():
             if absurd.mean() <= FEW:
                 return np.where(absurd, np.nan, column)
-            row = self.row(int(np.argmax(absurd)))
             raise InputError(
-                f"{self.path}, row {row}: column {self.label(index)} is infinite, or too large for a reading."
+                f"{self.where(np.argmax(absurd))}: column {self.label(index)} is infinite, or too large for a reading."
             )
         return column
 
@@ -113,7 +122,7 @@ class Table:
             except (TypeError, ValueError):
                 text = repr((cell.decode(errors="replace") if isinstance(cell, bytes) else str(cell))[:40])
                 raise InputError(
-                    f"{self.path}, row {self.row(at)}: column {self.label(index)} holds {text}, which is not a number."
+                    f"{self.where(at)}: column {self.label(index)} holds {text}, which is not a number."
                 ) from None
         return values
 
@@ -193,8 +202,9 @@ def _chunk(chunk: Any) -> np.ndarray:
 
 def named_with_units(fields: Sequence[Any]) -> tuple[str, ...]:
     """Arrow field names; a time-stamp type states its own unit."""
-    return tuple(f"{each.name} [{each.type.unit}]" if pa.types.is_timestamp(each.type) else each.name
-                 for each in fields)  # fmt: skip
+    return tuple(
+        f"{field.name} [{field.type.unit}]" if pa.types.is_timestamp(field.type) else field.name for field in fields
+    )
 
 
 def mapped_axes(schema: pa.Schema) -> str | None:

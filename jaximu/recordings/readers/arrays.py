@@ -66,8 +66,8 @@ def _opened(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[st
     for name, value in variables.items():
         if name.startswith("__") or (name == "units" and isinstance(value, Mapping)):
             continue
-        if isinstance(value, list) and value and all(isinstance(each, Mapping) for each in value):
-            value = {str(each.get("label") or each.get("name") or at) or str(at): each for at, each in enumerate(value)}
+        if isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
+            value = {str(entry.get("label") or entry.get("name") or at): entry for at, entry in enumerate(value)}
         fields = getattr(getattr(value, "dtype", None), "names", None)
         if fields:
             value = {field: value[field] for field in fields}

@@ -33,8 +33,10 @@ _HABITS = {
 }
 """Names of columns, lower case with anything else between as "_"; the group is the axis."""
 _TUM = ("time [s]", "tx [m]", "ty [m]", "tz [m]", "qx", "qy", "qz", "qw")
-_FACTORS = {"m/s": 1.0, "km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3,
-            "ft": 0.3048}  # fmt: skip
+_FACTORS = {
+    **{"m/s": 1.0, "km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3},
+    **{"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048},
+}
 """Units of velocity and position in SI."""
 _EPOCHS = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "µs"), (1e11, 1e-3, "ms"))
 """Stamps above these count since 1970 in the unit named."""
@@ -64,9 +66,9 @@ def holds_attitude(path: str | os.PathLike[str]) -> bool:
 
 def _tables(path: str | os.PathLike[str]) -> list[tuple[Table, dict[str, dict[str, int]]]]:
     """Return the tables of a file that hold an attitude, and where their columns are."""
-    found = [(table, _places(table)) for table in read_tables(path)]
+    tables = [(table, _places(table)) for table in read_tables(path)]
     kinds = {"quaternion", "numbered", "euler", "rotation vector", "table angles"}
-    return [(table, places) for table, places in found if kinds & set(places)]
+    return [(table, places) for table, places in tables if kinds & set(places)]
 
 
 def _places(table: Table) -> dict[str, dict[str, int]]:
@@ -74,29 +76,31 @@ def _places(table: Table) -> dict[str, dict[str, int]]:
     if table.names is None:
         if len(table.columns) != len(_TUM):
             return {}
-        return {"time": {"": 0}, "position": dict(zip("xyz", (1, 2, 3), strict=True)),
-                "quaternion": dict(zip("xyzw", (4, 5, 6, 7), strict=True))}  # fmt: skip
-    found: dict[str, dict[str, int]] = {}
-    for place, given in enumerate(table.names):
-        plain = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*", "", given.lower())).strip("_")
+        return {"time": {"": 0}, "position": {"x": 1, "y": 2, "z": 3}, "quaternion": {"x": 4, "y": 5, "z": 6, "w": 7}}
+    kinds: dict[str, dict[str, int]] = {}
+    for at, name in enumerate(table.names):
+        plain = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*", "", name.lower())).strip("_")
         for kind, patterns in _HABITS.items():
-            match = next(filter(None, (re.fullmatch(each, plain) for each in patterns)), None)
+            match = next(filter(None, (re.fullmatch(pattern, plain) for pattern in patterns)), None)
             if match is not None:
                 axis = match.group(1) if match.groups() else ""
-                found.setdefault(kind, {}).setdefault({"e": "x", "n": "y", "u": "z"}.get(axis, axis), place)
+                kinds.setdefault(kind, {}).setdefault({"e": "x", "n": "y", "u": "z"}.get(axis, axis), at)
                 break
     complete = {"time": {""}, "quaternion": set("wxyz"), "numbered": set("0123"), "euler": {"roll", "pitch", "yaw"}}
-    # one angle leaves a body that is mounted anew for each axis: that is a rate table's schedule
-    return {kind: axes for kind, axes in found.items()
-            if (len(axes) > 1 if kind == "table angles" else set(axes) >= complete.get(kind, set("xyz")))}  # fmt: skip
+
+    def whole(kind: str, axes: dict[str, int]) -> bool:
+        # one angle leaves a body that is mounted again for each axis: that is a rate table's schedule
+        return len(axes) > 1 if kind == "table angles" else set(axes) >= complete.get(kind, set("xyz"))
+
+    return {kind: axes for kind, axes in kinds.items() if whole(kind, axes)}
 
 
 def _columns(table: Table, places: dict[str, int], axes: Sequence[str], quantity: str = "") -> FloatArray:
     """Return the columns (n, k) of some axes in SI; a column without a unit is in SI."""
     columns = []
     for axis in axes:
-        place = places[axis]
-        title = table.names[place] if table.names else ""
+        at = places[axis]
+        title = table.names[at] if table.names else ""
         stated, factor = parse_column(title)[1], 1.0
         if stated and quantity == "angle":
             factor = unit(stated, (quantity,), file=table.path, column=title).factor
@@ -104,7 +108,7 @@ def _columns(table: Table, places: dict[str, int], axes: Sequence[str], quantity
             if stated not in _FACTORS:
                 raise InputError(f"{table.path}, column {title!r}: unknown unit; known are {', '.join(_FACTORS)}.")
             factor = _FACTORS[stated]
-        columns.append(np.asarray(table.numbers(place), np.float64) * factor)
+        columns.append(table.numbers(at) * factor)
     return np.stack(columns, axis=1)
 
 
@@ -125,22 +129,18 @@ def _attitude(table: Table, places: dict[str, dict[str, int]], name: str) -> Att
     else:
         vector = _columns(table, places["rotation vector"], "xyz", "angle")
         quaternion = _quaternion(scipy.spatial.transform.Rotation.from_rotvec(vector))
-    velocity, position = (
-        _columns(table, places[kind], "xyz", kind) if kind in places else None for kind in ("velocity", "position")
-    )
+    vectors = {kind: _columns(table, places[kind], "xyz", kind) for kind in ("velocity", "position") if kind in places}
     if table.names is None:
         notes.append(f"{name}: eight columns without names are taken as time, position and quaternion with w last.")
     kept = np.isfinite(time) & np.isfinite(quaternion).all(axis=1)
-    for values in (velocity, position):
-        kept &= True if values is None else np.isfinite(values).all(axis=1)
+    for values in vectors.values():
+        kept &= np.isfinite(values).all(axis=1)
     if kept.sum() < 16:
         raise InputError(f"{name}: {int(kept.sum())} rows hold an attitude, too few to compare with.")
     if not kept.all():
         notes.append(f"{name}: {int(np.sum(~kept))} of {len(kept)} rows hold no attitude and are left out.")
-    return Attitude(
-        time[kept], quaternion[kept], None if velocity is None else velocity[kept],
-        None if position is None else position[kept], start, name, tuple(notes),
-    )  # fmt: skip
+    vectors = {kind: values[kept] for kind, values in vectors.items()}
+    return Attitude(time[kept], quaternion[kept], **vectors, start=start, name=name, notes=tuple(notes))
 
 
 def _from_angles(table: Table, places: dict[str, int], axes: dict[str, str], name: str) -> FloatArray:
@@ -159,12 +159,14 @@ def _time(table: Table, places: dict[str, dict[str, int]], name: str, notes: lis
         if table.rate is None:
             raise InputError(f"{name}: has no time column: name it time [s].")
         return np.arange(len(table.columns[0])) / table.rate, 0.0
-    place = places["time"][""]
-    stamps = np.asarray(table.numbers(place))
-    stated = parse_column(table.names[place])[1] if table.names else "s"
+    at = places["time"][""]
+    stamps = table.numbers(at)
+    stated = parse_column(table.names[at])[1] if table.names else "s"
     if stated is None:
-        factor, said = next(((factor, said) for least, factor, said in _EPOCHS if stamps[0] > least), (1.0, "s"))
-        notes.append(f"{name}: the stamps state no unit and are taken as {said}.")
+        factor, unit_name = next(
+            ((factor, unit_name) for least, factor, unit_name in _EPOCHS if stamps[0] > least), (1.0, "s")
+        )
+        notes.append(f"{name}: the stamps state no unit and are taken as {unit_name}.")
     else:
         factor = unit(stated, ("time",), file=table.path, column="time").factor
     first = stamps[0]

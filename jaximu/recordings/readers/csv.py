@@ -18,12 +18,11 @@ import pyarrow.csv as pc
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, stated_rate
-from jaximu.recordings.columns.table import Table, from_arrow, parse_name
+from jaximu.recordings.columns.table import HEAD, Table, from_arrow, parse_name
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
-_SAMPLE = 1 << 18  # bytes in which binary data shows
 _PIECE = 1 << 22  # bytes parsed at once
 _LOOKED_AT = 200  # lines in which the layout is looked for
 _SINGLE_BLOCK = 2**31 - 2
@@ -42,13 +41,13 @@ class _Layout:
 def read(path: Path, source: Source) -> Table:
     """The table in a text file. Raises InputError for what is not a table of numbers, naming the row where it can."""
     with path.open("rb") as file:
-        head = file.read(_SAMPLE)
+        head = file.read(HEAD)
     wide = head[:2] in (b"\xff\xfe", b"\xfe\xff")  # UTF-16, as Excel's "Unicode text"
     if wide:
         with suppress(UnicodeDecodeError):
             head = path.read_bytes().decode("utf-16").encode()
-    whole = None if wide else _without_zeros(path)  # where the file ends in them
-    head = head if whole is None else whole[:_SAMPLE]
+    whole = head if wide else _without_zeros(path)  # None where the file stands as it is read
+    head = head if wide or whole is None else whole[:HEAD]
     if len(head) != len(head.translate(None, _CONTROL)):
         raise InputError(
             f"{source.path}: holds binary data of no known format; expected CSV, TSV, blank-separated text, "
@@ -56,25 +55,32 @@ def read(path: Path, source: Source) -> Table:
         )
     layout = _layout(_lines(head), source.path)
     rows: np.ndarray | int = layout.first + 1
-    found = None if layout.delimiter == " " or wide or whole is not None else _read_straight(path, layout)
-    if found is None:
-        data = head if wide else path.read_bytes() if whole is None else whole
-        table, rows = _read_cleaned(_lines(data), layout, source.path)
-        found = [from_arrow(column) for column in table.columns], table.schema
-    (columns, schema), names = found, layout.names or None
+    parsed = _read_straight(path, layout) if whole is None and layout.delimiter != " " else None
+    if parsed is None:
+        table, rows = _read_cleaned(_lines(path.read_bytes() if whole is None else whole), layout, source.path)
+        parsed = [from_arrow(column) for column in table.columns], table.schema
+    (columns, schema), names = parsed, layout.names or None
     if names:  # a column of dates states its own unit
-        names = tuple(f"{name} [{each.type.unit}]" if pa.types.is_timestamp(each.type) and "[" not in name else name
-                      for name, each in zip(names, schema, strict=True))  # fmt: skip
+        names = tuple(
+            f"{name} [{kind.type.unit}]" if pa.types.is_timestamp(kind.type) and "[" not in name else name
+            for name, kind in zip(names, schema, strict=True)
+        )
     for at, column in enumerate(columns):
-        if at == len(columns) - 1 and column.dtype == object and str(columns[0][0]).startswith("$"):
+        if column.dtype != object:
+            continue
+        if at == len(columns) - 1 and str(columns[0][0]).startswith("$"):
             columns[at] = np.array([str(cell).partition("*")[0] for cell in column], object)  # NMEA's checksum
-        elif column.dtype == object and all(str(cell).endswith(";") for cell in column):
+        elif all(str(cell).endswith(";") for cell in column):
             columns[at] = np.array([cell[:-1] for cell in column], object)
-        elif column.dtype == object and (stamps := seconds_of(column)) is not None:
+        elif (stamps := seconds_of(column)) is not None:
             columns[at] = stamps
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [ns]", *names[at + 1 :])
-    notes = () if whole is None else ("the file ends in zero bytes, as after a power loss: its last row is left out.",)
+    notes = (
+        ()
+        if wide or whole is None
+        else ("the file ends in zero bytes, as after a power loss: its last row is left out.",)
+    )
     return Table(source, names, tuple(columns), rows, layout.rate, notes=notes)
 
 
@@ -109,24 +115,24 @@ def _read_straight(path: Path, layout: _Layout) -> tuple[list[np.ndarray], pa.Sc
             schemas.append(table.schema)
             parts.append([from_arrow(column) for column in table.columns])
         fields = [_common(kinds) for kinds in zip(*schemas, strict=True)]
-        texts = any(pa.types.is_string(each.type) for each in fields if each)
+        texts = any(pa.types.is_string(schema_field.type) for schema_field in fields if schema_field)
         if fields and all(fields) and not (texts and _comments(path)):
             # one after the other, so that a long file is not held twice
             columns = [np.concatenate([part.pop(0) for part in parts]) for _ in fields]
-            return columns, pa.schema([each for each in fields if each])
+            return columns, pa.schema([schema_field for schema_field in fields if schema_field])
     return None
 
 
 def _common(fields: Sequence[pa.Field]) -> pa.Field | None:
     """The field whose type a column's pieces share, all numbers being alike; None for more than one."""
-    filled = [each for each in fields if not pa.types.is_null(each.type)] or [*fields]
-    numbers = [pa.types.is_integer(each.type) or pa.types.is_floating(each.type) for each in filled]
-    return filled[0] if all(numbers) or all(each.type == filled[0].type for each in filled) else None
+    filled = [kind for kind in fields if not pa.types.is_null(kind.type)] or [*fields]
+    numbers = [pa.types.is_integer(kind.type) or pa.types.is_floating(kind.type) for kind in filled]
+    return filled[0] if all(numbers) or all(kind.type == filled[0].type for kind in filled) else None
 
 
 def _comments(path: Path) -> bool:
     with path.open("rb") as file:
-        return any(b"#" in block for block in iter(partial(file.read, _SAMPLE), b""))
+        return any(b"#" in block for block in iter(partial(file.read, HEAD), b""))
 
 
 def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np.ndarray]:
@@ -172,7 +178,7 @@ _STYLES = (("\t", "."), (",", "."), (";", "."), (" ", "."), (";", ","), ("\t", "
 
 def _layout(data: bytes, path: str) -> _Layout:
     """Delimiter, decimal sign, header and first line of data: data is what most of the first lines look like."""
-    raw = data[:_SAMPLE].split(b"\n", _LOOKED_AT)
+    raw = data[:HEAD].split(b"\n", _LOOKED_AT)
     lines = [_text(line) for line in raw[:_LOOKED_AT]]
     filled = [(at, line) for at, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(_MARKS)]
     if not filled:
@@ -185,9 +191,12 @@ def _layout(data: bytes, path: str) -> _Layout:
         width, rows = max(widths.items(), key=lambda item: (item[1] * (item[0] > 1), item[0]), default=(0, 0))
         if width < 2:
             continue
-        filled_in = [count + sum(not cell.strip() for cell in cells)
-                     for cells, count in zip(split, numbers, strict=True) if len(cells) == width and count]  # fmt: skip
-        score = rows * max(0.1, sum(filled_in) / (width * rows))
+        filled_in = sum(
+            count + sum(not cell.strip() for cell in cells)
+            for cells, count in zip(split, numbers, strict=True)
+            if len(cells) == width and count
+        )
+        score = rows * max(0.1, filled_in / (width * rows))
         if best is None or score > 1.05 * best[0]:
             best = score, delimiter, decimal, width
     if best is None:

@@ -44,7 +44,7 @@ def kalibr_yaml(
         raise InputError(f"Kalibr's imu.yaml has no key {', '.join(sorted(unknown))}.")
     if not topic.isprintable() or not topic.replace("/", "").replace("_", "").replace("~", "").isalnum():
         raise InputError(f"a ROS topic is letters, digits, _ and /, found {topic!r}.")
-    lines = [f"# {_line(each)}" for each in comments]
+    lines = [f"# {_line(comment)}" for comment in comments]
     for key, unit in KALIBR_UNITS.items():
         if key not in numbers:
             lines.append(f"# {key}: not known, the recording has no such sensor; Kalibr needs it [{unit}]")
@@ -72,11 +72,11 @@ def read_noise(path: str | os.PathLike[str]) -> dict[str, float]:
     with readable(path):
         text = Path(path).read_text(encoding="utf-8", errors="replace")
     pattern = r"^\s*(\w+)\s*:\s*([0-9.]+(?:[eE][+-]?[0-9]+)?)\s*(?:#.*)?$"
-    found = {key: float(value) for key, value in re.findall(pattern, text[: 1 << 20], re.MULTILINE)}
-    noise = {key: value for key, value in found.items() if key in KALIBR_UNITS and 0.0 < value < 1e9}
+    numbers = {key: float(value) for key, value in re.findall(pattern, text[: 1 << 20], re.MULTILINE)}
+    noise = {key: value for key, value in numbers.items() if key in KALIBR_UNITS and 0.0 < value < 1e9}
     if not noise:
         raise InputError(
             f"{os.fspath(path)}: holds none of {', '.join(KALIBR_UNITS)}; give the imu.yaml that jaximu allan -o DIR "
             "writes."
         )
-    return noise | ({"update_rate": found["update_rate"]} if found.get("update_rate", 0.0) > 0.0 else {})
+    return noise | ({"update_rate": numbers["update_rate"]} if numbers.get("update_rate", 0.0) > 0.0 else {})

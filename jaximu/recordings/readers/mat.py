@@ -28,34 +28,34 @@ def read_hdf5(data: bytes, source: Source) -> Table:
     """
     import h5py
 
-    found: dict[str, Any] = {}
+    variables: dict[str, Any] = {}
     unpacking = Unpacking(source, len(data))
 
-    def take(path: str, each: Any) -> None:
+    def take(path: str, item: Any) -> None:
         *groups, name = path.split("/")
-        if not isinstance(each, h5py.Dataset) or path.startswith("#"):  # MATLAB's store of cell contents
+        if not isinstance(item, h5py.Dataset) or path.startswith("#"):  # MATLAB's store of cell contents
             return
-        if each.external or each.is_virtual or (each.dtype.hasobject and each.size != 1):
+        if item.external or item.is_virtual or (item.dtype.hasobject and item.size != 1):
             return
-        unpacking.take(each.size * each.dtype.itemsize)
-        value = each[()]
-        if each.attrs.get("MATLAB_class") == b"char":
+        unpacking.take(item.size * item.dtype.itemsize)
+        value = item[()]
+        if item.attrs.get("MATLAB_class") == b"char":
             value = "".join(map(chr, np.ravel(value)))
-        said = {str(key).lower(): value for key, value in each.attrs.items()}
-        unit = said.get("unit", said.get("units"))
+        attributes = {str(key).lower(): value for key, value in item.attrs.items()}
+        unit = attributes.get("unit", attributes.get("units"))
         unit = unit.decode() if isinstance(unit, bytes) else unit
-        place = found
+        opened = variables
         for group in groups:
-            place = place.setdefault(group, {})
-        place[f"{name} [{unit}]" if unit else name] = value.decode() if isinstance(value, bytes) else value
+            opened = opened.setdefault(group, {})
+        opened[f"{name} [{unit}]" if unit else name] = value.decode() if isinstance(value, bytes) else value
 
     rates: dict[str, Any] = {}
 
-    def note(path: str, each: Any) -> None:
-        rates.update({str(key): value for key, value in each.attrs.items() if np.size(value) == 1})
+    def note(path: str, item: Any) -> None:
+        rates.update({str(key): value for key, value in item.attrs.items() if np.size(value) == 1})
 
     with h5py.File(io.BytesIO(data), "r") as file:
         note("", file)
         file.visititems(note)
         file.visititems(take)
-    return table_of({**rates, **found}, source)
+    return table_of({**rates, **variables}, source)

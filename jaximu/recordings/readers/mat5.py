@@ -35,7 +35,7 @@ def checked(data: bytes, source: Source) -> tuple[bytes, tuple[str, ...]]:
     if order is None or struct.unpack_from(f"{order}H", data, 124) != (0x0100,):
         raise ValueError("its head is not that of version 5")
     unpacking = Unpacking(source, len(data))
-    found: dict[bytes, bytes] = {}
+    variables: dict[bytes, bytes] = {}
     left_out = []
     for kind, content in _elements(memoryview(data)[_HEADER:], order):
         if kind == _COMPRESSED:
@@ -47,15 +47,15 @@ def checked(data: bytes, source: Source) -> tuple[bytes, tuple[str, ...]]:
         except _UnsupportedClass as error:
             left_out.append(str(error))
             continue
-        if name in found:
+        if name in variables:
             raise ValueError("two variables are of one name")
-        found[name] = struct.pack(f"{order}II", _MATRIX, len(content)) + content
-    return b"".join([data[:_HEADER], *found.values()]), tuple(left_out)
+        variables[name] = struct.pack(f"{order}II", _MATRIX, len(content)) + content
+    return b"".join([data[:_HEADER], *variables.values()]), tuple(left_out)
 
 
 def _elements(data: bytes | memoryview, order: str) -> list[tuple[int, memoryview]]:
     """Type and data of the elements that make up `data`."""
-    data, found, at = memoryview(data), [], 0
+    data, elements, at = memoryview(data), [], 0
     while at < len(data):
         if at + 8 > len(data):
             raise ValueError("an element is cut off")
@@ -67,8 +67,8 @@ def _elements(data: bytes | memoryview, order: str) -> list[tuple[int, memoryvie
             at += count + (-count % 8 if kind not in (_MATRIX, _COMPRESSED) else 0)
         if start + count > at or at > len(data):
             raise ValueError("an element is longer than what holds it")
-        found.append((kind, data[start : start + count]))
-    return found
+        elements.append((kind, data[start : start + count]))
+    return elements
 
 
 def _integers(element: tuple[int, memoryview], order: str) -> tuple[int, ...]:

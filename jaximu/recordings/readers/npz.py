@@ -18,13 +18,16 @@ def read(data: bytes, source: Source) -> Table:
     """The table in an NPZ file; a row's number counts from 1."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()
-        if not any(each.filename.endswith(".npy") for each in members):
-            inside = [each.filename for each in members if not each.is_dir()]
-            what = "an Excel workbook; save its sheet as CSV" if "xl/workbook.xml" in inside else (
-                f"an archive of {', '.join(inside[:4])}; unpack it and read the files in it")  # fmt: skip
+        if not any(member.filename.endswith(".npy") for member in members):
+            inside = [member.filename for member in members if not member.is_dir()]
+            what = f"an archive of {', '.join(inside[:4])}; unpack it and read the files in it"
+            if "xl/workbook.xml" in inside:
+                what = "an Excel workbook; save its sheet as CSV"
             raise InputError(f"{source.path}: is {what}.")
-        Unpacking(source, len(data)).take(sum(each.file_size for each in members))
-        return table_of({each.filename.removesuffix(".npy"): _array(archive.read(each)) for each in members}, source)
+        Unpacking(source, len(data)).take(sum(member.file_size for member in members))
+        return table_of(
+            {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}, source
+        )
 
 
 def read_array(data: bytes, source: Source) -> Table:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit
-from jaximu.recordings.columns.table import Table
+from jaximu.recordings.columns.table import HEAD, Table
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
@@ -106,58 +105,53 @@ def explained(head: bytes) -> str:
     return ""
 
 
-@dataclass
-class _Naming:
+def _line_names(line: str, heading: str) -> list[str]:
     """Names of the numbers of a line, one after the other: words before them, and units after them.
 
     heading: of the lines above that hold no number.
     """
+    parts = re.split(r"[#@]", line)
+    names: list[str] = []
+    group, axis = "", 0
+    for number, text in enumerate(parts[:-1]):
+        words = _label(text)
+        if len(words) == 1 and words[0].lower() in tuple("wxyz") and group:
+            words = [group, *words]
+        elif words:
+            group = " ".join(word for word in words if word.lower() not in tuple("wxyz"))
+            axis = 0
+            if _vector(parts, number):
+                words = [*words, "x"]
+        elif group and axis < 2 and "," in text:
+            axis += 1
+            words = [group, "xyz"[axis]]
+        names.append(f"{heading}{' '.join(words)}" if words else "")
+    return _with_units(names, parts)
 
-    heading: str
 
-    def names(self, line: str) -> list[str]:
-        parts = re.split(r"[#@]", line)
-        names: list[str] = []
-        group, axis = "", 0
-        for number, text in enumerate(parts[:-1]):
-            words = self._label(text)
-            if words and len(words) == 1 and words[0].lower() in "wxyz" and len(words[0]) == 1 and group:
-                words = [group, *words]
-            elif words:
-                group = " ".join(word for word in words if not (len(word) == 1 and word.lower() in "wxyz"))
-                axis = 0
-                if self._vector(parts, number):
-                    words = [*words, "x"]
-            elif group and axis < 2 and "," in text:
-                axis += 1
-                words = [group, "xyz"[axis]]
-            names.append(f"{self.heading}{' '.join(words)}" if words else "")
-        return self._with_units(names, parts)
+def _vector(parts: list[str], number: int) -> bool:
+    """Whether a label stands before three numbers in brackets."""
+    between = [part.strip() for part in parts[number + 1 : number + 3]]
+    return parts[number].rstrip().endswith(("[", "(")) and between == [",", ","]
 
-    @staticmethod
-    def _vector(parts: list[str], number: int) -> bool:
-        """Whether a label stands before three numbers in brackets."""
-        between = [part.strip() for part in parts[number + 1 : number + 3]]
-        return parts[number].rstrip().endswith(("[", "(")) and between == [",", ","]
 
-    @staticmethod
-    def _label(text: str) -> list[str]:
-        """The words of a label between two numbers: what follows the last unit, bracket or comma."""
-        text = re.sub(r"[:=>\-]+\s*[\[(]?\s*$", "", text.rstrip().rstrip("[(").rstrip())
-        last = re.split(r"[,;|\])\t]", text)[-1].strip()
-        last = last.rpartition(" ")[2] if "=" in last else last  # tags of a protocol stand before its fields
-        words = re.findall(r"[A-Za-z_][\w./]*", last)
-        return words[1:] if len(words) > 1 and find_unit(words[0]) else words
+def _label(text: str) -> list[str]:
+    """The words of a label between two numbers: what follows the last unit, bracket or comma."""
+    text = re.sub(r"[:=>\-]+\s*[\[(]?\s*$", "", text.rstrip().rstrip("[(").rstrip())
+    last = re.split(r"[,;|\])\t]", text)[-1].strip()
+    last = last.rpartition(" ")[2] if "=" in last else last  # tags of a protocol stand before its fields
+    words = re.findall(r"[A-Za-z_][\w./]*", last)
+    return words[1:] if len(words) > 1 and find_unit(words[0]) else words
 
-    @staticmethod
-    def _with_units(names: list[str], parts: list[str]) -> list[str]:
-        """The names with the unit that stands after each number, or after the last one of a line."""
-        units = [re.match(r"\s*\[?\(?([^\s,;\[\]()|:=]+)", text) for text in parts[1:]]
-        stated = [match[1] if match and find_unit(match[1]) else "" for match in units]
-        if stated and stated[-1] and not any(stated[:-1]):
-            stated = [stated[-1] if name.rpartition(" ")[0] == names[-1].rpartition(" ")[0]
-                      or len(names[-1].split()) > 1 else "" for name in names[:-1]] + [stated[-1]]  # fmt: skip
-        return [f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, stated, strict=True)]
+
+def _with_units(names: list[str], parts: list[str]) -> list[str]:
+    """The names with the unit that stands after each number, or after the last one of a line."""
+    units = [re.match(r"\s*\[?\(?([^\s,;\[\]()|:=]+)", text) for text in parts[1:]]
+    stated = [match[1] if match and find_unit(match[1]) else "" for match in units]
+    if stated and stated[-1] and not any(stated[:-1]):
+        several, head = len(names[-1].split()) > 1, names[-1].rpartition(" ")[0]
+        stated = [stated[-1] if several or name.rpartition(" ")[0] == head else "" for name in names]
+    return [f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, stated, strict=True)]
 
 
 def _names(sample: tuple[str, ...]) -> list[str]:
@@ -168,7 +162,7 @@ def _names(sample: tuple[str, ...]) -> list[str]:
         indent = len(line) - len(line.lstrip())
         headings = [heading for heading in headings if heading[0] < indent]
         if "#" in line or "@" in line:
-            names += _Naming("".join(f"{name}." for _, name in headings)).names(line)
+            names += _line_names(line, "".join(f"{name}." for _, name in headings))
         elif match := re.fullmatch(r"\s*([A-Za-z_]\w*):", line):
             headings.append((indent, match[1]))
     return names
@@ -185,7 +179,7 @@ def _rows(lines: list[str], sample: tuple[str, ...]) -> Iterator[tuple[int, list
             at += 1
 
 
-def _numbers(texts: list[str]) -> np.ndarray:
+def _numbers(texts: Sequence[str]) -> np.ndarray:
     if all(re.fullmatch(r"[+-]?\d{1,18}", text) for text in texts[:1000]):
         try:
             return np.array(texts, np.int64)
@@ -199,7 +193,7 @@ def read(data: bytes, source: Source) -> Table:
     declared = _DECLARED.search(data)
     if declared is not None:
         return _declared(data, source, declared)
-    sample = _of(data[: 1 << 18])
+    sample = _of(data[:HEAD])
     rows = [] if sample is None else list(_rows(_text(data), sample))
     if sample is None or len(rows) < 2:
         raise InputError(f"{source.path}: holds no whole samples of text with labels.")
@@ -221,15 +215,10 @@ def read(data: bytes, source: Source) -> Table:
         note = "YAML as `ros2 topic echo` prints it." if "---" in sample else note
     else:
         note = "labels stand beside the numbers (name:value pairs), and name the columns."
-    for at in range(len(names)):
-        texts = [row[at] for row in cells]
-        if _CLOCK.fullmatch(texts[0]):
-            stamps = seconds_of(np.array(texts, object))
-            assert stamps is not None
-            columns.append(stamps)
-            names[at] = "time of day [ns]"
-        else:
-            columns.append(_numbers(texts))
+    for at, texts in enumerate(zip(*cells, strict=True)):
+        stamps = seconds_of(np.array(texts, object)) if _CLOCK.fullmatch(texts[0]) else None
+        columns.append(_numbers(texts) if stamps is None else stamps)
+        names[at] = names[at] if stamps is None else "time of day [ns]"
     return Table(source, tuple(names) if any(names) else None, tuple(columns), np.array(first), notes=(note,))
 
 

@@ -17,6 +17,7 @@ import pyarrow as pa
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, name_of, readable
+from jaximu.ground.quantities import counted
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.columns import nominal
@@ -31,7 +32,15 @@ from jaximu.recordings.columns.names import (
     header_columns,
     parse_columns,
 )
-from jaximu.recordings.columns.table import FEW, MessageSelection, Table, from_arrow, mapped_axes, named_with_units
+from jaximu.recordings.columns.table import (
+    FEW,
+    HEAD,
+    MessageSelection,
+    Table,
+    from_arrow,
+    mapped_axes,
+    named_with_units,
+)
 from jaximu.recordings.readers.records import apart, of_device
 from jaximu.recordings.recording import (
     Defect,
@@ -48,16 +57,15 @@ from jaximu.recordings.recording import (
     plausibility,
 )
 
-_HEAD = 1 << 18  # bytes in which a format shows
 _SMALL = 1 << 24  # bytes
 _TABLE = 200  # rows, up to which a file without time may be a table of pose means
 _SET_BACK = 1.0  # s: more than this is a clock that was set, not disorder
 _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their rows to be in order
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
 _ENDS = sorted({2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-9, 1e-6, 1e-3)} | {86400.0, 604800.0})
-"""Seconds after which clocks begin anew: counters of 16, 24 and 32 bits, a day, a week of GPS."""
+"""Seconds after which clocks start again: counters of 16, 24 and 32 bits, a day, a week of GPS."""
 _COUNTED = 64.0  # samples that a counter tells apart at the least
-_CARRIED = 10.0  # sample intervals between the last stamp before a clock began anew and the first after
+_CARRIED = 10.0  # sample intervals between the last stamp before a clock started again and the first after
 _FEW_SHARED, _FEW_SHARES = 10, 0.02  # rows, and share of them, from which on repeated stamps are a habit
 _SHARED = 0.1  # of the messages may share a stamp
 
@@ -192,7 +200,7 @@ def _read_as(
     # a gyroscope's offset changes with every power-on: where it is not stated, each log shows its own
     zeros = [name for name in counts if name == "accelerometer" or _counts(options, name)[1] is not None]
     columns, of_gyroscope = (
-        ",".join(text.split(",") if isinstance(text, str) else text) if text else None
+        (text if isinstance(text, str) else ",".join(text or ())) or None
         for text in (options.columns, options.gyro_columns)
     )
     return Reading(
@@ -219,11 +227,11 @@ def _stamped(table: Table, columns: str | Sequence[str] | None) -> Table:
 def _parts(tables: Sequence[Table], options: ReadOptions) -> "list[_FilePart]":
     """Return the signals of one file's tables."""
     first = _stamped(tables[0], options.columns)
-    named = {each.name for each in header_columns(first) or ()}
+    named = {column.name for column in header_columns(first) or ()}
     sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
     sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
     parts = [extract(first, choose_columns(first, options.columns, sensor), options, set(GROUPS))]
-    return parts + [extract(each, header_columns(each) or (), options, set(GROUPS)) for each in tables[1:]]
+    return parts + [extract(table, header_columns(table) or (), options, set(GROUPS)) for table in tables[1:]]
 
 
 def _finished(parts: "Sequence[_FilePart]", table: Table, options: ReadOptions) -> Recording:
@@ -245,14 +253,14 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     """
     options = _sound(options)
     parts = []
-    for place, table in enumerate(_read(path, options)):
-        options = options if place else _alike(options, table)
+    for at, table in enumerate(_read(path, options)):
+        options = options if at else _alike(options, table)
         table = _stamped(table, options.columns)
         columns = choose_columns(table, options.columns, "mag") if not table.messages else header_columns(table) or ()
         if options.rate is None and table.rate is None and not any(column.name == TIME for column in columns):
             options = replace(options, rate=1.0)
         parts.append(extract(table, columns, options, {"mag"}))
-    part = next((each for each in parts if "mag" in each.signals), None)
+    part = next((candidate for candidate in parts if "mag" in candidate.signals), None)
     if part is None:
         raise InputError(f"{os.fspath(path)}: columns mag_x, mag_y, mag_z are missing.")
     signal = part.signals["mag"]
@@ -272,7 +280,7 @@ def read_means(path: str | os.PathLike[str], options: ReadOptions | None = None)
     options = replace(options or ReadOptions(), rate=1.0)
     table = read_table(path)
     chosen = choose_columns(table, options.columns)
-    columns = [Column(None) if each.name == TIME else each for each in chosen]
+    columns = [Column(None) if column.name == TIME else column for column in chosen]
     part = extract(table, columns, options, {"accel", "gyro"})
     recording = _finished([replace(part, notes=table.notes)], table, replace(options, rate=None))
     triads = {"accel": recording.accelerometer, "gyro": recording.gyroscope}
@@ -301,8 +309,7 @@ def _sigma_of_means(table: Table, sensor: str, base: str) -> FloatArray | None:
     def positive(name: str, factor: float = 1.0) -> FloatArray:
         values = np.asarray(table.numbers(named[name][0]), np.float64) * factor
         if (wrong := ~(values > 0)).any():
-            at = int(np.argmax(wrong))
-            raise InputError(f"{table.path}, row {table.row(at)}: column {name!r} must be greater than zero.")
+            raise InputError(f"{table.where(np.argmax(wrong))}: column {name!r} must be greater than zero.")
         return values
 
     deviations = []
@@ -373,11 +380,11 @@ def _recognise(path: Path) -> _Format:
             f"calibrate all: jaximu fleet {path} -o fleet.parquet."
         )
     with path.open("rb") as file:
-        head = file.read(_HEAD)
+        head = file.read(HEAD)
     if not head or head.isspace():
         raise InputError(f"{path}: is empty.")
-    found = next((each for at, magic, each in _MAGIC if head[at : at + len(magic)] == magic), _TEXT)
-    return _of_text(head, path) if found is _TEXT else found
+    kind = next((kind for at, magic, kind in _MAGIC if head[at : at + len(magic)] == magic), _TEXT)
+    return _of_text(head, path) if kind is _TEXT else kind
 
 
 def _of_text(head: bytes, path: Path) -> _Format:
@@ -408,36 +415,36 @@ def read_tables(path: str | os.PathLike[str], selection: MessageSelection | None
 
     Raises InputError naming the file, and the package to install where one is missing.
     """
-    name, given = name_of(path), Path(path)
-    with readable(given):
-        found = _recognise(given)
-        data = given if found.by_path else given.read_bytes()
-    more = (selection or MessageSelection(),) if found.needs or found is _TAGGED else ()
+    name, file = name_of(path), Path(path)
+    with readable(file):
+        kind = _recognise(file)
+        data = file if kind.by_path else file.read_bytes()
+    more = (selection or MessageSelection(),) if kind.needs or kind is _TAGGED else ()
     try:
         with ThreadPoolExecutor(1) as beside:
             # a thread costs a small file more than it saves
             if isinstance(data, bytes) and len(data) < _SMALL:
                 sha256 = hashlib.sha256(data).hexdigest
             else:
-                sha256 = beside.submit(_hash, given).result
-            read = getattr(import_module(f"jaximu.recordings.readers.{found.module}"), found.function)
+                sha256 = beside.submit(_hash, file).result
+            read = getattr(import_module(f"jaximu.recordings.readers.{kind.module}"), kind.function)
             tables = read(data, Source(name, "", 0), *more)
             source = Source(name, sha256(), 0)
     except InputError:
         raise
     except ModuleNotFoundError as error:
         raise InputError(
-            f"{name}: is a {found.name}, which needs the package {found.needs}: install it with "
+            f"{name}: is a {kind.name}, which needs the package {kind.needs}: install it with "
             "pip install 'jaximu[formats]'."
         ) from error
     except Exception as error:  # the libraries behind raise nearly anything on damaged files
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise InputError(
-            f"{name}: begins like {found.name} but cannot be read; it is cut off or damaged ({reason})."
+            f"{name}: begins like {kind.name} but cannot be read; it is cut off or damaged ({reason})."
         ) from error
     if tables == ():
         raise InputError(f"{name}: holds no message of these sensors; it is cut off or damaged.")
-    return tuple(_checked(each, source) for each in (tables if isinstance(tables, tuple) else (tables,)))
+    return tuple(_checked(table, source) for table in (tables if isinstance(tables, tuple) else (tables,)))
 
 
 def advise_reading(path: str | os.PathLike[str], rate: float | None = None) -> Advice | None:
@@ -454,7 +461,7 @@ def _checked(table: Table, source: Source) -> Table:
     """The table with its source and number of rows, in our names where its own show what wrote it."""
     rows = len(table.columns[0]) if table.columns else 0
     if rows < 2:
-        raise InputError(f"{table.path}: holds {rows} row{'s' * (rows != 1)} of data; a recording needs more.")
+        raise InputError(f"{table.path}: holds {counted(rows, 'row')} of data; a recording needs more.")
     table = apart(replace(table, source=replace(source, rows=rows)))
     known = known_names(table)
     return table if known is None else replace(table, names=known[0], notes=(*table.notes, known[1]))
@@ -463,9 +470,9 @@ def _checked(table: Table, source: Source) -> Table:
 def _hash(path: Path) -> str:
     """The SHA-256 of a file, or of a folder's files one after the other, without holding them."""
     total = hashlib.sha256()
-    for each in sorted(path.iterdir()) if path.is_dir() else [path]:
-        if each.is_file():
-            with each.open("rb") as file:
+    for file_path in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file_path.is_file():
+            with file_path.open("rb") as file:
                 hashlib.file_digest(file, lambda: total)
     return total.hexdigest()
 
@@ -490,21 +497,22 @@ def extract(
     """The signals of the wanted groups in a table, checked sample by sample."""
     group_of = {name: key for key, group in GROUPS.items() for name in group.columns}
     wanted = [
-        each if each.name == TIME or group_of.get(each.name or "") in groups else Column(None) for each in columns
+        column if column.name == TIME or group_of.get(column.name or "") in groups else Column(None)
+        for column in columns
     ]
     sensor = "gyro" if option == "--gyro-columns" else None
-    found = column_units(table, wanted, option, sensor)
+    used = column_units(table, wanted, option, sensor)
     put_right = _ordered if table.messages else _rising
     disorder: list[str] = []
-    if TIME in found:
-        table, wraps = _carried_on(table, found)
-        table, disorder = put_right(table, found)
+    if TIME in used:
+        table, wraps = _carried_on(table, used)
+        table, disorder = put_right(table, used)
         disorder = [*wraps, *disorder]
-    stamps, origin, notes = _stamps(table, found, options)
+    stamps, origin, notes = _stamps(table, used, options)
     notes = [*table.notes, *disorder, *notes]
     signals: dict[str, Signal] = {}
-    for key in sorted(groups & {group_of[name] for name in found if name != TIME}, key=list(GROUPS).index):
-        places = [found[name] for name in GROUPS[key].columns]
+    for key in sorted(groups & {group_of[name] for name in used if name != TIME}, key=list(GROUPS).index):
+        places = [used[name] for name in GROUPS[key].columns]
         values = [(table.numbers(at), at, _per_second(unit, key, stamps)) for at, unit in places]
         if key == "mag" and len(groups) > 1 and any(np.ptp(axis) == 0 for axis, *_ in values):
             notes.append("the magnetometer, or an axis of it, never changes: it is left out.")
@@ -521,10 +529,10 @@ def extract(
         if dropped:
             notes.append(f"{GROUPS[key].field}: {dropped} of {len(stamps)} rows hold no whole sample of it.")
         signals[key] = signal
-    unused = [table.label(index) for index, each in enumerate(columns) if each.name is None]
+    unused = [table.label(index) for index, column in enumerate(columns) if column.name is None]
     if unused and table.names and options.columns is None and not table.messages:
         notes.append(f"columns not used: {', '.join(unused)}.")
-    units = {GROUPS[key].field: found[GROUPS[key].columns[0]][1].name for key in signals}
+    units = {GROUPS[key].field: used[GROUPS[key].columns[0]][1].name for key in signals}
     return _FilePart(table.source, signals, origin, tuple(notes), units)
 
 
@@ -534,51 +542,50 @@ _INCREMENTS = {("accel", "velocity increment"): "acceleration", ("gyro", "angle"
 def _per_second(unit: Unit, sensor: str, stamps: FloatArray) -> Unit:
     """The unit of a rate for increments over the sampling interval, any other unit as it is."""
     quantity = _INCREMENTS.get((sensor, unit.quantity))
-    return Unit(unit.name, quantity, unit.factor / float(np.median(np.diff(stamps)))) if quantity else unit
+    return Unit(unit.name, quantity, unit.factor / np.median(np.diff(stamps))) if quantity else unit
 
 
-def _carried_on(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
+def _carried_on(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
     """The rows with a time that goes on where a counter passed its end, or a day or a week of GPS began, and a note."""
-    index, unit = found[TIME]
+    index, unit = used[TIME]
     stamps = table.numbers(index)
     steps = np.diff(stamps)
     if not (steps < 0).any() or not (steps > 0).any():  # NaN is neither
         return table, []
-    usual = float(np.median(steps[steps > 0]))
+    usual = np.median(steps[steps > 0])
     for seconds in _ENDS:
         if seconds / unit.factor < _COUNTED * usual:
             continue
-        full = stamps.dtype.type(round(seconds / unit.factor) if stamps.dtype.kind == "i" else seconds / unit.factor)
+        span = seconds / unit.factor
+        full = stamps.dtype.type(round(span) if stamps.dtype.kind == "i" else span)
         back = np.flatnonzero(steps < -full / 2)
         if not len(back) or not np.all((steps[back] + full > 0) & (steps[back] + full < _CARRIED * usual)):
             continue
-        columns = list(table.columns)
         turns = np.zeros(len(stamps), stamps.dtype)
         turns[back + 1] = full
-        columns[index] = stamps + np.cumsum(turns)
-        places = f"{len(back)} place{'s' * (len(back) != 1)} (row {table.row(int(back[0]) + 1)})"
-        return replace(table, columns=tuple(columns)), [
+        places = f"{counted(len(back), 'place')} (row {table.row(back[0] + 1)})"
+        return table.with_column(index, stamps + np.cumsum(turns)), [
             f"the clock starts again after {seconds:.10g} s in {places}: its time goes on from there."
         ]
     return table, []
 
 
-def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
+def _ordered(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
     """The messages in the order of their stamps, each stamp once, and what was put right.
 
     Raises InputError where the clock was set back, or many messages share stamps.
     """
-    index, unit = found[TIME]
+    index, unit = used[TIME]
     stamps = table.numbers(index)
     steps = np.diff(stamps)
     if not (steps <= 0).any():
         return table, []
-    back = float((np.maximum.accumulate(stamps) - stamps).max()) * unit.factor
+    back = (np.maximum.accumulate(stamps) - stamps).max() * unit.factor
     if back > _SET_BACK:
-        at = int(np.argmax(steps < 0)) + 1
+        first = np.argmax(steps < 0) + 1
         raise InputError(
-            f"{table.path}, message {table.row(at)}: the clock goes back, by up to {back:.6g} s; cut the log there, or "
-            "use the receive stamps (--stamp receive)."
+            f"{table.path}, message {table.row(first)}: the clock goes back, by up to {back:.6g} s; cut the log there, "
+            "or use the receive stamps (--stamp receive)."
         )
     order = np.argsort(stamps, kind="stable")
     kept = order[np.concatenate([[True], np.diff(stamps[order]) > 0])]
@@ -589,101 +596,99 @@ def _ordered(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, l
             "(--stamp receive, or --stamp header)."
         )
     notes: list[str] = []
-    if late := int((steps < 0).sum()):
-        text = f"{late} messages came out of order, by up to {1e3 * back:.3g} ms, and were sorted by their stamps."
+    if out_of_order := int((steps < 0).sum()):
+        text = (
+            f"{out_of_order} messages came out of order, by up to {1e3 * back:.3g} ms, and were sorted by their stamps."
+        )
         notes.append(Defect("data.order", text))
     if shared:
         notes.append(Defect("data.duplicate", f"{shared} messages repeat the stamp of another and were left out."))
     return table.take(kept), notes
 
 
-def _rising(table: Table, found: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
+def _rising(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
     """The rows of a table in the order of their stamps, each row once, and what was put right.
 
     Rows that share a stamp but differ keep it, unless so many do that the stamps are times of arrival in bursts: then
-    they follow each other by nothing. Raises InputError where the clock starts anew within the file.
+    they follow each other by nothing. Raises InputError where the clock starts again within the file.
     """
-    index, unit = found[TIME]
+    index, unit = used[TIME]
     stamps = table.numbers(index)
     steps = np.diff(stamps)
-    if not (steps <= 0).any() or (stamps.dtype.kind == "f" and np.isnan(stamps).any()):
+    if not (steps <= 0).any() or np.isnan(stamps).any():
         return table, []
+
+    def listed(rows: np.ndarray) -> str:
+        return ", ".join(str(table.row(row)) for row in rows[:5])
+
     notes: list[str] = []
-    usual = float(np.median(np.abs(steps[steps != 0]))) if (steps != 0).any() else 0.0
+    usual = np.median(np.abs(steps[steps != 0])) if (steps != 0).any() else 0.0
     count = len(stamps)
     order = np.arange(count)
-    late = np.flatnonzero(steps < 0) + 1
-    if len(late) and (even := _even_clock(stamps)) is not None:
-        columns = list(table.columns)
-        columns[index] = even
-        spread = float(np.std(stamps - even)) * unit.factor
-        return replace(table, columns=tuple(columns)), [Defect(
-            "data.jitter",
-            f"The stamps jitter by {1e3 * spread:.2g} ms and go back in {len(late)} place{'s' * (len(late) != 1)}, and "
-            "the rows are in order: a steady clock fitted to the stamps replaces them.",
-        )]  # fmt: skip
-    if len(late):
+    back = np.flatnonzero(steps < 0) + 1
+    backwards = len(back) > 0.9 * (count - 1)
+    if len(back) and (even := _even_clock(stamps)) is not None:
+        spread = np.std(stamps - even) * unit.factor
+        text = (
+            f"The stamps jitter by {1e3 * spread:.2g} ms and go back in {counted(len(back), 'place')}, and "
+            "the rows are in order: a steady clock fitted to the stamps replaces them."
+        )
+        return table.with_column(index, even), [Defect("data.jitter", text)]
+    if len(back):
         order = np.argsort(stamps, kind="stable")
-        if len(late) > 0.9 * (count - 1):
+        if backwards:
             # rows of one stamp keep the order that they have when the file is read backwards
             order = count - 1 - np.argsort(stamps[::-1], kind="stable")
             text = "The rows run backwards in time. They were sorted by their stamps."
         else:
-            first = ", ".join(str(table.row(int(row))) for row in late[:5])
-            back = float(np.max(np.maximum.accumulate(stamps) - stamps)) * unit.factor
+            farthest = np.max(np.maximum.accumulate(stamps) - stamps) * unit.factor
             text = (
-                f"The rows are out of order in {len(late)} place{'s' * (len(late) != 1)} (row {first}), by up to "
-                f"{back:.6g} s. They were sorted by their stamps."
+                f"The rows are out of order in {counted(len(back), 'place')} (row {listed(back)}), by up to "
+                f"{farthest:.6g} s. They were sorted by their stamps."
             )
         notes.append(Defect("data.order", text))
     # where two rows have one stamp and are alike, one of them was written twice
-    again = np.flatnonzero(np.diff(stamps[order]) == 0) + 1
-    for column in map(np.asarray, table.columns):
-        here, before = column[order[again]], column[order[again - 1]]
-        again = again[(here == before) | ((here != here) & (before != before))]
-    kept = np.delete(order, again)
-    if len(again):
-        rows = np.sort(order[again])
-        first = ", ".join(str(table.row(int(row))) for row in rows[:5])
-        block = "" if len(late) else " one after the other"
+    repeats = np.flatnonzero(np.diff(stamps[order]) == 0) + 1
+    for column in table.columns:
+        values, before = column[order[repeats]], column[order[repeats - 1]]
+        repeats = repeats[(values == before) | ((values != values) & (before != before))]
+    kept = np.delete(order, repeats)
+    if len(repeats):
+        block = "" if len(back) else " one after the other"
         text = (
-            f"{len(rows)} row{'s' * (len(rows) != 1)} repeat others with the same stamp{block} (row {first} …). "
-            "They were left out."
+            f"{counted(len(repeats), 'row')} repeat others with the same stamp{block} "
+            f"(row {listed(np.sort(order[repeats]))} …). They were left out."
         )
-        if len(late) <= 0.9 * (count - 1) and (np.diff(stamps[np.sort(kept)]) >= 0).all():
-            notes = []  # what is left is in order
+        if not backwards and (np.diff(stamps[np.sort(kept)]) >= 0).all():
+            notes = []  # the rows that are kept are in order
         notes.append(Defect("data.duplicate", text))
-    left = np.diff(stamps[kept])
-    close, before = int(np.sum(left < 0.4 * usual)), int(np.sum((steps >= 0) & (steps < 0.4 * usual)))
-    if len(late) and close > max(20, 0.02 * count) + before:
-        at = int(late[np.argmax(stamps[late - 1] - stamps[late])])
+    kept_steps = np.diff(stamps[kept])
+    close, before = int(np.sum(kept_steps < 0.4 * usual)), int(np.sum((steps >= 0) & (steps < 0.4 * usual)))
+    if len(back) and close > max(20, 0.02 * count) + before:
+        row = back[np.argmin(steps[back - 1])]
         raise InputError(
-            f"{table.path}, row {table.row(at)}: the clock goes back by "
-            f"{(stamps[at - 1] - stamps[at]) * unit.factor:.6g} s, and the rows from there on are not those of the "
-            "same times before: two recordings in one file (data.order). Cut it there."
+            f"{table.where(row)}: the clock goes back by {-steps[row - 1] * unit.factor:.6g} s, and the rows "
+            "from there on are not those of the same times before: two recordings in one file (data.order). Cut it "
+            "there."
         )
-    shared = left == 0
-    if len(late) and (shared.any() or close > before):
+    shared = kept_steps == 0
+    if len(back) and (shared.any() or close > before):
         return table, []  # sorting does not help: stamps are wrong, and which, the refusal says
-    columns = [np.asarray(column)[kept] for column in table.columns]
-    if not len(late) and shared.sum() >= _FEW_SHARED and _FEW_SHARES < shared.mean() <= 0.25:
-        even = _even_clock(stamps[kept])
+    table, stamps = table.take(kept), stamps[kept]
+    if not len(back) and shared.sum() >= _FEW_SHARED and _FEW_SHARES < shared.mean() <= 0.25:
+        even = _even_clock(stamps)
         if even is not None:
-            columns[index] = even
-            rate = (len(even) - 1) / (float(even[-1] - even[0]) * unit.factor)
-            return table.take(kept, columns), [
-                *notes,
-                Defect(
-                    "data.jitter",
-                    f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of "
-                    f"{rate:.5g} Hz fitted to the stamps replaces them.",
-                ),
-            ]
+            rate = (len(even) - 1) / ((even[-1] - even[0]) * unit.factor)
+            text = (
+                f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of "
+                f"{rate:.5g} Hz fitted to the stamps replaces them."
+            )
+            return table.with_column(index, even), [*notes, Defect("data.jitter", text)]
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
         number = np.arange(len(kept))
-        place = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
-        columns[index] = stamps[kept].astype(np.float64) + 1e-4 * usual * place
-    return table.take(kept, columns), notes
+        position = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
+        table = table.with_column(index, stamps.astype(np.float64) + 1e-4 * usual * position)
+    return table, notes
 
 
 def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
@@ -697,33 +702,33 @@ def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
     whole = stamps.dtype.kind != "f"
     if period <= (2.0 if whole else 0.0) or np.max(np.abs(since - start - period * number)) > _JITTER * period:
         return None
-    if float(np.diff(np.sort(since)).std()) < _UNEVEN * period:
+    if np.diff(np.sort(since)).std() < _UNEVEN * period:
         return None
     even = start + period * number
     return stamps[0] + (np.round(even).astype(stamps.dtype) if whole else even)
 
 
 def _stamps(
-    table: Table, found: dict[str, tuple[int, Unit]], options: ReadOptions
+    table: Table, used: dict[str, tuple[int, Unit]], options: ReadOptions
 ) -> tuple[FloatArray, Fraction | float, list[str]]:
     """(rows,) seconds since the first stamp (NaN where it is missing), that stamp in seconds, notes.
 
     Integer stamps (nanoseconds since 1970 do not fit a float64) are subtracted before they become floats.
     """
-    if TIME not in found:
+    if TIME not in used:
         alike = (options.like or Reading()).rate
         rates = ((options.rate, "--rate"), (table.rate, "the file's sampling rate"), (alike, "the calibrated log"))
-        rate, said = next((pair for pair in rates if pair[0]), (None, ""))
+        rate, origin = next((pair for pair in rates if pair[0]), (None, ""))
         if not rate:
             means = " A table with a row of means a pose is for `jaximu calibrate --means`."
             means = means if table.source.rows <= _TABLE else ""
             raise InputError(f"{table.path}: has no time column; state the sample rate with --rate HZ.{means}")
-        return np.arange(table.source.rows) / rate, Fraction(0), [f"no time column: stamps from {said}, {rate:g} Hz."]
-    index, unit = found[TIME]
+        return np.arange(table.source.rows) / rate, Fraction(0), [f"no time column: stamps from {origin}, {rate:g} Hz."]
+    index, unit = used[TIME]
     stamps = table.numbers(index)
     notes = ["--rate not used: the file has a time column."] if options.rate else []
     if np.isnan(stamps[0]):
-        raise InputError(f"{table.path}, row {table.row(0)}: column {table.label(index)} is empty or NaN.")
+        raise InputError(f"{table.where(0)}: column {table.label(index)} is empty or NaN.")
     whole = stamps.dtype.kind == "i"
     exact = int(stamps[0]) * Fraction(unit.factor).limit_denominator(10**9) if whole else float(stamps[0]) * unit.factor
     return (stamps - stamps[0]) * unit.factor, exact, notes
@@ -737,30 +742,28 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
     """
     rows, kept = len(stamps), range(len(stamps))
     values = np.empty((rows, len(columns)))
-    for place, (each, _, unit) in enumerate(columns):  # column by column: passes over rows of three are slow
+    for at, (column, _, unit) in enumerate(columns):  # column by column: passes over rows of three are slow
         plain = unit.factor == 1.0 and unit.offset == 0.0
-        values[:, place] = each if plain else each * unit.factor + unit.offset
+        values[:, at] = column if plain else column * unit.factor + unit.offset
     if (missing := np.isnan(values)).any():
         absent = missing.all(1)
         broken = missing.any(1) & ~absent
         if 0 < broken.mean() <= FEW:
             absent |= broken
         elif broken.any():
-            row = int(np.argmax(broken))
+            row = np.argmax(broken)
             label = table.label(columns[int(np.argmax(missing[row]))][1])
-            raise InputError(
-                f"{table.path}, row {table.row(row)}: column {label} is empty or NaN beside the sensor's other axes."
-            )
+            raise InputError(f"{table.where(row)}: column {label} is empty or NaN beside the sensor's other axes.")
         kept = np.flatnonzero(~absent)
         stamps, values = stamps[kept], values[kept]
     if (missing := np.isnan(stamps)).any():
-        raise InputError(f"{table.path}, row {table.row(kept[np.argmax(missing)])}: the time stamp is empty or NaN.")
+        raise InputError(f"{table.where(kept[np.argmax(missing)])}: the time stamp is empty or NaN.")
     steps = np.diff(stamps)
     if (steps <= 0.0).any():
-        at = int(np.argmax(steps <= 0.0)) + 1
+        at = np.argmax(steps <= 0.0) + 1
         what = "repeats that of the row before" if steps[at - 1] == 0.0 else f"goes back by {-steps[at - 1]:.6g} s"
         raise InputError(
-            f"{table.path}, row {table.row(kept[at])}: the time stamp {what}; delete such rows, or if the stamps are "
+            f"{table.where(kept[at])}: the time stamp {what}; delete such rows, or if the stamps are "
             "unusable but the rate is steady, ignore the column (_ in --columns) and give --rate."
         )
     if values.shape[1] == 3 and len(values) > 1:
@@ -791,8 +794,8 @@ def _assemble(parts: Sequence[_FilePart], table: Table, options: ReadOptions) ->
         raise InputError(f"{accel_file}: columns accel_x, accel_y, accel_z are missing.")
     for key, file in (("accel", accel_file), ("gyro", gyro_file))[alone:]:
         if key in signals:
-            signals[key], said = _scaled(signals[key], key, file, options)
-            notes += said
+            signals[key], remarks = _scaled(signals[key], key, file, options)
+            notes += remarks
     if "gyro" in signals and not alone:
         accel, gyro = signals["accel"], signals["gyro"]
         if gyro.time[0] > accel.time[-1] or gyro.time[-1] < accel.time[0]:

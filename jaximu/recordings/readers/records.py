@@ -53,58 +53,61 @@ def read(data: bytes, source: Source) -> Table | tuple[Table, ...]:
 def _records(document: Any) -> list[dict[str, Any]] | None:
     """The longest list of records, or of rows under a list of names, in a document."""
     if isinstance(document, list):
-        return [each for each in document if isinstance(each, dict)] if any(map(_is_record, document)) else None
+        return [record for record in document if isinstance(record, dict)] if any(map(_is_record, document)) else None
     if not isinstance(document, Mapping):
         return None
     rows, sensors = document.get("values"), document.get("sensors")
     if isinstance(rows, list) and isinstance(sensors, list) and rows and isinstance(rows[0], list):
-        names = [f"{each['name']} [{each['units']}]" if each.get("units") else str(each["name"]) for each in sensors
-                 if isinstance(each, Mapping) and "name" in each]  # fmt: skip
+        columns = [sensor for sensor in sensors if isinstance(sensor, Mapping) and "name" in sensor]
+        names = [
+            f"{column['name']} [{column['units']}]" if column.get("units") else str(column["name"])
+            for column in columns
+        ]
         return [dict(zip(names, row, strict=False)) for row in rows]
-    found = [records for value in document.values() if (records := _records(value))]
-    return max(found, key=len) if found else None
+    lists = [records for value in document.values() if (records := _records(value))]
+    return max(lists, key=len) if lists else None
 
 
-def _is_record(each: Any) -> bool:
-    return isinstance(each, dict) and len(each) > 1
+def _is_record(value: Any) -> bool:
+    return isinstance(value, dict) and len(value) > 1
 
 
 def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """The values in nested objects, names joined by dots; a list of three or four numbers is a vector."""
-    for name, each in value.items():
-        if isinstance(each, Mapping):
-            yield from _leaves(each, f"{prefix}{name}.")
-        elif isinstance(each, list) and len(each) in (3, 4) and all(isinstance(v, int | float) for v in each):
-            yield from ((f"{prefix}{name}.{axis}", v) for axis, v in zip("xyz" if len(each) == 3 else "wxyz", each))  # noqa: B905
+    for name, item in value.items():
+        if isinstance(item, Mapping):
+            yield from _leaves(item, f"{prefix}{name}.")
+        elif isinstance(item, list) and len(item) in (3, 4) and all(isinstance(v, int | float) for v in item):
+            yield from ((f"{prefix}{name}.{axis}", v) for axis, v in zip("xyz" if len(item) == 3 else "wxyz", item))  # noqa: B905
         else:
-            yield prefix + name, each
+            yield prefix + name, item
 
 
 def _columns(records: list[dict[str, Any]]) -> dict[str, list[Any]]:
-    flat = [dict(_leaves(each)) for each in records]
-    names = dict.fromkeys(name for each in flat for name in each)
-    return {name: [each.get(name) for each in flat] for name in names}
+    flat = [dict(_leaves(record)) for record in records]
+    names = dict.fromkeys(name for record in flat for name in record)
+    return {name: [record.get(name) for record in flat] for name in names}
 
 
 def _table(columns: Mapping[str, Any], source: Source) -> Table:
     """The columns as arrays: numbers also where they are written as text, times of day as stamps."""
-    found: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     for name, values in columns.items():
         if not isinstance(values, list):
-            found[name] = values
+            arrays[name] = values
             continue
         try:
-            array = np.array([np.nan if each is None else each for each in values], dtype=object)
+            array = np.array([np.nan if value is None else value for value in values], dtype=object)
             numbers = array.astype(np.float64)
-            whole = all(isinstance(each, int) or (isinstance(each, str) and each.isdigit()) for each in array)
-            found[name] = array.astype(np.int64) if whole else numbers
+            whole = all(isinstance(value, int) or (isinstance(value, str) and value.isdigit()) for value in array)
+            arrays[name] = array.astype(np.int64) if whole else numbers
         except (TypeError, ValueError, OverflowError):
-            if all(isinstance(each, str) for each in values):
+            if all(isinstance(value, str) for value in values):
                 if (stamps := seconds_of(np.array(values, dtype=object))) is not None:
-                    found[f"{name} [ns]"] = stamps
-            elif all(isinstance(each, list) for each in values) and len(set(map(np.shape, values))) == 1:
-                found[name] = np.array(values, dtype=np.float64)
-    return table_of(found, source)
+                    arrays[f"{name} [ns]"] = stamps
+            elif all(isinstance(value, list) for value in values) and len(set(map(np.shape, values))) == 1:
+                arrays[name] = np.array(values, dtype=np.float64)
+    return table_of(arrays, source)
 
 
 def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[str, Table]]:
@@ -113,12 +116,12 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
     if tag is None:
         return
     parts: dict[str, list[dict[str, Any]]] = {}
-    for each in records:
-        if (sensor := _sensor(each.get(tag, ""))) and len(each) > 3:
-            parts.setdefault(sensor, []).append(each)
+    for record in records:
+        if (sensor := _sensor(record.get(tag, ""))) and len(record) > 3:
+            parts.setdefault(sensor, []).append(record)
     android = str(records[0][tag]).startswith("android.sensor.")  # whose units are Android's, and stamps in ns
     for sensor, rows in parts.items():
-        columns = _columns([{k: v for k, v in each.items() if k != tag} for each in rows])
+        columns = _columns([{k: v for k, v in record.items() if k != tag} for record in rows])
         named = {}
         for name, values in columns.items():
             last = name.rpartition(".")[2].lower()
@@ -138,7 +141,7 @@ def apart(table: Table) -> Table:
         if column.dtype != object or len(tags := dict.fromkeys(column[:10000].tolist())) > 40:
             continue
         sensors = {tag: sensor for tag in tags if (sensor := _sensor(tag))}
-        axes = {field.axis: place for place, field in enumerate(fields_of(table.names or ())) if not field.stem}
+        axes = {field.axis: index for index, field in enumerate(fields_of(table.names or ())) if not field.stem}
         if "accel" not in sensors.values() or not {"x", "y", "z"} <= set(axes):
             continue
         parts = []
@@ -147,11 +150,16 @@ def apart(table: Table) -> Table:
             for axis in "xyz":
                 unit = parse_column(names[axes[axis]])[1]
                 names[axes[axis]] = f"{sensor}_{axis} [{unit}]" if unit else f"{sensor}_{axis}"
-            kept = [place for place in range(len(names)) if place != at and part.columns[place].dtype != object]
-            parts.append((sensor, replace(part, names=tuple(names[k] for k in kept), rows=1,
-                                          columns=tuple(part.columns[k] for k in kept))))  # fmt: skip
-        found = _joined(parts)
-        return replace(found, notes=(*found.notes, f"each row is one sensor's, by {table.label(at)}."))
+            kept = [index for index in range(len(names)) if index != at and part.columns[index].dtype != object]
+            part = replace(
+                part,
+                names=tuple(names[index] for index in kept),
+                rows=1,
+                columns=tuple(part.columns[index] for index in kept),
+            )
+            parts.append((sensor, part))
+        joined = _joined(parts)
+        return replace(joined, notes=(*joined.notes, f"each row is one sensor's, by {table.label(at)}."))
     return table
 
 
@@ -215,14 +223,14 @@ def _joined(tables: list[tuple[str, Table]]) -> Table:
         return tables[0][1]
     names = list(dict.fromkeys(name for _, table in tables for name in table.names or ()))
     held = [dict(zip(table.names or (), table.columns, strict=True)) for _, table in tables]
-    clock = next((name for name in names if all(name in each and rises(each[name]) for each in held)), None)
+    clock = next((name for name in names if all(name in part and rises(part[name]) for part in held)), None)
     if clock is None:
         raise InputError(f"{tables[0][1].path}: the rows of its sensors share no column of time.")
-    stamps = np.unique(np.concatenate([each[clock] for each in held]))
+    stamps = np.unique(np.concatenate([part[clock] for part in held]))
     columns = {name: np.full(len(stamps), np.nan) for name in names}
-    for each in held:
-        places = np.searchsorted(stamps, each[clock])
-        for name, values in each.items():
+    for part in held:
+        places = np.searchsorted(stamps, part[clock])
+        for name, values in part.items():
             columns[name][places] = values
     columns[clock] = stamps
     first = tables[0][1]

@@ -111,14 +111,14 @@ def read_ros2(path: Path, source: Source, selection: MessageSelection) -> tuple[
     from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, zstd
 
     files = sorted(path.iterdir()) if path.is_dir() else [path]
-    unpacking = Unpacking(source, sum(each.stat().st_size for each in files))
-    for each in files:
-        _check_packed(each, zstd, unpacking)
+    unpacking = Unpacking(source, sum(file.stat().st_size for file in files))
+    for file in files:
+        _check_packed(file, zstd, unpacking)
     methods = {"lz4": LZ4FrameDecompressor, "zstd": zstd.ZstdDecompressor}
-    with _bounded(DECOMPRESSORS, methods, unpacking), _named(path) as given, Reader(_Path(given)) as bag:
+    with _bounded(DECOMPRESSORS, methods, unpacking), _named(path) as named, Reader(_Path(named)) as bag:
         storage: Any = bag.storage
-        for each in (storage, *getattr(storage, "storages", ())):
-            if database := getattr(each, "dbconn", None):
+        for part in (storage, *getattr(storage, "storages", ())):
+            if database := getattr(part, "dbconn", None):
                 database.limit(apsw.SQLITE_LIMIT_LENGTH, _LONGEST_ROW)
         packed = bag.compression_mode == "message"
         storage.metadata = storage.metadata._replace(compression_mode=None)
@@ -159,16 +159,18 @@ def _read(
 ) -> tuple[Table, ...]:
     wanted = _wanted(bag.connections, source, selection)
     kinds = {topic: kind for topic, kind, _ in wanted}
-    chosen = [each for each in bag.connections if kinds.get(each.topic) == each.msgtype]
-    for each in chosen:
-        if each.digest and len(each.digest) == 32 and each.digest != _KINDS[each.msgtype].md5:
-            raise InputError(f"{source.path}: topic {each.topic} is a {each.msgtype} of an unknown definition.")
-    found = {topic: _Columns(_KINDS[kind], cdr) for topic, kind in kinds.items()}
+    chosen = [connection for connection in bag.connections if kinds.get(connection.topic) == connection.msgtype]
+    for connection in chosen:
+        if connection.digest and len(connection.digest) == 32 and connection.digest != _KINDS[connection.msgtype].md5:
+            raise InputError(
+                f"{source.path}: topic {connection.topic} is a {connection.msgtype} of an unknown definition."
+            )
+    decoded = {topic: _Columns(_KINDS[kind], cdr) for topic, kind in kinds.items()}
     for connection, received, data in iterate(chosen):
         if len(data) > _LONGEST:
             raise ValueError("a message is not as its definition says")
-        found[connection.topic].add(received, data)
-    tables = (found[topic].table(source, topic, columns, selection.stamp) for topic, _, columns in wanted)
+        decoded[connection.topic].add(received, data)
+    tables = (decoded[topic].table(source, topic, columns, selection.stamp) for topic, _, columns in wanted)
     return tuple(table for table in tables if table)
 
 
@@ -190,34 +192,38 @@ def _named(path: Path) -> Iterator[Path]:
 
 def _wanted(
     connections: Sequence[Any], source: Source, selection: MessageSelection
-) -> list[tuple[str, str, dict[str, int]]]:  # fmt: skip
+) -> list[tuple[str, str, dict[str, int]]]:
     """Topic, type and columns of each table: of the one topic of `sensor_msgs/Imu`, or of those asked for, of which
     the first has the accelerometer and the second the gyroscope; and of what goes with them.
     """
-    imu = {each.topic: each for each in connections if each.msgtype == _IMU}
-    listed = ", ".join(f"{topic} ({each.msgcount} messages)" for topic, each in imu.items()) or "none"
+    imu = {connection.topic: connection for connection in connections if connection.msgtype == _IMU}
+    listed = ", ".join(f"{topic} ({connection.msgcount} messages)" for topic, connection in imu.items()) or "none"
     if selection.topic is not None:
-        asked = [each.strip() for each in selection.topic.split(",")]
-        if unknown := [each for each in asked if each not in imu]:
+        topics = [topic.strip() for topic in selection.topic.split(",")]
+        if unknown := [topic for topic in topics if topic not in imu]:
             raise InputError(f"{source.path}: has no IMU topic {unknown[0]}; --topic can be {listed}.")
-        if len(asked) > 2:
+        if len(topics) > 2:
             raise InputError("--topic: give one topic, or the accelerometer's and the gyroscope's.")
     else:  # two may differ in nothing but these words (RealSense)
-        asked = sorted(imu, key=lambda topic: "gyro" in topic)
-        pair = len(asked) == 2 and "accel" in asked[0] and asked[0].replace("accel", "gyro") == asked[1]
-        if len(asked) > 1 and not pair:
+        topics = sorted(imu, key=lambda topic: "gyro" in topic)
+        pair = len(topics) == 2 and "accel" in topics[0] and topics[0].replace("accel", "gyro") == topics[1]
+        if len(topics) > 1 and not pair:
             raise InputError(
                 f"{source.path}: holds {len(imu)} IMU topics, {listed}: choose one with --topic, or the "
                 "accelerometer's and the gyroscope's as --topic A,B."
             )
-    if not asked:
-        kinds = sorted({each.msgtype.replace("/msg/", "/") for each in connections})
+    if not topics:
+        kinds = sorted({connection.msgtype.replace("/msg/", "/") for connection in connections})
         raise InputError(f"{source.path}: holds no sensor_msgs/Imu; it holds {', '.join(kinds[:20]) or 'nothing'}.")
-    parts = [_GYRO | _ACCEL] if len(asked) == 1 else [_ACCEL, _GYRO]
-    wanted = [(topic, _IMU, columns) for topic, columns in zip(asked, parts, strict=True)]
-    beside = asked[0].rsplit("/", 1)[0]
+    parts = [_GYRO | _ACCEL] if len(topics) == 1 else [_ACCEL, _GYRO]
+    wanted = [(topic, _IMU, columns) for topic, columns in zip(topics, parts, strict=True)]
+    beside = topics[0].rsplit("/", 1)[0]
     for kind in tuple(_KINDS)[1:]:
-        others = {each.topic for each in connections if each.msgtype == kind and each.topic.startswith(f"{beside}/")}
+        others = {
+            connection.topic
+            for connection in connections
+            if connection.msgtype == kind and connection.topic.startswith(f"{beside}/")
+        }
         wanted += [(topic, kind, _KINDS[kind].columns) for topic in others if len(others) == 1]
     return wanted
 
@@ -240,14 +246,14 @@ class _Columns:
 
     def decode(self) -> None:
         """Take the messages held. Raises ValueError for one that is not as its definition says."""
-        lengths = np.array([len(each) for each in self.data])
+        lengths = np.array([len(message) for message in self.data])
         stamps = np.empty((len(lengths), 2), np.int64)
         numbers = np.empty((len(lengths), len(self.kind.used)))
         for length in np.unique(lengths):  # as a rule they are all of one
             if length < 16 + 8 * self.kind.doubles:
                 raise ValueError("a message is not as its definition says")
             here = lengths == length
-            rows = np.frombuffer(b"".join([each for each in self.data if len(each) == length]), np.uint8)
+            rows = np.frombuffer(b"".join([message for message in self.data if len(message) == length]), np.uint8)
             rows = rows.reshape(-1, length)
             head, stamp, frame = rows[:, :2], rows[:, 4:12], rows[:, 12:16]
             padding = length - 8 * self.kind.doubles - 16 - np.ascontiguousarray(frame).view("<u4").astype(np.int64)
@@ -271,10 +277,10 @@ class _Columns:
         double, note = dict(zip(self.kind.used, numbers.T, strict=True)), f"{topic}: "
         if stamp == "header" and (header == header[0]).all():
             stamp, note = "receive", f"{note}the header stamps are all the same; "
-        late = (received - header) / 1e6
-        said = {
-            "header": f"time is the header stamp; messages were received {np.median(late):.3g} ms later (median), "
-            f"up to {late.max():.3g} ms",
+        delay = (received - header) / 1e6
+        clock = {
+            "header": f"time is the header stamp; messages were received {np.median(delay):.3g} ms later (median), "
+            f"up to {delay.max():.3g} ms",
             "receive": "time is the receive stamp",
         }
         names, columns = ["time [ns]"], [header if stamp == "header" else received]
@@ -283,4 +289,4 @@ class _Columns:
             if absent is None or not (double[absent] == -1.0).all():
                 names.append(name)
                 columns.append(double[at])
-        return Table(source, tuple(names), tuple(columns), notes=(f"{note}{said[stamp]}.",), messages=True)
+        return Table(source, tuple(names), tuple(columns), notes=(f"{note}{clock[stamp]}.",), messages=True)

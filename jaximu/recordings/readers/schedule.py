@@ -65,8 +65,8 @@ def read_reference(path: str | os.PathLike[str], recording: Recording) -> tuple[
         entries = read_schedule(name)
         return tuple(replace(e, start=e.start - recording.start, stop=e.stop - recording.start) for e in entries)
     if "part" in header:
-        found = _marked_sections(text, header.index("part"), name, len(recording.accelerometer))
-        return _sections(found, name, recording)
+        sections = _marked_sections(text, header.index("part"), name, len(recording.accelerometer))
+        return _sections(sections, name, recording)
     table = read_table(name)
     columns = header_columns(table) or ()
     groups = {group for group in _REFERENCES if any(c.name in GROUPS[group].columns for c in columns)}
@@ -77,7 +77,7 @@ def read_reference(path: str | os.PathLike[str], recording: Recording) -> tuple[
         )
     part = extract(table, columns, ReadOptions(rate=recording.accelerometer.rate), groups)
     later = float(part.origin - recording.start) if any(c.name == "time" for c in columns) else 0.0
-    fields = {GROUPS[key].field: replace(each, time=each.time + later) for key, each in part.signals.items()}
+    fields = {GROUPS[key].field: replace(signal, time=signal.time + later) for key, signal in part.signals.items()}
     return replace(recording, **fields, sources=(*recording.sources, part.source))
 
 
@@ -93,8 +93,8 @@ def read_schedule(path: str | os.PathLike[str]) -> tuple[ScheduleEntry, ...]:
     without units.
     """
     name = os.fspath(path)
-    lines = [(row, cells) for row, cells in enumerate(csv.reader(_text(name).splitlines()), 1)
-             if any(cell.strip() for cell in cells)]  # fmt: skip
+    rows = enumerate(csv.reader(_text(name).splitlines()), 1)
+    lines = [(row, cells) for row, cells in rows if any(cell.strip() for cell in cells)]
     if len(lines) < 2:
         raise InputError(f"{name}: holds no poses or turns.")
     columns = _columns(lines[0][1], name)
@@ -105,29 +105,31 @@ def read_schedule(path: str | os.PathLike[str]) -> tuple[ScheduleEntry, ...]:
 
 def _columns(header: Sequence[str], name: str) -> dict[str, tuple[int, float]]:
     """The place of each column and the factor that takes it to SI."""
-    found: dict[str, tuple[int, float]] = {}
-    for place, cell in enumerate(header):
+    columns: dict[str, tuple[int, float]] = {}
+    for at, cell in enumerate(header):
         title, stated = parse_column(cell)
         title = title.strip().lower()
-        if title not in _FIELDS or title in found:
-            what = "stands twice" if title in found else f"is not known; known are {', '.join(_FIELDS)}"
+        if title not in _FIELDS or title in columns:
+            what = "stands twice" if title in columns else f"is not known; known are {', '.join(_FIELDS)}"
             raise InputError(f"{name}, row 1: the column {cell.strip()!r} {what}.")
         quantity = _QUANTITIES.get(title)
         if quantity and not stated:
-            raise InputError(f"{name}, row 1: the column {title} states no unit; write for example "
-                             f"{title} [{'s' if quantity == 'time' else 'deg'}].")  # fmt: skip
-        found[title] = place, unit(stated or "1", quantity, file=name, column=title).factor if quantity else 1.0
-    missing = [title for title in _FIELDS[:6] if title not in found]
+            example = "s" if quantity == "time" else "deg"
+            raise InputError(
+                f"{name}, row 1: the column {title} states no unit; write for example {title} [{example}]."
+            )
+        columns[title] = at, unit(stated or "1", quantity, file=name, column=title).factor if quantity else 1.0
+    missing = [title for title in _FIELDS[:6] if title not in columns]
     if missing:
         raise InputError(f"{name}, row 1: the column {missing[0]} is missing; a schedule has {', '.join(_FIELDS)}.")
-    return found
+    return columns
 
 
 def _entry(cells: Sequence[str], columns: dict[str, tuple[int, float]], where: str) -> ScheduleEntry:
     def number(title: str, optional: bool = False) -> float:
         """NaN for an optional cell that is empty."""
-        place, factor = columns.get(title, (len(cells), 1.0))
-        cell = cells[place].strip() if place < len(cells) else ""
+        at, factor = columns.get(title, (len(cells), 1.0))
+        cell = cells[at].strip() if at < len(cells) else ""
         if not cell and optional:
             return math.nan
         if not cell:
@@ -163,8 +165,10 @@ def _entry(cells: Sequence[str], columns: dict[str, tuple[int, float]], where: s
 def _require_apart(entries: Sequence[ScheduleEntry]) -> None:
     for before, after in pairwise(entries):
         if (before.start, before.stop) == (after.start, after.stop):
-            raise InputError(f"{after.label}: says of the same time ({after.start:g} to {after.stop:g} s) what "
-                             f"{before.label} says otherwise: one interval stands under two names.")  # fmt: skip
+            raise InputError(
+                f"{after.label}: says of the same time ({after.start:g} to {after.stop:g} s) what {before.label} says "
+                "otherwise: one interval stands under two names."
+            )
         if after.start < before.stop - 1e-6:
             raise InputError(
                 f"{after.label}: begins at {after.start:g} s, before {before.label} ends ({before.stop:g} s)."
@@ -183,47 +187,49 @@ def _json_sections(text: str, name: str, count: int) -> _Sections:
         document: Any = json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(f"{name}, row {error.lineno}: is no JSON document ({error.msg}).") from None
-    found: _Sections = {}
-    for section, given in document.items():
+    sections: _Sections = {}
+    for section, fields in document.items():
         where = f"{name}, section {section}"
-        if not isinstance(given, dict) or not all(isinstance(given.get(key), int) for key in ("start", "end")):
+        if not isinstance(fields, dict) or not all(isinstance(fields.get(key), int) for key in ("start", "end")):
             raise InputError(f"{where}: must have whole numbers start and end, the log's samples counted from 0.")
-        angle = given.get("angle [deg]")
-        unknown = sorted(set(given) - {"start", "end", "angle [deg]"})
+        angle = fields.get("angle [deg]")
+        unknown = sorted(set(fields) - {"start", "end", "angle [deg]"})
         if unknown or not isinstance(angle, int | float | None):
-            raise InputError(f'{where}: {unknown[0] if unknown else "angle [deg]"!r} is not understood; a section has '
-                             '"start", "end" and, of a turn, "angle [deg]".')  # fmt: skip
-        first, last = given["start"], given["end"]
+            key = unknown[0] if unknown else "angle [deg]"
+            raise InputError(
+                f'{where}: {key!r} is not understood; a section has "start", "end" and, of a turn, "angle [deg]".'
+            )
+        first, last = fields["start"], fields["end"]
         if not 0 <= first < last <= count:
             raise InputError(f"{where}: {first} to {last} is no part of the log's {count} samples.")
-        found[section] = first, last, None if angle is None else math.radians(angle)
-    return found
+        sections[section] = first, last, None if angle is None else math.radians(angle)
+    return sections
 
 
-def _marked_sections(text: str, place: int, name: str, count: int) -> _Sections:
+def _marked_sections(text: str, column: int, name: str, count: int) -> _Sections:
     rows = [cells for cells in csv.reader(text.splitlines()) if cells][1:]
     if len(rows) != count:
         raise InputError(f"{name}: has {len(rows)} rows, but the log {count} samples: the column part must mark each.")
-    parts = [cells[place].strip() if place < len(cells) else "" for cells in rows]
+    parts = [cells[column].strip() if column < len(cells) else "" for cells in rows]
     edges = [0, *(k for k in range(1, count) if parts[k] != parts[k - 1]), count]
-    found: _Sections = {}
+    sections: _Sections = {}
     for first, last in pairwise(edges):
         if not parts[first]:
             continue
-        if parts[first] in found:
+        if parts[first] in sections:
             raise InputError(f"{name}, row {first + 2}: section {parts[first]} begins for the second time.")
-        found[parts[first]] = first, last, None
-    return found
+        sections[parts[first]] = first, last, None
+    return sections
 
 
-def _sections(found: _Sections, name: str, recording: Recording) -> tuple[ScheduleEntry, ...]:
+def _sections(sections: _Sections, name: str, recording: Recording) -> tuple[ScheduleEntry, ...]:
     wanted = [f"{axis}_{kind}" for axis in "xyz" for kind in ("p", "a", "rot")]
-    missing = [each for each in wanted if each not in found]
+    missing = [section for section in wanted if section not in sections]
     if missing:
         raise InputError(f"{name}: the section {missing[0]} is missing; Ferraris' procedure has {', '.join(wanted)}.")
     time, half = recording.accelerometer.time, 0.5 / recording.accelerometer.rate
     entries = []
-    for section, (first, last, angle) in found.items():
+    for section, (first, last, angle) in sections.items():
         where = f"{name}, section {section}"
         match = re.fullmatch(r"([xyz])_(p|a|rot)", section)
         if match is None:
@@ -232,6 +238,6 @@ def _sections(found: _Sections, name: str, recording: Recording) -> tuple[Schedu
         kind, turned = ("turn", math.nan if angle is None else angle) if match[2] == "rot" else ("pose", 0.0)
         span = float(time[first] - half), float(time[last - 1] + half)
         entries.append(ScheduleEntry(*span, kind, axis, turned, label=where))
-    entries.sort(key=lambda each: each.start)
+    entries.sort(key=lambda entry: entry.start)
     _require_apart(entries)
     return tuple(entries)

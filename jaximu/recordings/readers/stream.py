@@ -77,21 +77,21 @@ class Lines:
         """
         if self._file is not None:
             return list(islice(self._sound(self._file), count))
-        found: list[bytes] = []
+        lines: list[bytes] = []
         until = time.monotonic() + self._patience
-        while len(found) < count or not self._queue.empty():
+        while len(lines) < count or not self._queue.empty():
             try:
                 line = self._queue.get(timeout=max(0.0, until - time.monotonic()))
             except Empty:
-                if found:
-                    return found
+                if lines:
+                    return lines
                 advice = "Is the sensor on, and --baud right?" if self._port is not None else "Is the sensor on?"
                 raise InputError(f"{self.name}: no line has come for {self._patience:g} s. {advice}") from None
             if line is None:
                 self._queue.put(None)  # the end is found again
-                return found
-            found += self._sound([line] if line else [])
-        return found
+                return lines
+            lines += self._sound([line] if line else [])
+        return lines
 
     def _sound(self, lines: Iterable[bytes]) -> Iterator[bytes]:
         """Yield the whole lines: text, ended, with as many fields as the first two alike; and what is above those."""

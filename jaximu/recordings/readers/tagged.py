@@ -13,10 +13,8 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import MessageSelection, Table, from_arrow
+from jaximu.recordings.columns.table import HEAD, MessageSelection, Table, from_arrow
 from jaximu.recordings.recording import Source
-
-_LOOKED_AT = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -53,38 +51,38 @@ _DIALECTS = (
 
 def dialect(data: bytes) -> _Dialect | None:
     """The program that wrote a text, by the header of its rows."""
-    return next((each for each in _DIALECTS if each.sign.search(data[:_LOOKED_AT])), None)
+    return next((dialect_of for dialect_of in _DIALECTS if dialect_of.sign.search(data[:HEAD])), None)
 
 
 def read(data: bytes, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
     """The tables in a tagged text, one a sensor. Raises InputError where no row of a sensor is there."""
-    found = dialect(data)
-    assert found is not None
+    log = dialect(data)
+    assert log is not None
     tables: list[Table] = []
-    shift = 0 if b"Stream Type,F#" not in data[:_LOOKED_AT] else -1  # older versions write no index
-    stamp = selection.stamp if selection.stamp in found.notes else "header"
-    for tag, (name, first) in found.tags.items():
+    shift = 0 if b"Stream Type,F#" not in data[:HEAD] else -1  # older versions write no index
+    stamp = selection.stamp if selection.stamp in log.notes else "header"
+    for tag, (name, first) in log.tags.items():
         rows = re.findall(rb"^" + tag.encode() + rb",.*$", data, re.MULTILINE)
         rows = [row for row in rows if row.partition(b",")[2][:1].isdigit()]  # not the header itself
         if not rows:
             continue
         width = rows[0].count(b",") + 1
-        at = [shift + each for each in (found.time[stamp], first, first + 1, first + 2)]
+        at = [shift + cell for cell in (log.time[stamp], first, first + 1, first + 2)]
         if width <= max(at):
-            raise InputError(f"{source.path}: rows of {tag} have {width} cells, fewer than {found.program} writes.")
+            raise InputError(f"{source.path}: rows of {tag} have {width} cells, fewer than {log.program} writes.")
         try:
             table = pc.read_csv(
                 pa.BufferReader(b"\n".join(rows)),
-                read_options=pc.ReadOptions(column_names=[str(each) for each in range(width)]),
-                convert_options=pc.ConvertOptions(include_columns=[str(each) for each in at]),
+                read_options=pc.ReadOptions(column_names=[str(number) for number in range(width)]),
+                convert_options=pc.ConvertOptions(include_columns=[str(number) for number in at]),
             )
         except pa.ArrowInvalid as error:
             reason = str(error).splitlines()[0][:200]
             raise InputError(f"{source.path}: rows of {tag} cannot be read as a table: {reason}") from None
         columns = map(from_arrow, table.columns)
-        names = (f"time [{found.unit}]", *map(name.format, "xyz"))
+        names = (f"time [{log.unit}]", *map(name.format, "xyz"))
         tables.append(Table(source, names, tuple(columns), messages=True))
     if not tables:
-        raise InputError(f"{source.path}: is a log of {found.program} without a row of accelerometer or gyroscope.")
-    note = f"a log of {found.program} (m/s^2, rad/s): {found.notes[stamp]}; each sensor has its own time stamps."
+        raise InputError(f"{source.path}: is a log of {log.program} without a row of accelerometer or gyroscope.")
+    note = f"a log of {log.program} (m/s^2, rad/s): {log.notes[stamp]}; each sensor has its own time stamps."
     return replace(tables[0], notes=(note,)), *tables[1:]

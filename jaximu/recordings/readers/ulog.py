@@ -61,13 +61,13 @@ def _fifo(data: _Fields, stamp: str) -> _Samples:
     """All samples since the message before, `dt` µs apart, the last one at the message's stamp (PX4-Autopilot,
     src/lib/drivers/gyroscope/PX4Gyroscope.cpp: what it averages into `sensor_gyro` ends with it). Time is in ns.
     """
-    place = np.arange(_DEEPEST_FIFO)
+    index = np.arange(_DEEPEST_FIFO)
     count, step, scale = (data[name][:, None] for name in ("samples", "dt", "scale"))
-    valid = place < count
+    valid = index < count
     time = data["timestamp_sample" if stamp == "header" else "timestamp"].astype(np.int64)
-    before = (count.astype(np.int64) - 1 - place) * step.astype(np.float64)
-    values = [(np.stack([data[f"{axis}[{at}]"] for at in place], 1) * scale.astype(np.float64))[valid]
-              for axis in "xyz"]  # fmt: skip
+    before = (count.astype(np.int64) - 1 - index) * step.astype(np.float64)
+    samples = (np.stack([data[f"{axis}[{at}]"] for at in index], 1) for axis in "xyz")
+    values = [(output * scale.astype(np.float64))[valid] for output in samples]
     return (time[:, None] * 1000 - np.rint(1e3 * before).astype(np.int64))[valid], values
 
 
@@ -91,45 +91,50 @@ def read(path: Path, source: Source, selection: MessageSelection) -> tuple[Table
     with path.open("rb") as head, path.open("rb") as file, redirect_stdout(io.StringIO()):  # pyulog prints its findings
         _check_formats(ULog(head, parse_header_only=True).message_formats)
         log = ULog(file, list(names))
-    found = {(each.name, each.multi_id): each.data for each in log.data_list if len(each.data.get("timestamp", ())) > 1}
-    instances = sorted({place for name, place in found if any(name == first[0][0] for first in _SOURCES.values())})
-    place = selection.instance if selection.instance is not None else (instances or [0])[0]
+    logged = {
+        (dataset.name, dataset.multi_id): dataset.data
+        for dataset in log.data_list
+        if len(dataset.data.get("timestamp", ())) > 1
+    }
+    first_names = {accel for (accel, _), _ in _SOURCES.values()}
+    instances = sorted({instance for name, instance in logged if name in first_names})
+    instance = selection.instance if selection.instance is not None else (instances or [0])[0]
     usable = {
-        topic: min(_samples(found[name, place]) for name, _ in messages)
+        topic: min(_samples(logged[name, instance]) for name, _ in messages)
         for topic, messages in _SOURCES.items()
-        if all((name, place) in found for name, _ in messages)
+        if all((name, instance) in logged for name, _ in messages)
     }
     usable = {topic: count for topic, count in usable.items() if count > 1}
     if not usable:
         held = f"instances {', '.join(map(str, instances))}" if instances else "no such message"
         raise InputError(
             f"{source.path}: has no sensor_accel with sensor_gyro (as they are, or _fifo), no sensor_combined and no "
-            f"vehicle_imu of instance {place} ({held}); choose with --instance, or log them (SDLOG_PROFILE, high "
+            f"vehicle_imu of instance {instance} ({held}); choose with --instance, or log them (SDLOG_PROFILE, high "
             "rate sensors)."
         )
     if selection.topic is not None and selection.topic not in usable:
         raise InputError(f"{source.path}: --topic {selection.topic}: there are {', '.join(usable)} here.")
-    topic = selection.topic or max(usable, key=lambda each: usable[each])
+    topic = selection.topic or max(usable, key=lambda name: usable[name])
     notes = ["PX4 axes are forward, right, down (gravity reads about -9.8 on z at rest): --axes FRD turns them."]
-    others = [f"{each} ({count} samples)" for each, count in usable.items() if each != topic]
+    others = [f"{name} ({count} samples)" for name, count in usable.items() if name != topic]
     more = f"; there are also {', '.join(others)} (--topic)" if others else ""
     more += f"; instances {', '.join(map(str, instances))} (--instance)" if len(instances) > 1 else ""
-    notes.append(f"read: {topic}, instance {place}, {usable[topic]} samples{more}.")
+    notes.append(f"read: {topic}, instance {instance}, {usable[topic]} samples{more}.")
     if topic == "sensor_combined":
         notes.append("sensor_combined is what PX4 has corrected by its CAL_ and TC_ parameters, not the raw output.")
     elif topic == "vehicle_imu":
         notes.append("vehicle_imu holds increments, corrected by PX4: values are their means over each interval.")
     if log.dropouts:
-        lost = sum(each.duration for each in log.dropouts)
+        lost = sum(dropout.duration for dropout in log.dropouts)
         notes.append(f"the logger dropped messages for {lost / 1e3:.3g} s, in {counted(len(log.dropouts), 'dropout')}.")
     if log.file_corruption:
         notes.append("parts of the file are damaged and were left out.")
     tables = []
     for title, (name, samples) in zip(("accel_{} [m/s^2]", "gyro_{} [rad/s]"), _SOURCES[topic], strict=True):
-        time, values = samples(found[name, place], selection.stamp)
+        time, values = samples(logged[name, instance], selection.stamp)
         unit = "ns" if name.endswith("_fifo") else "us"
         tables.append(_table(source, time, dict(zip(map(title.format, "xyz"), values, strict=True)), unit))
-    heat = found.get(("sensor_accel", place), {})
+    heat = logged.get(("sensor_accel", instance), {})
     if "temperature" in heat:
         tables.append(_table(source, heat["timestamp"], {"temperature [degC]": heat["temperature"]}))
     return replace(tables[0], notes=tuple(notes), frame="FRD"), *tables[1:]
@@ -162,5 +167,5 @@ def _table(source: Source, time: np.ndarray, values: Mapping[str, np.ndarray], u
     if time.dtype.kind not in "iu":
         raise ValueError("a time stamp is no number of microseconds")
     with np.errstate(invalid="ignore"):  # of a NaN that signals
-        columns = (time.astype(np.int64), *(each.astype(np.float64, copy=False) for each in values.values()))
+        columns = (time.astype(np.int64), *(column.astype(np.float64, copy=False) for column in values.values()))
     return Table(source, (f"time [{unit}]", *values), columns, messages=True)
