@@ -65,8 +65,10 @@ def document(analysis: NoiseAnalysis) -> dict[str, Any]:
 
     mean: dict[str, Any] = {}
     for name, quantity in SENSOR_QUANTITIES.items():
-        found = mean_terms(analysis.axes[name]) if name in analysis.axes else None
-        mean[name] = found and {term: each and each.document(SI_UNITS[quantity][term]) for term, each in found.items()}
+        terms = mean_terms(analysis.axes[name]) if name in analysis.axes else None
+        mean[name] = terms and {
+            term: estimate and estimate.document(SI_UNITS[quantity][term]) for term, estimate in terms.items()
+        }
     return analysis.document() | {"mean": mean, "filter": filter_document(analysis)}
 
 

@@ -57,25 +57,27 @@ def run(
     task = replace(task, goals=(*task.goals, *map(parse_goal, goal)))
     results.prepare()
     with progress("propagating errors"):
-        found = planning.budget(task, check, seed)
-    write = options.drawn("budget", "write_budget", found)
-    results.give(found.text, lambda: _print(found), write, "budget.json, report.html and budget.png", budget=found)
+        budget = planning.budget(task, check, seed)
+    write = options.drawn("budget", "write_budget", budget)
+    results.give(budget.text, lambda: _print(budget), write, "budget.json, report.html and budget.png", budget=budget)
 
 
-def _print(found: Budget) -> None:
+def _print(budget: Budget) -> None:
     from jaximu.cli.shown import console, table
     from jaximu.report.budget import check_words, goal_words, headline, nonlinear_words, parameter_rows, source_rows
 
     screen = console()
     headers = ("source", "size (1σ)", "mean share", "most of")
-    table(screen, headers, [*source_rows(found)], "Sources, dominant first")
-    drawn = ["by Monte Carlo"] if found.check else []
-    rows = [(words, sigma, *([simulated] if found.check else []), made)
-            for words, sigma, made, simulated in parameter_rows(found)]  # fmt: skip
+    table(screen, headers, [*source_rows(budget)], "Sources, dominant first")
+    drawn = ["by Monte Carlo"] if budget.check else []
+    rows = [
+        (words, sigma, *([simulated] if budget.check else []), made)
+        for words, sigma, made, simulated in parameter_rows(budget)
+    ]
     table(screen, ("parameter", "1σ", *drawn, "made of"), rows, "Parameters")
-    said = [headline(found), *(goal_words(found, goal) for goal in found.goals)]
-    said += [f"not linear: {text}" for text in nonlinear_words(found)]
-    said += [check_words(found)] if found.check else []
-    said += [f"stays open: {text}" for text in found.open] + [f"note: {text}" for text in found.notes]
-    for text in said:
+    texts = [headline(budget), *(goal_words(budget, goal) for goal in budget.goals)]
+    texts += [f"not linear: {text}" for text in nonlinear_words(budget)]
+    texts += [check_words(budget)] if budget.check else []
+    texts += [f"stays open: {text}" for text in budget.open] + [f"note: {text}" for text in budget.notes]
+    for text in texts:
         screen.print(text)

@@ -53,9 +53,15 @@ def run(
     gravity, trace = local.value(), traced.value(logs)
     results.prepare(*options.INERTIAL[: 1 if method == "accelerometer" else 2])
     if means:
-        meant = {"--static": static, "--effect": effect, "--threshold": poses.threshold, "--repair": repair,
-                 "--gyro-log": log.gyro_log, f"--method {method}": method.startswith("two-step")}  # fmt: skip
-        unusable = [name for name, asked in meant.items() if asked]
+        meant = {
+            "--static": static,
+            "--effect": effect,
+            "--threshold": poses.threshold,
+            "--repair": repair,
+            "--gyro-log": log.gyro_log,
+            f"--method {method}": method.startswith("two-step"),
+        }
+        unusable = [name for name, stated in meant.items() if stated]
         _give(replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace), results)
         return
     recordings, noise = log.read_unit(logs, gravity, static)
@@ -64,9 +70,16 @@ def run(
 
         names, sigmas = options.effects_of(effect)
         calibration = calibrate(
-            recordings, gravity, static=noise, segmentation=poses.value(), effects=names, effect_sigmas=sigmas,
-            method=method, loss=loss, repair=repair,
-        )  # fmt: skip
+            recordings,
+            gravity,
+            static=noise,
+            segmentation=poses.value(),
+            effects=names,
+            effect_sigmas=sigmas,
+            method=method,
+            loss=loss,
+            repair=repair,
+        )
     _give(replace(calibration, trace=trace), results)
 
 

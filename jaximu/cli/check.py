@@ -67,7 +67,7 @@ def print_validity(validity: Validity) -> None:
     screen.print(f"{data.get('file', 'recording')}: {held}")
     screen.print(f"{validity.verdict}: {validity.headline()}")
     largest = validity.moved or sorted((s for s in validity.shifts if s.tested), key=lambda s: -abs(s.z))[:3]
-    rows = [(each.words, each.amount, each.output, f"{abs(each.z):.1f}") for each in largest]
+    rows = [(shift.words, shift.amount, shift.output, f"{abs(shift.z):.1f}") for shift in largest]
     if rows:
         title = "moved:" if validity.moved else "largest differences, none beyond what is uncertain:"
         table(screen, ("parameter", "shift ± 95 %", "in the output ± 95 %", "σ"), rows, title)
@@ -77,9 +77,9 @@ def print_validity(validity: Validity) -> None:
     for cause in validity.causes:
         rivals = f"; or {', '.join(map(effect_title, cause.rivals))}: this recording cannot tell them apart"
         screen.print(f"explanation: {cause.sentence}{rivals if cause.rivals else ''}")
-    for name, each in validity.output_errors.items():
+    for name, error in validity.output_errors.items():
         where = "rotation over a turn" if name == "turns" else f"{name} output"
-        screen.print(f"{where}: off by up to {with_interval(each.value, each.sigma, each.unit)}")
+        screen.print(f"{where}: off by up to {with_interval(error.value, error.sigma, error.unit)}")
     screen.print(validity.bias_words())
     if validity.nis is not None:
         screen.print(f"squared innovations of the filter: {validity.nis:.2f} times what their uncertainty expects")

@@ -93,10 +93,10 @@ def _simulate(imu: Imu, seed: int, output: Path) -> None:
     from jaximu.simulation import consumer_noise, simulate
     from jaximu.simulation.protocols import Environment, HandHeld, Static
 
-    for place, name in enumerate(("recording", "heldout")):
+    for number, name in enumerate(("recording", "heldout")):
         # up and down: on a straight line temperature and time would be one cause
-        warming = Environment(temperature=[[0, 22 - 4 * place], [120, 34 + 4 * place], [220, 27]])
-        simulated, truth = simulate(imu, HandHeld(), consumer_noise(), seed=seed, power_on=place, environment=warming)
+        warming = Environment(temperature=[[0, 22 - 4 * number], [120, 34 + 4 * number], [220, 27]])
+        simulated, truth = simulate(imu, HandHeld(), consumer_noise(), seed=seed, power_on=number, environment=warming)
         write_recording(simulated, output / f"{name}.parquet")
         truth.save(output / f"{name}.parquet.truth.json")
     resting, _ = simulate(imu.with_effects(), Static(1200.0), consumer_noise(), seed=seed, power_on=2)

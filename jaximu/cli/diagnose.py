@@ -88,7 +88,7 @@ def run(
         with progress("diagnosing"):
             diagnosis = diagnose(
                 recordings, gravity, static=noise, heldout=other, segmentation=poses.value(), repair=repair
-            )  # fmt: skip
+            )
     elif measured:
         from jaximu.cli.reference import read_reference
 
@@ -102,11 +102,11 @@ def run(
         held = None
         if other is not None and heldout_reference is not None:
             others = [other]
-            (said,) = references_of(others, [heldout_reference])
-            held = others[0], said
+            (schedule,) = references_of(others, [heldout_reference])
+            held = others[0], schedule
         with progress("diagnosing"):
             diagnosis = diagnose_turntable(recordings[0], entries, gravity, static=noise, heldout=held, repair=repair)
-    if not thermal and any(each.rivals or each.weak for each in diagnosis.named):
+    if not thermal and any(effect.rivals or effect.weak for effect in diagnosis.named):
         from jaximu.planning.separation import advised
 
         with progress("looking for a recording that would separate the causes"):
@@ -123,9 +123,14 @@ def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
     """Print a diagnosis; write it, the extended calibration and the report where asked."""
     documents = {} if results.output is None else {"calibration": diagnosis.extended_calibration()}
     results.give(
-        diagnosis.text, lambda: print_diagnosis(diagnosis), options.drawn("diagnosis", "write_diagnosis", diagnosis),
-        "diagnosis.json, calibration.json and report.html", {}, diagnosis=diagnosis, **documents,
-    )  # fmt: skip
+        diagnosis.text,
+        lambda: print_diagnosis(diagnosis),
+        options.drawn("diagnosis", "write_diagnosis", diagnosis),
+        "diagnosis.json, calibration.json and report.html",
+        {},
+        diagnosis=diagnosis,
+        **documents,
+    )
 
 
 def print_diagnosis(diagnosis: Diagnosis) -> None:
@@ -142,9 +147,14 @@ def print_diagnosis(diagnosis: Diagnosis) -> None:
         screen.print(f"- {sentence(effect_title(finding.name))}. {sentence(finding.text)}")
     if diagnosis.effects:
         rows = [
-            (effect_title(each.name), "\n".join(each.numbers()), each.evidence + (" (weak)" if each.weak else ""),
-             "\n".join(map(effect_title, each.rivals))) for each in diagnosis.effects
-        ]  # fmt: skip
+            (
+                effect_title(effect.name),
+                "\n".join(effect.numbers()),
+                effect.evidence + (" (weak)" if effect.weak else ""),
+                "\n".join(map(effect_title, effect.rivals)),
+            )
+            for effect in diagnosis.effects
+        ]
         table(screen, ("effect", "coefficients ± 95 %", "evidence", "or"), rows)
     gain, words = diagnosis.gain, {kind.name: kind.words for kind in diagnosis.experiment.real.kinds}
     if gain is not None:

@@ -70,23 +70,25 @@ def run(
     written, paths = export(parameters, to, path)
     lost = losses(parameters, written, extent)
     axes = (written.parameters or parameters).axes
-    left = [each.title for triad in model.imu.triads().values() for each in triad.effects if each.scope != "device"]
+    left = [
+        effect.title for triad in model.imu.triads().values() for effect in triad.effects if effect.scope != "device"
+    ]
     if as_json:
         document = {
             "format": to,
-            "files": [str(each) for each in paths],
+            "files": [str(path) for path in paths],
             "axes": axes,
             "convention": written.convention,
             "equation": written.equation,
             "range": extent.text(),
-            "losses": [{"what": each.what, "worst": each.worst, "rms": each.rms} for each in lost],
+            "losses": [{"what": loss.what, "worst": loss.worst, "rms": loss.rms} for loss in lost],
         }
         options.print_json(document)
         return
     print(f"{axes}\n\nConvention: {written.convention}\n\nApply:\n{written.equation}\n")
     if lost:
         print(f"Not in the file, and what that costs over {extent.text()}:")
-        print("\n".join(f"- {each.text()}" for each in lost))
+        print("\n".join(f"- {loss.text()}" for loss in lost))
     if left:
         print(f"- {', '.join(left)}: of one session, not of the unit, and never exported.")
     say(f"Written: {', '.join(map(str, paths))}")

@@ -85,18 +85,26 @@ def run(
         if old is None:
             names, sigmas = options.effects_of(effect)
             calibration, history = calibrate_by_filter(
-                recording, gravity, attitude=attitude, latitude=local.latitude, static=still, effects=names,
-                effect_sigmas=sigmas, repair=repair,
+                recording,
+                gravity,
+                attitude=attitude,
+                latitude=local.latitude,
+                static=still,
+                effects=names,
+                effect_sigmas=sigmas,
+                repair=repair,
                 magnetometer=compass,
-            )  # fmt: skip
+            )
         else:
             noise = None if still is None else fit_noise(still)
-            place = gravity if local != options.LOCAL else None
-            calibration, history = followed_in_use(old, recording, noise, place, attitude, compass)
+            stated = gravity if local != options.LOCAL else None
+            calibration, history = followed_in_use(old, recording, noise, stated, attitude, compass)
     results.give(
-        calibration.text, lambda: _print(calibration, history),
-        options.drawn("filter", "write_filter_report", calibration, history), calibration=calibration,
-    )  # fmt: skip
+        calibration.text,
+        lambda: _print(calibration, history),
+        options.drawn("filter", "write_filter_report", calibration, history),
+        calibration=calibration,
+    )
 
 
 def _print(calibration: Calibration, history: History) -> None:
@@ -108,5 +116,5 @@ def _print(calibration: Calibration, history: History) -> None:
     screen = console()
     for text in mounting_words(calibration) if calibration.reference else ():
         screen.print(text)
-    for each in statements(calibration, history):
-        screen.print(f"{each.about}: {each.text}")
+    for entry in statements(calibration, history):
+        screen.print(f"{entry.about}: {entry.text}")

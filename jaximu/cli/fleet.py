@@ -92,7 +92,7 @@ def run(
     jobs = find_jobs(logs, output, static)
     if static is not None and (without := sum(not job.static for job in jobs)):
         say(f"{without} of {len(jobs)} have no recording at rest: their noise is estimated from their own poses.")
-    stated = {each.name: getattr(log, each.name) for each in fields(log)}
+    stated = {option.name: getattr(log, option.name) for option in fields(log)}
     settings = Settings(
         options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
         gravity=local.value(),
@@ -124,19 +124,19 @@ def run(
         line.save(document)
         written += [*options.draw(lambda: write_line(line, page, output)[-1:], page), document]
     if as_json:
-        found = fleet.document() | ({"acceptance": line.document()} if line else {})
-        options.print_json(found)
+        findings = fleet.document() | ({"acceptance": line.document()} if line else {})
+        options.print_json(findings)
         return
     print(f"{len(jobs)} recordings: {', '.join(f'{count} {status}' for status, count in statuses.most_common())}.")
     for reason, files, count in failure_words(fleet, 5, 3):
         print(f"  {count} not calibrated: {reason}{f' ({files})' if files else ''}")
     print(headline(fleet))
-    for each in field_words(output):
-        print(each)
-    for each in fleet.differences[:5]:
-        print(f"{difference_words(each)}.")
+    for text in field_words(output):
+        print(text)
+    for difference in fleet.differences[:5]:
+        print(f"{difference_words(difference)}.")
     if fleet.strangers:
-        shown = ", ".join(each.device for each in fleet.strangers[:10])
+        shown = ", ".join(stranger.device for stranger in fleet.strangers[:10])
         print(f"units that do not belong: {shown}{' …' if len(fleet.strangers) > 10 else ''}")
     if line is not None:
         from jaximu.cli.accept import print_line

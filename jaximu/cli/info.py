@@ -47,12 +47,12 @@ def run(
     if not logs:
         raise InputError("no log was given: name one or more files.")
     stated = [log.with_gyroscope(path) for path in logs]
-    documents = [_describe(*_read(*each)) for each in zip(stated, logs, strict=True)]
+    documents = [_describe(*_read(*pair)) for pair in zip(stated, logs, strict=True)]
     if as_json:
         options.print_json(documents[0] if len(documents) == 1 else documents)
         return
-    for path, document, each in zip(logs, documents, stated, strict=True):
-        _print(document, path, each.line())
+    for path, document, reading in zip(logs, documents, stated, strict=True):
+        _print(document, path, reading.line())
 
 
 def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
@@ -80,13 +80,15 @@ def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None
                 continue
         if recording is None or (log.rate is not None and not (advice and advice.line()) and not scales):
             raise
-    said = []
+    notes = []
     if log.rate is None and any("stamps from --rate" in note for note in recording.notes):
-        said.append(f"no time column: {_ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
+        notes.append(f"no time column: {_ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
     if any(scale == "1" for scale in scales.values()):
-        said.append("raw counts: state scales with --accel-scale and --gyro-scale (the accelerometer's is also found "
-                    "from gravity, given poses all around)")  # fmt: skip
-    return recording, advice, said
+        notes.append(
+            "raw counts: state scales with --accel-scale and --gyro-scale (the accelerometer's is also found "
+            "from gravity, given poses all around)"
+        )
+    return recording, advice, notes
 
 
 def _shown(advice: Advice) -> str:
@@ -109,14 +111,16 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     ready = prepare(recording)
     used = ready.recording.signals
     signals = {name: _signal(signal, used[name]) for name, signal in recording.signals.items()}
-    own = guessed or advice is not None
-    notes = [each for each in recording.remarks if not own or "--" not in each]  # options that only this verb gave
+    guessing = guessed or advice is not None
+    notes = [note for note in recording.remarks if not guessing or "--" not in note]  # options that only this verb gave
     findings = [*guessed, *notes, *ready.notes]
     uses: list[dict[str, str]] = []
     if "accelerometer" not in signals:
         findings.append("no accelerometer: poses cannot be found")
-        uses += [{"verb": "turntable", "why": "with a schedule of rests and turns (--reference)"},
-                 {"verb": "compensate", "why": "with a calibration of this gyroscope"}]  # fmt: skip
+        uses += [
+            {"verb": "turntable", "why": "with a schedule of rests and turns (--reference)"},
+            {"verb": "compensate", "why": "with a calibration of this gyroscope"},
+        ]
         return {"file": recording.name, "signals": signals, "findings": findings, "uses": uses}
     poses = 0
     timeless = any("stamps from --rate" in note for note in recording.notes)
@@ -126,11 +130,11 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     means = timeless and physical and len(force) <= _TABLE and near
     try:
         findings += plausibility(recording, STANDARD) if physical else ()
-        found = segment(ready.recording)
-        poses = len(found.intervals)
-        still = float(np.sum(found.intervals[:, 1] - found.intervals[:, 0]))
+        segmentation = segment(ready.recording)
+        poses = len(segmentation.intervals)
+        still = float(np.sum(segmentation.intervals[:, 1] - segmentation.intervals[:, 0]))
         findings.append(f"{poses} static poses, {still:.0f} s in all")
-        tilt = _tilt(ready.recording.accelerometer, found.intervals)
+        tilt = _tilt(ready.recording.accelerometer, segmentation.intervals)
         if poses > 1 and tilt < _TILTED:
             findings.append(
                 f"all {poses} poses are of one orientation, within {tilt:.2g}°: a calibration by poses needs nine or "
@@ -166,8 +170,11 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
         apart = f" but for {moved:.0f} s" if moved > 2.0 else ""
         use("allan", f"at rest for {length:.0f} s{apart}: noise up to some {length / 10:.0f} s of averaging")
     elif longest >= _CUT:
-        use("allan", f"once cut to the {longest:.0f} s at rest from {begin:.0f} s on: noise up to some "
-                     f"{longest / 10:.0f} s of averaging")  # fmt: skip
+        use(
+            "allan",
+            f"once cut to the {longest:.0f} s at rest from {begin:.0f} s on: noise up to some "
+            f"{longest / 10:.0f} s of averaging",
+        )
     heat = recording.temperature
     if heat is not None and (span := float(np.ptp(heat.values))) >= 5.0:
         use("thermal", f"the temperature spans {span:.0f} K")
@@ -256,14 +263,30 @@ def _print(document: dict[str, Any], path: Path, stated: str) -> None:
     from jaximu.ground.summary import sentence
 
     screen = console(150)
-    headers = ("signal", "unit", "samples", "rate [Hz]", "jitter [ms]", "longest gap [s]", "duration [s]", "minimum",
-               "maximum")  # fmt: skip
+    headers = (
+        "signal",
+        "unit",
+        "samples",
+        "rate [Hz]",
+        "jitter [ms]",
+        "longest gap [s]",
+        "duration [s]",
+        "minimum",
+        "maximum",
+    )
     rows = [
-        (name, unit_text(signal["unit"]), str(signal["samples"]), f"{signal['rate']:.5g}",
-         number(round(1e3 * signal["jitter"], 6)), f"{signal['longest_gap']:.3g}", f"{signal['duration']:.5g}",
-         *(" ".join(f"{value:.4g}" for value in signal[key]).replace("-", "−") for key in ("minimum", "maximum")))
+        (
+            name,
+            unit_text(signal["unit"]),
+            str(signal["samples"]),
+            f"{signal['rate']:.5g}",
+            number(round(1e3 * signal["jitter"], 6)),
+            f"{signal['longest_gap']:.3g}",
+            f"{signal['duration']:.5g}",
+            *(" ".join(f"{value:.4g}" for value in signal[key]).replace("-", "−") for key in ("minimum", "maximum")),
+        )
         for name, signal in document["signals"].items()
-    ]  # fmt: skip
+    ]
     table(screen, headers, rows, document["file"])
     if guess := document.get("guess"):
         blanks = ", fill in the ?" if "?" in guess["line"] else ""
@@ -278,10 +301,10 @@ def _print(document: dict[str, Any], path: Path, stated: str) -> None:
     if guess:
         stated = f" {guess['line']}"
     screen.print("Can be used for:")
-    for each in document["uses"]:
-        needs, results = _MORE.get(each["verb"], ("", " -o results"))
-        first = " results/calibration.json" if each["verb"] in ("check", "compensate") else ""
-        screen.print(f"  {sentence(each['why'])}:")
+    for use in document["uses"]:
+        needs, results = _MORE.get(use["verb"], ("", " -o results"))
+        first = " results/calibration.json" if use["verb"] in ("check", "compensate") else ""
+        screen.print(f"  {sentence(use['why'])}:")
         screen.print(
-            f"    jaximu {each['verb']}{first} {shlex.quote(str(path))}{stated}{needs}{results}", soft_wrap=True
+            f"    jaximu {use['verb']}{first} {shlex.quote(str(path))}{stated}{needs}{results}", soft_wrap=True
         )

@@ -76,7 +76,7 @@ def run(
         raise InputError("no log was given: name one or more files.")
     if mag_log and len(mag_log) != len(logs):
         raise InputError(f"{len(logs)} logs need as many --mag-log, found {len(mag_log)}.")
-    effects = [_effect(each) for each in effect]
+    effects = [_effect(text) for text in effect]
     gravity, trace = local.value(), traced.value(logs)
     strength = _strength(field, local, longitude, trace)
     results.prepare()
@@ -87,26 +87,28 @@ def run(
         old = None if check is None else load_calibration(check)
         base = None if calibration is None else load_calibration(calibration).inertial()
         log = log.alike(base or old)
-        given = [_read(log, path, mag_log[k] if mag_log else None, mag_columns) for k, path in enumerate(logs)]
+        magnetic_logs = [_read(log, path, mag_log[k] if mag_log else None, mag_columns) for k, path in enumerate(logs)]
     southern = None if local.latitude is None or abs(local.latitude) < _NEAR_THE_EQUATOR else local.latitude < 0
     with progress("calibrating"):
-        found, measurement, heading = calibrate_magnetometer(given, strength, base, gravity, southern, effects)
-    shift = None if old is None else check_magnetometer(old, found)
+        result, measurement, heading = calibrate_magnetometer(magnetic_logs, strength, base, gravity, southern, effects)
+    shift = None if old is None else check_magnetometer(old, result)
     with progress("asking for effects"):
-        asked = diagnose_magnetometer(found, measurement)
-    found = replace(
-        found, trace=trace, diagnosis=asked.document() | ({} if shift is None else {"check": shift.document()})
+        diagnosis = diagnose_magnetometer(result, measurement)
+    result = replace(
+        result, trace=trace, diagnosis=diagnosis.document() | ({} if shift is None else {"check": shift.document()})
     )
 
     def show_all() -> None:
-        _print(found)
-        for each in filter(None, (shift, *asked.causes)):
-            print(each.text())
+        _print(result)
+        for part in filter(None, (shift, *diagnosis.causes)):
+            print(part.text())
 
     results.give(
-        found.text, show_all, options.drawn("magnetometer", "write_magnetometer_report", found, measurement, heading),
-        calibration=found,
-    )  # fmt: skip
+        result.text,
+        show_all,
+        options.drawn("magnetometer", "write_magnetometer_report", result, measurement, heading),
+        calibration=result,
+    )
 
 
 def _strength(
@@ -132,7 +134,7 @@ def _effect(text: str) -> Effect:
     kind = type(effect_named(name))
     try:
         values = {
-            key.strip(): float(value) for key, _, value in (each.partition("=") for each in inner.split(",") if each)
+            key.strip(): float(value) for key, _, value in (pair.partition("=") for pair in inner.split(",") if pair)
         }
     except ValueError:
         raise InputError(f"--effect {text!r} is not understood; write NAME or NAME:onset=30.") from None
@@ -176,11 +178,11 @@ def _print(calibration: Calibration) -> None:
     from jaximu.cli.shown import console
     from jaximu.report.magnetometer import lead, statements
 
-    own = tuple(name for name in calibration.names if name.owner == "magnetometer")
-    rows = [calibration.names.index(name) for name in own]
-    alone = replace(calibration, names=own, covariance=calibration.covariance[rows][:, rows], rms={}, excess={})
+    names = tuple(name for name in calibration.names if name.owner == "magnetometer")
+    rows = [calibration.names.index(name) for name in names]
+    alone = replace(calibration, names=names, covariance=calibration.covariance[rows][:, rows], rms={}, excess={})
     screen = console()
     screen.print(lead(calibration).sentence)
     print_calibration(alone)
-    for each in statements(calibration):
-        screen.print(f"{each.about}: {each.text}")
+    for entry in statements(calibration):
+        screen.print(f"{entry.about}: {entry.text}")

@@ -192,7 +192,7 @@ class LogOptions:
         """Return what the library asks for."""
         from jaximu.recordings.readers import ReadOptions
 
-        stated = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "gyro_log"}
+        stated = {option.name: getattr(self, option.name) for option in fields(self) if option.name != "gyro_log"}
         return ReadOptions(**stated, gravity=gravity, check=check, alone=alone)
 
     def read_unit(
@@ -206,8 +206,8 @@ class LogOptions:
         with progress("reading"):
             require_files(*paths, static)
             recordings = [self.read(path, gravity, alone=alone) for path in paths]
-            own = replace(self, gyro_log=None)  # --gyro-log is LOG's
-            return recordings, None if static is None else own.read(static, gravity)
+            rest_options = replace(self, gyro_log=None)  # --gyro-log is LOG's
+            return recordings, None if static is None else rest_options.read(static, gravity)
 
 
 @dataclass(frozen=True)
@@ -285,7 +285,7 @@ class TraceOptions:
         path = self.trace if self.trace is not None or not logs else sidecar(logs[0])
         if path is not None and self.trace is None:
             say(f"{path} is read: it lies beside the log.")
-        stated = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "trace"}
+        stated = {option.name: getattr(self, option.name) for option in fields(self) if option.name != "trace"}
         return read_trace(path, stated) or None
 
 

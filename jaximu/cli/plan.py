@@ -84,7 +84,7 @@ def run(
         raise InputError("--effect names states of the filter: add --for filter.")
     chosen = FILTERED if filtered else EQUIPMENT[equipment]
     poses = (19 if filtered else 12) if poses is None else poses
-    given = {"rest": rest, "turn": turn, "fastest": fastest, "step": step, "accuracy": accuracy}
+    stated = {"rest": rest, "turn": turn, "fastest": fastest, "step": step, "accuracy": accuracy}
     if fastest is not None and (chosen.by_hand or not 0 < fastest < math.inf):
         raise InputError("--fastest is the largest rate of a table, in °/s: greater than zero, and not for hands.")
     if accuracy is not None and chosen.accuracy is None:
@@ -92,7 +92,7 @@ def run(
     if turns is not None and chosen.chained:
         how = "by hand" if chosen.by_hand else "on a robot"
         raise InputError(f"--turns goes with a table: {how} each pose but the first is reached by one turn.")
-    chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
+    chosen = replace(chosen, **{name: value for name, value in stated.items() if value is not None})
     results.prepare()
     known, magnetometer = _known(source, log, local)
     if known is None:  # a magnetometer by itself

@@ -119,7 +119,7 @@ def _record(lines: Lines, path: Path, log: options.LogOptions, guide: Guide) -> 
             _tell(moment, last, guide.rest)
             last = moment
             if moment.done:
-                return all(each.reached for each in moment.goals)
+                return all(goal.reached for goal in moment.goals)
     return False
 
 
@@ -138,7 +138,7 @@ def _tell(moment: Moment, last: Moment | None, rest: float) -> None:
     before = 0 if last is None else len(last.taken)
     if len(moment.taken) > before:
         bell = "\a" if sys.stderr.isatty() else ""
-        goals = "".join(f" {_goal_words(each)}." for each in moment.goals)
+        goals = "".join(f" {_goal_words(goal)}." for goal in moment.goals)
         say(f"{bell}Pose {len(moment.taken)} counts.{goals}" + ("" if moment.done else f" Next: {moment.words}."))
     elif len(moment.taken) < before:
         say(f"The unit moved in a pose: {len(moment.taken)} count. Next: {moment.words or 'hold it still'}.")

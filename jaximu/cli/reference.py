@@ -63,9 +63,11 @@ def run(
             recording, attitude, gravity, static=noise, effects=names, effect_sigmas=sigmas, loss=loss, repair=repair
         )
     results.give(
-        calibration.text, lambda: _print(calibration),
-        options.drawn("attitude", "write_attitude_report", calibration, measurement), calibration=calibration,
-    )  # fmt: skip
+        calibration.text,
+        lambda: _print(calibration),
+        options.drawn("attitude", "write_attitude_report", calibration, measurement),
+        calibration=calibration,
+    )
 
 
 def read_reference(path: Path, log_path: Path, recording: Recording) -> Attitude:

@@ -54,14 +54,14 @@ def run(
     from jaximu.simulation import read_specification, write_case
 
     check_suffix(output)
-    found = read_specification(specification_file)
-    cases = found.cases()  # all of them are checked before anything is written
+    task = read_specification(specification_file)
+    cases = task.cases()  # all of them are checked before anything is written
     if not output.parent.is_dir():
         raise InputError(f"{output}: the folder {output.parent} does not exist.")
     written = []
     for unit, recordings in enumerate(cases):
         for number, case in enumerate(recordings):
-            path = _numbered(output, unit if found.units > 1 else None, number if found.recordings > 1 else None)
+            path = _numbered(output, unit if task.units > 1 else None, number if task.recordings > 1 else None)
             with progress(f"simulating {path}"):
                 truth = write_case(case, path)
             truth.save(f"{path}.truth.json")
@@ -99,9 +99,9 @@ def _print_protocols() -> None:
         console.print(f"[bold]{kind}[/bold]")
         for paragraph in (inspect.getdoc(protocol) or "").split("\n\n"):
             console.print(" ".join(paragraph.split()), markup=False)
-        for each in fields(protocol):
-            default = "" if each.default is MISSING else f" = {_toml(each.default)}"
-            console.print(f"    {each.name}{default}", markup=False)
+        for option in fields(protocol):
+            default = "" if option.default is MISSING else f" = {_toml(option.default)}"
+            console.print(f"    {option.name}{default}", markup=False)
         console.print()
 
 

@@ -68,8 +68,8 @@ def run(
 
     base = None if calibration is None else load_calibration(calibration).inertial()
     recordings, noise = log.alike(base).read_unit(logs, gravity, static)
-    recordings = [without_flagged(each, path) for each, path in zip(recordings, logs, strict=True)]
-    by_hand = [turned_by_hand(each) for each in recordings]
+    recordings = [without_flagged(recording, path) for recording, path in zip(recordings, logs, strict=True)]
+    by_hand = [turned_by_hand(recording) for recording in recordings]
     if all(by_hand):
         if base is not None or block is not None or to:
             raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
@@ -82,59 +82,59 @@ def run(
         first = str(logs[by_hand.index(True)])
         raise InputError(f"{first} is poses by hand and others are a unit at rest: give one kind at a time.")
     with progress("fitting"):
-        found = calibrate_thermal(recordings, static=noise, base=base, block=block)
-        exports = {"px4.params": px4_parameters(found, sensor or 0, accel_id, gyro_id)} if "px4" in to else {}
+        thermal = calibrate_thermal(recordings, static=noise, base=base, block=block)
+        exports = {"px4.params": px4_parameters(thermal, sensor or 0, accel_id, gyro_id)} if "px4" in to else {}
         if "ardupilot" in to:
-            exports["ardupilot.param"] = ardupilot_parameters(found, 1 if sensor is None else sensor)
+            exports["ardupilot.param"] = ardupilot_parameters(thermal, 1 if sensor is None else sensor)
     parameters = tuple(exports.values())
 
     def write(folder: Path) -> Path:
         from jaximu.report.thermal import write_thermal
 
-        return write_thermal(found, folder, parameters)
+        return write_thermal(thermal, folder, parameters)
 
     results.give(
-        found.text,
-        lambda: _print(found, parameters),
+        thermal.text,
+        lambda: _print(thermal, parameters),
         write,
-        files={name: each.text.encode() for name, each in exports.items()},
-        calibration=found.calibration,
-        thermal=found,
+        files={name: export.text.encode() for name, export in exports.items()},
+        calibration=thermal.calibration,
+        thermal=thermal,
     )
 
 
-def _print_by_hand(found: HandHeldThermal) -> None:
+def _print_by_hand(thermal: HandHeldThermal) -> None:
     from jaximu.cli.shown import console, table
     from jaximu.report.thermal import EFFECTS, effect_rows
     from jaximu.report.thermal_hand_held import headline, limit_rows, undetermined
 
     screen = console()
-    for sentence in headline(found):
+    for sentence in headline(thermal):
         screen.print(sentence)
-    if found.steps:
-        table(screen, EFFECTS, effect_rows(found.calibration), "Effects, ± half of the 95 % interval")
-    if found.limits:
+    if thermal.steps:
+        table(screen, EFFECTS, effect_rows(thermal.calibration), "Effects, ± half of the 95 % interval")
+    if thermal.limits:
         title = "Smaller than this, others could hide (90 % power)"
-        table(screen, ("effect", "size", "at the end"), limit_rows(found), title)
-    for text in (*undetermined(found), *(f"note: {note}" for note in found.notes)):
+        table(screen, ("effect", "size", "at the end"), limit_rows(thermal), title)
+    for text in (*undetermined(thermal), *(f"note: {note}" for note in thermal.notes)):
         screen.print(text)
 
 
-def _print(found: ThermalCalibration, exports: Sequence[AutopilotParameters]) -> None:
+def _print(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters]) -> None:
     from jaximu.cli.shown import console, table
     from jaximu.report import thermal as report
 
     screen = console()
-    for sentence in report.headline(found):
+    for sentence in report.headline(thermal):
         screen.print(sentence)
-    for name in found.fits:
+    for name in thermal.fits:
         headers = ("axis", "over temperature", "left", "held out")
-        unit, rows = report.rms_rows(found, name)
+        unit, rows = report.rms_rows(thermal, name)
         table(screen, headers, rows, f"{name}, rms in {unit}")
-        table(screen, ("model", "effects", "held out, rms", "score, nats"), report.candidate_rows(found, name))
-    table(screen, report.EFFECTS, report.effect_rows(found.calibration), "Effects, ± half of the 95 % interval")
-    said = [*report.words(found), *(f"note: {note}" for note in found.notes)]
-    for each in exports:
-        said += [report.loss_words(each, found), *(f"{each.name}: {note}" for note in each.notes)]
-    for text in said:
+        table(screen, ("model", "effects", "held out, rms", "score, nats"), report.candidate_rows(thermal, name))
+    table(screen, report.EFFECTS, report.effect_rows(thermal.calibration), "Effects, ± half of the 95 % interval")
+    texts = [*report.words(thermal), *(f"note: {note}" for note in thermal.notes)]
+    for export in exports:
+        texts += [report.loss_words(export, thermal), *(f"{export.name}: {note}" for note in export.notes)]
+    for text in texts:
         screen.print(text)

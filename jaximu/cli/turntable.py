@@ -80,9 +80,15 @@ def run(
 
         wanted = (*fit, GyroEarthRotation.name) if earth_rotation == "fit" else fit
         calibration = calibrate_turntable(
-            recordings, references, gravity, static=noise, effects=list(dict.fromkeys(wanted)),
-            latitude=local.latitude if earth_rotation == "known" else None, loss=loss, repair=repair,
-        )  # fmt: skip
+            recordings,
+            references,
+            gravity,
+            static=noise,
+            effects=list(dict.fromkeys(wanted)),
+            latitude=local.latitude if earth_rotation == "known" else None,
+            loss=loss,
+            repair=repair,
+        )
     calibration = replace(calibration, trace=trace)
     write = options.drawn("stations", "write_station_report", calibration)
     results.give(calibration.text, lambda: print_calibration(calibration), write, calibration=calibration)
@@ -94,11 +100,11 @@ def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Se
     from jaximu.recordings.recording import Recording
     from jaximu.recordings.reference import entries_of_columns
 
-    found = []
-    for place, recording in enumerate(recordings):
-        read = read_reference(paths[place], recording) if paths else recording
+    entries = []
+    for index, recording in enumerate(recordings):
+        read = read_reference(paths[index], recording) if paths else recording
         if isinstance(read, Recording):
-            recordings[place] = read
+            recordings[index] = read
             read = entries_of_columns(read)
-        found.append(read)
-    return found
+        entries.append(read)
+    return entries

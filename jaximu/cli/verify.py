@@ -47,10 +47,12 @@ def run(
     else:
         for link in links:
             print(f"{link.state}: {link.what} {link.file}")
-        print({
-            "changed": "Changed: at least one file is not what it was when the result was written.",
-            "intact": "Intact: every file is what it was.",
-            "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
-        }[verdict])  # fmt: skip
+        print(
+            {
+                "changed": "Changed: at least one file is not what it was when the result was written.",
+                "intact": "Intact: every file is what it was.",
+                "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
+            }[verdict]
+        )
     if verdict != "intact":
         raise SystemExit(3 if changed else 4)

@@ -66,7 +66,7 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
     if used.any() and fit.imu.gyroscope is not None:
         # rotating the rate's white noise along the turn keeps its mean over the three axes
         inverse = np.linalg.inv(np.asarray(fit.imu.gyroscope.gain))
-        density = float(np.trace(inverse @ np.asarray(observations.turns.noise) @ inverse.T)) / 3
+        density = np.trace(inverse @ np.asarray(observations.turns.noise) @ inverse.T) / 3
         turned = density * np.asarray(observations.turns.interval).sum(axis=1)
         noise, total = noise + turned, total + turned + excess[1] * turned[used].mean()
 
@@ -98,4 +98,4 @@ def largest_gap(directions: FloatArray) -> tuple[float, FloatArray]:
     points = spiral(4000)  # one every 3°
     angles = nearest_angles(points, directions)
     worst = int(np.argmax(angles))
-    return float(angles[worst]), points[worst]
+    return angles[worst], points[worst]

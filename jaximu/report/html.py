@@ -43,27 +43,35 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str], title
     """
     if "poses" not in calibration.data:
         raise InputError("a calibration of several kinds of data has no page: its summary() says what was found.")
-    found, drawn = evidence(calibration), {}
-    if found is not None:
-        drawn["residuals"] = partial(figures.residual_figure, found)
-        drawn["orientations"] = partial(figures.orientation_figure, found)
+    errors, drawn = evidence(calibration), {}
+    if errors is not None:
+        drawn["residuals"] = partial(figures.residual_figure, errors)
+        drawn["orientations"] = partial(figures.orientation_figure, errors)
     if calibration.segmentations:
         drawn["recording"] = partial(figures.recording_of, calibration)
-    said = (
+    picture = (
         "Errors of each pose and turn, before and after calibration",
         "“Before” is where the fit started: the nominal scale and offset, no misalignment. The inner band is what the "
         "noise, measured while the unit was still, explains; where a wider one surrounds it, the errors scatter more "
         "than that, and the intervals below count with the wider one.",
     )
-    return write_calibration(calibration, folder, words.lead(calibration), words.trust(calibration),
-                             words.limits(calibration, found), drawn, said, title)  # fmt: skip
+    return write_calibration(
+        calibration,
+        folder,
+        words.lead(calibration),
+        words.trust(calibration),
+        words.limits(calibration, errors),
+        drawn,
+        picture,
+        title,
+    )
 
 
 def write_calibration(
     calibration: Calibration,
     folder: str | os.PathLike[str],
     lead: tuple[str, str, str],
-    said: Sequence[words.Statement],
+    trust: Sequence[words.Statement],
     unknown: Sequence[words.Statement],
     drawn: Drawn,
     residuals: tuple[str, str] = ("", ""),
@@ -76,21 +84,24 @@ def write_calibration(
 
     Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
     """
-    sources = [[str(each.get(key, "")) for key in ("file", "rows", "sha256")]
-               for each in calibration.data.get("files", [])]  # fmt: skip
+    sources = [
+        [str(file.get(key, "")) for key in ("file", "rows", "sha256")] for file in calibration.data.get("files", [])
+    ]
     triads = calibration.triads()
     return write_page(
         folder,
         "calibration",
         {**drawn, "correlation": partial(figures.correlation_figure, calibration)},
-        title=title or f"Calibration from {', '.join(Path(each[0]).name for each in sources) or 'a recording'}",
+        title=title or f"Calibration from {', '.join(Path(source[0]).name for source in sources) or 'a recording'}",
         lead=lead[0],
         number=lead[1],
         meaning=lead[2],
-        trust=said,
+        trust=trust,
         limits=unknown,
         weak=len(calibration.weak),
-        warnings=[each.about for each in said if each.caution and not each.about.startswith("What")],
+        warnings=[
+            statement.about for statement in trust if statement.caution and not statement.about.startswith("What")
+        ],
         residuals=residuals,
         shared_gravity=calibration.gravity.sigma > 0 and "accelerometer" in triads,
         equations=tables.equations(calibration),
@@ -127,9 +138,11 @@ def page(template: str, drawn: Drawn, *, notes: Sequence[str] = (), **values: An
             sources[name] = vector.drawing(figure, name)
         except Exception as error:
             sources[name] = _failure(f"The figure “{name}”", error)
-    text = _environment().get_template(f"{template}.html.jinja").render(
-        pictures=sources, notes=[words.sentence(each) for each in notes], **values
-    )  # fmt: skip
+    text = (
+        _environment()
+        .get_template(f"{template}.html.jinja")
+        .render(pictures=sources, notes=[words.sentence(note) for note in notes], **values)
+    )
     text = _TABLE.sub(_labelled, _FOLDERS.sub("", text))
     return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
 
@@ -163,9 +176,12 @@ def _environment() -> jinja2.Environment:
 
     made = jinja2.Environment(
         loader=jinja2.FunctionLoader(_file),
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
         keep_trailing_newline=True,
-    )  # fmt: skip
+    )
     script = _file("figure.js")
     made.globals |= {
         "script": script,
@@ -179,10 +195,10 @@ _FOLDERS = re.compile(r"""(?<=[\s>("'])(?:/|[A-Za-z]:[\\/])(?:[^\s<>"'/\\;&]+[/\
 _TABLE = re.compile(r'<div class="scroll"><table.*?</table>', re.DOTALL)
 
 
-def _labelled(found: re.Match[str]) -> str:
+def _labelled(match: re.Match[str]) -> str:
     """Write into each cell of a table which column it is in: a telephone shows rows one below the other."""
-    head, separator, body = found[0].partition("</thead>")
-    labels = [re.sub("<[^>]*>", "", each) for each in re.findall(r"<th\b[^>]*>(.*?)</th>", head, re.DOTALL)]
+    head, separator, body = match[0].partition("</thead>")
+    labels = [re.sub("<[^>]*>", "", label) for label in re.findall(r"<th\b[^>]*>(.*?)</th>", head, re.DOTALL)]
 
     def row(line: re.Match[str]) -> str:
         cells = iter(labels)

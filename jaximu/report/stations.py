@@ -39,8 +39,10 @@ _WORDS = {
 def _lead(calibration: Calibration) -> Lead:
     if calibration.exact:
         return without_freedom(calibration)
-    parts = [f"{_WORDS[name]} from {number(before)} to {number(after, 2)} {unit}"
-             for name, (before, after, unit) in calibration.rms.items()]  # fmt: skip
+    parts = [
+        f"{_WORDS[name]} from {number(before)} to {number(after, 2)} {unit}"
+        for name, (before, after, unit) in calibration.rms.items()
+    ]
     name, (before, after, unit) = next(iter(calibration.rms.items()))
     poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
     return Lead(
@@ -52,19 +54,19 @@ def _lead(calibration: Calibration) -> Lead:
 
 def _trust(calibration: Calibration) -> list[Statement]:
     """Say what to trust: where noise explains the errors, and what no interval contains."""
-    said = [*scatter_statements(calibration), gravity_statement(calibration)]
+    entries = [*scatter_statements(calibration), gravity_statement(calibration)]
     text = (
         "The intervals are sampling error and the uncertainty of gravity. What the set-up gets wrong every time (a "
         "table that is not level, axes that are not square, a wrong angle) shifts the parameters by as much and is in "
         "no interval; `jaximu budget` computes how much."
     )
-    said.append(Statement("The set-up", text, not calibration.imu.setup))
-    return said
+    entries.append(Statement("The set-up", text, not calibration.imu.setup))
+    return entries
 
 
 def _limits(calibration: Calibration) -> list[Statement]:
     """Say what the data cannot tell."""
-    said = weak_statements(
+    entries = weak_statements(
         calibration.weak,
         f"All {len(calibration.names)} parameters are determined by these poses and turns; none is weak.",
     )
@@ -72,7 +74,7 @@ def _limits(calibration: Calibration) -> list[Statement]:
         "The body frame is the fixture's, in which the reference states its directions; how the fixture is turned "
         "against the table cannot be distinguished from misalignment."
     )
-    return [*said, Statement("The fixture", text)]
+    return [*entries, Statement("The fixture", text)]
 
 
 def _figure(calibration: Calibration) -> Figure:
@@ -97,7 +99,7 @@ def _figure(calibration: Calibration) -> Figure:
 def write_station_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     working = calibration.fit is not None and calibration.stations is not None
-    said = (
+    picture = (
         "Errors of each pose and turn after calibration",
         "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI.",
     )
@@ -108,5 +110,5 @@ def write_station_report(calibration: Calibration, folder: str | os.PathLike[str
         _trust(calibration),
         _limits(calibration),
         {"residuals": partial(_figure, calibration)} if working else {},
-        said,
+        picture,
     )
