@@ -14,6 +14,7 @@ from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 
@@ -30,19 +31,19 @@ def run(
     calibrations: Annotated[
         tuple[Path, ...],
         Positional,
-        arg(name="calibrations", metavar="CALIBRATION...", help="calibration.json, or a fleet's TABLE.parquet."),
+        option("CALIBRATION...", "calibration.json, or a fleet's TABLE.parquet.", name="calibrations"),
     ] = (),
     /,
     *,
     limits: Annotated[
-        Path | None, arg(metavar="LIMITS.toml", help="Limits; or TABLE.parquet of a fleet, whose population sets them.")
+        Path | None, option("LIMITS.toml", "Limits; or TABLE.parquet of a fleet, whose population sets them.")
     ] = None,
     noise: Annotated[
-        Path | None, arg(metavar="ALLAN.json", help="From jaximu allan, for limits of noise and repeatability.")
+        Path | None, option("ALLAN.json", "From jaximu allan, for limits of noise and repeatability.")
     ] = None,
     trace: Annotated[
         Path | None,
-        arg(metavar="TRACE.toml", help="Serial number, operator, references …, beside what a calibration says."),
+        option("TRACE.toml", "Serial number, operator, references …, beside what a calibration says."),
     ] = None,
     rule: Annotated[Literal["guarded", "simple"] | None, arg(help="Decision rule, instead of that of LIMITS.")] = None,
     risk: Annotated[
@@ -52,14 +53,12 @@ def run(
         Literal["undecided", "fail", "never"],
         arg(help="Which verdicts end with another exit status than 0: both, fail alone, or none."),
     ] = "undecided",
-    golden: Annotated[
-        str, arg(metavar="DEVICE", help="Of a table: the unit recorded again and again to watch the line.")
-    ] = "",
+    golden: Annotated[str, option("DEVICE", "Of a table: the unit recorded again and again to watch the line.")] = "",
     measurements: Annotated[
         Path | None,
-        arg(
-            metavar="FILE",
-            help="Also write each limit with value and verdict for a test system: .csv, .xml (JUnit), .json (OpenHTF).",
+        option(
+            "FILE",
+            "Also write each limit with value and verdict for a test system: .csv, .xml (JUnit), .json (OpenHTF).",
         ),
     ] = None,
     without_certificate: Annotated[bool, arg(help="Write the verdict alone to DIR.")] = False,
@@ -168,7 +167,7 @@ def _units(
         f"{stem}acceptance.json": (acceptance.text() + "\n").encode()
         for stem, acceptance in _stems(acceptances).items()
     }
-    results.give(text, lambda: [_print(acceptance) for acceptance in acceptances], write, names, files)
+    results.give(lambda: [*map(_print, acceptances)], write, names, files, text)
     _measurements(acceptances, measurements)
     return verdict
 
@@ -263,30 +262,22 @@ def _write(
 
 
 def _print(acceptance: Acceptance) -> None:
-    from jaximu.cli.shown import console, table
-    from jaximu.report.certificate import item_row
+    from jaximu.cli.shown import print_all
+    from jaximu.report.certificate import item_row, remarks, sources
 
-    screen = console(120)
-    screen.print(
-        f"{acceptance.file}{f', serial number {acceptance.serial}' if acceptance.serial else ''}: {acceptance.verdict}"
+    columns = ("name", "value", "limits", "probability", "verdict")
+    rows = [tuple(row[key] for key in columns) for row in map(item_row, acceptance.items)]
+    serial = f", serial number {acceptance.serial}" if acceptance.serial else ""
+    limits = sources(acceptance)
+    print_all(
+        f"{acceptance.file}{serial}: {acceptance.verdict}",
+        (("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"), rows),
+        *(f"{', '.join(names)}: {text}" for text, names in remarks(acceptance).items()),
+        acceptance.rule.words(),
+        *([f"Limits from: {limits}."] if limits else []),
+        notes=acceptance.notes,
+        width=120,
     )
-    rows = [
-        (row["name"], row["value"], row["limits"], row["probability"], row["verdict"])
-        for row in map(item_row, acceptance.items)
-    ]
-    table(screen, ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"), rows)
-    reasons: dict[str, list[str]] = {}
-    for item in acceptance.items:
-        if text := item.said():
-            reasons.setdefault(text, []).append(item_row(item)["name"])
-    for text, names in reasons.items():
-        screen.print(f"{', '.join(names)}: {text}")
-    screen.print(acceptance.rule.words())
-    sources = list(dict.fromkeys(item.source for item in acceptance.items if item.source))
-    if sources:
-        screen.print(f"Limits from: {'; '.join(sources)}.")
-    for note in acceptance.notes:
-        screen.print(f"note: {note}")
 
 
 # --- a fleet's table --------------------------------------------------------------------------------------------------
@@ -302,7 +293,6 @@ def _line(path: Path, limits: Limits | None, golden: str, measurements: Path | N
     with progress("following the line"):
         line = follow(read_table(path), limits, golden)
     results.give(
-        line.text,
         lambda: print_line(line),
         lambda folder: later("report.line", "write_line")(line, folder / "report.html", folder / path.name),
         "acceptance.json, report.html and the table with verdicts",

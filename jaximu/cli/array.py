@@ -44,15 +44,12 @@ def run(
     units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(array.units, 1)}
     names = "array.json, report.html and the calibrations"
     write = options.drawn("array", "write_array", array)
-    results.give(array.text, lambda: _print(array), write, names, {}, array=array, **units)
+    results.give(lambda: _print(array), write, names, {}, array.text, array=array, **units)
 
 
 def _print(array: Array) -> None:
-    from jaximu.cli.shown import console, table
+    from jaximu.cli.shown import print_all
     from jaximu.report.array import HEADERS, headline, statements, unit_rows
 
-    screen = console()
-    screen.print(headline(array))
-    table(screen, HEADERS, unit_rows(array), "± is 95 %; positions in the first unit's axes")
-    for text in statements(array):
-        screen.print(text)
+    units = (HEADERS, unit_rows(array), "± is 95 %; positions in the first unit's axes")
+    print_all(headline(array), units, *statements(array))

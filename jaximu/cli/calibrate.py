@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jaximu.estimation.problem import Loss
     from jaximu.ground.gravity import LocalGravity
 
-__all__ = ["print_calibration", "run"]
+__all__ = ["give_calibration", "print_calibration", "run"]
 
 
 def run(
@@ -62,7 +62,7 @@ def run(
             f"--method {method}": method.startswith("two-step"),
         }
         unusable = [name for name, stated in meant.items() if stated]
-        _give(replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace), results)
+        give_calibration(replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace), results)
         return
     recordings, noise = log.read_unit(logs, gravity, static)
     with progress("calibrating"):
@@ -80,7 +80,7 @@ def run(
             loss=loss,
             repair=repair,
         )
-    _give(replace(calibration, trace=trace), results)
+    give_calibration(replace(calibration, trace=trace), results)
 
 
 def _calibrated_means(
@@ -101,10 +101,12 @@ def _calibrated_means(
         return calibrate_means(read_means(logs[0], log.reading(gravity)), gravity, loss)
 
 
-def _give(calibration: Calibration, results: options.Results) -> None:
-    """Print a calibration by hand and write it where asked."""
-    write = options.drawn("html", "write_report", calibration)
-    results.give(calibration.text, lambda: print_calibration(calibration), write, calibration=calibration)
+def give_calibration(
+    calibration: Calibration, results: options.Results, module: str = "html", name: str = "write_report"
+) -> None:
+    """Print a calibration, and write it and the report of that name where asked."""
+    write = options.drawn(module, name, calibration)
+    results.give(lambda: print_calibration(calibration), write, calibration=calibration)
 
 
 def print_calibration(calibration: Calibration) -> None:

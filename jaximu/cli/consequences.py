@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import arg
-
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,41 +29,35 @@ def run(
     calibration: options.CalibrationFile,
     /,
     *,
-    path: Annotated[
-        Path | None, arg(metavar="SPEC|LOG", help="The path (default: ten minutes of level driving).")
-    ] = None,
-    allan: Annotated[Path | None, arg(metavar="ALLAN.JSON", help="Noise, as jaximu allan -o DIR writes it.")] = None,
-    against: Annotated[
-        Path | None, arg(metavar="CALIBRATION", help="Compare with another calibration of the unit.")
-    ] = None,
+    path: Annotated[Path | None, option("SPEC|LOG", "The path (default: ten minutes of level driving).")] = None,
+    allan: Annotated[Path | None, option("ALLAN.JSON", "Noise, as jaximu allan -o DIR writes it.")] = None,
+    against: Annotated[Path | None, option("CALIBRATION", "Compare with another calibration of the unit.")] = None,
     duration: Annotated[
-        float | None, arg(metavar="S", help="Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
+        float | None, option("S", "Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
     ] = None,
     temperature: Annotated[
-        float | None, arg(metavar="DEGC", help="Temperature of level driving (default: the calibration's).")
+        float | None, option("DEGC", "Temperature of level driving (default: the calibration's).")
     ] = None,
-    accel_range: Annotated[
-        str | None, arg(metavar="TEXT", help='Refuse a path beyond this range, such as "16 g".')
-    ] = None,
-    gyro_range: Annotated[str | None, arg(metavar="TEXT", help='The same, such as "2000 deg/s".')] = None,
+    accel_range: Annotated[str | None, option("TEXT", 'Refuse a path beyond this range, such as "16 g".')] = None,
+    gyro_range: Annotated[str | None, option("TEXT", 'The same, such as "2000 deg/s".')] = None,
     draws: Annotated[
-        int, arg(metavar="N", help="Simulated flights with all errors drawn, beside the linear budget; 0 for none.")
+        int, option("N", "Simulated flights with all errors drawn, beside the linear budget; 0 for none.")
     ] = 100,
-    seed: Annotated[int, arg(metavar="N", help="Seed of these draws.")] = 0,
+    seed: Annotated[int, option("N", "Seed of these draws.")] = 0,
     noise_for: Annotated[
         str | None,
-        arg(
-            metavar="LIST",
-            help="Noise for these estimators, enlarged for the motion of the path: gtsam, vins, openvins, lio-sam, "
+        option(
+            "LIST",
+            "Noise for these estimators, enlarged for the motion of the path: gtsam, vins, openvins, lio-sam, "
             "kalibr, px4, ardupilot, separated by commas.",
         ),
     ] = None,
     noise_interval: Annotated[
-        float, arg(metavar="S", help="Time between two states (keyframes, fixes) of that estimator.")
+        float, option("S", "Time between two states (keyframes, fixes) of that estimator.")
     ] = 1.0,
     reference: Annotated[
         Path | None,
-        arg(metavar="REF", help="Attitude (and velocity or position) measured along LOG: noise from the errors seen."),
+        option("REF", "Attitude (and velocity or position) measured along LOG: noise from the errors seen."),
     ] = None,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
@@ -114,7 +107,7 @@ def run(
     write = options.drawn("consequences", "write_consequences", result)
     names = "consequences.json, report.html and pictures"
     if not targets:
-        results.give(result.text, lambda: _print(result), write, names, consequences=result)
+        results.give(lambda: _print(result), write, names, consequences=result)
         return
     assert noise is not None
     from jaximu.navigation.estimator_noise import ModelledErrors, estimator_noise
@@ -137,11 +130,11 @@ def run(
             print(f"\n{name}:\n{text.decode()}", end="")
 
     results.give(
-        document,
         show,
         write,
         f"{names}, {', '.join(files)}",
         files,
+        document,
         consequences=result,
         estimator_noise=estimated[-1],
     )
@@ -245,27 +238,24 @@ def _trajectory(
 
 
 def _print(consequences: Consequences) -> None:
-    from jaximu.cli.shown import console, table
+    from jaximu.cli.shown import print_all
     from jaximu.report.consequences import budget_rows, headers, headline, statements, total_rows
 
-    screen = console()
-    screen.print(headline(consequences))
-    screen.print(f"Path: {consequences.trajectory.words}. Its start is taken as known exactly.\n")
-    table(screen, ("position error, 1σ", *headers(consequences)), budget_rows(consequences))
-    screen.print()
-    table(screen, ("everything, 1σ", *headers(consequences)), total_rows(consequences))
-    screen.print()
-    for about, text in statements(consequences):
-        screen.print(f"{about}: {text}")
-    for note in consequences.notes:
-        screen.print(f"note: {note}")
+    times = headers(consequences)
+    print_all(
+        headline(consequences),
+        f"Path: {consequences.trajectory.words}. Its start is taken as known exactly.\n",
+        (("position error, 1σ", *times), budget_rows(consequences)),
+        "",
+        (("everything, 1σ", *times), total_rows(consequences)),
+        "",
+        *map(str, statements(consequences)),
+        notes=consequences.notes,
+    )
 
 
 def _print_noise(noise: EstimatorNoise) -> None:
-    from jaximu.cli.shown import console, table
+    from jaximu.cli.shown import print_all
 
-    screen = console()
-    screen.print(f"\n{noise.headline()}")
-    table(screen, ("multiples of N", *(f"over {length:g} s" for length in noise.lengths)), noise.rows())
-    for text in (*noise.statements(), *(f"note: {note}" for note in noise.notes)):
-        screen.print(text)
+    multiples = (("multiples of N", *(f"over {length:g} s" for length in noise.lengths)), noise.rows())
+    print_all(f"\n{noise.headline()}", multiples, *noise.statements(), notes=noise.notes)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import arg
-
 from jaximu.cli import options
 from jaximu.cli.diagnose import give_diagnosis
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 
@@ -32,14 +31,14 @@ _HIDDEN = {
 
 def run(
     *,
-    seed: Annotated[int, arg(metavar="N", help="Random seed of the unit and its noise.")] = 0,
-    effect: Annotated[str | None, arg(metavar="NAME", help="Effect to hide (default: the seed chooses one).")] = None,
+    seed: Annotated[int, option("N", "Random seed of the unit and its noise.")] = 0,
+    effect: Annotated[str | None, option("NAME", "Effect to hide (default: the seed chooses one).")] = None,
     data: Annotated[
-        Path | None, arg(metavar="DIR", help="Only write a simulated phone's recording there, to try commands on.")
+        Path | None, option("DIR", "Only write a simulated phone's recording there, to try commands on.")
     ] = None,
-    output: Annotated[
-        Path, arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for recording and report.")
-    ] = Path("jaximu-demo"),
+    output: Annotated[Path, option("DIR", "Folder for recording and report.", name="output", aliases=["-o"])] = Path(
+        "jaximu-demo"
+    ),
     force: options.ForceFlag = False,
 ) -> None:
     """Simulate a unit with a hidden flaw, diagnose it and write a report: no recording needed.

@@ -6,9 +6,8 @@ import difflib
 import inspect
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import arg
-
 from jaximu.cli import options
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import joined, plain, unit_text
 
@@ -19,7 +18,7 @@ __all__ = ["run"]
 
 
 def run(
-    name: Annotated[str | None, arg(metavar="[NAME]", help="Show this effect in full.")] = None,
+    name: Annotated[str | None, option("[NAME]", "Show this effect in full.")] = None,
     /,
     *,
     as_json: options.JsonFlag = False,

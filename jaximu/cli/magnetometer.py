@@ -7,11 +7,12 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import UseAppendAction
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,30 +31,23 @@ def run(
     mag_log: Annotated[
         tuple[Path, ...],
         UseAppendAction,
-        arg(metavar="LOG", help="The magnetometer's own file, if it is not in LOG; once per LOG."),
+        option("LOG", "The magnetometer's own file, if it is not in LOG; once per LOG."),
     ] = (),
-    mag_columns: Annotated[str | None, arg(metavar="NAMES", help="Its columns in order, as for --columns.")] = None,
+    mag_columns: Annotated[str | None, option("NAMES", "Its columns in order, as for --columns.")] = None,
     field: options.FieldText = None,
     longitude: Annotated[
         float | None,
-        arg(
-            metavar="DEG",
-            help="With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field.",
-        ),
+        option("DEG", "With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field."),
     ] = None,
     calibration: Annotated[
         Path | None,
-        arg(
-            metavar="FILE", help="Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."
-        ),
+        option("FILE", "Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."),
     ] = None,
-    check: Annotated[
-        Path | None, arg(metavar="FILE", help="Check whether this old calibration is still valid.")
-    ] = None,
+    check: Annotated[Path | None, option("FILE", "Check whether this old calibration is still valid.")] = None,
     effect: Annotated[
         tuple[str, ...],
         UseAppendAction,
-        arg(metavar="NAME[:onset=S]", help="Also fit this effect: mag.lag, mag.temperature … May be repeated."),
+        option("NAME[:onset=S]", "Also fit this effect: mag.lag, mag.temperature … May be repeated."),
     ] = (),
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
@@ -104,7 +98,6 @@ def run(
             print(part.text())
 
     results.give(
-        result.text,
         show_all,
         options.drawn("magnetometer", "write_magnetometer_report", result, measurement, heading),
         calibration=result,
@@ -175,14 +168,12 @@ def _require_overlap(first, second, mag_log: Path, path: Path) -> None:
 
 
 def _print(calibration: Calibration) -> None:
-    from jaximu.cli.shown import console
+    from jaximu.cli.shown import print_all
     from jaximu.report.magnetometer import lead, statements
 
     names = tuple(name for name in calibration.names if name.owner == "magnetometer")
     rows = [calibration.names.index(name) for name in names]
     alone = replace(calibration, names=names, covariance=calibration.covariance[rows][:, rows], rms={}, excess={})
-    screen = console()
-    screen.print(lead(calibration).sentence)
+    print_all(lead(calibration).sentence)
     print_calibration(alone)
-    for entry in statements(calibration):
-        screen.print(f"{entry.about}: {entry.text}")
+    print_all(*map(str, statements(calibration)))

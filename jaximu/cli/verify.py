@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 __all__ = ["run"]
@@ -17,11 +18,11 @@ def run(
     documents: Annotated[
         tuple[Path, ...],
         Positional,
-        arg(name="documents", metavar="DOCUMENT [DOCUMENT ...]", help="calibration.json or acceptance.json."),
+        option("DOCUMENT [DOCUMENT ...]", "calibration.json or acceptance.json.", name="documents"),
     ],
     /,
     *,
-    folder: Annotated[Path | None, arg(metavar="DIR", help="Look for moved recordings here, too.")] = None,
+    folder: Annotated[Path | None, option("DIR", "Look for moved recordings here, too.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Check a calibration.json or an acceptance.json, and every file behind it, against the hashes they carry.

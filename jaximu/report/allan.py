@@ -17,7 +17,15 @@ from jaximu.ground.quantities import listed, number, unit_text
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
 from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.analysis import NoiseAnalysis
-from jaximu.noise.filter_noise import filter_numbers, mean_terms, random_walk_only, recorded_seconds, white_noise_only
+from jaximu.noise.filter_noise import (
+    FLICKER,
+    FilterNumbers,
+    filter_numbers,
+    mean_terms,
+    random_walk_only,
+    recorded_seconds,
+    white_noise_only,
+)
 from jaximu.noise.identification import Identified, Term
 from jaximu.recordings.readers.kalibr import kalibr_yaml
 from jaximu.recordings.recording import Source
@@ -32,6 +40,7 @@ if TYPE_CHECKING:
 __all__ = [
     "TermRow",
     "allan_figure",
+    "filter_rows",
     "hours",
     "kalibr_text",
     "lead",
@@ -52,12 +61,16 @@ Cell = tuple[float, float, float] | float
 
 @dataclass(frozen=True)
 class TermRow:
-    """One term in one unit: value, low and high for x, y, z and their mean; where not seen, how large it may be."""
+    """One term in one unit: value, low and high for x, y, z and their mean; where not seen, how large it may be.
+
+    first: whether it is the first row of its term.
+    """
 
     term: str
     meaning: str
     unit: str
     cells: tuple[Cell, ...]
+    first: bool
 
     def texts(self) -> list[tuple[str, str]]:
         """Return value and interval as a person reads them."""
@@ -69,30 +82,38 @@ class TermRow:
         ]
 
 
-def _in_unit(value: float, quantity: str, term: str, unit: str, digits: int = 3) -> str:
-    """Return an SI value of a term in a unit."""
-    return f"{number(float(convert(value, SI_UNITS[quantity][term], unit)), digits)} {unit_text(unit)}"
+def _factor(quantity: str, term: str, unit: str) -> float:
+    """Return how many of a unit the SI unit of a term is."""
+    return float(convert(1.0, SI_UNITS[quantity][term], unit))
+
+
+def _in_unit(value: float, quantity: str, term: str, digits: int = 3) -> str:
+    """Return an SI value of a term in the unit of data sheets."""
+    unit = DATASHEET_UNITS[quantity][term]
+    return f"{number(value * _factor(quantity, term, unit), digits)} {unit_text(unit)}"
+
+
+def _units(quantity: str, term: str) -> Sequence[str]:
+    """Return the unit of data sheets, then SI; one unit where they are the same."""
+    return list(dict.fromkeys((DATASHEET_UNITS[quantity][term], SI_UNITS[quantity][term])))
 
 
 def term_rows(axes: Sequence[Identified], quantity: str) -> list[TermRow]:
     """Return two rows for each term that any axis supports: in the unit of data sheets, then in SI; continuous."""
-    made = []
+    rows = []
     mean = mean_terms(axes)
     for term, meaning in TERM_NAMES.items():
         estimates: list[Term | None] = [*(axis.terms.get(term) for axis in axes), mean.get(term)]
-        if all(estimate is None for estimate in estimates):
-            continue
-        si = SI_UNITS[quantity][term]
-        for unit in dict.fromkeys((DATASHEET_UNITS[quantity][term], si)):
-            factor = float(convert(1.0, si, unit))
+        for unit in _units(quantity, term) if any(estimates) else ():
+            factor = _factor(quantity, term, unit)
             cells = tuple(
                 factor * axes[column].limits[term]
                 if estimate is None
                 else (factor * estimate.value, factor * estimate.low, factor * estimate.high)
                 for column, estimate in enumerate(estimates)
             )
-            made.append(TermRow(term, meaning, unit, cells))
-    return made
+            rows.append(TermRow(term, meaning, unit, cells, unit == DATASHEET_UNITS[quantity][term]))
+    return rows
 
 
 def unseen_notes(axes: Sequence[Identified], quantity: str) -> list[str]:
@@ -105,8 +126,8 @@ def unseen_notes(axes: Sequence[Identified], quantity: str) -> list[str]:
         if estimate is not None and estimate.axes != letters
     ]
     missing = [
-        f"{TERM_NAMES[term]} {term} (up to {_in_unit(max(limits), quantity, term, unit, 2)})"
-        for term, unit in DATASHEET_UNITS[quantity].items()
+        f"{TERM_NAMES[term]} {term} (up to {_in_unit(max(limits), quantity, term, 2)})"
+        for term in DATASHEET_UNITS[quantity]
         if len(limits := [axis.limits[term] for axis in axes if term in axis.limits]) == len(axes)
     ]
     return [*notes, f"Not seen on any axis: {listed(missing)}."] if missing else notes
@@ -139,7 +160,7 @@ def lead(analysis: NoiseAnalysis) -> str:
         if name in analysis.axes:
             quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
             sizes = [
-                f"{TERM_NAMES[term]} of {_in_unit(estimate.value, quantity, term, DATASHEET_UNITS[quantity][term])}"
+                f"{TERM_NAMES[term]} of {_in_unit(estimate.value, quantity, term)}"
                 for term in "NBK"
                 if (estimate := mean.get(term)) is not None
             ]
@@ -168,7 +189,7 @@ def _line(term: str, value: float, tau: FloatArray) -> FloatArray:
         "N": 1 / np.sqrt(tau),
         "K": np.sqrt(tau / 3),
         "R": tau / math.sqrt(2),
-        "B": math.sqrt(2 * math.log(2) / math.pi) * np.ones_like(tau),
+        "B": math.sqrt(FLICKER) * np.ones_like(tau),
     }
     return value * shapes[term]
 
@@ -202,10 +223,10 @@ def allan_figure(analysis: NoiseAnalysis) -> Figure:
 
 
 def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    from matplotlib.ticker import LogLocator
 
     quantity = SENSOR_QUANTITIES[name]
-    factor = float(convert(1.0, SI_UNITS[quantity]["B"], unit))
+    factor = _factor(quantity, "B", unit)
     tau = axes[0].deviation.tau
     longest, length = tau[-1], max(recorded_seconds(axes[0]), 2 * tau[-1])
     fine = np.geomspace(tau[0], longest, 200)
@@ -267,9 +288,9 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
         rotation=90 if narrow else 0,
     )
     panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if top / bottom < 300 else (1.0,)))
-    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    panel.yaxis.set_minor_formatter(NullFormatter())
-    panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.yaxis.set_major_formatter("{x:g}")
+    panel.yaxis.set_minor_formatter("")
+    panel.xaxis.set_major_formatter("{x:g}")
     panel.set(xlabel="averaging time τ [s]", ylabel=f"Allan deviation σ(τ) [{unit_text(unit)}]")
     si = panel.secondary_yaxis(
         "right", functions=(lambda value: np.asarray(value) / factor, lambda value: np.asarray(value) * factor)
@@ -283,9 +304,8 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
 def _headline(name: str, axes: Sequence[Identified]) -> str:
     quantity, white = SENSOR_QUANTITIES[name], mean_terms(axes).get("N")
     at, size = _lowest(axes)
-    units = DATASHEET_UNITS[quantity]
-    bottom = f"lowest {_in_unit(size, quantity, 'B', units['B'], 2)} at {number(at, 2)} s"
-    first = "" if white is None else f"N = {_in_unit(white.value, quantity, 'N', units['N'])}, "
+    bottom = f"lowest {_in_unit(size, quantity, 'B', 2)} at {number(at, 2)} s"
+    first = "" if white is None else f"N = {_in_unit(white.value, quantity, 'N')}, "
     return f"{name.capitalize()}: {first}{bottom}"
 
 
@@ -370,21 +390,10 @@ def noise_report(
 def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
     """Return what the page says of one triad, as text."""
     axes, quantity, rate = analysis.axes[name], SENSOR_QUANTITIES[name], analysis.rates[name]
-    terms, last = [], ""
+    terms = []
     for row in term_rows(axes, quantity):
-        si, first = row.unit == SI_UNITS[quantity][row.term], row.term != last
-        kind = "SI and data sheets" if si and first else "SI" if si else "data sheets"
-        terms.append(
-            {
-                "term": row.term,
-                "meaning": row.meaning,
-                "first": first,
-                "unit": unit_text(row.unit),
-                "kind": kind,
-                "cells": row.texts(),
-            }
-        )
-        last = row.term
+        kinds = ["SI"] * (row.unit == SI_UNITS[quantity][row.term]) + ["data sheets"] * row.first
+        terms.append((row, unit_text(row.unit), " and ".join(kinds)))
     columns: list[dict[str, Any]] = [*(dict(axis.terms) for axis in axes), dict(mean_terms(axes))]
     discrete = []
     for term, words in (("N", "white noise of one sample, σ = N √rate"), ("K", "step of the bias walk, σ = K/√rate")):
@@ -393,19 +402,14 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
             for column in columns
         ]
         for unit in _DISCRETE_UNITS[quantity] if any(size is not None for size in sizes) else ():
-            factor = float(convert(1.0, SI_UNITS[quantity]["B"], unit))
+            factor = _factor(quantity, "B", unit)
             cells = [None if size is None else number(factor * size, 4) for size in sizes]
             discrete.append((words, unit_text(unit), cells))
     per_axis, mean = filter_numbers(analysis, name)
     numbers = [
-        (
-            row[0][1],
-            row[0][2],
-            unit_text(row[0][4]),
-            [None if cell[3] is None else number(cell[3], 4 if cell[0] != "decay" else 8) for cell in row],
-        )
-        for row in zip(*(part.rows() for part in (*per_axis, mean)), strict=True)
-        if any(cell[3] is not None for cell in row)
+        (*row[0][:2], row[0][3], [text for _, _, text, _ in row])
+        for row in zip(*map(filter_rows, (*per_axis, mean)), strict=True)
+        if any(text for _, _, text, _ in row)
     ]
     at, size = _lowest(axes)
     return {
@@ -415,17 +419,25 @@ def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
         "discrete": discrete,
         "numbers": numbers,
         "notes": unseen_notes(axes, quantity),
-        "lowest": f"{_in_unit(size, quantity, 'B', DATASHEET_UNITS[quantity]['B'], 2)} at {hours(at)}",
+        "lowest": f"{_in_unit(size, quantity, 'B', 2)} at {hours(at)}",
         "flat": None if mean.flat is None else [hours(end) for end in sorted(mean.flat)],
     }
 
 
+def filter_rows(numbers: FilterNumbers) -> list[tuple[str, str, str | None, str]]:
+    """Return formula, words, value as text and unit of each number that a filter takes; None where there is none."""
+    return [
+        (formula, words, None if value is None else number(value, 8 if key == "decay" else 4), unit_text(unit))
+        for key, formula, words, value, unit in numbers.rows()
+    ]
+
+
 def repeatability_rows(analysis: NoiseAnalysis) -> list[TermRow]:
     """Return how the bias scatters over recordings, by triad: a row in the unit of data sheets, then one in SI."""
-    made = []
+    rows = []
     for name, table in analysis.repeatability.items():
-        si = SI_UNITS[SENSOR_QUANTITIES[name]]["B"]
-        for unit in (DATASHEET_UNITS[SENSOR_QUANTITIES[name]]["B"], si):
-            cells = tuple((v, low, high) for v, low, high in np.asarray(convert(table, si, unit)))
-            made.append(TermRow("B", name, unit, cells))
-    return made
+        quantity = SENSOR_QUANTITIES[name]
+        for unit in _units(quantity, "B"):
+            cells = tuple(map(tuple, _factor(quantity, "B", unit) * np.asarray(table)))
+            rows.append(TermRow("B", name, unit, cells, unit == DATASHEET_UNITS[quantity]["B"]))
+    return rows

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +12,7 @@ import scipy
 from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.ground.quantities import number, with_interval
 from jaximu.report.figures import AXES, dressed, new_figure
-from jaximu.report.html import write_page
+from jaximu.report.html import Folder, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,7 +82,7 @@ def unit_rows(array: Array) -> list[tuple[str, ...]]:
     return rows
 
 
-def write_array(array: Array, folder: str | os.PathLike[str]) -> Path:
+def write_array(array: Array, folder: Folder) -> Path:
     """Write `report.html`, whose path is returned, and `array.png`. Raises `InputError` where they cannot be."""
     return write_page(
         folder,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.ground.quantities import number, unit_text
+from jaximu.ground.quantities import Z95, number, unit_text
 from jaximu.ground.summary import sentence
 from jaximu.model.mounting import Mounting
-from jaximu.report.figures import AFTER, BEFORE, dressed, new_figure
-from jaximu.report.html import write_calibration
+from jaximu.report.figures import AFTER, BEFORE, dressed, legend, new_figure, zero_line
+from jaximu.report.html import Folder, write_calibration
 from jaximu.report.words import Lead, Statement, gravity_statement, how_much_smaller, weak_statements
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ def mounting_words(calibration: Calibration) -> list[str]:
             f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's."
         )
     wide, sigma = alignment["filter"]["variance"], alignment["filter"]["sigma"]
-    most, least = (1e3 * np.sqrt(max(abs(wide) + times * 1.96 * sigma, 0.0)) for times in (1, -1))
+    most, least = (1e3 * np.sqrt(max(abs(wide) + times * Z95 * sigma, 0.0)) for times in (1, -1))
     if least and wide > 0:
         texts.append(f"The reference is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %).")
     elif least:
@@ -85,9 +84,7 @@ def share_words(calibration: Calibration) -> list[str]:
     ]
 
 
-def write_attitude_report(
-    calibration: Calibration, measurement: AgainstAttitude, folder: str | os.PathLike[str]
-) -> Path:
+def write_attitude_report(calibration: Calibration, measurement: AgainstAttitude, folder: Folder) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     before, after, unit = calibration.rms["rotation"]
     old, new, force = calibration.rms["specific_force"]
@@ -126,7 +123,7 @@ def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
             panel.plot(time, values, ".", color=colour, markersize=4)
             panel.plot([], [], ".", color=colour, label=label)
             dressed(panel, title, ylabel=f"error [{unit_text(unit)}]")
-        panel.axhline(0.0, color="0.6", linewidth=0.8)
-    panels[0].legend(ncols=2, fontsize=8, frameon=False, loc="upper right")
+        zero_line(panel)
+    legend(panels[0], 2, "upper right")
     panels[-1].set_xlabel("time [s]")
     return figure

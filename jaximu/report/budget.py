@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from functools import partial
 from pathlib import Path
@@ -12,12 +11,12 @@ import numpy as np
 
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.quantities import number, size
+from jaximu.ground.quantities import Z95, number, size
 from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import ErrorSource
 from jaximu.report import figures
-from jaximu.report.figures import OTHERS, PALETTE, dressed
-from jaximu.report.html import write_page
+from jaximu.report.figures import OTHERS, PALETTE, dressed, legend_below
+from jaximu.report.html import Folder, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,7 +37,7 @@ _LEAST = 0.01  # of a parameter's variance: a source that has it nowhere is draw
 _GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": "Set-up"}
 
 
-def write_budget(budget: Budget, folder: str | os.PathLike[str]) -> Path:
+def write_budget(budget: Budget, folder: Folder) -> Path:
     """Write `report.html`, whose path is returned, and `budget.png`. Raises `InputError` where they cannot be."""
     goals = [
         ("Reached" if goal.reached else "Not reached", goal_words(budget, goal), not goal.reached)
@@ -199,7 +198,7 @@ def check_words(budget: Budget) -> str:
     known = np.flatnonzero(budget.determined)
     ratio = check.rms[known] / budget.total[known]
     worst = int(np.argmax(np.abs(ratio - 1)))
-    chance = 1.96 / np.sqrt(2 * check.draws)
+    chance = Z95 / np.sqrt(2 * check.draws)
     failed = f" {check.failed} of them did not converge and are left out." if check.failed else ""
     return (
         f"{check.draws} sessions with all errors at once, through the whole estimator, scatter on average "
@@ -231,7 +230,7 @@ def _figure(budget: Budget) -> Figure:
     for axes, group in zip(figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True):
         _draw_bars(axes, budget, [index for index in _reading_order(budget) if owners[index] == group], stacked)
         axes.set_title(_GROUPS[group], loc="left", fontsize=11, fontweight="bold")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="lower center", ncols=4, fontsize=8.5, frameon=False)
+    legend_below(figure, figure.axes[0], 4)
     dominant = budget.sources[order[0]].words if order else "nothing"
     figure.suptitle(
         f"Where the uncertainty comes from: most of all {dominant}", x=0.01, ha="left", fontsize=12, fontweight="bold"

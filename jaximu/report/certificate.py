@@ -17,7 +17,7 @@ from jaximu.ground.summary import sentence
 from jaximu.report.html import page
 from jaximu.report.tables import provenance
 
-__all__ = ["item_row", "write_certificate"]
+__all__ = ["item_row", "remarks", "sources", "write_certificate"]
 
 _COLUMNS = ("name", "value", "limits", "probability", "verdict", "coverage", "freedom", "recording", "gravity")
 _MEANINGS = {
@@ -46,11 +46,6 @@ def _certificate(acceptance: Acceptance, calibration: Calibration) -> bytes:
     facts += [("Received", trace["received"])] if "received" in trace else []
     facts += [("Calibrated", f"{trace['date']} by {trace['operator']}"), ("Conditions", conditions)]
     facts += [(name, known[name]) for name in ("Method", "Gravity", "Used", "Sample rate", "Software") if name in known]
-    open_items: dict[str, list[str]] = {}
-    for item in acceptance.items:
-        if text := item.said():
-            open_items.setdefault(text, []).append(spoken(item.name))
-    sources = list(dict.fromkeys(item.source for item in acceptance.items if item.source))
     hashes = [
         (f"Recording {Path(str(file.get('file', ''))).name}", str(file.get("sha256", "")))
         for file in calibration.data.get("files", ())
@@ -66,10 +61,10 @@ def _certificate(acceptance: Acceptance, calibration: Calibration) -> bytes:
         meaning=_MEANINGS[acceptance.verdict],
         facts=facts,
         rows=[(*(row[key] for key in _COLUMNS), row["verdict"] != "pass") for row in map(item_row, acceptance.items)],
-        open=[(sentence(", ".join(names)), text) for text, names in open_items.items()],
+        open=[(sentence(", ".join(names)), text) for text, names in remarks(acceptance).items()],
         remarks=" ".join(sentence(note) for note in acceptance.notes),
         rule=acceptance.rule.words(),
-        limits=f"{'; '.join(sources) or 'as stated'} ({Path(acceptance.limits['file']).name})",
+        limits=f"{sources(acceptance) or 'as stated'} ({Path(acceptance.limits['file']).name})",
         statement="The accelerometer's scale is traced to the local gravity stated above, the gyroscope's scale to the "
         "angles of turns, as gravity or a table shows them, and to the clock of the recording, by the references below;"
         " the results are in SI units. The hashes let anyone check with `jaximu verify` that no file was changed.",
@@ -94,6 +89,20 @@ def _certificate(acceptance: Acceptance, calibration: Calibration) -> bytes:
         closing=f"Issued {issued}. Authorised by {stated['authorised_by']}. The results hold for this item as it was "
         "calibrated. The certificate may not be reproduced except in full without approval of the laboratory.",
     )[0]
+
+
+def remarks(acceptance: Acceptance) -> dict[str, list[str]]:
+    """Return what is to be said of items beside their row, each text with the items that it is about."""
+    texts: dict[str, list[str]] = {}
+    for item in acceptance.items:
+        if text := item.said():
+            texts.setdefault(text, []).append(spoken(item.name))
+    return texts
+
+
+def sources(acceptance: Acceptance) -> str:
+    """Return where the limits come from, as far as they say it."""
+    return "; ".join(dict.fromkeys(item.source for item in acceptance.items if item.source))
 
 
 def item_row(item: Item) -> dict[str, str]:

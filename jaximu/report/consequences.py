@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,11 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.quantities import number
+from jaximu.ground.quantities import Z95, number
 from jaximu.navigation.consequences import Consequences, position
 from jaximu.report import figures
-from jaximu.report.figures import OTHERS, PALETTE, dressed
-from jaximu.report.html import write_page
+from jaximu.report.figures import OTHERS, PALETTE, dressed, legend, legend_below
+from jaximu.report.html import Folder, write_page
+from jaximu.report.words import Statement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,7 +26,7 @@ _LEAST = 0.01  # of the variance at a time that is shown: a term below it everyw
 _COMMON = 0.1  # by how much the calibration's terms together may differ from their root sum of squares unsaid
 
 
-def write_consequences(consequences: Consequences, folder: str | os.PathLike[str]) -> Path:
+def write_consequences(consequences: Consequences, folder: Folder) -> Path:
     """Write `report.html`, whose path is returned, `budget.png` and, with draws, `tracks.png`.
 
     Raises `InputError` where they cannot be written.
@@ -40,8 +40,8 @@ def write_consequences(consequences: Consequences, folder: str | os.PathLike[str
         drawn,
         title=f"What the errors of {Path(consequences.calibration_file).name} do",
         lead=headline(consequences),
-        number=_metres(position(consequences.total)[-1]),
-        meaning=f"error of position after {_seconds(consequences.times[-1])} (1σ)",
+        number=_metres(_at_end(consequences.total)),
+        meaning=f"error of position after {_end(consequences)} (1σ)",
         path=consequences.trajectory.words,
         statements=statements(consequences),
         headers=headers(consequences),
@@ -65,6 +65,15 @@ def _seconds(value: float) -> str:
     return f"{round(value, 1):g} s"
 
 
+def _at_end(variances: FloatArray) -> float:
+    """Return the error of position at the end of the path."""
+    return position(variances)[-1]
+
+
+def _end(consequences: Consequences) -> str:
+    return _seconds(consequences.times[-1])
+
+
 def _places(consequences: Consequences) -> list[int]:
     """Rows of the times that are shown: 1, 10, 60, 600 s and the last, as far as the path goes."""
     wanted = [time for time in _SHOWN if time < consequences.times[-1]]
@@ -79,16 +88,16 @@ def headers(consequences: Consequences) -> list[str]:
 
 def _order(consequences: Consequences) -> list[str]:
     """Names of the terms, the largest at the end of the path first."""
-    return sorted(consequences.terms, key=lambda name: -position(consequences.terms[name])[-1])
+    return sorted(consequences.terms, key=lambda name: -_at_end(consequences.terms[name]))
 
 
 def headline(consequences: Consequences) -> str:
     """Say how far position is off at the end, and why."""
     name = _order(consequences)[0]
-    largest, total = position(consequences.terms[name])[-1], position(consequences.total)[-1]
+    largest, total = _at_end(consequences.terms[name]), _at_end(consequences.total)
     return (
         f"Navigating by this unit alone, position is off by {_metres(total)} (1σ) after "
-        f"{_seconds(consequences.times[-1])}. The largest term is {name}: {_metres(largest)} by itself."
+        f"{_end(consequences)}. The largest term is {name}: {_metres(largest)} by itself."
     )
 
 
@@ -120,9 +129,9 @@ def total_rows(consequences: Consequences) -> list[tuple[str, ...]]:
     return shown
 
 
-def statements(consequences: Consequences) -> list[tuple[str, str]]:
+def statements(consequences: Consequences) -> list[Statement]:
     """Return what the budget means, each with what it is about."""
-    total, end = position(consequences.total), _seconds(consequences.times[-1])
+    total, end = position(consequences.total), _end(consequences)
     last = total[-1]
     parts = [
         f"{name} from {round(start, 1):g} to {round(stop, 1):g} s" for name, start, stop in consequences.dominant()
@@ -131,7 +140,7 @@ def statements(consequences: Consequences) -> list[tuple[str, str]]:
     texts = {"What dominates when": f"{'; '.join(parts[:6])}{more}."}
 
     def better(variances: FloatArray) -> float:
-        return position(variances + consequences.noise)[-1]
+        return _at_end(variances + consequences.noise)
 
     best = min(consequences.known, key=lambda name: better(consequences.known[name]))
     floor = better(np.zeros_like(consequences.noise))
@@ -143,8 +152,8 @@ def statements(consequences: Consequences) -> list[tuple[str, str]]:
     if consequences.noise.any():
         buys += f" Noise alone leaves {_metres(floor)}, which no calibration can undo."
     texts["What a better calibration buys"] = buys
-    apart = np.sqrt(sum(position(consequences.terms[name])[-1] ** 2 for name in consequences.known))
-    together = position(consequences.calibration)[-1]
+    apart = np.sqrt(sum(_at_end(consequences.terms[name]) ** 2 for name in consequences.known))
+    together = _at_end(consequences.calibration)
     if abs(together / apart - 1) > _COMMON:
         texts["Correlation"] = (
             f"The calibration's terms are not independent: together they make {_metres(together)} after {end}, where "
@@ -155,21 +164,21 @@ def statements(consequences: Consequences) -> list[tuple[str, str]]:
         listed = "; ".join(f"{name} {_metres(error[-1])}" for name, error in lost)
         texts["What a simpler model costs"] = f"Left out of the correction, each by itself, after {end}: {listed}."
     if consequences.check is not None:
-        ratio = position(consequences.check.sigma**2)[-1] / last
+        ratio = _at_end(consequences.check.sigma**2) / last
         draws = len(consequences.check.errors)
-        chance = 1.96 / np.sqrt(2 * draws)
+        chance = Z95 / np.sqrt(2 * draws)
         texts["Check"] = (
             f"{draws} draws of all errors, through the whole mechanisation, scatter {ratio:.2f} times as much as the "
             f"budget says after {end} (by chance {1 - chance:.2f} to {1 + chance:.2f})."
         )
     if consequences.against is not None and consequences.apart is not None:
-        other = position(consequences.against.total)[-1]
+        other = _at_end(consequences.against.total)
         off = float(np.linalg.norm(consequences.apart[-1, :3]))
         texts["The other calibration"] = (
             f"With {Path(consequences.against.calibration_file).name} position is off by {_metres(other)} (1σ) after "
             f"{end} if it is right, and it puts the unit {_metres(off)} from where this one does."
         )
-    return list(texts.items())
+    return [Statement(about, text) for about, text in texts.items()]
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -179,7 +188,7 @@ def _budget_figure(consequences: Consequences) -> Figure:
     variances = {name: position(term) ** 2 for name, term in consequences.terms.items()}
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
     visible = [name for name in _order(consequences) if np.max(variances[name] / whole) >= _LEAST]
-    drawn, end = visible[: len(PALETTE)], f"after {_seconds(consequences.times[-1])}"
+    drawn, end = visible[: len(PALETTE)], f"after {_end(consequences)}"
     figure = figures.new_figure(7.2)
     above, below = figure.subplots(2, 1, sharex=True)
     for name, color in zip(drawn, PALETTE, strict=False):
@@ -197,10 +206,10 @@ def _budget_figure(consequences: Consequences) -> Figure:
             consequences.times, position(consequences.check.sigma**2), color="#8A8A8A", linewidth=1.2, label="draws"
         )
     figures.logarithmic(above, "y")
-    above.legend(frameon=False, fontsize=9, loc="lower right")
+    legend(above, where="lower right")
     dressed(
         above,
-        f"Position is off by {_metres(position(consequences.total)[-1])} {end}",
+        f"Position is off by {_metres(_at_end(consequences.total))} {end}",
         ylabel="position error, 1σ (m)",
     )
     shares = [100 * variances[name] / whole for name in drawn]
@@ -216,7 +225,7 @@ def _budget_figure(consequences: Consequences) -> Figure:
         ylim=(0, 100),
         xlim=(consequences.times[0], consequences.times[-1]),
     )
-    figure.legend(*below.get_legend_handles_labels(), loc="lower center", ncols=3, frameon=False, fontsize=9)
+    legend_below(figure, below, 3)
     return figure
 
 
@@ -231,12 +240,12 @@ def _tracks_figure(consequences: Consequences) -> Figure:
     east, north = 2.45 * np.sqrt(
         consequences.total[-1, :2]
     )  # of two components, 95 % lie within 2.45 standard deviations
-    angle, sigma = np.linspace(0, 2 * np.pi, 100), 1.96 * np.sqrt(consequences.total[:, 2])
+    angle, sigma = np.linspace(0, 2 * np.pi, 100), Z95 * np.sqrt(consequences.total[:, 2])
     plane.plot(east * np.cos(angle), north * np.sin(angle), color=figures.FLAGGED, linewidth=1.6)
     plane.set_aspect("equal", "datalim")
     for side in (-1, 1):
         height.plot(consequences.times, side * sigma, color=figures.FLAGGED, linewidth=1.6)
-    title = f"{min(100, len(check.errors))} draws over {_seconds(consequences.times[-1])}"
+    title = f"{min(100, len(check.errors))} draws over {_end(consequences)}"
     dressed(plane, title, xlabel="error east (m)", ylabel="error north (m)")
     dressed(height, "and their heights", xlabel="time (s)", ylabel="error up (m)")
     return figure

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -23,21 +22,21 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.noise.deviations import deviation
 from jaximu.report import figures
-from jaximu.report.figures import band, dressed
-from jaximu.report.html import write_page
+from jaximu.report.figures import band, dressed, legend, zero_line
+from jaximu.report.html import Folder, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["write_diagnosis"]
+__all__ = ["limit_rows", "write_diagnosis"]
 
 _MEASURED, _TWIN, _EXTENDED = figures.FLAGGED, figures.BEFORE, figures.AFTER
 _SHOWN = 12
 _AN_ERROR = 1e-3  # m/s², rad/s: sizes that errors have, whose unit the axes take
 
 
-def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Path:
+def write_diagnosis(diagnosis: Diagnosis, folder: Folder) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     twin = twin_of(diagnosis)
     copied = twin.fit(asking=())  # its errors alone are shown
@@ -78,13 +77,18 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
         gain=gain,
         gains=[] if gain is None else [(words[kind], gain.errors(kind)) for kind in gain.before.rms],
         options=_option_rows(diagnosis),
-        limits=[(effect_title(name), size(*limit, 2)) for name, limit in sorted(diagnosis.detection_limits.items())],
+        limits=limit_rows(diagnosis),
         checks=[
             (check.text, probability(check.adjusted).removeprefix("= "), bool(check.adjusted < 0.01))
             for check in diagnosis.checks
         ],
         not_observable=_by_reason(diagnosis.not_observable),
     )
+
+
+def limit_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """Return each effect with the size up to which it could be there unnoticed."""
+    return [(effect_title(name), size(*limit, 2)) for name, limit in sorted(diagnosis.detection_limits.items())]
 
 
 def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, str]]:
@@ -132,9 +136,9 @@ def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
     for label, colour, source, state in series:
         time = source.real.dependences(kind)[TIME]  # a twin need not have as many poses and turns
         left.plot(time, factor * source.errors(state)[kind], "o", color=colour, markersize=4, label=label)
-    left.axhline(0.0, color="0.7", linewidth=0.8)
+    zero_line(left)
     dressed(left, shown.words, xlabel="time [s]", ylabel=f"error [{unit}]")
-    left.legend(fontsize=8)
+    legend(left)
     _ranking(right, diagnosis)
     return figure
 
@@ -193,7 +197,7 @@ def _learned(learned: LearnedTerm) -> Figure:
     panels = figure.subplots(1, 3, sharey=True)
     for axis, panel in enumerate(panels):
         band(panel, x, size * learned.y[:, axis], size * learned.half_width[:, axis], _EXTENDED)
-        panel.axhline(0.0, color="0.7", linewidth=0.8)
+        zero_line(panel)
         dressed(panel, f"{learned.triad} {'xyz'[axis]}", xlabel=f"{learned.covariate} [{unit.replace('^2', '²')}]")
         panel.xaxis.label.set_size(8)
     panels[0].set_ylabel(f"[{label}]")
@@ -215,7 +219,7 @@ def _noise(diagnosis: Diagnosis, twin: Experiment) -> Figure:
         low, high = spectrum.get_ylim()
         for panel in (spectrum, allan):
             figures.logarithmic(panel)
-            panel.legend(fontsize=8)
+            legend(panel)
         dressed(
             spectrum,
             name,

@@ -103,6 +103,21 @@ def dressed(axes: Axes, title: str = "", **labels: Any) -> None:
     axes.set(**labels)
 
 
+def zero_line(axes: Axes, value: float = 0.0) -> None:
+    """Draw the level that errors lie about."""
+    axes.axhline(value, color="0.6", linewidth=0.8)
+
+
+def legend(axes: Axes, columns: int = 1, where: Any = "best") -> None:
+    """Draw the key of a panel in it."""
+    axes.legend(loc=where, ncols=columns, fontsize=8, frameon=False)
+
+
+def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
+    """Draw the key of a panel at the bottom of its figure."""
+    figure.legend(*axes.get_legend_handles_labels(), loc="lower center", ncols=columns, fontsize=9, frameon=False)
+
+
 def band(axes: Axes, x: FloatArray, value: FloatArray, half: FloatArray, color: str, **style: Any) -> None:
     """Draw a line and its 95 % band, by at most one value for each point of its width."""
     kept = np.unique(np.linspace(0, len(x) - 1, 72 * round(_WIDTH)).astype(int))
@@ -166,7 +181,7 @@ def signals_figure(recording: Recording) -> Figure:
         dressed(axes)
         axes.set_ylabel(f"{name.replace('_', ' ')}\n({unit})" if unit else name, fontsize=8)
         if signal.values.shape[1] == len(AXES):
-            axes.legend(loc="upper right", ncols=3, fontsize=7, frameon=False)
+            legend(axes, 3, "upper right")
     grid[-1].set_xlabel("time (s)")
     return figure
 
@@ -230,7 +245,7 @@ def recording_of(calibration: Calibration) -> Figure:
         right.set_ylabel("(°/s)")
         right.spines["right"].set_visible(False)
     grid[-1].set_xlabel("time (s)" + (", one recording after another" if several else ""))
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="lower center", ncols=4, frameon=False, fontsize=9)
+    legend_below(figure, grid[0], 4)
     return figure
 
 
@@ -272,7 +287,7 @@ def residual_figure(errors: PoseAndTurnErrors) -> Figure:
     title = f"… and misses it by {size(after, 'm/s^2', 2)} after: {how_much_smaller(before, after)}"
     dressed(grid[1], title, ylabel=f"after ({unit})")
     for axes in grid[:2]:
-        axes.axhline(0, color="black", linewidth=0.8)
+        zero_line(axes)
 
     if rows == 3:
         axes = grid[2]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,11 +11,12 @@ import numpy as np
 
 from jaximu.calibration import Calibration, History
 from jaximu.estimation.uncertainty import label
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import Z95, number
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.effects.magnetic_field import SetupMagneticField
-from jaximu.report.figures import AXES, band, dressed, logarithmic, new_figure
-from jaximu.report.html import write_calibration
+from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, new_figure, zero_line
+from jaximu.report.html import Folder, write_calibration
 from jaximu.report.words import Lead, Statement, gravity_statement, sentence, weak_statements
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def _earth(history: History) -> Statement | None:
     )
 
 
-def write_filter_report(calibration: Calibration, history: History, folder: str | os.PathLike[str]) -> Path:
+def write_filter_report(calibration: Calibration, history: History, folder: Folder) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     assert calibration.filter is not None
     bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
@@ -143,46 +144,51 @@ def write_filter_report(calibration: Calibration, history: History, folder: str 
     )
 
 
-def _effects(calibration: Calibration, history: History) -> dict[str, list[int]]:
-    """Return the places of the effects' numbers among the states, by what their picture is called."""
-    groups: dict[str, list[int]] = {}
+_Line = tuple[FloatArray, FloatArray, str, str]
+"""A state over time, its standard deviation, colour and name."""
+
+
+def _triads(calibration: Calibration, history: History) -> Iterator[tuple[str, list[_Line]]]:
+    """Yield the title of each panel of biases and scales, and its lines, less their last values."""
+    for owner, part, title, factor in _PANELS:
+        gain, lines = np.linalg.norm(np.asarray(getattr(calibration.imu, owner).gain), axis=1), []
+        for state in _places(history, owner, part):
+            axes = history.names[state].axes
+            if len(set(axes)) == 1:
+                unit, axis = factor / gain[axes[0]], "xyz"[axes[0]]
+                value = history.values[:, state] - history.values[-1, state]
+                lines.append((unit * value, abs(unit) * history.sigmas[:, state], AXES[axis], axis))
+        yield title, lines
+
+
+def _effects(calibration: Calibration, history: History) -> Iterable[tuple[str, list[_Line]]]:
+    """Return the title of each panel of effects' numbers, and its lines."""
+    groups: dict[str, list[_Line]] = {}
     units = {name: triad.output_unit for name, triad in calibration.triads().items()}
     for state, name in enumerate(history.names):
         effect = calibration.imu.all_effects().get((name.owner, name.effect))
         if effect is not None and state not in history.earth:
             title = f"{sentence(effect.english)} [{effect.coefficient_unit(units.get(name.owner, ''))}]"
-            groups.setdefault(title, []).append(state)
-    return groups
+            lines = groups.setdefault(title, [])
+            text = label(name, calibration.imu)
+            lines.append((history.values[:, state], history.sigmas[:, state], f"C{len(lines)}", text))
+    return groups.items()
 
 
 def _figure(calibration: Calibration, history: History) -> Figure:
-    effects = _effects(calibration, history)
-    count = len(_PANELS) + len(effects) + 1
-    figure = new_figure(2.4 * count)
-    panels = figure.subplots(count, 1, sharex=True)
+    drawn = [*_triads(calibration, history), *_effects(calibration, history)]
+    figure = new_figure(2.4 * (len(drawn) + 1))
+    panels = figure.subplots(len(drawn) + 1, 1, sharex=True)
     time = history.time
     middle = np.searchsorted(time, (time[0] + time[-1]) / 2)
-    for panel, (owner, part, title, factor) in zip(panels, _PANELS, strict=False):
-        gain, limit = np.linalg.norm(np.asarray(getattr(calibration.imu, owner).gain), axis=1), 0.0
-        for state in _places(history, owner, part):
-            axes = history.names[state].axes
-            if len(set(axes)) == 1:
-                unit, axis = factor / gain[axes[0]], "xyz"[axes[0]]
-                line = (history.values[:, state] - history.values[-1, state]) * unit
-                half = Z95 * history.sigmas[:, state] * abs(unit)
-                band(panel, time, line, half, AXES[axis], label=axis)
-                limit = max(limit, np.max(np.abs(line[middle:]) + half[middle:]))
-        panel.set_ylim(-1.1 * limit, 1.1 * limit)  # the data sheet's uncertainty at the start would hide the rest
-        panel.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
-        dressed(panel, title)
-    for panel, (title, places) in zip(panels[len(_PANELS) :], effects.items(), strict=False):
+    for panel, (title, lines) in zip(panels, drawn, strict=False):
         limit = 0.0
-        for colour, state in enumerate(places):
-            line, half = history.values[:, state], Z95 * history.sigmas[:, state]
-            band(panel, time, line, half, f"C{colour}", label=label(history.names[state], calibration.imu))
+        for line, sigma, color, name in lines:
+            half = Z95 * sigma
+            band(panel, time, line, half, color, label=name)
             limit = max(limit, np.max(np.abs(line[middle:]) + half[middle:]))
-        panel.set_ylim(-1.1 * limit, 1.1 * limit)
-        panel.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
+        panel.set_ylim(-1.1 * limit, 1.1 * limit)  # the data sheet's uncertainty at the start would hide the rest
+        legend(panel, 3, "upper right")
         dressed(panel, title)
     used = history.freedom > 0
     panels[-1].plot(
@@ -193,7 +199,7 @@ def _figure(calibration: Calibration, history: History) -> Figure:
         markersize=3,
     )
     logarithmic(panels[-1], "y")
-    panels[-1].axhline(1.0, color="0.4", linewidth=0.8)
+    zero_line(panels[-1], 1.0)
     dressed(panels[-1], "Squared innovations over their expectation", xlabel="time [s]")
     for panel in panels:
         panel.fill_between(

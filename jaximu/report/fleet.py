@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
 from jaximu.fleets.population import Difference, Fleet, Population, write_shrunk
 from jaximu.ground.atomic import write_files
-from jaximu.ground.quantities import number, probability
+from jaximu.ground.quantities import Z95, number, probability
 from jaximu.ground.summary import sentence
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
@@ -122,11 +123,15 @@ def headline(fleet: Fleet) -> str:
         )
     )
     if groups:
-        shown = ", ".join(groups[:3]) + (f" and {len(groups) - 3} more" if len(groups) > 3 else "")
-        text += f"; different from the rest: {shown}"
+        text += f"; different from the rest: {_first(groups, 3)}"
     if any(difference.kind == "date" for difference in fleet.differences):
         text += "; parameters drift with the date"
     return f"{text}."
+
+
+def _first(names: Sequence[str], most: int) -> str:
+    """Return the first of some names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def failure_words(fleet: Fleet, reasons: int, files: int) -> list[tuple[str, str, int]]:
@@ -136,8 +141,7 @@ def failure_words(fleet: Fleet, reasons: int, files: int) -> list[tuple[str, str
     """
     rows = []
     for reason, met in list(fleet.failed.items())[:reasons]:
-        more = len(met) - files
-        rows.append((sentence(reason), ", ".join(met[:files]) + (f" and {more} more" if more > 0 else ""), len(met)))
+        rows.append((sentence(reason), _first(met, files), len(met)))
     rest = list(fleet.failed.values())[reasons:]
     if rest:
         rows.append((f"{len(rest)} other reasons, in the table's column `message`.", "", sum(map(len, rest))))
@@ -153,7 +157,7 @@ def difference_words(difference: Difference) -> str:
     """Say what a group changes, with 95 % intervals."""
     rate = " a year" if difference.kind == "date" else ""
     parts = [
-        f"{describe(name)} by {amount(name, value, 1.96 * sigma)}{rate}"
+        f"{describe(name)} by {amount(name, value, Z95 * sigma)}{rate}"
         for name, value, sigma in difference.parameters[:5]
     ]
     more = len(difference.parameters) - 5

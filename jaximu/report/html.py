@@ -29,10 +29,14 @@ if TYPE_CHECKING:
     Drawn = Mapping[str, Callable[[], Figure]]
     """Figures by name, each drawn when its turn comes: one that fails takes nothing else with it."""
 
-__all__ = ["page", "write_calibration", "write_failure", "write_page", "write_report"]
+__all__ = ["Folder", "page", "write_calibration", "write_failure", "write_page", "write_report"]
 
 
-def write_report(calibration: Calibration, folder: str | os.PathLike[str], title: str | None = None) -> Path:
+Folder = str | os.PathLike[str]
+"""Where the files of a report go; made if it is missing."""
+
+
+def write_report(calibration: Calibration, folder: Folder, title: str | None = None) -> Path:
     """Write `report.html` and its pictures as PNGs into `folder`, which is made if it is missing.
 
     **Arguments:** `title`: the report's heading; the names of the recordings if None. A calibration that was loaded
@@ -69,7 +73,7 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str], title
 
 def write_calibration(
     calibration: Calibration,
-    folder: str | os.PathLike[str],
+    folder: Folder,
     lead: tuple[str, str, str],
     trust: Sequence[words.Statement],
     unknown: Sequence[words.Statement],
@@ -113,7 +117,7 @@ def write_calibration(
     )
 
 
-def write_page(folder: str | os.PathLike[str], template: str, drawn: Drawn, **values: Any) -> Path:
+def write_page(folder: Folder, template: str, drawn: Drawn, **values: Any) -> Path:
     """Write a page as `report.html` and its pictures as PNGs into a folder, all or none; return the page's path.
 
     Raises `InputError` where the folder cannot be made or written to.

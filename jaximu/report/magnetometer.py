@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.ground.quantities import number
+from jaximu.ground.quantities import Z95, number
 from jaximu.ground.summary import sentence
-from jaximu.report.figures import dressed, hemispheres, new_figure
-from jaximu.report.html import write_calibration
+from jaximu.report.figures import dressed, hemispheres, legend, new_figure
+from jaximu.report.html import Folder, write_calibration
 from jaximu.report.words import Lead, Statement, weak_statements
 
 if TYPE_CHECKING:
@@ -60,10 +59,10 @@ def statements(calibration: Calibration) -> list[Statement]:
     # a field's image is an ellipsoid; how far from round it is, is soft iron and scale
     axes = np.linalg.svd(gain, compute_uv=False)
     iron = float(np.linalg.norm(np.linalg.solve(gain, bias)))
-    text = f"{number(strength['value'], 3)} ± {number(1.96 * strength['sigma'], 2)} µT"
+    text = f"{number(strength['value'], 3)} ± {number(Z95 * strength['sigma'], 2)} µT"
     if dip is not None:
         way = "below" if dip["value"] > 0 else "above"
-        text += f", pointing {number(abs(dip['value']), 3)} ± {number(1.96 * dip['sigma'], 2)}° {way} the level"
+        text += f", pointing {number(abs(dip['value']), 3)} ± {number(Z95 * dip['sigma'], 2)}° {way} the level"
     known = " (95 %)"
     if strength["sigma"] > 0.01 * strength["value"]:
         known += "; every gain shares the uncertainty of the strength, which --field or --longitude would narrow"
@@ -129,7 +128,7 @@ def _along(direction: Sequence[float]) -> str:
 
 
 def write_magnetometer_report(
-    calibration: Calibration, measurement: MagneticField, heading: Heading | None, folder: str | os.PathLike[str]
+    calibration: Calibration, measurement: MagneticField, heading: Heading | None, folder: Folder
 ) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     weak = [
@@ -183,5 +182,5 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
         dressed(axes)
         axes.set(title="heading good to [°]", xlabel="heading [°]", ylim=(0, None))
         axes.set_xticks([0, 90, 180, 270, 360], ["N", "E", "S", "W", "N"])
-        axes.legend(fontsize=7, frameon=False)
+        legend(axes)
     return figure

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import textwrap
 from functools import partial
 from pathlib import Path
@@ -14,9 +13,10 @@ from scipy.spatial.transform import Rotation
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe, spoken_amount
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import Z95
 from jaximu.planning import Proposal
 from jaximu.report import figures
-from jaximu.report.html import write_page
+from jaximu.report.html import Folder, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +33,7 @@ _CRITERIA = {
 }
 
 
-def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> Path:
+def write_plan(proposal: Proposal, folder: Folder) -> Path:
     """Write `report.html`, whose path is returned, and `poses.png`. Raises `InputError` where they cannot be."""
     return write_page(
         folder,
@@ -72,7 +72,7 @@ def sigma_rows(proposal: Proposal) -> list[tuple[str, str, str, str]]:
     sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
 
     def interval(name: Name, sigma: float) -> str:
-        return f"± {spoken_amount(name, 1.96 * sigma, proposal.imu)}"
+        return f"± {spoken_amount(name, Z95 * sigma, proposal.imu)}"
 
     return [
         (describe(name, proposal.imu), interval(name, before), interval(name, after), f"{before / after:.3g}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,9 +10,9 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.data.stations import station_errors
-from jaximu.ground.quantities import number
-from jaximu.report.figures import AXES, dressed, new_figure
-from jaximu.report.html import write_calibration
+from jaximu.ground.quantities import Z95, number
+from jaximu.report.figures import AXES, dressed, legend, new_figure, zero_line
+from jaximu.report.html import Folder, write_calibration
 from jaximu.report.words import (
     Lead,
     Statement,
@@ -88,15 +87,15 @@ def _figure(calibration: Calibration) -> Figure:
         for shift, (axis, color), error, sigma in zip(
             (-0.2, 0.0, 0.2), AXES.items(), panel.error, panel.sigma, strict=True
         ):
-            axes.errorbar(panel.place + shift, error, 1.96 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
-        axes.axhline(0, color="#888888", lw=0.8)
+            axes.errorbar(panel.place + shift, error, Z95 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
+        zero_line(axes)
         dressed(axes, f"Error of the {_WORDS[panel.name]}", ylabel=panel.unit)
-    grid[0].legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
+    legend(grid[0], 3, "upper right")
     grid[-1].set_xlabel("pose or turn, in order of time (bars: 95 % of the noise)")
     return figure
 
 
-def write_station_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
+def write_station_report(calibration: Calibration, folder: Folder) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     working = calibration.fit is not None and calibration.stations is not None
     picture = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -17,13 +16,13 @@ from jaximu.calibration.thermal_regression import multifactor
 from jaximu.calibration.thermal_selection import CUBIC
 from jaximu.data.rest_blocks import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.estimation.track import TEMPERATURE_WINDOW
-from jaximu.ground.quantities import listed, number, readable, size, unit_text, with_interval
+from jaximu.ground.quantities import Z95, listed, number, readable, size, unit_text, with_interval
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.planning.ramps import next_ramps
 from jaximu.recordings.recording import smoothed_slope
-from jaximu.report.figures import dressed, new_figure
-from jaximu.report.html import write_page
+from jaximu.report.figures import dressed, legend, new_figure, zero_line
+from jaximu.report.html import Folder, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -244,11 +243,11 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
     for axis, panel in enumerate(figure.subplots(1, 3)):
         for part, style in parts:
             panel.plot(thermal.blocks.temperature[part], factor * data[part, axis], ".", ms=2.5, **style)
-        low, high = (factor * (value + sign * 1.96 * sigma)[:, axis] for sign in (-1, 1))
+        low, high = (factor * (value + sign * Z95 * sigma)[:, axis] for sign in (-1, 1))
         panel.fill_between(temperature, low, high, color="0.5", alpha=0.35, linewidth=0)
         panel.plot(temperature, factor * value[:, axis], color="black", lw=1.1, label="steady, with 95 % band")
         dressed(panel, f"{'xyz'[axis]} [{unit}]", xlabel="temperature [°C]")
-    figure.axes[0].legend(fontsize=7, frameon=False)
+    legend(figure.axes[0])
     return figure
 
 
@@ -262,12 +261,12 @@ def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
         for panel, x in zip(grid[axis], (blocks.temperature, blocks.time / 3600), strict=True):
             for part, style in parts:
                 panel.plot(x[part], residual[part, axis], ".", ms=3, **style)
-            panel.axhline(0.0, color="0.5", lw=0.8)
+            zero_line(panel)
             dressed(panel)
         grid[axis][0].set_ylabel(f"{'xyz'[axis]} [{unit}]")
     dressed(grid[0][0], "Left of the bias, by temperature")
     dressed(grid[0][1], "by time")
-    grid[0][0].legend(fontsize=8, frameon=False, ncols=2)
+    legend(grid[0][0], 2)
     grid[2][0].set_xlabel("temperature [°C]")
     grid[2][1].set_xlabel("time [h]")
     return figure
@@ -280,16 +279,14 @@ def covered_figure(thermal: ThermalCalibration) -> Figure:
     for part, style in _both_ways(thermal):
         left.plot(blocks.temperature[part], 60 * blocks.rate[part], ".", ms=4, **style)
         right.plot(blocks.time[part] / 3600, blocks.temperature[part], ".", ms=3, **style)
-    left.axhline(0.0, color="0.6", lw=0.8)
-    left.legend(fontsize=8, frameon=False)
+    zero_line(left)
+    legend(left)
     dressed(left, "Temperatures and rates covered", xlabel="temperature [°C]", ylabel="rate of temperature [K/min]")
     dressed(right, "Over time", xlabel="time [h]", ylabel="temperature [°C]")
     return figure
 
 
-def write_thermal(
-    thermal: ThermalCalibration, folder: str | os.PathLike[str], exports: Sequence[AutopilotParameters] = ()
-) -> Path:
+def write_thermal(thermal: ThermalCalibration, folder: Folder, exports: Sequence[AutopilotParameters] = ()) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     panels = {"bias": band_figure, "surface": surface_figure, "residual": residual_figure}
     drawn = {f"{part}_{name}": partial(draw, thermal, name) for name in thermal.fits for part, draw in panels.items()}

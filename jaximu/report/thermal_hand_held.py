@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,13 +11,13 @@ import numpy as np
 from jaximu.calibration.thermal import change
 from jaximu.calibration.thermal_terms import POWERS, SCALE
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
-from jaximu.ground.quantities import readable, size
+from jaximu.ground.quantities import Z95, readable, size
 from jaximu.ground.summary import sentence
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
-from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, new_figure
-from jaximu.report.html import write_page
+from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, legend, legend_below, new_figure, zero_line
+from jaximu.report.html import Folder, write_page
 from jaximu.report.thermal import effect_rows
 
 if TYPE_CHECKING:
@@ -101,10 +100,10 @@ def _change_figure(thermal: HandHeldThermal) -> Figure:
         panel.remove()
     for panel, (title, value, sigma) in zip(panels, drawn, strict=False):
         for axis, (name, colour) in enumerate(AXES.items()):
-            band(panel, temperature, value[:, axis], 1.96 * sigma[:, axis], colour, label=name)
-        panel.axhline(0.0, color="0.6", lw=0.8)
+            band(panel, temperature, value[:, axis], Z95 * sigma[:, axis], colour, label=name)
+        zero_line(panel)
         dressed(panel, title, xlabel="temperature [°C]")
-    panels[0].legend(fontsize=8, frameon=False, ncols=3)
+    legend(panels[0], 3)
     return figure
 
 
@@ -125,15 +124,14 @@ def _error_figure(thermal: HandHeldThermal) -> Figure:
         warmth = temperature[real.kind == index][:: kind.components]
         for label, colour, state in series:
             panel.plot(warmth, factor * thermal.experiment.errors(state)[index], ".", ms=5, color=colour, label=label)
-        panel.axhline(0.0, color="0.6", lw=0.8)
+        zero_line(panel)
         dressed(panel, xlabel="temperature [°C]")
         panel.set_title(f"{sentence(kind.words)} [{unit}]", loc="left", fontsize=9, fontweight="bold")
-    handles = panels[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="lower center", ncols=2, fontsize=8, frameon=False)
+    legend_below(figure, panels[0], 2)
     return figure
 
 
-def write_thermal_by_hand(thermal: HandHeldThermal, folder: str | os.PathLike[str]) -> Path:
+def write_thermal_by_hand(thermal: HandHeldThermal, folder: Folder) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     drawn = {"errors": partial(_error_figure, thermal)}
     if _changed(thermal):

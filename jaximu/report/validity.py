@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +13,8 @@ from jaximu.diagnosis.validity import Shift
 from jaximu.estimation.rows import TIME
 from jaximu.ground.quantities import change, number, probability, with_interval
 from jaximu.report import figures
-from jaximu.report.html import write_page
+from jaximu.report.figures import legend, zero_line
+from jaximu.report.html import Folder, write_page
 from jaximu.report.tables import short_name
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _OUTPUTS = {
 }
 
 
-def write_validity(validity: Validity, folder: str | os.PathLike[str]) -> Path:
+def write_validity(validity: Validity, folder: Folder) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     name = Path(str(validity.data.get("file", "a recording"))).name
     moved = [shift.parameter.owner for shift in validity.moved if shift.parameter.owner in validity.output_errors]
@@ -116,9 +116,9 @@ def _errors(validity: Validity) -> Figure:
     for panel, title, unit in zip(
         panels, ("gravity norm at rest", "gravity carried over a turn"), ("mm/s²", "°"), strict=True
     ):
-        panel.axhline(0.0, color="0.7", linewidth=0.8)
+        zero_line(panel)
         figures.dressed(panel, title, xlabel="time [s]", ylabel=f"error [{unit}]")
-        panel.legend(fontsize=8)
+        legend(panel)
     return figure
 
 
@@ -132,7 +132,7 @@ def _innovations(validity: Validity) -> Figure:
     panel.plot(
         history.time[used], history.innovations[used] / history.freedom[used], "o", color=figures.FLAGGED, markersize=4
     )
-    panel.axhline(1.0, color="0.7", linewidth=0.8)
+    zero_line(panel, 1.0)
     figures.logarithmic(panel, "y")
     figures.dressed(panel, "innovations", xlabel="time [s]", ylabel="squared, over expected")
     return figure

@@ -44,6 +44,9 @@ class Statement(NamedTuple):
     text: str
     caution: bool = False
 
+    def __str__(self) -> str:
+        return f"{self.about}: {self.text}"
+
 
 def how_much_smaller(before: float, after: float) -> str:
     """Say how much smaller `after` is, in two digits."""
