@@ -68,17 +68,15 @@ def run(
     with progress("calibrating"):
         from jaximu.calibration import calibrate
 
-        names, sigmas = options.effects_of(effect)
         calibration = calibrate(
             recordings,
             gravity,
             static=noise,
             segmentation=poses.value(),
-            effects=names,
-            effect_sigmas=sigmas,
             method=method,
             loss=loss,
             repair=repair,
+            **options.effects_of(effect),
         )
     give_calibration(replace(calibration, trace=trace), results)
 

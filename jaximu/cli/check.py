@@ -60,6 +60,7 @@ def _print(validity: Validity) -> None:
     from jaximu.cli.shown import print_all
     from jaximu.ground.quantities import probability, size, with_interval
     from jaximu.mistakes.titles import effect_title
+    from jaximu.report.validity import kind_words
 
     data = validity.data
     held = f"{data['poses']} poses, {data['turns']} turns" if validity.history is None else f"{data['updates']} updates"
@@ -83,7 +84,7 @@ def _print(validity: Validity) -> None:
     texts.append(validity.bias_words())
     if validity.nis is not None:
         texts.append(f"squared innovations of the filter: {validity.nis:.2f} times what their uncertainty expects")
-    words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.real.kinds}
+    words = kind_words(validity)
     for name, (before, after, unit) in validity.errors.items():
         texts.append(
             f"{words[name]}: rms {size(before, unit)} with this calibration, {size(after, unit)} with a fresh one"

@@ -84,17 +84,15 @@ def run(
     attitude = None if reference is None else read_reference(reference, log_path, recording)
     with progress("filtering" if old is None else "following"):
         if old is None:
-            names, sigmas = options.effects_of(effect)
             calibration, history = calibrate_by_filter(
                 recording,
                 gravity,
                 attitude=attitude,
                 latitude=local.latitude,
                 static=still,
-                effects=names,
-                effect_sigmas=sigmas,
                 repair=repair,
                 magnetometer=compass,
+                **options.effects_of(effect),
             )
         else:
             noise = None if still is None else fit_noise(still)

@@ -102,11 +102,8 @@ def _shown(advice: Advice) -> str:
 
 
 def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -> dict[str, Any]:
-    import numpy as np
-
+    """Return what the log holds, what was noticed, and what it can be used for: as `--json` prints it."""
     from jaximu.mistakes import prepare
-    from jaximu.recordings.recording import plausibility
-    from jaximu.recordings.segmentation import segment
 
     ready = prepare(recording)
     used = ready.recording.signals
@@ -114,82 +111,97 @@ def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -
     guessing = guessed or advice is not None
     notes = [note for note in recording.remarks if not guessing or "--" not in note]  # options that only this verb gave
     findings = [*guessed, *notes, *ready.notes]
-    uses: list[dict[str, str]] = []
-    if "accelerometer" not in signals:
+    if "accelerometer" in signals:
+        uses = _uses(recording, ready.recording, findings, not guessed or recording.accelerometer.unit != "count")
+    else:
         findings.append("no accelerometer: poses cannot be found")
-        uses += [
-            {"verb": "turntable", "why": "with a schedule of rests and turns (--reference)"},
-            {"verb": "compensate", "why": "with a calibration of this gyroscope"},
-        ]
-        return {"file": recording.name, "signals": signals, "findings": findings, "uses": uses}
-    poses = 0
-    timeless = any("stamps from --rate" in note for note in recording.notes)
-    physical = not (guessed and recording.accelerometer.unit == "count")
+        uses = {
+            "turntable": "with a schedule of rests and turns (--reference)",
+            "compensate": "with a calibration of this gyroscope",
+        }
+        advice = None
+    document = {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings))}
+    document["uses"] = [{"verb": verb, "why": why} for verb, why in uses.items()]
+    if advice is not None:
+        document["guess"] = {"line": advice.line(), **{k: getattr(advice, k) for k in ("reasons", "questions", "rows")}}
+    return document
+
+
+def _uses(recording: Recording, repaired: Recording, findings: list[str], physical: bool) -> dict[str, str]:
+    """Return by verb why it can be run on a log with an accelerometer; what is noticed is added to `findings`.
+
+    `physical`: the outputs are in physical units, or their scale is known.
+    """
+    import numpy as np
+
+    from jaximu.recordings.recording import plausibility
+
+    uses, signals, poses = {}, recording.signals, 0
     force = np.linalg.norm(recording.accelerometer.si(), axis=1)
+    timeless = any("stamps from --rate" in note for note in recording.notes)
     near = bool(np.all(np.abs(force / STANDARD.value - 1) < _NEAR_GRAVITY))
     means = timeless and physical and len(force) <= _TABLE and near
     try:
         findings += plausibility(recording, STANDARD) if physical else ()
-        segmentation = segment(ready.recording)
-        poses = len(segmentation.intervals)
-        still = float(np.sum(segmentation.intervals[:, 1] - segmentation.intervals[:, 0]))
-        findings.append(f"{poses} static poses, {still:.0f} s in all")
-        tilt = _tilt(ready.recording.accelerometer, segmentation.intervals)
-        if poses > 1 and tilt < _TILTED:
-            findings.append(
-                f"all {poses} poses are of one orientation, within {tilt:.2g}°: a calibration by poses needs nine or "
-                "more, all around"
-            )
-            poses = 0
+        poses = _poses(repaired, findings)
     except JaximuError as error:
         if not means:
             findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
-    rest, longest, begin = _rest(ready.recording) if physical else (0.0, 0.0, 0.0)
-    length = signals["accelerometer"]["duration"]
+    rest, longest, begin = _rest(repaired) if physical else (0.0, 0.0, 0.0)
+    length = _signal(recording.accelerometer, repaired.accelerometer)["duration"]
     if rest:
         findings.append(
             f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
-            f"{_STILL_FORCE:g} m/s²{f' and {_STILL_RATE:g} rad/s' if recording.gyroscope else ''} rms)"
+            f"{_STILL_FORCE:g} m/s²{f' and {_STILL_RATE:g} rad/s' if 'gyroscope' in signals else ''} rms)"
         )
-
-    def use(verb: str, why: str) -> None:
-        uses.append({"verb": verb, "why": why})
-
     if means:
-        use("calibrate --means", f"if each of the {len(force)} rows is the mean of a pose at rest")
-    if recording.magnetometer is not None:
-        use("magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round")
+        uses["calibrate --means"] = f"if each of the {len(force)} rows is the mean of a pose at rest"
+    if "magnetometer" in signals:
+        uses["magnetometer"] = "soft and hard iron, and how good a heading becomes, where the unit is turned all round"
     if poses >= 9:
-        use("calibrate", f"{poses} poses" + ("" if recording.gyroscope is None else " and the turns between them"))
-        if recording.gyroscope is not None:
-            use("diagnose", "the same, and what the model gets wrong")
+        uses["calibrate"] = f"{poses} poses" + (" and the turns between them" if "gyroscope" in signals else "")
+        if "gyroscope" in signals:
+            uses["diagnose"] = "the same, and what the model gets wrong"
     elif poses > 1:
-        use("calibrate", f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one")
+        uses["calibrate"] = f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one"
     moved = length - rest
     if rest >= 60.0 and moved <= 2.0 + _BUMPS * length:
         apart = f" but for {moved:.0f} s" if moved > 2.0 else ""
-        use("allan", f"at rest for {length:.0f} s{apart}: noise up to some {length / 10:.0f} s of averaging")
+        uses["allan"] = f"at rest for {length:.0f} s{apart}: noise up to some {length / 10:.0f} s of averaging"
     elif longest >= _CUT:
-        use(
-            "allan",
-            f"once cut to the {longest:.0f} s at rest from {begin:.0f} s on: noise up to some "
-            f"{longest / 10:.0f} s of averaging",
+        uses["allan"] = (
+            f"once cut to the {longest:.0f} s at rest from {begin:.0f} s on: noise up to some {longest / 10:.0f} s of "
+            "averaging"
         )
     heat = recording.temperature
-    if heat is not None and (span := float(np.ptp(heat.values))) >= 5.0:
-        use("thermal", f"the temperature spans {span:.0f} K")
+    if heat is not None and (span := np.ptp(heat.values)) >= 5.0:
+        uses["thermal"] = f"the temperature spans {span:.0f} K"
     table = [name for name in ("table_angle", "table_rate") if getattr(recording, name) is not None]
     if table or (recording.attitude is not None and poses >= _STATIONS):
-        use("turntable", f"it holds a reference: {', '.join(table) or 'attitude'}")
-    if recording.attitude is not None and recording.gyroscope is not None:
-        use("reference", "the attitude beside it calibrates both sensors in any motion that turns about all axes")
-    use("compensate", "to correct it with a calibration of this unit")
-    if poses > 1 and recording.gyroscope is not None:
-        use("check", "whether a calibration of this unit is still valid")
-    document = {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings)), "uses": uses}
-    if advice is not None:
-        document["guess"] = {"line": advice.line(), **{k: getattr(advice, k) for k in ("reasons", "questions", "rows")}}
-    return document
+        uses["turntable"] = f"it holds a reference: {', '.join(table) or 'attitude'}"
+    if recording.attitude is not None and "gyroscope" in signals:
+        uses["reference"] = "the attitude beside it calibrates both sensors in any motion that turns about all axes"
+    uses["compensate"] = "to correct it with a calibration of this unit"
+    if poses > 1 and "gyroscope" in signals:
+        uses["check"] = "whether a calibration of this unit is still valid"
+    return uses
+
+
+def _poses(recording: Recording, findings: list[str]) -> int:
+    """Return how many poses there are, 0 where all are alike; what is noticed is added to `findings`."""
+    from jaximu.recordings.segmentation import segment
+
+    intervals = segment(recording).intervals
+    poses, still = len(intervals), (intervals[:, 1] - intervals[:, 0]).sum()
+    findings.append(f"{poses} static poses, {still:.0f} s in all")
+    tilt = _tilt(recording.accelerometer, intervals)
+    if poses > 1 and tilt < _TILTED:
+        findings.append(
+            f"all {poses} poses are of one orientation, within {tilt:.2g}°: a calibration by poses needs nine or more, "
+            "all around"
+        )
+        return 0
+    return poses
 
 
 def _signal(signal: Signal, used: Signal) -> dict[str, Any]:

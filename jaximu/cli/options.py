@@ -390,8 +390,8 @@ def print_json(value: Any) -> None:
     print(json.dumps(value, indent=1, allow_nan=False))
 
 
-def effects_of(stated: tuple[str, ...]) -> tuple[list[str], dict[str, float]]:
-    """Return the effects that options name, and the standard deviations of those stated as NAME+-SIGMA."""
+def effects_of(stated: tuple[str, ...]) -> dict[str, Any]:
+    """Return, as the library's arguments, the effects that options name and the deviations stated as NAME+-SIGMA."""
     names, sigmas = [], {}
     for text in stated:
         name, known, sigma = text.partition("+-")
@@ -401,7 +401,7 @@ def effects_of(stated: tuple[str, ...]) -> tuple[list[str], dict[str, float]]:
                 sigmas[name.strip()] = float(sigma)
             except ValueError:
                 raise InputError(f"--effect {text}: {sigma!r} is not a number.") from None
-    return names, sigmas
+    return {"effects": names, "effect_sigmas": sigmas}
 
 
 Reading = Annotated[LogOptions, arg(name="")]

@@ -97,8 +97,8 @@ def run(
         return
     with progress("planning") as report:
         if filtered:
-            names, _ = options.effects_of(effect)
-            proposal = propose_sequence(known, chosen, poses, criterion, parameter, names, report=report)
+            effects = options.effects_of(effect)["effects"]
+            proposal = propose_sequence(known, chosen, poses, criterion, parameter, effects, report=report)
         else:
             proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
     if magnetometer is not None:

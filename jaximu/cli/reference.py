@@ -58,10 +58,9 @@ def run(
     from jaximu.calibration import calibrate_against_attitude
 
     attitude = read_reference(log_path if reference is None else reference, log_path, recording)
-    names, sigmas = options.effects_of(effect)
     with progress("calibrating"):
         calibration, measurement = calibrate_against_attitude(
-            recording, attitude, gravity, static=noise, effects=names, effect_sigmas=sigmas, loss=loss, repair=repair
+            recording, attitude, gravity, static=noise, loss=loss, repair=repair, **options.effects_of(effect)
         )
     results.give(
         lambda: _print(calibration),

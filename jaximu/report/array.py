@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ import scipy
 from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.ground.quantities import number, with_interval
 from jaximu.report.figures import AXES, dressed, new_figure
-from jaximu.report.html import Folder, write_page
+from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,29 +32,27 @@ def headline(array: Array) -> str:
     )
 
 
-def statements(array: Array) -> list[str]:
+def statements(array: Array) -> Iterator[str]:
     """Return what else is to be known, a sentence each."""
-    texts = []
     for (unit, mean, expected), words, factor, spoken in (
         (array.averaged.rate, "gyroscope", np.degrees(1.0), "°/s"),
         (array.averaged.force, "accelerometer", 1e3, "mm/s²"),
     ):
-        texts.append(
+        yield (
             f"Noise of the {words} at rest, means of a quarter of a second: {factor * unit:.3g} {spoken} of a typical "
             f"unit, {factor * mean:.3g} {spoken} of the mean; {factor * expected:.3g} {spoken} if the units' noises "
             "were independent."
         )
     for unit, words, times in array.suspects():
-        texts.append(
+        yield (
             f"{Path(unit.name).name} scatters {times:.2g} times as far about the shared motion as a typical unit in "
             f"{words}: look for its cause with `jaximu diagnose`, or leave it out of the mean."
         )
     if len(array.units) == 2:
-        texts.append("Two units cannot show which of them scatters: add a third.")
-    return texts
+        yield "Two units cannot show which of them scatters: add a third."
 
 
-def unit_rows(array: Array) -> list[tuple[str, ...]]:
+def unit_rows(array: Array) -> TextRows:
     """Return the table of units, with 95 % intervals."""
 
     def scatter(value: float | None, factor: float) -> str:
@@ -94,7 +93,7 @@ def write_array(array: Array, folder: Folder) -> Path:
         meaning="less gyroscope noise in the mean of all units",
         headers=HEADERS,
         rows=unit_rows(array),
-        statements=statements(array),
+        statements=[*statements(array)],
         notes=array.notes,
     )
 

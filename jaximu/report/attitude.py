@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,42 +38,39 @@ _SIZES = {
 """What each component is in words, its standard deviation at an excess of one, and how a person reads it."""
 
 
-def mounting_words(calibration: Calibration) -> list[str]:
+def mounting_words(calibration: Calibration) -> Iterator[str]:
     """Say how the reference is mounted, how late and smoothed it is, and how its vertical stands."""
     alignment = calibration.reference
     assert alignment is not None
     offset = alignment["time_offset"]
     angle = np.degrees(2 * np.arccos(min(1.0, abs(alignment["rotation"][0]))))
     delay = 1e3 * offset["value"]
-    texts = [
+    yield from [
         f"The reference's stamps are {abs(delay):.3g} ± {1.96e3 * offset['sigma']:.2g} ms "
         f"{'late' if delay > 0 else 'early'}.",
         f"The unit is turned by {angle:.3g}° relative to the body of the reference.",
     ]
     drift = 1e6 * (alignment["clock_scale"] - 1)
     if drift:
-        texts.append(
-            f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's."
-        )
+        yield (f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's.")
     wide, sigma = alignment["filter"]["variance"], alignment["filter"]["sigma"]
     most, least = (1e3 * np.sqrt(max(abs(wide) + times * Z95 * sigma, 0.0)) for times in (1, -1))
     if least and wide > 0:
-        texts.append(f"The reference is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %).")
+        yield f"The reference is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %)."
     elif least:
-        texts.append(
+        yield (
             f"The gyroscope is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %) beyond "
             "the reference."
         )
     else:
-        texts.append(f"No filter of the reference shows; a first-order lag is below {most:.3g} ms.")
+        yield f"No filter of the reference shows; a first-order lag is below {most:.3g} ms."
     if arm := alignment["lever_arm"]:
         places = ", ".join(
             f"{1e3 * value:.3g} ± {1.96e3 * sigma:.2g}" for value, sigma in zip(arm["value"], arm["sigma"], strict=True)
         )
-        texts.append(f"The unit lies {places} mm (95 %) from the point that is tracked, along the reference's x, y, z.")
+        yield f"The unit lies {places} mm (95 %) from the point that is tracked, along the reference's x, y, z."
     tilt = np.linalg.norm(Mounting.of(calibration.imu).tilt)
-    texts.append(f"The reference's vertical is off by {np.degrees(tilt):.2g}°.")
-    return texts
+    yield f"The reference's vertical is off by {np.degrees(tilt):.2g}°."
 
 
 def share_words(calibration: Calibration) -> list[str]:

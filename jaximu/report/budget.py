@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +17,7 @@ from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import ErrorSource
 from jaximu.report import figures
 from jaximu.report.figures import OTHERS, PALETTE, dressed, legend_below
-from jaximu.report.html import Folder, write_page
+from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,7 +102,7 @@ def headline(budget: Budget) -> str:
     return text + (f" {lost} more are not determined by this scheme." if lost else "")
 
 
-def parameter_rows(budget: Budget) -> list[tuple[str, str, str, str]]:
+def parameter_rows(budget: Budget) -> TextRows:
     """Return each parameter in words, its 1σ, what it is made of (dominant first), and its 1σ by Monte Carlo."""
     part, total, off = shares(budget), budget.total, budget.nonlinear()
     rows = []
@@ -119,7 +120,7 @@ def parameter_rows(budget: Budget) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def source_rows(budget: Budget) -> list[tuple[str, str, str, str]]:
+def source_rows(budget: Budget) -> TextRows:
     """Return each source, dominant first: in words, its size, its mean share, and the parameter it has most of."""
     part, known = shares(budget), np.flatnonzero(budget.determined)
     rows = []
@@ -136,19 +137,17 @@ def _percent(share: float) -> str:
     return "below 0.1 %" if share < 1e-3 else f"{100 * share:.{0 if share >= 0.1 else 1}f} %"
 
 
-def nonlinear_words(budget: Budget) -> list[str]:
+def nonlinear_words(budget: Budget) -> Iterator[str]:
     """Say where the linear budget is off by more than 5 %."""
-    off, texts = budget.off, []
     for row, index in budget.nonlinear():
         source, unit = budget.sources[row], budget.units[index]
         linear, actual = budget.sigma[row, index], budget.actual[row, index]
-        change = 100 * off[row, index]
-        texts.append(
+        change = 100 * budget.off[row, index]
+        yield (
             f"{describe(budget.names[index], budget.imu)}: {source.words} reaches it with "
             f"{amount(actual, unit)} in the whole fit, {amount(linear, unit)} to first order; its total of "
             f"{amount(budget.total[index], unit)} is {_wrong(change)}."
         )
-    return texts
 
 
 def _wrong(change: float) -> str:

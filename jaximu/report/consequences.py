@@ -13,7 +13,7 @@ from jaximu.ground.quantities import Z95, number
 from jaximu.navigation.consequences import Consequences, position
 from jaximu.report import figures
 from jaximu.report.figures import OTHERS, PALETTE, dressed, legend, legend_below
-from jaximu.report.html import Folder, write_page
+from jaximu.report.html import Folder, TextRows, write_page
 from jaximu.report.words import Statement
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def headline(consequences: Consequences) -> str:
     )
 
 
-def budget_rows(consequences: Consequences) -> list[tuple[str, ...]]:
+def budget_rows(consequences: Consequences) -> TextRows:
     """Return each term and its position error at the times that are shown, the largest first, then the total."""
     rows = _places(consequences)
 
@@ -116,7 +116,7 @@ def budget_rows(consequences: Consequences) -> list[tuple[str, ...]]:
     return shown
 
 
-def total_rows(consequences: Consequences) -> list[tuple[str, ...]]:
+def total_rows(consequences: Consequences) -> TextRows:
     """Return the errors of position, velocity and attitude by direction at the times that are shown."""
     rows, sigma = _places(consequences), np.sqrt(consequences.total)
     shown = []

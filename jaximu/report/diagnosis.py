@@ -23,7 +23,7 @@ from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.noise.deviations import deviation
 from jaximu.report import figures
 from jaximu.report.figures import band, dressed, legend, zero_line
-from jaximu.report.html import Folder, write_page
+from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -86,12 +86,12 @@ def write_diagnosis(diagnosis: Diagnosis, folder: Folder) -> Path:
     )
 
 
-def limit_rows(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+def limit_rows(diagnosis: Diagnosis) -> TextRows:
     """Return each effect with the size up to which it could be there unnoticed."""
     return [(effect_title(name), size(*limit, 2)) for name, limit in sorted(diagnosis.detection_limits.items())]
 
 
-def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, str]]:
+def _by_reason(reasons: Mapping[str, str]) -> TextRows:
     """Return each reason once, with the effects that it hides."""
     return [
         (sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))

@@ -33,12 +33,11 @@ _PANELS = (
 _HOUR = np.degrees(3600.0)
 
 
-def statements(calibration: Calibration, history: History) -> list[Statement]:
+def statements(calibration: Calibration, history: History) -> Iterator[Statement]:
     """Say whether the innovations are noise, when each kind of number was known, and what the Earth's rotation is."""
     assert calibration.filter is not None
-    entries = []
     if (text := calibration.filter.get("diverged")) is not None:
-        entries.append(Statement("Diverged", sentence(text), True))
+        yield Statement("Diverged", sentence(text), True)
     nis = calibration.filter["nis"]
     measured = int(np.sum(history.freedom > 0))
     fits = 0.7 < nis < 1.4
@@ -46,20 +45,17 @@ def statements(calibration: Calibration, history: History) -> list[Statement]:
         f"Over {measured} updates the squared innovations are {number(nis, 2)} times what their uncertainty "
         f"expects: {'noise explains them' if fits else 'an unmodelled effect, or the noise stated is not this unit’s'}."
     )
-    entries.append(Statement("Innovations", text, not fits))
-    entries.append(Statement("Convergence", _convergence(history)))
+    yield Statement("Innovations", text, not fits)
+    yield Statement("Convergence", _convergence(history))
     if (earth := _earth(history)) is not None:
-        entries.append(earth)
+        yield earth
     if (field := np.asarray(calibration.imu.coefficients(SetupMagneticField))).any():
         strength = float(np.linalg.norm(field))
-        entries.append(
-            Statement(
-                "Magnetic field",
-                f"{number(strength)} µT, {np.degrees(np.arcsin(-field[2] / strength)):.1f}° below the "
-                "level: it shows the heading of every rest.",
-            )
+        yield Statement(
+            "Magnetic field",
+            f"{number(strength)} µT, {np.degrees(np.arcsin(-field[2] / strength)):.1f}° below the "
+            "level: it shows the heading of every rest.",
         )
-    return entries
 
 
 def _convergence(history: History) -> str:

@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from html import escape
 from importlib.resources import files
@@ -29,11 +29,13 @@ if TYPE_CHECKING:
     Drawn = Mapping[str, Callable[[], Figure]]
     """Figures by name, each drawn when its turn comes: one that fails takes nothing else with it."""
 
-__all__ = ["Folder", "page", "write_calibration", "write_failure", "write_page", "write_report"]
+__all__ = ["Folder", "TextRows", "page", "write_calibration", "write_failure", "write_page", "write_report"]
 
 
 Folder = str | os.PathLike[str]
 """Where the files of a report go; made if it is missing."""
+TextRows = list[tuple[str, ...]]
+"""The rows of a table, as texts."""
 
 
 def write_report(calibration: Calibration, folder: Folder, title: str | None = None) -> Path:
@@ -75,15 +77,15 @@ def write_calibration(
     calibration: Calibration,
     folder: Folder,
     lead: tuple[str, str, str],
-    trust: Sequence[words.Statement],
-    unknown: Sequence[words.Statement],
+    trust: Iterable[words.Statement],
+    unknown: Iterable[words.Statement],
     drawn: Drawn,
     residuals: tuple[str, str] = ("", ""),
     title: str | None = None,
 ) -> Path:
     """Write the report of any calibration into a folder; return its path.
 
-    **Arguments:** `lead`: the one sentence, the one number and what it means; `said`, `unknown`: what to trust, what
+    **Arguments:** `lead`: the one sentence, the one number and what it means; `trust`, `unknown`: what to trust, what
     the data cannot show; `drawn`: its figures by name, `residuals` for one with these alternative text and caption.
 
     Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
@@ -91,7 +93,7 @@ def write_calibration(
     sources = [
         [str(file.get(key, "")) for key in ("file", "rows", "sha256")] for file in calibration.data.get("files", [])
     ]
-    triads = calibration.triads()
+    triads, trust = calibration.triads(), [*trust]
     return write_page(
         folder,
         "calibration",
@@ -101,7 +103,7 @@ def write_calibration(
         number=lead[1],
         meaning=lead[2],
         trust=trust,
-        limits=unknown,
+        limits=[*unknown],
         weak=len(calibration.weak),
         warnings=[
             statement.about for statement in trust if statement.caution and not statement.about.startswith("What")

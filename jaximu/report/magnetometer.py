@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -50,7 +50,7 @@ def lead(calibration: Calibration) -> Lead:
     )
 
 
-def statements(calibration: Calibration) -> list[Statement]:
+def statements(calibration: Calibration) -> Iterator[Statement]:
     """Say what the field is, what the iron does, and where the field was seen."""
     facts, triad = calibration.magnetic, calibration.imu.magnetometer
     assert facts is not None and triad is not None
@@ -66,46 +66,39 @@ def statements(calibration: Calibration) -> list[Statement]:
     known = " (95 %)"
     if strength["sigma"] > 0.01 * strength["value"]:
         known += "; every gain shares the uncertainty of the strength, which --field or --longitude would narrow"
-    entries = [
+    yield from [
         Statement("The field", f"{text}{known}."),
         Statement("Hard iron", f"{number(iron, 3)} µT, {number(100 * iron / strength['value'], 2)} % of the field."),
         Statement(
             "Soft iron and scale",
-            f"the output changes {number(100 * (axes[0] / axes[-1] - 1), 2)} % more with a field along one direction "
+            f"The output changes {number(100 * (axes[0] / axes[-1] - 1), 2)} % more with a field along one direction "
             "than along another.",
         ),
     ]
     share = facts["coverage"]
     words = "all round" if share > 0.9 else "from most directions" if share > _ENOUGH else "from some directions only"
-    entries.append(
-        Statement(
-            "Directions",
-            f"the field was seen {words}: {100 * share:.0f} % of the sphere lies within 15° of a measured direction.",
-            share < _ENOUGH,
-        )
+    yield Statement(
+        "Directions",
+        f"The field was seen {words}: {100 * share:.0f} % of the sphere lies within 15° of a measured direction.",
+        share < _ENOUGH,
     )
     if facts.get("next") is not None:
-        entries.append(Statement("Next", next_words(facts["next"])))
+        yield Statement("Next", sentence(next_words(facts["next"])))
     if facts["heading_error"] is not None:
         worst = facts["heading_error"]
-        entries.append(
-            Statement(
-                "Heading in other attitudes",
-                f"rolled or pitched by 45°, or upside down, it is good to {number(worst['worst'], 2)}° at the worst "
-                f"(before: off by up to {number(worst['before']['worst'], 2)}°).",
-            )
+        yield Statement(
+            "Heading in other attitudes",
+            f"Rolled or pitched by 45°, or upside down, it is good to {number(worst['worst'], 2)}° at the worst "
+            f"(before: off by up to {number(worst['before']['worst'], 2)}°).",
         )
     spread = facts["norm_spread"]
     if spread["algebraic"] is not None:
-        entries.append(
-            Statement(
-                "Other tools",
-                f"an algebraic ellipsoid, as most tools fit it, leaves {number(100 * spread['algebraic'], 2)} % of the "
-                f"strength on the same parts left out, this calibration {number(100 * spread['after'], 2)} %; the "
-                f"sensor's noise alone makes {number(100 * spread['noise'], 2)} %.",
-            )
+        yield Statement(
+            "Other tools",
+            f"An algebraic ellipsoid, as most tools fit it, leaves {number(100 * spread['algebraic'], 2)} % of the "
+            f"strength on the same parts left out, this calibration {number(100 * spread['after'], 2)} %; the "
+            f"sensor's noise alone makes {number(100 * spread['noise'], 2)} %.",
         )
-    return [entry._replace(text=sentence(entry.text)) for entry in entries]
 
 
 def next_words(plan: dict[str, Any]) -> str:

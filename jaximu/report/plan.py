@@ -16,7 +16,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import Z95
 from jaximu.planning import Proposal
 from jaximu.report import figures
-from jaximu.report.html import Folder, write_page
+from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,7 +52,7 @@ def write_plan(proposal: Proposal, folder: Folder) -> Path:
     )
 
 
-def pose_rows(proposal: Proposal) -> list[tuple[str, ...]]:
+def pose_rows(proposal: Proposal) -> TextRows:
     """Return each pose's number, words and, by hand and on a robot, the turn to it."""
     turns = ["", *(turn.words for turn in proposal.turns)]
     return [
@@ -61,13 +61,13 @@ def pose_rows(proposal: Proposal) -> list[tuple[str, ...]]:
     ]
 
 
-def turn_rows(proposal: Proposal) -> list[tuple[str, str]]:
+def turn_rows(proposal: Proposal) -> TextRows:
     """Return each turn of a table, its number and words; else they stand beside the poses."""
     turns = () if proposal.equipment.chained else proposal.turns
     return [(str(row), turn.words) for row, turn in enumerate(turns, 1)]
 
 
-def sigma_rows(proposal: Proposal) -> list[tuple[str, str, str, str]]:
+def sigma_rows(proposal: Proposal) -> TextRows:
     """Return each parameter in words, its 95 % interval before and after, and how many times smaller it becomes."""
     sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
 

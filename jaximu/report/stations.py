@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +17,7 @@ from jaximu.report.html import Folder, write_calibration
 from jaximu.report.words import (
     Lead,
     Statement,
+    counts,
     gravity_statement,
     how_much_smaller,
     scatter_statements,
@@ -43,7 +45,7 @@ def _lead(calibration: Calibration) -> Lead:
         for name, (before, after, unit) in calibration.rms.items()
     ]
     name, (before, after, unit) = next(iter(calibration.rms.items()))
-    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    poses, turns = counts(calibration)
     return Lead(
         f"Against what the set-up says of {poses} poses and {turns} turns the errors fall (rms): {'; '.join(parts)}.",
         f"{number(after, 2)} {unit}",
@@ -51,21 +53,20 @@ def _lead(calibration: Calibration) -> Lead:
     )
 
 
-def _trust(calibration: Calibration) -> list[Statement]:
+def _trust(calibration: Calibration) -> Iterator[Statement]:
     """Say what to trust: where noise explains the errors, and what no interval contains."""
-    entries = [*scatter_statements(calibration), gravity_statement(calibration)]
+    yield from [*scatter_statements(calibration), gravity_statement(calibration)]
     text = (
         "The intervals are sampling error and the uncertainty of gravity. What the set-up gets wrong every time (a "
         "table that is not level, axes that are not square, a wrong angle) shifts the parameters by as much and is in "
         "no interval; `jaximu budget` computes how much."
     )
-    entries.append(Statement("The set-up", text, not calibration.imu.setup))
-    return entries
+    yield Statement("The set-up", text, not calibration.imu.setup)
 
 
-def _limits(calibration: Calibration) -> list[Statement]:
+def _limits(calibration: Calibration) -> Iterator[Statement]:
     """Say what the data cannot tell."""
-    entries = weak_statements(
+    yield from weak_statements(
         calibration.weak,
         f"All {len(calibration.names)} parameters are determined by these poses and turns; none is weak.",
     )
@@ -73,7 +74,7 @@ def _limits(calibration: Calibration) -> list[Statement]:
         "The body frame is the fixture's, in which the reference states its directions; how the fixture is turned "
         "against the table cannot be distinguished from misalignment."
     )
-    return [*entries, Statement("The fixture", text)]
+    yield Statement("The fixture", text)
 
 
 def _figure(calibration: Calibration) -> Figure:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from jaximu.mistakes.titles import effect_title
 from jaximu.planning.ramps import next_ramps
 from jaximu.recordings.recording import smoothed_slope
 from jaximu.report.figures import dressed, legend, new_figure, zero_line
-from jaximu.report.html import Folder, write_page
+from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,32 +59,31 @@ def _unit(thermal: ThermalCalibration, name: str) -> tuple[float, str]:
     return readable(SENSOR_UNITS[name], np.max(thermal.fits[name].after))
 
 
-def headline(thermal: ThermalCalibration) -> list[str]:
+def headline(thermal: ThermalCalibration) -> Iterator[str]:
     """Return the sentences that a person wants first: what temperature did, what is left, by which model."""
-    span, texts = "{:.0f} and {:.0f} °C".format(*thermal.blocks.range).replace("-", "−"), []
+    span = "{:.0f} and {:.0f} °C".format(*thermal.blocks.range).replace("-", "−")
     included, apart = (", jumps included", ", jumps apart") if thermal.jumps else ("", "")
     for name, fit in thermal.fits.items():
         effects = [effect_title(f"{PREFIXES[name]}.{effect}") for effect in fit.candidate.names]
-        texts.append(
+        yield (
             f"The {name}'s output at rest moves by {_size(name, fit.before)} rms between {span}. "
             f"With {listed(effects) if effects else 'no effect'} modelled, {_size(name, fit.after)} remain"
             f"{included}, {_size(name, fit.candidate.held.rms)} on {_folds(thermal)} left out{apart}."
         )
-    return texts
 
 
 def _folds(thermal: ThermalCalibration) -> str:
     return "ramps" if len(thermal.identifiability.legs) > 3 else "stretches"
 
 
-def rms_rows(thermal: ThermalCalibration, name: str) -> tuple[str, list[tuple[str, ...]]]:
+def rms_rows(thermal: ThermalCalibration, name: str) -> tuple[str, TextRows]:
     """Return the unit, and a row for each axis: rms over temperature, after the model, and on what was left out."""
     (factor, unit), fit = _unit(thermal, name), thermal.fits[name]
     sizes = factor * np.stack([fit.before, fit.after, fit.candidate.held.rms], axis=1)
     return unit, [(axis, *map(number, row)) for axis, row in zip("xyz", sizes.tolist(), strict=True)]
 
 
-def candidate_rows(thermal: ThermalCalibration, name: str) -> list[tuple[str, ...]]:
+def candidate_rows(thermal: ThermalCalibration, name: str) -> TextRows:
     """Return rows of family, effects, rms on what was left out and score; those chosen are marked with their axes."""
     fit = thermal.fits[name]
     rows = []
@@ -101,7 +100,7 @@ def candidate_rows(thermal: ThermalCalibration, name: str) -> list[tuple[str, ..
     return rows
 
 
-def effect_rows(calibration: Calibration) -> list[tuple[str, ...]]:
+def effect_rows(calibration: Calibration) -> TextRows:
     """Return rows of effects' coefficients with 95 % half-widths, three a row, and one for each inner parameter."""
     rows, document = [], calibration.document()
     for name, entry in (item for triad in calibration.triads() for item in document[triad]["effects"].items()):
@@ -145,14 +144,14 @@ def _ways(thermal: ThermalCalibration) -> list[str]:
     ]
 
 
-def _ambient(thermal: ThermalCalibration) -> list[str]:
+def _ambient(thermal: ThermalCalibration) -> Iterator[str]:
     """Say what a regression on the sensor's and the ambient temperature and their rates would leave, where it is known.
 
     The full quadratic of the four has 15 terms, of which an information criterion keeps some.
     """
     blocks = thermal.blocks
     if blocks.ambient is None or np.ptp(blocks.ambient) < LEAST_RANGE or len(blocks) < _ROWS:
-        return []
+        return
     rate = np.concatenate(
         [
             smoothed_slope((blocks.start + blocks.stop)[rows] / 2, blocks.ambient[rows], 3 * blocks.duration)
@@ -160,16 +159,14 @@ def _ambient(thermal: ThermalCalibration) -> list[str]:
         ]
     )
     factors = {"T": blocks.temperature, "dT": blocks.rate, "To": blocks.ambient, "dTo": rate}
-    texts = []
     for name, fit in thermal.fits.items():
         fits = [multifactor(factors, values) for values in _added(thermal, name).T]
         held, kept = np.array([rms for _, rms in fits]), max(len(terms) for terms, _ in fits)
-        texts.append(
+        yield (
             f"The {name} by a regression on sensor and ambient temperature and their rates, at most {kept} of 15 terms "
             f"kept: {_size(name, held)} rms on fifths left out, against {_size(name, fit.candidate.held.rms)} of the "
             f"model above on {_folds(thermal)}."
         )
-    return texts
 
 
 def loss_words(parameters: AutopilotParameters, thermal: ThermalCalibration) -> str:
@@ -297,7 +294,7 @@ def write_thermal(thermal: ThermalCalibration, folder: Folder, exports: Sequence
         "thermal",
         {"covered": partial(covered_figure, thermal), **drawn},
         title=f"Bias over temperature of {names or 'a recording'}",
-        lead=headline(thermal),
+        lead=[*headline(thermal)],
         words=words(thermal),
         effects=effect_rows(thermal.calibration),
         low=number(low),

@@ -17,7 +17,7 @@ from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
 from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, legend, legend_below, new_figure, zero_line
-from jaximu.report.html import Folder, write_page
+from jaximu.report.html import Folder, TextRows, write_page
 from jaximu.report.thermal import effect_rows
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def headline(thermal: HandHeldThermal) -> list[str]:
     return texts
 
 
-def limit_rows(thermal: HandHeldThermal) -> list[tuple[str, str, str]]:
+def limit_rows(thermal: HandHeldThermal) -> TextRows:
     """Return by effect that was not taken in: its detection limit, and what that is at the end of the range.
 
     Of a scale or a misalignment in percent.

@@ -20,7 +20,7 @@ from jaximu.report.tables import short_name
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["write_validity"]
+__all__ = ["kind_words", "write_validity"]
 
 _OUTPUTS = {
     "accelerometer": "accelerometer's output",
@@ -40,7 +40,7 @@ def write_validity(validity: Validity, folder: Folder) -> Path:
     if value is not None:
         shown = with_interval(value.value, value.sigma, value.unit)
         meaning = f"largest error of the {triad} in this recording under the old calibration, 95 % interval"
-    words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.real.kinds}
+    words = kind_words(validity)
     pictures = {"errors": partial(_errors, validity)}
     if any(_drawn(shift) for shift in validity.shifts):
         pictures = {"check": partial(_shifts, validity), **pictures}
@@ -61,6 +61,11 @@ def write_validity(validity: Validity, folder: Folder) -> Path:
             for key, error in validity.output_errors.items()
         ],
     )
+
+
+def kind_words(validity: Validity) -> dict[str, str]:
+    """Return what each kind of error is called."""
+    return {} if validity.experiment is None else {kind.name: kind.words for kind in validity.experiment.real.kinds}
 
 
 def _shift_rows(validity: Validity) -> list[tuple]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -48,6 +48,11 @@ class Statement(NamedTuple):
         return f"{self.about}: {self.text}"
 
 
+def counts(calibration: Calibration) -> tuple[int, int]:
+    """Return the number of poses and of turns that a calibration was made from."""
+    return calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+
+
 def how_much_smaller(before: float, after: float) -> str:
     """Say how much smaller `after` is, in two digits."""
     if not after > 0:
@@ -63,7 +68,7 @@ def how_much_smaller(before: float, after: float) -> str:
 
 def without_freedom(calibration: Calibration) -> Lead:
     """Say that a fit passes through its conditions by construction."""
-    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    poses, turns = counts(calibration)
     return Lead(
         f"{poses} poses and {turns} turns leave no degrees of freedom: the fit passes through them by construction, "
         "and nothing is left to check it by. Record more of them.",
@@ -76,7 +81,7 @@ def lead(calibration: Calibration) -> Lead:
     """Say how far the errors against gravity fall."""
     if calibration.exact:
         return without_freedom(calibration)
-    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    poses, turns = counts(calibration)
     before, after, _ = calibration.rms["gravity_norm"]
     factor, unit = readable("m/s^2", after)
     text = (
@@ -113,23 +118,22 @@ _SCATTER = {
 }
 
 
-def trust(calibration: Calibration) -> list[Statement]:
+def trust(calibration: Calibration) -> Iterator[Statement]:
     """Say what to trust: where noise explains the errors, where not, and what no interval contains."""
-    entries = scatter_statements(calibration)
-    entries += [_new_poses(calibration), gravity_statement(calibration)]
+    yield from scatter_statements(calibration)
+    yield from [_new_poses(calibration), gravity_statement(calibration)]
     if calibration.method.startswith("two-step"):
         text = (
             "The gyroscope was fitted with the accelerometer held fixed: its intervals leave out what the "
             "accelerometer's uncertainty adds."
         )
-        entries.append(Statement("Method", text))
+        yield Statement("Method", text)
     text = (
         "The intervals are sampling error: how far the numbers would scatter if the same unit were recorded again in "
         "the same way. Model error is another thing: what this model (scale, misalignment and bias, near "
         f"{_temperature(calibration)}, at these rates and accelerations) leaves out. No interval contains it."
     )
-    entries.append(Statement("Two kinds of error", text))
-    return entries
+    yield Statement("Two kinds of error", text)
 
 
 def scatter_statements(calibration: Calibration) -> list[Statement]:
@@ -137,7 +141,7 @@ def scatter_statements(calibration: Calibration) -> list[Statement]:
     entries = []
     for name, (about, subject, causes) in _SCATTER.items():
         excess = calibration.excess.get(name)
-        if excess is None or (name == "turns" and not calibration.data.get("turns", 0)):
+        if excess is None or (name == "turns" and not counts(calibration)[1]):
             continue
         times = np.sqrt(1 + excess)
         large = times >= _BEYOND
@@ -155,7 +159,7 @@ def scatter_statements(calibration: Calibration) -> list[Statement]:
 
 def _new_poses(calibration: Calibration) -> Statement:
     """Say what the errors of the fitted poses tell about others: with n poses and p parameters √((n + p)/(n − p))."""
-    poses = int(calibration.data.get("poses", 0))
+    poses, _ = counts(calibration)
     fitted = sum(name.owner == "accelerometer" for name in calibration.names)
     if poses <= fitted + 2:
         text = (
@@ -207,9 +211,9 @@ def weak_statements(weak: Sequence[WeakDirection], *otherwise: str) -> list[Stat
     ] or [Statement("Parameters", text) for text in otherwise]
 
 
-def limits(calibration: Calibration, errors: PoseAndTurnErrors | None) -> list[Statement]:
+def limits(calibration: Calibration, errors: PoseAndTurnErrors | None) -> Iterator[Statement]:
     """Say what the data cannot tell."""
-    entries = weak_statements(
+    yield from weak_statements(
         calibration.weak,
         f"All {len(calibration.names)} parameters are determined by the recording; no combination of them is weak.",
     )
@@ -220,26 +224,23 @@ def limits(calibration: Calibration, errors: PoseAndTurnErrors | None) -> list[S
                 f"The direction {_direction(where)} is {gap:.0f}° away from every direction that pointed up in a pose: "
                 "what the accelerometer does there is extrapolated. Record poses there."
             )
-            entries.append(Statement("Orientations", text, True))
+            yield Statement("Orientations", text, True)
     text = (
         "The body frame is the accelerometer's own: x along its x axis, y in the plane of its x and y axes. How it is "
         "turned against the case cannot be seen without a reference; three entries of the accelerometer's gain are "
         "zero for this reason."
     )
-    entries.append(Statement("The case", text))
+    yield Statement("The case", text)
     missing = "temperature, nonlinearity, time lags, ageing"
     if calibration.imu.gyroscope is None:
-        entries.append(
-            Statement("Gyroscope", "It is not part of this calibration: the accelerometer alone was calibrated.")
-        )
+        yield (Statement("Gyroscope", "It is not part of this calibration: the accelerometer alone was calibrated."))
     else:
         missing += ", the gyroscope's sensitivity to acceleration"
     text = f"Effects beyond scale, misalignment and bias were not tested ({missing})."
     effects = [effect.title for triad in calibration.triads().values() for effect in triad.effects]
     if effects:
         text = f"Effects other than {', '.join(effects)} were not tested."
-    entries.append(Statement("Not modelled", text))
-    return entries
+    yield Statement("Not modelled", text)
 
 
 def _direction(vector: np.ndarray) -> str:
