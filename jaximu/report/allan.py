@@ -256,25 +256,7 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
             continue
         line = factor * _line(term, mean.value, whole)
         panel.plot(whole, line, "--", color="0.3", linewidth=0.9, zorder=2.5)
-        inside = np.flatnonzero((line > bottom * 1.25) & (line < top / 1.25))
-        if not len(inside):
-            continue
-        # the letter stands where the term is farthest below the whole: there it covers no data
-        end = inside[np.argmax((total / line)[inside])]
-        room = line[-1] < line[0] and end < 0.7 * len(whole)
-        spot, align = end, "left" if room else "right"  # beside a line that leaves at the bottom
-        if end < 12 or end > len(whole) - 12:  # on a line that leaves at the side
-            spot, align = (8, "left") if end < 12 else (len(whole) - 8, "right")
-        panel.annotate(
-            f" {term}  {TERM_NAMES[term]} ",
-            (whole[spot], line[spot]),
-            fontsize=8.5,
-            color="0.15",
-            zorder=5,
-            ha=align,
-            va="center",
-            bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
-        )
+        _letter(panel, term, whole, line, total, bottom, top)
     panel.axvspan(longest, right, color="0.88", zorder=1)
     narrow = math.log(right / longest) < 0.19 * math.log(right / left)
     panel.text(
@@ -299,6 +281,23 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
     si.tick_params(labelsize=8)
     dressed(panel, _headline(name, axes))
     panel.grid(True, which="both", color="#EBEBEB", linewidth=0.6)
+
+
+def _letter(
+    panel: Axes, term: str, tau: FloatArray, line: FloatArray, total: FloatArray, bottom: float, top: float
+) -> None:
+    """Name a term's line where it is farthest below the whole: there the letter covers no data."""
+    inside = np.flatnonzero((line > bottom * 1.25) & (line < top / 1.25))
+    if not len(inside):
+        return
+    end = inside[np.argmax((total / line)[inside])]
+    room = line[-1] < line[0] and end < 0.7 * len(tau)
+    spot, align = end, "left" if room else "right"  # beside a line that leaves at the bottom
+    if end < 12 or end > len(tau) - 12:  # on a line that leaves at the side
+        spot, align = (8, "left") if end < 12 else (len(tau) - 8, "right")
+    box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+    text = f" {term}  {TERM_NAMES[term]} "
+    panel.annotate(text, (tau[spot], line[spot]), fontsize=8.5, color="0.15", zorder=5, ha=align, va="center", bbox=box)
 
 
 def _headline(name: str, axes: Sequence[Identified]) -> str:

@@ -16,7 +16,7 @@ from jaximu.ground.quantities import Z95, number, size
 from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import ErrorSource
 from jaximu.report import figures
-from jaximu.report.figures import OTHERS, PALETTE, dressed, legend_below
+from jaximu.report.figures import LEAST_SHARE, OTHERS, PALETTE, dressed, legend_below
 from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ __all__ = [
     "write_budget",
 ]
 
-_LEAST = 0.01  # of a parameter's variance: a source that has it nowhere is drawn among the others
 _GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": "Set-up"}
 
 
@@ -111,7 +110,7 @@ def parameter_rows(budget: Budget) -> TextRows:
         if not budget.determined[index]:
             rows.append((words, "not determined", "", ""))
             continue
-        ranked = [int(row) for row in np.argsort(-part[:, index], kind="stable") if part[row, index] >= 0.01][:3]
+        ranked = [int(row) for row in np.argsort(-part[:, index], kind="stable") if part[row, index] >= LEAST_SHARE][:3]
         made = [f"{budget.sources[row].words} {100 * part[row, index]:.0f} %" for row in ranked]
         wrong = [budget.sources[row].words for row, column in off if column == index]
         made += [f"not linear in {source}" for source in wrong]
@@ -219,7 +218,7 @@ def _figure(budget: Budget) -> Figure:
     owners = [name.owner for name in budget.names]
     columns = [group for group in _GROUPS if group in owners]
     part, order = shares(budget), budget.order()
-    visible = [row for row in order if np.any(part[row, budget.determined] >= _LEAST)][: len(PALETTE)]
+    visible = [row for row in order if np.any(part[row, budget.determined] >= LEAST_SHARE)][: len(PALETTE)]
     stacked = [(budget.sources[row].words, part[row], color) for row, color in zip(visible, PALETTE, strict=False)]
     if others := [row for row in order if row not in visible]:
         stacked.append(("others", part[others].sum(axis=0), OTHERS))

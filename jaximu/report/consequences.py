@@ -12,7 +12,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import Z95, number
 from jaximu.navigation.consequences import Consequences, position
 from jaximu.report import figures
-from jaximu.report.figures import OTHERS, PALETTE, dressed, legend, legend_below
+from jaximu.report.figures import LEAST_SHARE, OTHERS, PALETTE, dressed, legend, legend_below
 from jaximu.report.html import Folder, TextRows, write_page
 from jaximu.report.words import Statement
 
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 __all__ = ["budget_rows", "headers", "headline", "statements", "total_rows", "write_consequences"]
 
 _SHOWN = (1.0, 10.0, 60.0, 600.0)  # s
-_LEAST = 0.01  # of the variance at a time that is shown: a term below it everywhere is drawn among the others
 _COMMON = 0.1  # by how much the calibration's terms together may differ from their root sum of squares unsaid
 
 
@@ -187,7 +186,7 @@ def statements(consequences: Consequences) -> list[Statement]:
 def _budget_figure(consequences: Consequences) -> Figure:
     variances = {name: position(term) ** 2 for name, term in consequences.terms.items()}
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
-    visible = [name for name in _order(consequences) if np.max(variances[name] / whole) >= _LEAST]
+    visible = [name for name in _order(consequences) if np.max(variances[name] / whole) >= LEAST_SHARE]
     drawn, end = visible[: len(PALETTE)], f"after {_end(consequences)}"
     figure = figures.new_figure(7.2)
     above, below = figure.subplots(2, 1, sharex=True)

@@ -6,6 +6,7 @@ Figures are objects; pyplot is not touched.
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -33,17 +34,21 @@ __all__ = [
     "AXES",
     "BEFORE",
     "FLAGGED",
+    "LEAST_SHARE",
     "OTHERS",
     "PALETTE",
     "band",
     "dressed",
     "hemispheres",
+    "legend",
+    "legend_below",
     "logarithmic",
     "new_figure",
     "png",
     "recording_of",
     "residuals_of",
     "signals_figure",
+    "zero_line",
 ]
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
@@ -53,6 +58,8 @@ PALETTE, OTHERS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E
 NOISE, SCATTER = "#56B4E9", "#CFE8F7"
 GAPS = ("white", "#E6E6E6", "#C4C4C4", "#9C9C9C")
 
+LEAST_SHARE = 0.01
+"""Of a variance: what is below it everywhere is drawn among the others."""
 _WIDTH = 9.6  # inches
 _MOST_POINTS = 3000  # drawn of one trace: more than there are pixels
 
@@ -219,19 +226,7 @@ def recording_of(calibration: Calibration) -> Figure:
             label="pose (at rest)",
         )
         dressed(axes, ylabel=label)
-    every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 1000, 10**9) if len(spans) <= 25 * step)
-    for pose, (start, length) in enumerate(spans, start=1):
-        if pose == 1 or pose % every == 0:
-            grid[0].text(
-                start + length / 2,
-                1.01,
-                str(pose),
-                transform=grid[0].get_xaxis_transform(),
-                fontsize=7,
-                ha="center",
-                va="bottom",
-                color="#444444",
-            )
+    _number_poses(grid[0], spans)
     several = f" in {len(parts)} recordings" if len(parts) > 1 else ""
     grid[0].set_title(
         f"{len(spans)} poses found{several}: at rest for {still:.0f} of {shift:.0f} s",
@@ -247,6 +242,15 @@ def recording_of(calibration: Calibration) -> Figure:
     grid[-1].set_xlabel("time (s)" + (", one recording after another" if several else ""))
     legend_below(figure, grid[0], 4)
     return figure
+
+
+def _number_poses(axes: Axes, spans: Sequence[tuple[float, float]]) -> None:
+    """Write the numbers of poses above them, as many as there is room for."""
+    every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 1000, 10**9) if len(spans) <= 25 * step)
+    style = {"fontsize": 7, "ha": "center", "va": "bottom", "color": "#444444"}
+    for pose, (start, length) in enumerate(spans, start=1):
+        if pose == 1 or pose % every == 0:
+            axes.text(start + length / 2, 1.01, str(pose), transform=axes.get_xaxis_transform(), **style)
 
 
 # --- residuals --------------------------------------------------------------------------------------------------------
@@ -414,6 +418,16 @@ def hemispheres(
     return panels, grid
 
 
+def _number_dots(axes: Axes, spots: FloatArray, numbers: NDArray[np.intp]) -> None:
+    """Write one label for all poses on nearly the same spot: their numbers, the first three of them."""
+    left = list(range(len(spots)))
+    while left:
+        near = [dot for dot in left if np.linalg.norm(spots[dot] - spots[left[0]]) < 0.07]
+        text = ", ".join(map(str, numbers[near[:3]])) + (" …" if len(near) > 3 else "")
+        axes.annotate(text, spots[left[0]], (5, 4), textcoords="offset points", fontsize=7, color="#333333", zorder=5)
+        left = [dot for dot in left if dot not in near]
+
+
 def orientation_figure(poses: PoseAndTurnErrors) -> Figure:
     """Draw which way was up in each pose, and where no pose was."""
     figure = new_figure(5.4)
@@ -444,14 +458,7 @@ def orientation_figure(poses: PoseAndTurnErrors) -> Figure:
         for tilt in (30, 60):
             ring = np.sqrt(1 - np.cos(np.radians(tilt)))
             axes.plot(ring * np.cos(circle), ring * np.sin(circle), color="#BBBBBB", linewidth=0.5)
-        left, numbers = list(range(len(spot))), np.flatnonzero(here) + 1
-        while left:  # one label for all poses on nearly the same spot: their numbers, the first three of them
-            near = [dot for dot in left if np.linalg.norm(spot[dot] - spot[left[0]]) < 0.07]
-            text = ", ".join(map(str, numbers[near[:3]])) + (" …" if len(near) > 3 else "")
-            axes.annotate(
-                text, spot[left[0]], (5, 4), textcoords="offset points", fontsize=7, color="#333333", zorder=5
-            )
-            left = [dot for dot in left if dot not in near]
+        _number_dots(axes, spot, np.flatnonzero(here) + 1)
         if (where[2] >= 0) == (sign > 0):
             px, py = _flat(where[None])[0]
             axes.plot(px, py, "x", color="#CC0033", markersize=10, markeredgewidth=2.2, zorder=4)

@@ -19,6 +19,7 @@ from jaximu.ground.summary import sentence
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
 from jaximu.report.figures import dressed
+from jaximu.report.html import MOST_ROWS
 from jaximu.report.html import page as page_of
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ __all__ = [
     "write_fleet",
 ]
 
-_SHOWN = 50  # strangers in the table
 _UNIT, _STRANGER, _PRIOR = figures.AXES.values()
 _KINDS = (
     ("accelerometer", "gain", True, "accelerometer scale", "%", 100.0),
@@ -78,7 +78,7 @@ def _page(fleet: Fleet, document: str) -> bytes:
             probability(stranger.p_value).removeprefix("= "),
             stranger.file,
         )
-        for stranger in fleet.strangers[:_SHOWN]
+        for stranger in fleet.strangers[:MOST_ROWS]
     ]
     statuses = sorted(fleet.statuses.items(), key=lambda item: (item[0] != "ok", -item[1]))
     return page_of(
@@ -95,7 +95,7 @@ def _page(fleet: Fleet, document: str) -> bytes:
         differences=[(_about(difference), difference_words(difference), True) for difference in fleet.differences]
         or [("Lots, dates, devices recorded again", _nothing(fleet))],
         strangers=strangers,
-        more=max(0, len(fleet.strangers) - _SHOWN),
+        more=max(0, len(fleet.strangers) - MOST_ROWS),
         document=document,
         rows=_rows(fleet),
         notes=fleet.notes,

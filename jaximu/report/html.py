@@ -29,13 +29,24 @@ if TYPE_CHECKING:
     Drawn = Mapping[str, Callable[[], Figure]]
     """Figures by name, each drawn when its turn comes: one that fails takes nothing else with it."""
 
-__all__ = ["Folder", "TextRows", "page", "write_calibration", "write_failure", "write_page", "write_report"]
+__all__ = [
+    "MOST_ROWS",
+    "Folder",
+    "TextRows",
+    "page",
+    "write_calibration",
+    "write_failure",
+    "write_page",
+    "write_report",
+]
 
 
 Folder = str | os.PathLike[str]
 """Where the files of a report go; made if it is missing."""
 TextRows = list[tuple[str, ...]]
 """The rows of a table, as texts."""
+MOST_ROWS = 50
+"""Rows of a table that may grow with the number of units: what is beyond is counted."""
 
 
 def write_report(calibration: Calibration, folder: Folder, title: str | None = None) -> Path:

@@ -16,6 +16,7 @@ from jaximu.ground.summary import sentence
 from jaximu.report import figures
 from jaximu.report.certificate import item_row
 from jaximu.report.figures import dressed
+from jaximu.report.html import MOST_ROWS
 from jaximu.report.html import page as page_of
 from jaximu.report.vector import named
 
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 __all__ = ["headline", "line_alarms", "write_line"]
 
-_SHOWN = 50  # items in the table
 _CHARTS = 4  # drawn
 _CAPABLE, _CATEGORIES, _LEVEL = 1.33, 5, 0.01
 _TITLES = {
@@ -77,7 +77,7 @@ def _page(line: Line) -> bytes:
     for about, text in line_alarms(line):
         alarms.setdefault(about, []).append(text)
     items = []
-    for device, item in line.items(_SHOWN):
+    for device, item in line.items(MOST_ROWS):
         row = item_row(item)
         items.append((device, *(row[key] for key in ("name", "value", "limits", "probability", "verdict")), True))
     return page_of(
@@ -90,7 +90,7 @@ def _page(line: Line) -> bytes:
         alarms=alarms,
         quiet=quiet if drawn else "There is nothing to chart: too few units.",
         items=items,
-        more=max(0, total - _SHOWN),
+        more=max(0, total - MOST_ROWS),
         notes=line.notes,
         capability=[_capability(quantity) for quantity in line.followed if quantity.capability],
         gauge=[_gauge(quantity, questions) for quantity in line.followed if quantity.gauge],
