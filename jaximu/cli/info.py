@@ -238,8 +238,8 @@ def _rest(recording: Recording) -> tuple[float, float, float]:
     """Seconds at rest in all, at a stretch, and when that begins: from seconds' scatter and how their means move."""
     import numpy as np
 
-    sensors = [(recording.accelerometer, _STILL_FORCE)]
-    sensors += [] if recording.gyroscope is None else [(recording.gyroscope, _STILL_RATE)]
+    limits = {"accelerometer": _STILL_FORCE, "gyroscope": _STILL_RATE}
+    sensors = [(signal, limits[name]) for name, signal in recording.signals.items() if name in limits]
     start = max(signal.time[0] for signal, _ in sensors)
     seconds = int(min(signal.time[-1] for signal, _ in sensors) - start)
     still = np.ones(max(seconds, 0), bool)

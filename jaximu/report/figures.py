@@ -200,7 +200,7 @@ def recording_of(calibration: Calibration) -> Figure:
         raise InputError(
             "this calibration holds no recording with poses: files and fits to several kinds of data do not keep it."
         )
-    rows = 1 if parts[0].recording.gyroscope is None else 2
+    rows = 1 + ("gyroscope" in parts[0].recording.signals)
     figure = new_figure(2.0 + 2.0 * rows)
     grid = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     shift, still, spans = 0.0, 0.0, []

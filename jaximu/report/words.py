@@ -232,7 +232,7 @@ def limits(calibration: Calibration, errors: PoseAndTurnErrors | None) -> Iterat
     )
     yield Statement("The case", text)
     missing = "temperature, nonlinearity, time lags, ageing"
-    if calibration.imu.gyroscope is None:
+    if "gyroscope" not in calibration.triads():
         yield (Statement("Gyroscope", "It is not part of this calibration: the accelerometer alone was calibrated."))
     else:
         missing += ", the gyroscope's sensitivity to acceleration"

@@ -173,20 +173,10 @@ class ExportedUnit:
             raise InputError("this calibration holds a magnetometer alone, and no accelerometer or gyroscope.")
         return self.triads["accelerometer"]
 
-    @property
-    def magnetometer(self) -> LinearTriad | None:
-        """The magnetometer's, or None."""
-        return self.triads.get("magnetometer")
-
-    @property
-    def gyroscope(self) -> LinearTriad | None:
-        """The gyroscope's, or None."""
-        return self.triads.get("gyroscope")
-
     def kalibr(self) -> dict[str, FloatArray]:
         """The fields of `conventions.Kalibr` on the host; an accelerometer alone gets a perfect gyroscope."""
         self._require("rotations alone", lambda turn: np.linalg.det(turn) > 0)
-        gyroscope = self.gyroscope or LinearTriad(np.eye(3), np.zeros(3), "rad/s")
+        gyroscope = self.triads.get("gyroscope") or LinearTriad(np.eye(3), np.zeros(3), "rad/s")
         view = Kalibr.from_gains(
             self.accelerometer.gain, self.accelerometer.bias, gyroscope.gain, gyroscope.bias, gyroscope.g_sensitivity
         )

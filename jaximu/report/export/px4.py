@@ -37,7 +37,7 @@ def write(parameters: ExportedUnit) -> Written:
     devices = [_SENSORS[name] for name in ("accelerometer", "gyroscope") if name in parameters.triads]
     mine = devices or ["MAG"]  # a magnetometer is a device of its own
     left = [] if parameters.device is not None else [*mine]
-    left += ["MAG"] if devices and parameters.magnetometer is not None else []
+    left += ["MAG"] if devices and "magnetometer" in parameters.triads else []
     rows = [f"1\t1\t{name}\t{value!r}\t{_REAL}" for name, value in values]
     if parameters.device is not None:
         rows += [f"1\t1\tCAL_{sensor}{number}_ID\t{parameters.device}\t{_INTEGER}" for sensor in mine]

@@ -137,8 +137,8 @@ class _Targets:
     """
 
     def __init__(self, calibration: Calibration | ThermalCalibration):
-        self.working = None if isinstance(calibration, Calibration) else calibration
-        self.calibration = calibration if isinstance(calibration, Calibration) else calibration.calibration
+        by_itself = isinstance(calibration, Calibration)
+        self.working, self.calibration = (None, calibration) if by_itself else (calibration, calibration.calibration)
         span = self.calibration.data.get("temperature_range")
         if span is None:
             raise NotPossibleError(
