@@ -14,6 +14,7 @@ from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 
@@ -30,19 +31,19 @@ def run(
     calibrations: Annotated[
         tuple[Path, ...],
         Positional,
-        arg(name="calibrations", metavar="CALIBRATION...", help="calibration.json, or a fleet's TABLE.parquet."),
+        option("CALIBRATION...", "calibration.json, or a fleet's TABLE.parquet.", name="calibrations"),
     ] = (),
     /,
     *,
     limits: Annotated[
-        Path | None, arg(metavar="LIMITS.toml", help="Limits; or TABLE.parquet of a fleet, whose population sets them.")
+        Path | None, option("LIMITS.toml", "Limits; or TABLE.parquet of a fleet, whose population sets them.")
     ] = None,
     noise: Annotated[
-        Path | None, arg(metavar="ALLAN.json", help="From jaximu allan, for limits of noise and repeatability.")
+        Path | None, option("ALLAN.json", "From jaximu allan, for limits of noise and repeatability.")
     ] = None,
     trace: Annotated[
         Path | None,
-        arg(metavar="TRACE.toml", help="Serial number, operator, references …, beside what a calibration says."),
+        option("TRACE.toml", "Serial number, operator, references …, beside what a calibration says."),
     ] = None,
     rule: Annotated[Literal["guarded", "simple"] | None, arg(help="Decision rule, instead of that of LIMITS.")] = None,
     risk: Annotated[
@@ -52,14 +53,12 @@ def run(
         Literal["undecided", "fail", "never"],
         arg(help="Which verdicts end with another exit status than 0: both, fail alone, or none."),
     ] = "undecided",
-    golden: Annotated[
-        str, arg(metavar="DEVICE", help="Of a table: the unit recorded again and again to watch the line.")
-    ] = "",
+    golden: Annotated[str, option("DEVICE", "Of a table: the unit recorded again and again to watch the line.")] = "",
     measurements: Annotated[
         Path | None,
-        arg(
-            metavar="FILE",
-            help="Also write each limit with value and verdict for a test system: .csv, .xml (JUnit), .json (OpenHTF).",
+        option(
+            "FILE",
+            "Also write each limit with value and verdict for a test system: .csv, .xml (JUnit), .json (OpenHTF).",
         ),
     ] = None,
     without_certificate: Annotated[bool, arg(help="Write the verdict alone to DIR.")] = False,
@@ -154,23 +153,30 @@ def _units(
     _refuse_doubled(loaded, paths)
     results.prepare()
     with progress("deciding"):
-        found = [accept(each, limits, known, path) for each, path in zip(loaded, paths, strict=True)]
+        acceptances = [
+            accept(calibration, limits, known, path) for calibration, path in zip(loaded, paths, strict=True)
+        ]
     if results.output is not None and certificate:
-        found = [_with_what_is_missing(each) for each in found]
-    verdict = worst([each.verdict for each in found])
-    text = found[0].text if len(found) == 1 else partial(json.dumps, _together(found, verdict), indent=1)
-    write, names = partial(_write, found, loaded, certificate), "acceptance.json and certificate.html"
-    files = {f"{stem}acceptance.json": (each.text() + "\n").encode() for stem, each in _stems(found).items()}
-    results.give(text, lambda: [_print(each) for each in found], write, names, files)
-    _measurements(found, measurements)
+        acceptances = [_with_what_is_missing(acceptance) for acceptance in acceptances]
+    verdict = worst([acceptance.verdict for acceptance in acceptances])
+    text = (
+        acceptances[0].text if len(acceptances) == 1 else partial(json.dumps, _together(acceptances, verdict), indent=1)
+    )
+    write, names = partial(_write, acceptances, loaded, certificate), "acceptance.json and certificate.html"
+    files = {
+        f"{stem}acceptance.json": (acceptance.text() + "\n").encode()
+        for stem, acceptance in _stems(acceptances).items()
+    }
+    results.give(lambda: [*map(_print, acceptances)], write, names, files, text)
+    _measurements(acceptances, measurements)
     return verdict
 
 
-def _measurements(found: Sequence[Acceptance] | Line, path: Path | None) -> None:
+def _measurements(judged: Sequence[Acceptance] | Line, path: Path | None) -> None:
     if path is not None:
         from jaximu.acceptance.interchange import write_measurements
 
-        write_measurements(found, path)
+        write_measurements(judged, path)
         say(f"Written: {path}")
 
 
@@ -192,23 +198,23 @@ def _loaded(path: Path, trace: Path | None) -> Calibration:
 
 
 def _refuse_doubled(calibrations: Sequence[Calibration], paths: Sequence[Path]) -> None:
-    seen: dict[str, Path] = {}
+    earlier: dict[str, Path] = {}
     for calibration, path in zip(calibrations, paths, strict=True):
         serial = (calibration.trace or {}).get("serial", "")
-        if serial and serial in seen:
-            raise InputError(f"{seen[serial]} and {path} have the same serial number, {serial}: each unit once.")
-        seen[serial] = path
+        if serial and serial in earlier:
+            raise InputError(f"{earlier[serial]} and {path} have the same serial number, {serial}: each unit once.")
+        earlier[serial] = path
 
 
-def _together(found: Sequence[Acceptance], verdict: str) -> dict[str, Any]:
+def _together(acceptances: Sequence[Acceptance], verdict: str) -> dict[str, Any]:
     """Return one document of several units, whose items say which unit they are of."""
-    documents = [each.document() for each in found]
+    documents = [acceptance.document() for acceptance in acceptances]
     items = [
-        item | {"serial": each["serial"], "file": each["calibration"]["file"]}
-        for each in documents
-        for item in each["items"]
+        item | {"serial": document["serial"], "file": document["calibration"]["file"]}
+        for document in documents
+        for item in document["items"]
     ]
-    units = [{key: each[key] for key in ("verdict", "serial", "calibration")} for each in documents]
+    units = [{key: document[key] for key in ("verdict", "serial", "calibration")} for document in documents]
     shared = {key: documents[0][key] for key in ("schema", "limits", "decision", "software")}
     return {**shared, "verdict": verdict, "units": units, "items": items}
 
@@ -227,21 +233,27 @@ def _with_what_is_missing(acceptance: Acceptance) -> Acceptance:
     return replace(acceptance, notes=(*acceptance.notes, text))
 
 
-def _stems(found: Sequence[Acceptance]) -> dict[str, Acceptance]:
+def _stems(acceptances: Sequence[Acceptance]) -> dict[str, Acceptance]:
     """Return units by what their files' names begin with."""
-    if len(found) == 1:
-        return {"": found[0]}
+    if len(acceptances) == 1:
+        return {"": acceptances[0]}
     serials = [
-        "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in each.serial) for each in found
+        "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in acceptance.serial)
+        for acceptance in acceptances
     ]
-    return {f"{serial or place}-": each for place, (serial, each) in enumerate(zip(serials, found, strict=True), 1)}
+    return {
+        f"{serial or number}-": acceptance
+        for number, (serial, acceptance) in enumerate(zip(serials, acceptances, strict=True), 1)
+    }
 
 
-def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], certificate: bool, output: Path) -> list[Path]:
+def _write(
+    acceptances: Sequence[Acceptance], loaded: Sequence[Calibration], certificate: bool, output: Path
+) -> list[Path]:
     from jaximu.recordings.trace import missing
     from jaximu.report.certificate import write_certificate
 
-    units = zip(_stems(found).items(), loaded, strict=True)
+    units = zip(_stems(acceptances).items(), loaded, strict=True)
     return [
         write_certificate(acceptance, calibration, output / f"{stem}certificate.html")
         for (stem, acceptance), calibration in units
@@ -249,29 +261,23 @@ def _write(found: Sequence[Acceptance], loaded: Sequence[Calibration], certifica
     ]
 
 
-def _print(found: Acceptance) -> None:
-    from jaximu.cli.shown import console, table
-    from jaximu.report.certificate import item_row
+def _print(acceptance: Acceptance) -> None:
+    from jaximu.cli.shown import print_all
+    from jaximu.report.certificate import item_row, remarks, sources
 
-    screen = console(120)
-    screen.print(f"{found.file}{f', serial number {found.serial}' if found.serial else ''}: {found.verdict}")
-    rows = [
-        (row["name"], row["value"], row["limits"], row["probability"], row["verdict"])
-        for row in map(item_row, found.items)
-    ]
-    table(screen, ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"), rows)
-    said: dict[str, list[str]] = {}
-    for each in found.items:
-        if text := each.said():
-            said.setdefault(text, []).append(item_row(each)["name"])
-    for text, names in said.items():
-        screen.print(f"{', '.join(names)}: {text}")
-    screen.print(found.rule.words())
-    sources = list(dict.fromkeys(each.source for each in found.items if each.source))
-    if sources:
-        screen.print(f"Limits from: {'; '.join(sources)}.")
-    for note in found.notes:
-        screen.print(f"note: {note}")
+    columns = ("name", "value", "limits", "probability", "verdict")
+    rows = [tuple(row[key] for key in columns) for row in map(item_row, acceptance.items)]
+    serial = f", serial number {acceptance.serial}" if acceptance.serial else ""
+    limits = sources(acceptance)
+    print_all(
+        f"{acceptance.file}{serial}: {acceptance.verdict}",
+        (("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"), rows),
+        *(f"{', '.join(names)}: {text}" for text, names in remarks(acceptance).items()),
+        acceptance.rule.words(),
+        *([f"Limits from: {limits}."] if limits else []),
+        notes=acceptance.notes,
+        width=120,
+    )
 
 
 # --- a fleet's table --------------------------------------------------------------------------------------------------
@@ -287,10 +293,11 @@ def _line(path: Path, limits: Limits | None, golden: str, measurements: Path | N
     with progress("following the line"):
         line = follow(read_table(path), limits, golden)
     results.give(
-        line.text, lambda: print_line(line),
+        lambda: print_line(line),
         lambda folder: later("report.line", "write_line")(line, folder / "report.html", folder / path.name),
-        "acceptance.json, report.html and the table with verdicts", acceptance=line,
-    )  # fmt: skip
+        "acceptance.json, report.html and the table with verdicts",
+        acceptance=line,
+    )
     _measurements(line, measurements)
     return "pass" if limits is None else line.verdict
 

@@ -12,10 +12,7 @@ from jaximu.cli.messages import progress
 from jaximu.ground.gravity import STANDARD
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from jaximu.noise.analysis import NoiseAnalysis
-    from jaximu.noise.filter_noise import FilterNumbers
     from jaximu.recordings.recording import Recording
 
 __all__ = ["document", "run"]
@@ -49,11 +46,11 @@ def run(
         yaml = kalibr_text(analysis).encode("utf-8", "backslashreplace")
     names = "allan.json, allan.png, report.html and Kalibr's imu.yaml"
     results.give(
-        lambda: text,
         lambda: _print(analysis),
         partial(_write, analysis, recordings),
         names,
         {"allan.json": (text + "\n").encode(), "imu.yaml": yaml},
+        lambda: text,
     )
 
 
@@ -65,8 +62,10 @@ def document(analysis: NoiseAnalysis) -> dict[str, Any]:
 
     mean: dict[str, Any] = {}
     for name, quantity in SENSOR_QUANTITIES.items():
-        found = mean_terms(analysis.axes[name]) if name in analysis.axes else None
-        mean[name] = found and {term: each and each.document(SI_UNITS[quantity][term]) for term, each in found.items()}
+        terms = mean_terms(analysis.axes[name]) if name in analysis.axes else None
+        mean[name] = terms and {
+            term: estimate and estimate.document(SI_UNITS[quantity][term]) for term, estimate in terms.items()
+        }
     return analysis.document() | {"mean": mean, "filter": filter_document(analysis)}
 
 
@@ -80,55 +79,40 @@ def _write(analysis: NoiseAnalysis, recordings: list[Recording], folder: Path) -
 
 
 def _print(analysis: NoiseAnalysis) -> None:
-
-    from jaximu.cli.shown import console, table
+    from jaximu.cli.shown import print_all
     from jaximu.ground.quantities import unit_text
     from jaximu.ground.units import SENSOR_QUANTITIES
     from jaximu.noise.filter_noise import filter_numbers
-    from jaximu.report.allan import repeatability_rows, term_rows, unresolved, unseen_notes
+    from jaximu.report.allan import filter_rows, repeatability_rows, term_rows, unresolved, unseen_notes
 
-    screen = console()
     for name, axes in analysis.axes.items():
-        screen.print(
-            f"\n{name}, {analysis.rates[name]:.5g} Hz. Continuous, two-sided, with 95 % intervals; mean: root "
-            "mean square"
-        )
-        made: list[tuple[str, ...]] = []
-        last = ""
+        rows: list[tuple[str, ...]] = []
         for row in term_rows(axes, SENSOR_QUANTITIES[name]):
-            words = "" if row.term == last else f"{row.term} {row.meaning}"
             values, intervals = zip(*row.texts(), strict=True)
-            made.append((words, unit_text(row.unit), *values))
-            if row.term != last:  # the interval once: it is the same share of the value in either unit
-                made.append(("", "", *intervals))
-            last = row.term
-        table(screen, ("term", "unit", "x", "y", "z", "mean"), made)
-        for note in unseen_notes(axes, SENSOR_QUANTITIES[name]):
-            screen.print(note)
+            rows.append((f"{row.term} {row.meaning}" if row.first else "", unit_text(row.unit), *values))
+            if row.first:  # the interval once: it is the same share of the value in either unit
+                rows.append(("", "", *intervals))
+        print_all(
+            f"\n{name}, {analysis.rates[name]:.5g} Hz. Continuous, two-sided, with 95 % intervals; mean: root "
+            "mean square",
+            (("term", "unit", "x", "y", "z", "mean"), rows),
+            *unseen_notes(axes, SENSOR_QUANTITIES[name]),
+        )
     for name in analysis.axes:
-        numbers = filter_numbers(analysis, name)[1]
-        _print_filter(name, numbers, screen)
-    for name, text in unresolved(analysis).items():
-        screen.print(f"\nLength, {name}: {text}")
+        mean = filter_numbers(analysis, name)[1]  # those of the axes are in the report and in allan.json
+        print_all(
+            f"\nFor a Kalman filter, {name} (mean of the axes, SI; Δt = 1/{mean.rate:.5g} s)",
+            (("", "", "value", "unit"), [row for row in filter_rows(mean) if None not in row]),
+        )
+    print_all(*(f"\nLength, {name}: {text}" for name, text in unresolved(analysis).items()))
     if analysis.repeatability:
-        screen.print("\nRepeatability: standard deviation of the bias over the recordings, with its 95 % interval")
-        made = []
-        for row in repeatability_rows(analysis)[::2]:
-            values, intervals = zip(*row.texts(), strict=True)
-            made += [(row.meaning, unit_text(row.unit), *values), ("", "", *intervals)]
-        table(screen, ("", "unit", "x", "y", "z"), made)
-    for note in analysis.notes:
-        screen.print(f"note: {note}")
-
-
-def _print_filter(name: str, numbers: FilterNumbers, screen: Console) -> None:
-    """Print a filter's numbers of a triad's mean; those of the axes are in the report and in allan.json."""
-    from jaximu.cli.shown import table
-    from jaximu.ground.quantities import number, unit_text
-
-    screen.print(f"\nFor a Kalman filter, {name} (mean of the axes, SI; Δt = 1/{numbers.rate:.5g} s)")
-    made = []
-    for key, formula, words, value, unit in numbers.rows():
-        if value is not None:
-            made.append((formula, words, number(value, 8 if key == "decay" else 4), unit_text(unit)))
-    table(screen, ("", "", "value", "unit"), made)
+        rows = []
+        for row in repeatability_rows(analysis):
+            if row.first:
+                values, intervals = zip(*row.texts(), strict=True)
+                rows += [(row.meaning, unit_text(row.unit), *values), ("", "", *intervals)]
+        print_all(
+            "\nRepeatability: standard deviation of the bias over the recordings, with its 95 % interval",
+            (("", "unit", "x", "y", "z"), rows),
+        )
+    print_all(notes=analysis.notes)

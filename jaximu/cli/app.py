@@ -117,12 +117,12 @@ def _groups() -> dict[str, list[str]]:
     return groups | ({"More": more} if more else {})
 
 
-def _parse(name: str, given: Sequence[str]) -> Callable[[], None]:
+def _parse(name: str, arguments: Sequence[str]) -> Callable[[], None]:
     """Return a verb with its arguments. Raises `InputError` for a mistake in them."""
     import tyro
 
     run = _verb(name)
-    line = check_options(name, run, given)
+    line = check_options(name, run, arguments)
 
     @functools.wraps(run)
     def bind(*values, **options) -> Callable[[], None]:
@@ -137,13 +137,13 @@ def _parse(name: str, given: Sequence[str]) -> Callable[[], None]:
         raise usage_mistake(name, run, printed.getvalue()) from None
 
 
-def _common(given: Sequence[str]) -> list[str]:
+def _common(arguments: Sequence[str]) -> list[str]:
     """Take out what every verb takes, and do as it says."""
     from jaximu.cli import messages
 
     messages.level = 1
     rest = []
-    for text in given:
+    for text in arguments:
         if text in ("--quiet", "-q"):
             messages.level = 0
         elif text in ("--verbose", "-v"):
@@ -170,9 +170,9 @@ def _defaults_unchecked() -> Iterator[None]:
         del sys.modules["typeguard"]
 
 
-def _run(given: Sequence[str]) -> int:
+def _run(arguments: Sequence[str]) -> int:
     """Run the verb that comes first with the options that follow it."""
-    name, *rest = given or [""]
+    name, *rest = arguments or [""]
     if name in VERBS:
         if "--help" in rest or "-h" in rest:
             print(help_text(name, _verb(name)))
@@ -204,12 +204,12 @@ def _run(given: Sequence[str]) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
-    given = sys.argv[1:] if arguments is None else arguments
+    line = sys.argv[1:] if arguments is None else arguments
     try:
         with command_line():
-            return _run(given)
+            return _run(line)
     except JaximuError as error:
-        return _failed(str(error.args[0]), error.exit_status, given)
+        return _failed(str(error.args[0]), error.exit_status, line)
     except SystemExit as stop:
         return int(stop.code or 0) if not isinstance(stop.code, str) else 2
     except KeyboardInterrupt:
@@ -218,18 +218,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:  # a defect of ours; a user gets a sentence, a developer the traceback on request
         if os.environ.get("JAXIMU_DEBUG"):
             raise
-        if {"--verbose", "-v"} & set(given):
+        if {"--verbose", "-v"} & set(line):
             import traceback
 
             traceback.print_exc()
         kind = f"{type(error).__name__}: {error}".splitlines()[0]
-        return _failed(f"this should not happen ({kind}); --verbose shows where. Please report it.", 1, given)
+        return _failed(f"this should not happen ({kind}); --verbose shows where. Please report it.", 1, line)
 
 
-def _failed(message: str, status: int, given: Sequence[str]) -> int:
+def _failed(message: str, status: int, arguments: Sequence[str]) -> int:
     """Say what went wrong on stderr, and with --json as a document on stdout too; return the exit status."""
     print(f"jaximu: {message}", file=sys.stderr)
-    if "--json" in given:
+    if "--json" in arguments:
         import json
 
         print(json.dumps({"schema": "jaximu.error/1", "error": message, "exit_status": status}))

@@ -40,19 +40,16 @@ def run(
     from jaximu.calibration import calibrate_array
 
     with progress("calibrating"):
-        found = calibrate_array(recordings, gravity, static=noise, loss=loss, repair=repair)
-    units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(found.units, 1)}
+        array = calibrate_array(recordings, gravity, static=noise, loss=loss, repair=repair)
+    units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(array.units, 1)}
     names = "array.json, report.html and the calibrations"
-    write = options.drawn("array", "write_array", found)
-    results.give(found.text, lambda: _print(found), write, names, {}, array=found, **units)
+    write = options.drawn("array", "write_array", array)
+    results.give(lambda: _print(array), write, names, {}, array.text, array=array, **units)
 
 
-def _print(found: Array) -> None:
-    from jaximu.cli.shown import console, table
+def _print(array: Array) -> None:
+    from jaximu.cli.shown import print_all
     from jaximu.report.array import HEADERS, headline, statements, unit_rows
 
-    screen = console()
-    screen.print(headline(found))
-    table(screen, HEADERS, unit_rows(found), "± is 95 %; positions in the first unit's axes")
-    for text in statements(found):
-        screen.print(text)
+    units = (HEADERS, unit_rows(array), "± is 95 %; positions in the first unit's axes")
+    print_all(headline(array), units, *statements(array))

@@ -11,6 +11,7 @@ from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,15 +21,15 @@ __all__ = ["run"]
 
 
 def run(
-    specification_file: Annotated[Path | None, arg(metavar="SPEC", help="TOML file; --explain describes it.")] = None,
+    specification_file: Annotated[Path | None, option("SPEC", "TOML file; --explain describes it.")] = None,
     /,
     *,
     goal: Annotated[
         tuple[str, ...],
-        arg(metavar="GOAL [GOAL ...]", help='Standard deviations wanted, such as "accelerometer.bias 0.2 mg".'),
+        option("GOAL [GOAL ...]", 'Standard deviations wanted, such as "accelerometer.bias 0.2 mg".'),
     ] = (),
-    check: Annotated[int, arg(metavar="N", help="Compare with N simulated sessions, each calibrated in full.")] = 0,
-    seed: Annotated[int, arg(metavar="N", help="Random seed of these sessions.")] = 0,
+    check: Annotated[int, option("N", "Compare with N simulated sessions, each calibrated in full.")] = 0,
+    seed: Annotated[int, option("N", "Random seed of these sessions.")] = 0,
     explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False,
     results: options.Output = options.RESULTS,
 ) -> None:
@@ -57,25 +58,27 @@ def run(
     task = replace(task, goals=(*task.goals, *map(parse_goal, goal)))
     results.prepare()
     with progress("propagating errors"):
-        found = planning.budget(task, check, seed)
-    write = options.drawn("budget", "write_budget", found)
-    results.give(found.text, lambda: _print(found), write, "budget.json, report.html and budget.png", budget=found)
+        budget = planning.budget(task, check, seed)
+    write = options.drawn("budget", "write_budget", budget)
+    results.give(lambda: _print(budget), write, "budget.json, report.html and budget.png", budget=budget)
 
 
-def _print(found: Budget) -> None:
-    from jaximu.cli.shown import console, table
+def _print(budget: Budget) -> None:
+    from jaximu.cli.shown import print_all
     from jaximu.report.budget import check_words, goal_words, headline, nonlinear_words, parameter_rows, source_rows
 
-    screen = console()
-    headers = ("source", "size (1σ)", "mean share", "most of")
-    table(screen, headers, [*source_rows(found)], "Sources, dominant first")
-    drawn = ["by Monte Carlo"] if found.check else []
-    rows = [(words, sigma, *([simulated] if found.check else []), made)
-            for words, sigma, made, simulated in parameter_rows(found)]  # fmt: skip
-    table(screen, ("parameter", "1σ", *drawn, "made of"), rows, "Parameters")
-    said = [headline(found), *(goal_words(found, goal) for goal in found.goals)]
-    said += [f"not linear: {text}" for text in nonlinear_words(found)]
-    said += [check_words(found)] if found.check else []
-    said += [f"stays open: {text}" for text in found.open] + [f"note: {text}" for text in found.notes]
-    for text in said:
-        screen.print(text)
+    drawn = ["by Monte Carlo"] if budget.check else []
+    rows = [
+        (words, sigma, *([simulated] if drawn else []), made)
+        for words, sigma, made, simulated in parameter_rows(budget)
+    ]
+    print_all(
+        (("source", "size (1σ)", "mean share", "most of"), source_rows(budget), "Sources, dominant first"),
+        (("parameter", "1σ", *drawn, "made of"), rows, "Parameters"),
+        headline(budget),
+        *(goal_words(budget, goal) for goal in budget.goals),
+        *(f"not linear: {text}" for text in nonlinear_words(budget)),
+        *filter(None, [check_words(budget)]),
+        *(f"stays open: {text}" for text in budget.open),
+        notes=budget.notes,
+    )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jaximu.estimation.problem import Loss
     from jaximu.ground.gravity import LocalGravity
 
-__all__ = ["print_calibration", "run"]
+__all__ = ["give_calibration", "print_calibration", "run"]
 
 
 def run(
@@ -53,21 +53,32 @@ def run(
     gravity, trace = local.value(), traced.value(logs)
     results.prepare(*options.INERTIAL[: 1 if method == "accelerometer" else 2])
     if means:
-        meant = {"--static": static, "--effect": effect, "--threshold": poses.threshold, "--repair": repair,
-                 "--gyro-log": log.gyro_log, f"--method {method}": method.startswith("two-step")}  # fmt: skip
-        unusable = [name for name, asked in meant.items() if asked]
-        _give(replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace), results)
+        meant = {
+            "--static": static,
+            "--effect": effect,
+            "--threshold": poses.threshold,
+            "--repair": repair,
+            "--gyro-log": log.gyro_log,
+            f"--method {method}": method.startswith("two-step"),
+        }
+        unusable = [name for name, stated in meant.items() if stated]
+        give_calibration(replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace), results)
         return
     recordings, noise = log.read_unit(logs, gravity, static)
     with progress("calibrating"):
         from jaximu.calibration import calibrate
 
-        names, sigmas = options.effects_of(effect)
         calibration = calibrate(
-            recordings, gravity, static=noise, segmentation=poses.value(), effects=names, effect_sigmas=sigmas,
-            method=method, loss=loss, repair=repair,
-        )  # fmt: skip
-    _give(replace(calibration, trace=trace), results)
+            recordings,
+            gravity,
+            static=noise,
+            segmentation=poses.value(),
+            method=method,
+            loss=loss,
+            repair=repair,
+            **options.effects_of(effect),
+        )
+    give_calibration(replace(calibration, trace=trace), results)
 
 
 def _calibrated_means(
@@ -88,10 +99,12 @@ def _calibrated_means(
         return calibrate_means(read_means(logs[0], log.reading(gravity)), gravity, loss)
 
 
-def _give(calibration: Calibration, results: options.Results) -> None:
-    """Print a calibration by hand and write it where asked."""
-    write = options.drawn("html", "write_report", calibration)
-    results.give(calibration.text, lambda: print_calibration(calibration), write, calibration=calibration)
+def give_calibration(
+    calibration: Calibration, results: options.Results, module: str = "html", name: str = "write_report"
+) -> None:
+    """Print a calibration, and write it and the report of that name where asked."""
+    write = options.drawn(module, name, calibration)
+    results.give(lambda: print_calibration(calibration), write, calibration=calibration)
 
 
 def print_calibration(calibration: Calibration) -> None:

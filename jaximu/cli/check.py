@@ -50,43 +50,43 @@ def run(
     with progress("checking"):
         validity = check(old, recordings, gravity, static=noise, segmentation=poses.value())
     write = options.drawn("validity", "write_validity", validity)
-    results.give(validity.text, lambda: print_validity(validity), write, "check.json and report.html", check=validity)
+    results.give(lambda: _print(validity), write, "check.json and report.html", check=validity)
     if fail_on == "invalid" and validity.verdict not in ("valid", "session"):
         raise SystemExit(1)
 
 
-def print_validity(validity: Validity) -> None:
+def _print(validity: Validity) -> None:
     """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
-    from jaximu.cli.shown import console, table
+    from jaximu.cli.shown import print_all
     from jaximu.ground.quantities import probability, size, with_interval
     from jaximu.mistakes.titles import effect_title
+    from jaximu.report.validity import kind_words
 
-    screen = console()
     data = validity.data
     held = f"{data['poses']} poses, {data['turns']} turns" if validity.history is None else f"{data['updates']} updates"
-    screen.print(f"{data.get('file', 'recording')}: {held}")
-    screen.print(f"{validity.verdict}: {validity.headline()}")
+    print_all(f"{data.get('file', 'recording')}: {held}", f"{validity.verdict}: {validity.headline()}")
     largest = validity.moved or sorted((s for s in validity.shifts if s.tested), key=lambda s: -abs(s.z))[:3]
-    rows = [(each.words, each.amount, each.output, f"{abs(each.z):.1f}") for each in largest]
-    if rows:
+    if largest:
+        headers = ("parameter", "shift ± 95 %", "in the output ± 95 %", "σ")
+        rows = [(shift.words, shift.amount, shift.output, f"{abs(shift.z):.1f}") for shift in largest]
         title = "moved:" if validity.moved else "largest differences, none beyond what is uncertain:"
-        table(screen, ("parameter", "shift ± 95 %", "in the output ± 95 %", "σ"), rows, title)
+        print_all((headers, rows, title))
+    texts = []
     statistic, freedom, p_value = validity.difference
     if freedom:
-        screen.print(f"all {freedom} parameters together: χ² {statistic:.1f}, p {probability(p_value)}")
+        texts.append(f"all {freedom} parameters together: χ² {statistic:.1f}, p {probability(p_value)}")
     for cause in validity.causes:
         rivals = f"; or {', '.join(map(effect_title, cause.rivals))}: this recording cannot tell them apart"
-        screen.print(f"explanation: {cause.sentence}{rivals if cause.rivals else ''}")
-    for name, each in validity.output_errors.items():
+        texts.append(f"explanation: {cause.sentence}{rivals if cause.rivals else ''}")
+    for name, error in validity.output_errors.items():
         where = "rotation over a turn" if name == "turns" else f"{name} output"
-        screen.print(f"{where}: off by up to {with_interval(each.value, each.sigma, each.unit)}")
-    screen.print(validity.bias_words())
+        texts.append(f"{where}: off by up to {with_interval(error.value, error.sigma, error.unit)}")
+    texts.append(validity.bias_words())
     if validity.nis is not None:
-        screen.print(f"squared innovations of the filter: {validity.nis:.2f} times what their uncertainty expects")
-    words = {} if validity.experiment is None else {k.name: k.words for k in validity.experiment.real.kinds}
+        texts.append(f"squared innovations of the filter: {validity.nis:.2f} times what their uncertainty expects")
+    words = kind_words(validity)
     for name, (before, after, unit) in validity.errors.items():
-        screen.print(
+        texts.append(
             f"{words[name]}: rms {size(before, unit)} with this calibration, {size(after, unit)} with a fresh one"
         )
-    for note in validity.notes:
-        screen.print(f"note: {note}")
+    print_all(*texts, notes=validity.notes)

@@ -3,27 +3,28 @@
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
+from jaximu.cli.options import option
 
 __all__ = ["run"]
 
 
 def run(
     calibration: options.CalibrationFile,
-    recording: Annotated[Path, Positional, arg(metavar="LOG", help="The log to correct.")],
+    recording: Annotated[Path, Positional, option("LOG", "The log to correct.")],
     /,
     *,
     output: Annotated[
         Path,
-        arg(
+        option(
+            "OUT",
+            "File to write; the suffix sets the format. OUT.mcap, or OUT without a suffix for a ROS 2 bag, holds "
+            "the log before and after, and how far its magnitude is from gravity.",
             name="output",
             aliases=["-o"],
-            metavar="OUT",
-            help="File to write; the suffix sets the format. OUT.mcap, or OUT without a suffix for a ROS 2 bag, holds "
-            "the log before and after, and how far its magnitude is from gravity.",
         ),
     ],
     log: options.Reading = options.READING,

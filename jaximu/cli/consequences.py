@@ -8,10 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import arg
-
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,41 +29,35 @@ def run(
     calibration: options.CalibrationFile,
     /,
     *,
-    path: Annotated[
-        Path | None, arg(metavar="SPEC|LOG", help="The path (default: ten minutes of level driving).")
-    ] = None,
-    allan: Annotated[Path | None, arg(metavar="ALLAN.JSON", help="Noise, as jaximu allan -o DIR writes it.")] = None,
-    against: Annotated[
-        Path | None, arg(metavar="CALIBRATION", help="Compare with another calibration of the unit.")
-    ] = None,
+    path: Annotated[Path | None, option("SPEC|LOG", "The path (default: ten minutes of level driving).")] = None,
+    allan: Annotated[Path | None, option("ALLAN.JSON", "Noise, as jaximu allan -o DIR writes it.")] = None,
+    against: Annotated[Path | None, option("CALIBRATION", "Compare with another calibration of the unit.")] = None,
     duration: Annotated[
-        float | None, arg(metavar="S", help="Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
+        float | None, option("S", "Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
     ] = None,
     temperature: Annotated[
-        float | None, arg(metavar="DEGC", help="Temperature of level driving (default: the calibration's).")
+        float | None, option("DEGC", "Temperature of level driving (default: the calibration's).")
     ] = None,
-    accel_range: Annotated[
-        str | None, arg(metavar="TEXT", help='Refuse a path beyond this range, such as "16 g".')
-    ] = None,
-    gyro_range: Annotated[str | None, arg(metavar="TEXT", help='The same, such as "2000 deg/s".')] = None,
+    accel_range: Annotated[str | None, option("TEXT", 'Refuse a path beyond this range, such as "16 g".')] = None,
+    gyro_range: Annotated[str | None, option("TEXT", 'The same, such as "2000 deg/s".')] = None,
     draws: Annotated[
-        int, arg(metavar="N", help="Simulated flights with all errors drawn, beside the linear budget; 0 for none.")
+        int, option("N", "Simulated flights with all errors drawn, beside the linear budget; 0 for none.")
     ] = 100,
-    seed: Annotated[int, arg(metavar="N", help="Seed of these draws.")] = 0,
+    seed: Annotated[int, option("N", "Seed of these draws.")] = 0,
     noise_for: Annotated[
         str | None,
-        arg(
-            metavar="LIST",
-            help="Noise for these estimators, enlarged for the motion of the path: gtsam, vins, openvins, lio-sam, "
+        option(
+            "LIST",
+            "Noise for these estimators, enlarged for the motion of the path: gtsam, vins, openvins, lio-sam, "
             "kalibr, px4, ardupilot, separated by commas.",
         ),
     ] = None,
     noise_interval: Annotated[
-        float, arg(metavar="S", help="Time between two states (keyframes, fixes) of that estimator.")
+        float, option("S", "Time between two states (keyframes, fixes) of that estimator.")
     ] = 1.0,
     reference: Annotated[
         Path | None,
-        arg(metavar="REF", help="Attitude (and velocity or position) measured along LOG: noise from the errors seen."),
+        option("REF", "Attitude (and velocity or position) measured along LOG: noise from the errors seen."),
     ] = None,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
@@ -100,21 +93,21 @@ def run(
     noise = None if allan is None else read_sensor_noise(allan)
     _require_densities(targets, noise or {})
     gravity = model.gravity if local == options.LOCAL else local.value()
-    place = Place(_LATITUDE if local.latitude is None else local.latitude, local.height, gravity)
+    site = Place(_LATITUDE if local.latitude is None else local.latitude, local.height, gravity)
     limits = _limits({"accelerometer": accel_range, "gyroscope": gyro_range})
     measured = None
     if reference is not None and path is not None:
-        measured = _measured(path, reference, model, place, log)
-    trajectory, stated = _trajectory(path, model, place, duration, temperature, log, measured)
+        measured = _measured(path, reference, model, site, log)
+    trajectory, stated = _trajectory(path, model, site, duration, temperature, log, measured)
     trajectory.require_range(stated | limits)
     with progress("propagating errors"):
-        found = consequences(
+        result = consequences(
             model, trajectory, noise, draws=draws, seed=seed, against=other, files=(str(calibration), str(against))
         )
-    write = options.drawn("consequences", "write_consequences", found)
+    write = options.drawn("consequences", "write_consequences", result)
     names = "consequences.json, report.html and pictures"
     if not targets:
-        results.give(found.text, lambda: _print(found), write, names, consequences=found)
+        results.give(lambda: _print(result), write, names, consequences=result)
         return
     assert noise is not None
     from jaximu.navigation.estimator_noise import ModelledErrors, estimator_noise
@@ -122,27 +115,27 @@ def run(
     with progress("finding the estimator's noise"):
         sources = [ModelledErrors(model, trajectory, str(calibration)), *([] if measured is None else [measured])]
         estimated = [estimator_noise(source, noise, interval=noise_interval, seed=seed) for source in sources]
-    files = _files(targets, estimated[-1], place.gravity.value)
+    files = _files(targets, estimated[-1], site.gravity.value)
 
     def document() -> str:
         added = estimated[-1].document() | {"files": {name: text.decode() for name, text in files.items()}}
         added |= {} if measured is None else {"expected": estimated[0].document()}
-        return json.dumps(found.document() | {"estimator_noise": added}, indent=1, allow_nan=False)
+        return json.dumps(result.document() | {"estimator_noise": added}, indent=1, allow_nan=False)
 
     def show() -> None:
-        _print(found)
-        for each in estimated:
-            _print_noise(each)
+        _print(result)
+        for estimate in estimated:
+            _print_noise(estimate)
         for name, text in files.items():
             print(f"\n{name}:\n{text.decode()}", end="")
 
     results.give(
-        document,
         show,
         write,
         f"{names}, {', '.join(files)}",
         files,
-        consequences=found,
+        document,
+        consequences=result,
         estimator_noise=estimated[-1],
     )
 
@@ -155,15 +148,15 @@ def _targets(text: str | None, allan: Path | None, reference: Path | None, path:
         raise InputError("--reference goes with --path LOG and --noise-for: it is what was measured along that log.")
     if text is None:
         return []
-    found = list(dict.fromkeys(target(each) for each in text.split(",") if each.strip()))
-    if not found:
+    targets = list(dict.fromkeys(target(name) for name in text.split(",") if name.strip()))
+    if not targets:
         raise InputError("--noise-for names no estimator.")
     if allan is None:
         raise InputError(
             "--noise-for multiplies known noise: give --allan allan.json, which `jaximu allan LOG -o DIR` writes, or a "
             "Kalibr imu.yaml with the data sheet's figures."
         )
-    return found
+    return targets
 
 
 def _require_densities(targets: list[str], noise: dict[str, Any]) -> None:
@@ -178,25 +171,25 @@ def _require_densities(targets: list[str], noise: dict[str, Any]) -> None:
         noise_values(name, known, 1.0)
 
 
-def _measured(path: Path, reference: Path, model: Calibration, place: Place, log: options.LogOptions) -> MeasuredErrors:
+def _measured(path: Path, reference: Path, model: Calibration, site: Place, log: options.LogOptions) -> MeasuredErrors:
     """Return the errors of the calibrated unit along a log against what a reference measured."""
     from jaximu.navigation.estimator_noise import MeasuredErrors
     from jaximu.recordings.readers import read_attitude
 
     with progress("comparing with the reference"):
-        recording = log.alike(model).read(path, place.gravity)
-        return MeasuredErrors.of(model.inertial().imu, recording, read_attitude(reference), place.gravity)
+        recording = log.alike(model).read(path, site.gravity)
+        return MeasuredErrors.of(model.inertial().imu, recording, read_attitude(reference), site.gravity)
 
 
-def _files(targets: list[str], found: EstimatorNoise, gravity: float) -> dict[str, bytes]:
+def _files(targets: list[str], noise: EstimatorNoise, gravity: float) -> dict[str, bytes]:
     """Return the estimators' files by name."""
     from jaximu._version import __version__
     from jaximu.report.export.noise import noise_files
 
-    head = [f"By jaximu {__version__}. {found.headline()}"]
+    head = [f"By jaximu {__version__}. {noise.headline()}"]
     made: dict[str, bytes] = {}
     for name in targets:
-        made |= noise_files(name, found.densities(), found.rate, head, gravity)
+        made |= noise_files(name, noise.densities(), noise.rate, head, gravity)
     return made
 
 
@@ -204,63 +197,65 @@ def _limits(stated: dict[str, str | None]) -> dict[str, float]:
     """Return the ranges that were stated, by triad in SI."""
     from jaximu.model.data_sheet import SI_UNITS, parse_quantity
 
-    found = {}
+    limits = {}
     for triad, text in stated.items():
         if text is not None:
             option, quantity = _LIMITS[triad]
-            found[triad] = parse_quantity(text, SI_UNITS[quantity]["B"], option)
-            if not 0 < found[triad] < math.inf:
+            limits[triad] = parse_quantity(text, SI_UNITS[quantity]["B"], option)
+            if not 0 < limits[triad] < math.inf:
                 raise InputError(f"{option}: {text!r} is no range.")
-    return found
+    return limits
 
 
 def _trajectory(
-    path: Path | None, model: Calibration, place: Place, duration: float | None, temperature: float | None,
-    log: options.LogOptions, measured: MeasuredErrors | None,
-) -> tuple[Trajectory, dict[str, float]]:  # fmt: skip
+    path: Path | None,
+    model: Calibration,
+    site: Place,
+    duration: float | None,
+    temperature: float | None,
+    log: options.LogOptions,
+    measured: MeasuredErrors | None,
+) -> tuple[Trajectory, dict[str, float]]:
     """Return the path, and the ranges that it states."""
     from jaximu.navigation.trajectory import level_driving, of_recording, of_specification
     from jaximu.recordings.recording import Signal
 
     if path is None:
         reference = model.inertial().imu.accelerometer.temperature_reference
-        return level_driving(place, duration or 600.0, reference if temperature is None else temperature), {}
+        return level_driving(site, duration or 600.0, reference if temperature is None else temperature), {}
     with progress("reading the path"):
         if options.is_toml(path):
             from jaximu.simulation import read_specification
 
-            return of_specification(read_specification(path), place, duration)
+            return of_specification(read_specification(path), site, duration)
         try:
-            recording = log.alike(model).read(path, place.gravity)
+            recording = log.alike(model).read(path, site.gravity)
         except InputError as error:
             raise InputError(f"{path} is no specification, and as a log: {error}") from error
         if measured is not None and recording.attitude is None:
             recording = replace(recording, attitude=Signal(measured.stamp, measured.rotation, ""))
-        return of_recording(recording, model, place, duration or 60.0), {}
+        return of_recording(recording, model, site, duration or 60.0), {}
 
 
-def _print(found: Consequences) -> None:
-    from jaximu.cli.shown import console, table
+def _print(consequences: Consequences) -> None:
+    from jaximu.cli.shown import print_all
     from jaximu.report.consequences import budget_rows, headers, headline, statements, total_rows
 
-    screen = console()
-    screen.print(headline(found))
-    screen.print(f"Path: {found.trajectory.words}. Its start is taken as known exactly.\n")
-    table(screen, ("position error, 1σ", *headers(found)), budget_rows(found))
-    screen.print()
-    table(screen, ("everything, 1σ", *headers(found)), total_rows(found))
-    screen.print()
-    for about, text in statements(found):
-        screen.print(f"{about}: {text}")
-    for note in found.notes:
-        screen.print(f"note: {note}")
+    times = headers(consequences)
+    print_all(
+        headline(consequences),
+        f"Path: {consequences.trajectory.words}. Its start is taken as known exactly.\n",
+        (("position error, 1σ", *times), budget_rows(consequences)),
+        "",
+        (("everything, 1σ", *times), total_rows(consequences)),
+        "",
+        *map(str, statements(consequences)),
+        notes=consequences.notes,
+    )
 
 
-def _print_noise(found: EstimatorNoise) -> None:
-    from jaximu.cli.shown import console, table
+def _print_noise(noise: EstimatorNoise) -> None:
+    from jaximu.cli.shown import print_all
 
-    screen = console()
-    screen.print(f"\n{found.headline()}")
-    table(screen, ("multiples of N", *(f"over {length:g} s" for length in found.lengths)), found.rows())
-    for text in (*found.statements(), *(f"note: {each}" for each in found.notes)):
-        screen.print(text)
+    multiples = (("multiples of N", *(f"over {length:g} s" for length in noise.lengths)), noise.rows())
+    print_all(f"\n{noise.headline()}", multiples, *noise.statements(), notes=noise.notes)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import arg
-
 from jaximu.cli import options
 from jaximu.cli.diagnose import give_diagnosis
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 
@@ -32,14 +31,14 @@ _HIDDEN = {
 
 def run(
     *,
-    seed: Annotated[int, arg(metavar="N", help="Random seed of the unit and its noise.")] = 0,
-    effect: Annotated[str | None, arg(metavar="NAME", help="Effect to hide (default: the seed chooses one).")] = None,
+    seed: Annotated[int, option("N", "Random seed of the unit and its noise.")] = 0,
+    effect: Annotated[str | None, option("NAME", "Effect to hide (default: the seed chooses one).")] = None,
     data: Annotated[
-        Path | None, arg(metavar="DIR", help="Only write a simulated phone's recording there, to try commands on.")
+        Path | None, option("DIR", "Only write a simulated phone's recording there, to try commands on.")
     ] = None,
-    output: Annotated[
-        Path, arg(name="output", aliases=["-o"], metavar="DIR", help="Folder for recording and report.")
-    ] = Path("jaximu-demo"),
+    output: Annotated[Path, option("DIR", "Folder for recording and report.", name="output", aliases=["-o"])] = Path(
+        "jaximu-demo"
+    ),
     force: options.ForceFlag = False,
 ) -> None:
     """Simulate a unit with a hidden flaw, diagnose it and write a report: no recording needed.
@@ -93,10 +92,10 @@ def _simulate(imu: Imu, seed: int, output: Path) -> None:
     from jaximu.simulation import consumer_noise, simulate
     from jaximu.simulation.protocols import Environment, HandHeld, Static
 
-    for place, name in enumerate(("recording", "heldout")):
+    for number, name in enumerate(("recording", "heldout")):
         # up and down: on a straight line temperature and time would be one cause
-        warming = Environment(temperature=[[0, 22 - 4 * place], [120, 34 + 4 * place], [220, 27]])
-        simulated, truth = simulate(imu, HandHeld(), consumer_noise(), seed=seed, power_on=place, environment=warming)
+        warming = Environment(temperature=[[0, 22 - 4 * number], [120, 34 + 4 * number], [220, 27]])
+        simulated, truth = simulate(imu, HandHeld(), consumer_noise(), seed=seed, power_on=number, environment=warming)
         write_recording(simulated, output / f"{name}.parquet")
         truth.save(output / f"{name}.parquet.truth.json")
     resting, _ = simulate(imu.with_effects(), Static(1200.0), consumer_noise(), seed=seed, power_on=2)

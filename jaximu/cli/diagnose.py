@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,18 +26,16 @@ def run(
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
     static: options.StaticLog = None,
-    heldout: Annotated[
-        Path | None, arg(metavar="LOG", help="Another recording of the unit, to measure the gain on.")
-    ] = None,
+    heldout: Annotated[Path | None, option("LOG", "Another recording of the unit, to measure the gain on.")] = None,
     reference: Annotated[
         Path | None,
-        arg(
-            metavar="REF",
-            help="What the turntable or fixture did, as for jaximu turntable (LOG itself if it has reference "
+        option(
+            "REF",
+            "What the turntable or fixture did, as for jaximu turntable (LOG itself if it has reference "
             "columns): errors of the set-up are then tested as well. Or a measured attitude, as for jaximu reference.",
         ),
     ] = None,
-    heldout_reference: Annotated[Path | None, arg(metavar="REF", help="The same for the held-out recording.")] = None,
+    heldout_reference: Annotated[Path | None, option("REF", "The same for the held-out recording.")] = None,
     thermal: Annotated[
         bool, arg(help="The unit was at rest while the temperature changed: test thermal effects only.")
     ] = False,
@@ -81,41 +81,34 @@ def run(
     other = None if heldout is None else log.read(heldout, gravity)
     from jaximu.diagnosis import diagnose, diagnose_against_attitude, diagnose_thermal, diagnose_turntable
 
+    held: Any = other
     if thermal:
-        with progress("diagnosing"):
-            diagnosis = diagnose_thermal(recordings, static=noise, heldout=other)
+        work = partial(diagnose_thermal, recordings)
     elif reference is None:
-        with progress("diagnosing"):
-            diagnosis = diagnose(
-                recordings, gravity, static=noise, heldout=other, segmentation=poses.value(), repair=repair
-            )  # fmt: skip
+        work = partial(diagnose, recordings, gravity, segmentation=poses.value(), repair=repair)
     elif measured:
         from jaximu.cli.reference import read_reference
 
         attitude = read_reference(reference, logs[0], recordings[0])
-        with progress("diagnosing"):
-            diagnosis = diagnose_against_attitude(recordings[0], attitude, gravity, static=noise, repair=repair)
+        work = partial(diagnose_against_attitude, recordings[0], attitude, gravity, repair=repair)
     else:
         from jaximu.cli.turntable import references_of
 
         (entries,) = references_of(recordings, [reference])
-        held = None
+        work = partial(diagnose_turntable, recordings[0], entries, gravity, repair=repair)
         if other is not None and heldout_reference is not None:
-            others = [other]
-            (said,) = references_of(others, [heldout_reference])
-            held = others[0], said
-        with progress("diagnosing"):
-            diagnosis = diagnose_turntable(recordings[0], entries, gravity, static=noise, heldout=held, repair=repair)
-    if not thermal and any(each.rivals or each.weak for each in diagnosis.named):
+            others = [other]  # whose reference columns are put beside its signals
+            (schedule,) = references_of(others, [heldout_reference])
+            held = others[0], schedule
+    with progress("diagnosing"):
+        diagnosis = work(static=noise, **({} if held is None else {"heldout": held}))
+    if not thermal and any(effect.rivals or effect.weak for effect in diagnosis.named):
         from jaximu.planning.separation import advised
 
         with progress("looking for a recording that would separate the causes"):
             diagnosis = advised(diagnosis)
     give_diagnosis(diagnosis, results)
-    if (
-        diagnosis.verdict
-        in {"never": (), "unexplained": ("unexplained",), "effects": ("effects", "unexplained")}[fail_on]
-    ):
+    if fail_on != "never" and diagnosis.verdict in ("unexplained", fail_on):
         raise SystemExit(1)
 
 
@@ -123,52 +116,61 @@ def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
     """Print a diagnosis; write it, the extended calibration and the report where asked."""
     documents = {} if results.output is None else {"calibration": diagnosis.extended_calibration()}
     results.give(
-        diagnosis.text, lambda: print_diagnosis(diagnosis), options.drawn("diagnosis", "write_diagnosis", diagnosis),
-        "diagnosis.json, calibration.json and report.html", {}, diagnosis=diagnosis, **documents,
-    )  # fmt: skip
+        lambda: print_diagnosis(diagnosis),
+        options.drawn("diagnosis", "write_diagnosis", diagnosis),
+        "diagnosis.json, calibration.json and report.html",
+        {},
+        diagnosis.text,
+        diagnosis=diagnosis,
+        **documents,
+    )
 
 
 def print_diagnosis(diagnosis: Diagnosis) -> None:
     """Print the sentence, the effects with their evidence, and what else a person should know."""
-    from jaximu.cli.shown import console, table
-    from jaximu.ground.quantities import probability, size
+    from jaximu.cli.shown import console, print_all
+    from jaximu.ground.quantities import probability
     from jaximu.ground.summary import sentence
     from jaximu.mistakes.titles import effect_title
+    from jaximu.report.diagnosis import limit_rows
 
-    screen = console()
-    screen.print(diagnosis.summary().title, style="bold")
-    screen.print(f"{diagnosis.verdict}: {diagnosis.headline()}")
-    for finding in diagnosis.preflight:
-        screen.print(f"- {sentence(effect_title(finding.name))}. {sentence(finding.text)}")
+    console().print(diagnosis.summary().title, style="bold")
+    print_all(
+        f"{diagnosis.verdict}: {diagnosis.headline()}",
+        *(f"- {sentence(effect_title(finding.name))}. {sentence(finding.text)}" for finding in diagnosis.preflight),
+    )
     if diagnosis.effects:
         rows = [
-            (effect_title(each.name), "\n".join(each.numbers()), each.evidence + (" (weak)" if each.weak else ""),
-             "\n".join(map(effect_title, each.rivals))) for each in diagnosis.effects
-        ]  # fmt: skip
-        table(screen, ("effect", "coefficients ± 95 %", "evidence", "or"), rows)
+            (
+                effect_title(effect.name),
+                "\n".join(effect.numbers()),
+                effect.evidence + (" (weak)" if effect.weak else ""),
+                "\n".join(map(effect_title, effect.rivals)),
+            )
+            for effect in diagnosis.effects
+        ]
+        print_all((("effect", "coefficients ± 95 %", "evidence", "or"), rows))
+    texts = []
     gain, words = diagnosis.gain, {kind.name: kind.words for kind in diagnosis.experiment.real.kinds}
     if gain is not None:
         before, after = (part.chi_squared / part.count for part in (gain.before, gain.after))
-        screen.print(
+        texts.append(
             f"On data not fitted ({gain.data}): χ² per condition {before:.2f} → {after:.2f}, log-likelihood "
             f"{gain.log_likelihood:+.1f}."
         )
-        for kind in gain.before.rms:
-            screen.print(f"  {words[kind]}: rms {gain.errors(kind)}")
+        texts += [f"  {words[kind]}: rms {gain.errors(kind)}" for kind in gain.before.rms]
     wrong = sorted((check for check in diagnosis.checks if check.adjusted < 1e-2), key=lambda check: check.adjusted)
-    for check in wrong[:6]:
-        screen.print(f"base model: {check.text} (p {probability(check.adjusted)})")
+    texts += [f"base model: {check.text} (p {probability(check.adjusted)})" for check in wrong[:6]]
     learned = diagnosis.learned
     if learned is not None:
-        for kind in learned.gain.before.rms:
-            screen.print(f"  {words[kind]}, with {learned.effect.title}: rms {learned.gain.errors(kind)}")
+        gain, title = learned.gain, learned.effect.title
+        texts += [f"  {words[kind]}, with {title}: rms {gain.errors(kind)}" for kind in gain.before.rms]
+    print_all(*texts)
     if not diagnosis.effects:
-        limits = sorted(diagnosis.detection_limits.items())
-        rows = [(effect_title(name), size(value, unit, 2)) for name, (value, unit) in limits]
-        table(screen, ("effect", "could be up to this size unnoticed (90 % power)"), rows, "Detection limits")
+        headers = ("effect", "could be up to this size unnoticed (90 % power)")
+        print_all((headers, limit_rows(diagnosis), "Detection limits"))
     if diagnosis.unit > 1.05:
-        screen.print(f"- Remaining scatter: {diagnosis.unit:.2f} × noise. The tests allow for it.")
+        print_all(f"- Remaining scatter: {diagnosis.unit:.2f} × noise. The tests allow for it.")
     if diagnosis.suggestion:
-        screen.print(f"Next: {diagnosis.suggestion}")
-    for note in diagnosis.notes:
-        screen.print(f"- {sentence(note)}")
+        print_all(f"Next: {diagnosis.suggestion}")
+    print_all(*(f"- {sentence(note)}" for note in diagnosis.notes))

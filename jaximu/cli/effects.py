@@ -6,9 +6,8 @@ import difflib
 import inspect
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import arg
-
 from jaximu.cli import options
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import joined, plain, unit_text
 
@@ -19,7 +18,7 @@ __all__ = ["run"]
 
 
 def run(
-    name: Annotated[str | None, arg(metavar="[NAME]", help="Show this effect in full.")] = None,
+    name: Annotated[str | None, option("[NAME]", "Show this effect in full.")] = None,
     /,
     *,
     as_json: options.JsonFlag = False,
@@ -54,7 +53,7 @@ def _entry(kind: type[Effect]) -> dict[str, Any]:
         "formula": kind.formula,
         "coefficients": kind.size,
         "unit": kind.unit,
-        "inner": {name: each._asdict() for name, each in kind.inner.items()},
+        "inner": {name: parameter._asdict() for name, parameter in kind.inner.items()},
         "scope": kind.scope,
         "acts_on": "set-up" if kind.owner == "setup" else kind.refers_to,
         "needs": list(kind.needs),
@@ -103,15 +102,17 @@ def _print_entry(kind: type[Effect]) -> None:
         "acts on": "what the sensors go through, as against what the set-up says"
         if kind.owner == "setup"
         else {"input": "what the axes sense, before the gain", "output": "what the axes put out"}[kind.refers_to],
-        "needs": ", ".join(each.replace("_", " ") for each in kind.needs),
+        "needs": ", ".join(need.replace("_", " ") for need in kind.needs),
         "excited by": kind.excited_by,
         "easily taken for": ", ".join(kind.look_alikes) or "nothing else in the catalogue",
         "compensation": kind.recovery,
         "source": kind.source,
     }
-    for inner, each in kind.inner.items():
-        usual = joined(plain(each.typical), unit_text(each.unit))
-        rows[inner.replace("_", " ")] = f"{each.meaning}; {usual}, from {plain(each.low)} to {plain(each.high)}"
+    for inner, parameter in kind.inner.items():
+        usual = joined(plain(parameter.typical), unit_text(parameter.unit))
+        rows[inner.replace("_", " ")] = (
+            f"{parameter.meaning}; {usual}, from {plain(parameter.low)} to {plain(parameter.high)}"
+        )
     from rich.table import Table
 
     table = Table(show_header=False, box=None, padding=(0, 2))

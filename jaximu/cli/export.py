@@ -6,10 +6,9 @@ import math
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import arg
-
 from jaximu.cli import options
 from jaximu.cli.messages import say
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.report.export.catalogue import WRITERS, writer
 from jaximu.report.export.noise import TARGETS
@@ -21,24 +20,20 @@ def run(
     calibration: options.CalibrationFile,
     /,
     *,
-    to: Annotated[str, arg(metavar="FORMAT", help=f"One of {', '.join(WRITERS)}.")],
+    to: Annotated[str, option("FORMAT", f"One of {', '.join(WRITERS)}.")],
     output: Annotated[
-        Path | None, arg(name="output", aliases=["-o"], metavar="FILE", help="Default: beside CALIBRATION.")
+        Path | None, option("FILE", "Default: beside CALIBRATION.", name="output", aliases=["-o"])
     ] = None,
-    noise: Annotated[
-        Path | None, arg(metavar="IMU.YAML", help="Noise densities, as jaximu allan -o DIR writes them.")
-    ] = None,
+    noise: Annotated[Path | None, option("IMU.YAML", "Noise densities, as jaximu allan -o DIR writes them.")] = None,
     axes: Annotated[
         str | None,
-        arg(metavar="MAP", help="The --axes used for calibration, where CALIBRATION does not say how it was read."),
+        option("MAP", "The --axes used for calibration, where CALIBRATION does not say how it was read."),
     ] = None,
-    instance: Annotated[int, arg(metavar="N", help="Which of the autopilot's sensors, from 0.")] = 0,
-    device: Annotated[int | None, arg(metavar="ID", help="The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None,
-    rate_range: Annotated[
-        float, arg(metavar="DEG/S", help="State the error of what the file leaves out up to this rate.")
-    ] = 250,
+    instance: Annotated[int, option("N", "Which of the autopilot's sensors, from 0.")] = 0,
+    device: Annotated[int | None, option("ID", "The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None,
+    rate_range: Annotated[float, option("DEG/S", "State the error of what the file leaves out up to this rate.")] = 250,
     temperature_range: Annotated[
-        str | None, arg(metavar="LOW,HIGH", help="State it between these temperatures in °C (default: ±20 K).")
+        str | None, option("LOW,HIGH", "State it between these temperatures in °C (default: ±20 K).")
     ] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
@@ -70,23 +65,26 @@ def run(
     written, paths = export(parameters, to, path)
     lost = losses(parameters, written, extent)
     axes = (written.parameters or parameters).axes
-    left = [each.title for triad in model.imu.triads().values() for each in triad.effects if each.scope != "device"]
+    left = [
+        effect.title for triad in model.imu.triads().values() for effect in triad.effects if effect.scope != "device"
+    ]
     if as_json:
-        document = {
-            "format": to,
-            "files": [str(each) for each in paths],
-            "axes": axes,
-            "convention": written.convention,
-            "equation": written.equation,
-            "range": extent.text(),
-            "losses": [{"what": each.what, "worst": each.worst, "rms": each.rms} for each in lost],
-        }
-        options.print_json(document)
+        options.print_json(
+            {
+                "format": to,
+                "files": [str(path) for path in paths],
+                "axes": axes,
+                "convention": written.convention,
+                "equation": written.equation,
+                "range": extent.text(),
+                "losses": [vars(loss) for loss in lost],
+            }
+        )
         return
     print(f"{axes}\n\nConvention: {written.convention}\n\nApply:\n{written.equation}\n")
     if lost:
         print(f"Not in the file, and what that costs over {extent.text()}:")
-        print("\n".join(f"- {each.text()}" for each in lost))
+        print("\n".join(f"- {loss.text()}" for loss in lost))
     if left:
         print(f"- {', '.join(left)}: of one session, not of the unit, and never exported.")
     say(f"Written: {', '.join(map(str, paths))}")

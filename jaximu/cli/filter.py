@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.cli.reference import read_reference
 from jaximu.ground.errors import InputError
 
@@ -20,30 +21,30 @@ __all__ = ["run"]
 
 
 def run(
-    log_path: Annotated[Path, Positional, arg(name="log", metavar="LOG", help="A recording that begins at rest.")],
+    log_path: Annotated[Path, Positional, option("LOG", "A recording that begins at rest.", name="log")],
     /,
     *,
     online: Annotated[
         Path | None,
-        arg(
-            metavar="CALIBRATION",
-            help="Follow this calibrated unit through LOG, sample by sample: what changes, and is it this unit?",
+        option(
+            "CALIBRATION",
+            "Follow this calibrated unit through LOG, sample by sample: what changes, and is it this unit?",
         ),
     ] = None,
     reference: Annotated[
         Path | None,
-        arg(
-            metavar="REF",
-            help="A measured attitude as a further measurement, with its own clock: a table with time and quaternion, "
+        option(
+            "REF",
+            "A measured attitude as a further measurement, with its own clock: a table with time and quaternion, "
             "Euler angles, rotation vectors or a table's angles (table_angle_z, table_angle_x …, outermost axis first) "
             "and velocity or position if known; may be LOG itself.",
         ),
     ] = None,
     magnetometer: Annotated[
         Path | None,
-        arg(
-            metavar="CALIBRATION",
-            help="A calibration of the magnetometer in LOG (`jaximu magnetometer`): the Earth's field as a further "
+        option(
+            "CALIBRATION",
+            "A calibration of the magnetometer in LOG (`jaximu magnetometer`): the Earth's field as a further "
             "measurement, which shows the heading of every rest.",
         ),
     ] = None,
@@ -83,30 +84,32 @@ def run(
     attitude = None if reference is None else read_reference(reference, log_path, recording)
     with progress("filtering" if old is None else "following"):
         if old is None:
-            names, sigmas = options.effects_of(effect)
             calibration, history = calibrate_by_filter(
-                recording, gravity, attitude=attitude, latitude=local.latitude, static=still, effects=names,
-                effect_sigmas=sigmas, repair=repair,
+                recording,
+                gravity,
+                attitude=attitude,
+                latitude=local.latitude,
+                static=still,
+                repair=repair,
                 magnetometer=compass,
-            )  # fmt: skip
+                **options.effects_of(effect),
+            )
         else:
             noise = None if still is None else fit_noise(still)
-            place = gravity if local != options.LOCAL else None
-            calibration, history = followed_in_use(old, recording, noise, place, attitude, compass)
+            stated = gravity if local != options.LOCAL else None
+            calibration, history = followed_in_use(old, recording, noise, stated, attitude, compass)
     results.give(
-        calibration.text, lambda: _print(calibration, history),
-        options.drawn("filter", "write_filter_report", calibration, history), calibration=calibration,
-    )  # fmt: skip
+        lambda: _print(calibration, history),
+        options.drawn("filter", "write_filter_report", calibration, history),
+        calibration=calibration,
+    )
 
 
 def _print(calibration: Calibration, history: History) -> None:
-    from jaximu.cli.shown import console
+    from jaximu.cli.shown import print_all
     from jaximu.report.attitude import mounting_words
     from jaximu.report.filter import statements
 
     print_calibration(calibration)
-    screen = console()
-    for text in mounting_words(calibration) if calibration.reference else ():
-        screen.print(text)
-    for each in statements(calibration, history):
-        screen.print(f"{each.about}: {each.text}")
+    mounting = mounting_words(calibration) if calibration.reference else []
+    print_all(*mounting, *map(str, statements(calibration, history)))

@@ -8,13 +8,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
+
+if TYPE_CHECKING:
+    from jaximu.fleets.population import Fleet
 
 __all__ = ["run"]
 
@@ -26,35 +30,31 @@ def run(
     logs: Annotated[
         tuple[str, ...],
         Positional,
-        arg(name="logs", metavar="LOGS...", help="Logs, folders, patterns in quotes, or a manifest (CSV)."),
+        option("LOGS...", "Logs, folders, patterns in quotes, or a manifest (CSV).", name="logs"),
     ],
     /,
     *,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
     output: Annotated[
-        Path | None, arg(name="output", aliases=["-o"], metavar="TABLE.parquet", help="The table to write.")
+        Path | None, option("TABLE.parquet", "The table to write.", name="output", aliases=["-o"])
     ] = None,
     static: Annotated[
         Path | None,
-        arg(
-            metavar="LOG|DIR",
-            help="A recording at rest to measure the noise, or a folder of them, each named after its device.",
+        option(
+            "LOG|DIR", "A recording at rest to measure the noise, or a folder of them, each named after its device."
         ),
     ] = None,
     diagnose: Annotated[bool, arg(help="Also diagnose each recording.")] = False,
     engine: Annotated[Literal["local", "ray"], arg(help="Processes on this machine, or a Ray cluster.")] = "local",
-    workers: Annotated[int | None, arg(metavar="N", help="Number of processes (default: one per core).")] = None,
+    workers: Annotated[int | None, option("N", "Number of processes (default: one per core).")] = None,
     field: options.FieldText = None,
     poses: options.Poses = options.POSES,
     limits: Annotated[
         Path | None,
-        arg(
-            metavar="LIMITS.toml",
-            help="Hold every unit to these limits, and follow the line; see jaximu accept --explain.",
-        ),
+        option("LIMITS.toml", "Hold every unit to these limits, and follow the line; see jaximu accept --explain."),
     ] = None,
-    golden: Annotated[str, arg(metavar="DEVICE", help="With --limits: the unit that watches the line.")] = "",
+    golden: Annotated[str, option("DEVICE", "With --limits: the unit that watches the line.")] = "",
     as_json: options.JsonFlag = False,
 ) -> None:
     """Calibrate many units: one row per recording in one Parquet table, and a report on the population.
@@ -92,7 +92,7 @@ def run(
     jobs = find_jobs(logs, output, static)
     if static is not None and (without := sum(not job.static for job in jobs)):
         say(f"{without} of {len(jobs)} have no recording at rest: their noise is estimated from their own poses.")
-    stated = {each.name: getattr(log, each.name) for each in fields(log)}
+    stated = {option.name: getattr(log, option.name) for option in fields(log)}
     settings = Settings(
         options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
         gravity=local.value(),
@@ -106,9 +106,8 @@ def run(
     except KeyboardInterrupt:
         say(f"{kept_rows(output)} of {len(jobs)} rows are kept: the same command goes on from there.")
         raise
-    from jaximu.fleets.field import field_words
-    from jaximu.fleets.population import read_fleet  # only now: what they import takes a second
-    from jaximu.report.fleet import difference_words, failure_words, headline, write_fleet
+    from jaximu.fleets.population import read_fleet  # only now: what it imports takes a second
+    from jaximu.report.fleet import write_fleet
 
     with progress("questioning the fleet"):
         fleet = read_fleet(output)
@@ -124,25 +123,31 @@ def run(
         line.save(document)
         written += [*options.draw(lambda: write_line(line, page, output)[-1:], page), document]
     if as_json:
-        found = fleet.document() | ({"acceptance": line.document()} if line else {})
-        options.print_json(found)
+        options.print_json(fleet.document() | ({"acceptance": line.document()} if line else {}))
         return
     print(f"{len(jobs)} recordings: {', '.join(f'{count} {status}' for status, count in statuses.most_common())}.")
-    for reason, files, count in failure_words(fleet, 5, 3):
-        print(f"  {count} not calibrated: {reason}{f' ({files})' if files else ''}")
-    print(headline(fleet))
-    for each in field_words(output):
-        print(each)
-    for each in fleet.differences[:5]:
-        print(f"{difference_words(each)}.")
-    if fleet.strangers:
-        shown = ", ".join(each.device for each in fleet.strangers[:10])
-        print(f"units that do not belong: {shown}{' …' if len(fleet.strangers) > 10 else ''}")
+    _print(fleet, output)
     if line is not None:
         from jaximu.cli.accept import print_line
 
         print_line(line)
     print(f"Written: {', '.join(map(str, (output, *written)))}")
+
+
+def _print(fleet: Fleet, table: Path) -> None:
+    """Print what failed, what the fleet shows, and which lots, dates and units differ."""
+    from jaximu.fleets.field import field_words
+    from jaximu.report.fleet import difference_words, failure_words, headline
+
+    for reason, files, count in failure_words(fleet, 5, 3):
+        print(f"  {count} not calibrated: {reason}{f' ({files})' if files else ''}")
+    for text in (headline(fleet), *field_words(table)):
+        print(text)
+    for difference in fleet.differences[:5]:
+        print(f"{difference_words(difference)}.")
+    if fleet.strangers:
+        shown = ", ".join(stranger.device for stranger in fleet.strangers[:10])
+        print(f"units that do not belong: {shown}{' …' if len(fleet.strangers) > 10 else ''}")
 
 
 @contextmanager

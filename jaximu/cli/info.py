@@ -47,12 +47,12 @@ def run(
     if not logs:
         raise InputError("no log was given: name one or more files.")
     stated = [log.with_gyroscope(path) for path in logs]
-    documents = [_describe(*_read(*each)) for each in zip(stated, logs, strict=True)]
+    documents = [_describe(*_read(*pair)) for pair in zip(stated, logs, strict=True)]
     if as_json:
         options.print_json(documents[0] if len(documents) == 1 else documents)
         return
-    for path, document, each in zip(logs, documents, stated, strict=True):
-        _print(document, path, each.line())
+    for path, document, reading in zip(logs, documents, stated, strict=True):
+        _print(document, path, reading.line())
 
 
 def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
@@ -80,13 +80,15 @@ def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None
                 continue
         if recording is None or (log.rate is not None and not (advice and advice.line()) and not scales):
             raise
-    said = []
+    notes = []
     if log.rate is None and any("stamps from --rate" in note for note in recording.notes):
-        said.append(f"no time column: {_ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
+        notes.append(f"no time column: {_ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
     if any(scale == "1" for scale in scales.values()):
-        said.append("raw counts: state scales with --accel-scale and --gyro-scale (the accelerometer's is also found "
-                    "from gravity, given poses all around)")  # fmt: skip
-    return recording, advice, said
+        notes.append(
+            "raw counts: state scales with --accel-scale and --gyro-scale (the accelerometer's is also found "
+            "from gravity, given poses all around)"
+        )
+    return recording, advice, notes
 
 
 def _shown(advice: Advice) -> str:
@@ -100,89 +102,106 @@ def _shown(advice: Advice) -> str:
 
 
 def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -> dict[str, Any]:
-    import numpy as np
-
+    """Return what the log holds, what was noticed, and what it can be used for: as `--json` prints it."""
     from jaximu.mistakes import prepare
-    from jaximu.recordings.recording import plausibility
-    from jaximu.recordings.segmentation import segment
 
     ready = prepare(recording)
     used = ready.recording.signals
     signals = {name: _signal(signal, used[name]) for name, signal in recording.signals.items()}
-    own = guessed or advice is not None
-    notes = [each for each in recording.remarks if not own or "--" not in each]  # options that only this verb gave
+    guessing = guessed or advice is not None
+    notes = [note for note in recording.remarks if not guessing or "--" not in note]  # options that only this verb gave
     findings = [*guessed, *notes, *ready.notes]
-    uses: list[dict[str, str]] = []
-    if "accelerometer" not in signals:
+    if "accelerometer" in signals:
+        uses = _uses(recording, ready.recording, findings, not guessed or recording.accelerometer.unit != "count")
+    else:
         findings.append("no accelerometer: poses cannot be found")
-        uses += [{"verb": "turntable", "why": "with a schedule of rests and turns (--reference)"},
-                 {"verb": "compensate", "why": "with a calibration of this gyroscope"}]  # fmt: skip
-        return {"file": recording.name, "signals": signals, "findings": findings, "uses": uses}
-    poses = 0
-    timeless = any("stamps from --rate" in note for note in recording.notes)
-    physical = not (guessed and recording.accelerometer.unit == "count")
+        uses = {
+            "turntable": "with a schedule of rests and turns (--reference)",
+            "compensate": "with a calibration of this gyroscope",
+        }
+        advice = None
+    document = {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings))}
+    document["uses"] = [{"verb": verb, "why": why} for verb, why in uses.items()]
+    if advice is not None:
+        document["guess"] = {"line": advice.line(), **{k: getattr(advice, k) for k in ("reasons", "questions", "rows")}}
+    return document
+
+
+def _uses(recording: Recording, repaired: Recording, findings: list[str], physical: bool) -> dict[str, str]:
+    """Return by verb why it can be run on a log with an accelerometer; what is noticed is added to `findings`.
+
+    `physical`: the outputs are in physical units, or their scale is known.
+    """
+    import numpy as np
+
+    from jaximu.recordings.recording import plausibility
+
+    uses, signals, poses = {}, recording.signals, 0
     force = np.linalg.norm(recording.accelerometer.si(), axis=1)
+    timeless = any("stamps from --rate" in note for note in recording.notes)
     near = bool(np.all(np.abs(force / STANDARD.value - 1) < _NEAR_GRAVITY))
     means = timeless and physical and len(force) <= _TABLE and near
     try:
         findings += plausibility(recording, STANDARD) if physical else ()
-        found = segment(ready.recording)
-        poses = len(found.intervals)
-        still = float(np.sum(found.intervals[:, 1] - found.intervals[:, 0]))
-        findings.append(f"{poses} static poses, {still:.0f} s in all")
-        tilt = _tilt(ready.recording.accelerometer, found.intervals)
-        if poses > 1 and tilt < _TILTED:
-            findings.append(
-                f"all {poses} poses are of one orientation, within {tilt:.2g}°: a calibration by poses needs nine or "
-                "more, all around"
-            )
-            poses = 0
+        poses = _poses(repaired, findings)
     except JaximuError as error:
         if not means:
             findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
-    rest, longest, begin = _rest(ready.recording) if physical else (0.0, 0.0, 0.0)
-    length = signals["accelerometer"]["duration"]
+    rest, longest, begin = _rest(repaired) if physical else (0.0, 0.0, 0.0)
+    length = _signal(recording.accelerometer, repaired.accelerometer)["duration"]
     if rest:
         findings.append(
             f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
-            f"{_STILL_FORCE:g} m/s²{f' and {_STILL_RATE:g} rad/s' if recording.gyroscope else ''} rms)"
+            f"{_STILL_FORCE:g} m/s²{f' and {_STILL_RATE:g} rad/s' if 'gyroscope' in signals else ''} rms)"
         )
-
-    def use(verb: str, why: str) -> None:
-        uses.append({"verb": verb, "why": why})
-
     if means:
-        use("calibrate --means", f"if each of the {len(force)} rows is the mean of a pose at rest")
-    if recording.magnetometer is not None:
-        use("magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round")
+        uses["calibrate --means"] = f"if each of the {len(force)} rows is the mean of a pose at rest"
+    if "magnetometer" in signals:
+        uses["magnetometer"] = "soft and hard iron, and how good a heading becomes, where the unit is turned all round"
     if poses >= 9:
-        use("calibrate", f"{poses} poses" + ("" if recording.gyroscope is None else " and the turns between them"))
-        if recording.gyroscope is not None:
-            use("diagnose", "the same, and what the model gets wrong")
+        uses["calibrate"] = f"{poses} poses" + (" and the turns between them" if "gyroscope" in signals else "")
+        if "gyroscope" in signals:
+            uses["diagnose"] = "the same, and what the model gets wrong"
     elif poses > 1:
-        use("calibrate", f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one")
+        uses["calibrate"] = f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one"
     moved = length - rest
     if rest >= 60.0 and moved <= 2.0 + _BUMPS * length:
         apart = f" but for {moved:.0f} s" if moved > 2.0 else ""
-        use("allan", f"at rest for {length:.0f} s{apart}: noise up to some {length / 10:.0f} s of averaging")
+        uses["allan"] = f"at rest for {length:.0f} s{apart}: noise up to some {length / 10:.0f} s of averaging"
     elif longest >= _CUT:
-        use("allan", f"once cut to the {longest:.0f} s at rest from {begin:.0f} s on: noise up to some "
-                     f"{longest / 10:.0f} s of averaging")  # fmt: skip
+        uses["allan"] = (
+            f"once cut to the {longest:.0f} s at rest from {begin:.0f} s on: noise up to some {longest / 10:.0f} s of "
+            "averaging"
+        )
     heat = recording.temperature
-    if heat is not None and (span := float(np.ptp(heat.values))) >= 5.0:
-        use("thermal", f"the temperature spans {span:.0f} K")
+    if heat is not None and (span := np.ptp(heat.values)) >= 5.0:
+        uses["thermal"] = f"the temperature spans {span:.0f} K"
     table = [name for name in ("table_angle", "table_rate") if getattr(recording, name) is not None]
     if table or (recording.attitude is not None and poses >= _STATIONS):
-        use("turntable", f"it holds a reference: {', '.join(table) or 'attitude'}")
-    if recording.attitude is not None and recording.gyroscope is not None:
-        use("reference", "the attitude beside it calibrates both sensors in any motion that turns about all axes")
-    use("compensate", "to correct it with a calibration of this unit")
-    if poses > 1 and recording.gyroscope is not None:
-        use("check", "whether a calibration of this unit is still valid")
-    document = {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings)), "uses": uses}
-    if advice is not None:
-        document["guess"] = {"line": advice.line(), **{k: getattr(advice, k) for k in ("reasons", "questions", "rows")}}
-    return document
+        uses["turntable"] = f"it holds a reference: {', '.join(table) or 'attitude'}"
+    if recording.attitude is not None and "gyroscope" in signals:
+        uses["reference"] = "the attitude beside it calibrates both sensors in any motion that turns about all axes"
+    uses["compensate"] = "to correct it with a calibration of this unit"
+    if poses > 1 and "gyroscope" in signals:
+        uses["check"] = "whether a calibration of this unit is still valid"
+    return uses
+
+
+def _poses(recording: Recording, findings: list[str]) -> int:
+    """Return how many poses there are, 0 where all are alike; what is noticed is added to `findings`."""
+    from jaximu.recordings.segmentation import segment
+
+    intervals = segment(recording).intervals
+    poses, still = len(intervals), (intervals[:, 1] - intervals[:, 0]).sum()
+    findings.append(f"{poses} static poses, {still:.0f} s in all")
+    tilt = _tilt(recording.accelerometer, intervals)
+    if poses > 1 and tilt < _TILTED:
+        findings.append(
+            f"all {poses} poses are of one orientation, within {tilt:.2g}°: a calibration by poses needs nine or more, "
+            "all around"
+        )
+        return 0
+    return poses
 
 
 def _signal(signal: Signal, used: Signal) -> dict[str, Any]:
@@ -219,8 +238,8 @@ def _rest(recording: Recording) -> tuple[float, float, float]:
     """Seconds at rest in all, at a stretch, and when that begins: from seconds' scatter and how their means move."""
     import numpy as np
 
-    sensors = [(recording.accelerometer, _STILL_FORCE)]
-    sensors += [] if recording.gyroscope is None else [(recording.gyroscope, _STILL_RATE)]
+    limits = {"accelerometer": _STILL_FORCE, "gyroscope": _STILL_RATE}
+    sensors = [(signal, limits[name]) for name, signal in recording.signals.items() if name in limits]
     start = max(signal.time[0] for signal, _ in sensors)
     seconds = int(min(signal.time[-1] for signal, _ in sensors) - start)
     still = np.ones(max(seconds, 0), bool)
@@ -256,14 +275,30 @@ def _print(document: dict[str, Any], path: Path, stated: str) -> None:
     from jaximu.ground.summary import sentence
 
     screen = console(150)
-    headers = ("signal", "unit", "samples", "rate [Hz]", "jitter [ms]", "longest gap [s]", "duration [s]", "minimum",
-               "maximum")  # fmt: skip
+    headers = (
+        "signal",
+        "unit",
+        "samples",
+        "rate [Hz]",
+        "jitter [ms]",
+        "longest gap [s]",
+        "duration [s]",
+        "minimum",
+        "maximum",
+    )
     rows = [
-        (name, unit_text(signal["unit"]), str(signal["samples"]), f"{signal['rate']:.5g}",
-         number(round(1e3 * signal["jitter"], 6)), f"{signal['longest_gap']:.3g}", f"{signal['duration']:.5g}",
-         *(" ".join(f"{value:.4g}" for value in signal[key]).replace("-", "−") for key in ("minimum", "maximum")))
+        (
+            name,
+            unit_text(signal["unit"]),
+            str(signal["samples"]),
+            f"{signal['rate']:.5g}",
+            number(round(1e3 * signal["jitter"], 6)),
+            f"{signal['longest_gap']:.3g}",
+            f"{signal['duration']:.5g}",
+            *(" ".join(f"{value:.4g}" for value in signal[key]).replace("-", "−") for key in ("minimum", "maximum")),
+        )
         for name, signal in document["signals"].items()
-    ]  # fmt: skip
+    ]
     table(screen, headers, rows, document["file"])
     if guess := document.get("guess"):
         blanks = ", fill in the ?" if "?" in guess["line"] else ""
@@ -278,10 +313,10 @@ def _print(document: dict[str, Any], path: Path, stated: str) -> None:
     if guess:
         stated = f" {guess['line']}"
     screen.print("Can be used for:")
-    for each in document["uses"]:
-        needs, results = _MORE.get(each["verb"], ("", " -o results"))
-        first = " results/calibration.json" if each["verb"] in ("check", "compensate") else ""
-        screen.print(f"  {sentence(each['why'])}:")
+    for use in document["uses"]:
+        needs, results = _MORE.get(use["verb"], ("", " -o results"))
+        first = " results/calibration.json" if use["verb"] in ("check", "compensate") else ""
+        screen.print(f"  {sentence(use['why'])}:")
         screen.print(
-            f"    jaximu {each['verb']}{first} {shlex.quote(str(path))}{stated}{needs}{results}", soft_wrap=True
+            f"    jaximu {use['verb']}{first} {shlex.quote(str(path))}{stated}{needs}{results}", soft_wrap=True
         )

@@ -7,11 +7,12 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import UseAppendAction
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,30 +31,23 @@ def run(
     mag_log: Annotated[
         tuple[Path, ...],
         UseAppendAction,
-        arg(metavar="LOG", help="The magnetometer's own file, if it is not in LOG; once per LOG."),
+        option("LOG", "The magnetometer's own file, if it is not in LOG; once per LOG."),
     ] = (),
-    mag_columns: Annotated[str | None, arg(metavar="NAMES", help="Its columns in order, as for --columns.")] = None,
+    mag_columns: Annotated[str | None, option("NAMES", "Its columns in order, as for --columns.")] = None,
     field: options.FieldText = None,
     longitude: Annotated[
         float | None,
-        arg(
-            metavar="DEG",
-            help="With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field.",
-        ),
+        option("DEG", "With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field."),
     ] = None,
     calibration: Annotated[
         Path | None,
-        arg(
-            metavar="FILE", help="Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."
-        ),
+        option("FILE", "Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."),
     ] = None,
-    check: Annotated[
-        Path | None, arg(metavar="FILE", help="Check whether this old calibration is still valid.")
-    ] = None,
+    check: Annotated[Path | None, option("FILE", "Check whether this old calibration is still valid.")] = None,
     effect: Annotated[
         tuple[str, ...],
         UseAppendAction,
-        arg(metavar="NAME[:onset=S]", help="Also fit this effect: mag.lag, mag.temperature … May be repeated."),
+        option("NAME[:onset=S]", "Also fit this effect: mag.lag, mag.temperature … May be repeated."),
     ] = (),
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
@@ -76,7 +70,7 @@ def run(
         raise InputError("no log was given: name one or more files.")
     if mag_log and len(mag_log) != len(logs):
         raise InputError(f"{len(logs)} logs need as many --mag-log, found {len(mag_log)}.")
-    effects = [_effect(each) for each in effect]
+    effects = [_effect(text) for text in effect]
     gravity, trace = local.value(), traced.value(logs)
     strength = _strength(field, local, longitude, trace)
     results.prepare()
@@ -87,26 +81,27 @@ def run(
         old = None if check is None else load_calibration(check)
         base = None if calibration is None else load_calibration(calibration).inertial()
         log = log.alike(base or old)
-        given = [_read(log, path, mag_log[k] if mag_log else None, mag_columns) for k, path in enumerate(logs)]
+        magnetic_logs = [_read(log, path, mag_log[k] if mag_log else None, mag_columns) for k, path in enumerate(logs)]
     southern = None if local.latitude is None or abs(local.latitude) < _NEAR_THE_EQUATOR else local.latitude < 0
     with progress("calibrating"):
-        found, measurement, heading = calibrate_magnetometer(given, strength, base, gravity, southern, effects)
-    shift = None if old is None else check_magnetometer(old, found)
+        result, measurement, heading = calibrate_magnetometer(magnetic_logs, strength, base, gravity, southern, effects)
+    shift = None if old is None else check_magnetometer(old, result)
     with progress("asking for effects"):
-        asked = diagnose_magnetometer(found, measurement)
-    found = replace(
-        found, trace=trace, diagnosis=asked.document() | ({} if shift is None else {"check": shift.document()})
+        diagnosis = diagnose_magnetometer(result, measurement)
+    result = replace(
+        result, trace=trace, diagnosis=diagnosis.document() | ({} if shift is None else {"check": shift.document()})
     )
 
     def show_all() -> None:
-        _print(found)
-        for each in filter(None, (shift, *asked.causes)):
-            print(each.text())
+        _print(result)
+        for part in filter(None, (shift, *diagnosis.causes)):
+            print(part.text())
 
     results.give(
-        found.text, show_all, options.drawn("magnetometer", "write_magnetometer_report", found, measurement, heading),
-        calibration=found,
-    )  # fmt: skip
+        show_all,
+        options.drawn("magnetometer", "write_magnetometer_report", result, measurement, heading),
+        calibration=result,
+    )
 
 
 def _strength(
@@ -132,7 +127,7 @@ def _effect(text: str) -> Effect:
     kind = type(effect_named(name))
     try:
         values = {
-            key.strip(): float(value) for key, _, value in (each.partition("=") for each in inner.split(",") if each)
+            key.strip(): float(value) for key, _, value in (pair.partition("=") for pair in inner.split(",") if pair)
         }
     except ValueError:
         raise InputError(f"--effect {text!r} is not understood; write NAME or NAME:onset=30.") from None
@@ -173,14 +168,12 @@ def _require_overlap(first, second, mag_log: Path, path: Path) -> None:
 
 
 def _print(calibration: Calibration) -> None:
-    from jaximu.cli.shown import console
+    from jaximu.cli.shown import print_all
     from jaximu.report.magnetometer import lead, statements
 
-    own = tuple(name for name in calibration.names if name.owner == "magnetometer")
-    rows = [calibration.names.index(name) for name in own]
-    alone = replace(calibration, names=own, covariance=calibration.covariance[rows][:, rows], rms={}, excess={})
-    screen = console()
-    screen.print(lead(calibration).sentence)
+    names = tuple(name for name in calibration.names if name.owner == "magnetometer")
+    rows = [calibration.names.index(name) for name in names]
+    alone = replace(calibration, names=names, covariance=calibration.covariance[rows][:, rows], rms={}, excess={})
+    print_all(lead(calibration).sentence)
     print_calibration(alone)
-    for each in statements(calibration):
-        screen.print(f"{each.about}: {each.text}")
+    print_all(*map(str, statements(calibration)))

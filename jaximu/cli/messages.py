@@ -26,7 +26,7 @@ def progress(text: str, every: float | None = None) -> Iterator[Callable[[str], 
 
     **Gives** a function that takes what the stage is at, in words.
     """
-    began = said = time.monotonic()
+    began = spoken = time.monotonic()
     if level == 1 and sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -38,9 +38,9 @@ def progress(text: str, every: float | None = None) -> Iterator[Callable[[str], 
         return
 
     def tell(part: str) -> None:
-        nonlocal said
-        if (now := time.monotonic()) - said > (_LONG if every is None else every):
-            said = now
+        nonlocal spoken
+        if (now := time.monotonic()) - spoken > (_LONG if every is None else every):
+            spoken = now
             say(f"{text}: {part}, {now - began:.0f} s")
 
     say(f"{text} …")

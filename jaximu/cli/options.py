@@ -59,29 +59,36 @@ __all__ = [
     "effects_of",
     "field_strength",
     "is_toml",
+    "option",
     "print_json",
     "require_apart",
     "require_files",
 ]
 
+
+def option(metavar: str, text: str, **more: Any) -> Any:
+    """Return what an option is called in its help, and what it does; `more`: as for tyro's `arg`."""
+    return arg(metavar=metavar, help=text, **more)
+
+
 Logs = Annotated[
     tuple[Path, ...],
     Positional,
-    arg(name="log", metavar="LOG [LOG ...]", help="Recordings of one unit, in any format that jaximu reads."),
+    option("LOG [LOG ...]", "Recordings of one unit, in any format that jaximu reads.", name="log"),
 ]
-CalibrationFile = Annotated[Path, Positional, arg(metavar="CALIBRATION", help="A calibration.json that jaximu wrote.")]
-StaticLog = Annotated[Path | None, arg(metavar="LOG", help="A recording at rest, to measure noise and bias drift.")]
+CalibrationFile = Annotated[Path, Positional, option("CALIBRATION", "A calibration.json that jaximu wrote.")]
+StaticLog = Annotated[Path | None, option("LOG", "A recording at rest, to measure noise and bias drift.")]
 LossChoice = Annotated[Literal["linear", "huber", "cauchy"], arg(help="Least squares, or robust against outliers.")]
 JsonFlag = Annotated[bool, arg(name="json", help="Print one JSON document on stdout, errors too.")]
 ForceFlag = Annotated[bool, arg(help="Replace results that would be lost: a calibration of other sensors in DIR.")]
 RepairFlag = Annotated[
     bool, arg(help="Repair lost samples, overflows and axes where possible; the notes say what was changed.")
 ]
-FieldText = Annotated[str | None, arg(metavar="H[+-S]", help="Field strength in µT, if known: 48.9 or 48.9+-0.2.")]
+FieldText = Annotated[str | None, option("H[+-S]", "Field strength in µT, if known: 48.9 or 48.9+-0.2.")]
 EffectNames = Annotated[
     tuple[str, ...],
     UseAppendAction,
-    arg(metavar="NAME", help="Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."),
+    option("NAME", "Also fit this effect; NAME+-SIGMA if its size is known to SIGMA. May be repeated."),
 ]
 
 INERTIAL = ("accelerometer", "gyroscope")
@@ -94,59 +101,54 @@ class LogOptions:
     """How to read a log that does not say everything itself."""
 
     title: ClassVar[str] = "Reading"
-    gyro_log: Annotated[Path | None, arg(metavar="LOG", help="The gyroscope's own file, if it is not in LOG.")] = None
+    gyro_log: Annotated[Path | None, option("LOG", "The gyroscope's own file, if it is not in LOG.")] = None
     columns: Annotated[
         str | None,
-        arg(
-            metavar="NAMES",
-            help='Names of all columns in order, with units: "time [s],accel [m/s^2],gyro [rad/s]"; '
-            '"_" skips a column.',
+        option(
+            "NAMES",
+            'Names of all columns in order, with units: "time [s],accel [m/s^2],gyro [rad/s]"; "_" skips a column.',
         ),
     ] = None
-    gyro_columns: Annotated[str | None, arg(metavar="NAMES", help="The same for the gyroscope's file.")] = None
-    rate: Annotated[float | None, arg(metavar="HZ", help="Sample rate of a log without a time column.")] = None
+    gyro_columns: Annotated[str | None, option("NAMES", "The same for the gyroscope's file.")] = None
+    rate: Annotated[float | None, option("HZ", "Sample rate of a log without a time column.")] = None
     axes: Annotated[
         str | None,
-        arg(
-            metavar="MAP",
-            help='Body axes: FLU, FRD or "y,-x,z"; one sensor: "accel=…;gyro=…"; add ";-f" if the '
+        option(
+            "MAP",
+            'Body axes: FLU, FRD or "y,-x,z"; one sensor: "accel=…;gyro=…"; add ";-f" if the '
             "logger records minus specific force.",
         ),
     ] = None
     accel_scale: Annotated[
         str | None,
-        arg(
-            metavar="SCALE",
-            help='Scale of raw counts: "16384 count/g" or "0.061 mg/count". A bare number from 1 up '
+        option(
+            "SCALE",
+            'Scale of raw counts: "16384 count/g" or "0.061 mg/count". A bare number from 1 up '
             "is counts per m/s², below 1 m/s² per count.",
         ),
     ] = None
-    accel_offset: Annotated[
-        str | None, arg(metavar="COUNTS", help="Counts at zero specific force, one number or three.")
-    ] = None
+    accel_offset: Annotated[str | None, option("COUNTS", "Counts at zero specific force, one number or three.")] = None
     gyro_scale: Annotated[
         str | None,
-        arg(
-            metavar="SCALE",
-            help='Scale of raw counts: "131 count/(deg/s)". A bare number from 1 up is counts per '
+        option(
+            "SCALE",
+            'Scale of raw counts: "131 count/(deg/s)". A bare number from 1 up is counts per '
             "rad/s, below 1 rad/s per count.",
         ),
     ] = None
-    gyro_offset: Annotated[str | None, arg(metavar="COUNTS", help="Counts at zero rate, one number or three.")] = None
+    gyro_offset: Annotated[str | None, option("COUNTS", "Counts at zero rate, one number or three.")] = None
     device: Annotated[
-        str | None, arg(metavar="ID", help="Whose rows to take of a table in which several units write in turn.")
+        str | None, option("ID", "Whose rows to take of a table in which several units write in turn.")
     ] = None
     topic: Annotated[
         str | None,
-        arg(
-            metavar="TOPIC",
-            help="Topic or message of a bag or flight log; A,B if the accelerometer and the gyroscope have one each.",
+        option(
+            "TOPIC",
+            "Topic or message of a bag or flight log; A,B if the accelerometer and the gyroscope have one each.",
         ),
     ] = None
-    instance: Annotated[int | None, arg(metavar="N", help="Which of a flight log's sensors, from 0.")] = None
-    stamp: Annotated[
-        str, arg(metavar="{header,receive}", help="Time of a message: the sensor's own or the logger's.")
-    ] = "header"
+    instance: Annotated[int | None, option("N", "Which of a flight log's sensors, from 0.")] = None
+    stamp: Annotated[str, option("{header,receive}", "Time of a message: the sensor's own or the logger's.")] = "header"
     like: Suppress[Any] = field(default=None, repr=False)  # no option: see `alike`
 
     def alike(self, calibration: Calibration | None) -> LogOptions:
@@ -192,7 +194,7 @@ class LogOptions:
         """Return what the library asks for."""
         from jaximu.recordings.readers import ReadOptions
 
-        stated = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "gyro_log"}
+        stated = {option.name: getattr(self, option.name) for option in fields(self) if option.name != "gyro_log"}
         return ReadOptions(**stated, gravity=gravity, check=check, alone=alone)
 
     def read_unit(
@@ -206,8 +208,8 @@ class LogOptions:
         with progress("reading"):
             require_files(*paths, static)
             recordings = [self.read(path, gravity, alone=alone) for path in paths]
-            own = replace(self, gyro_log=None)  # --gyro-log is LOG's
-            return recordings, None if static is None else own.read(static, gravity)
+            rest_options = replace(self, gyro_log=None)  # --gyro-log is LOG's
+            return recordings, None if static is None else rest_options.read(static, gravity)
 
 
 @dataclass(frozen=True)
@@ -217,16 +219,14 @@ class GravityOptions:
     title: ClassVar[str] = "Gravity"
     gravity: Annotated[
         str | None,
-        arg(
-            metavar="G[+-S]",
-            help="Local gravity in m/s², with its standard deviation if known: 9.81744+-0.0005; a bare 9.81 is "
+        option(
+            "G[+-S]",
+            "Local gravity in m/s², with its standard deviation if known: 9.81744+-0.0005; a bare 9.81 is "
             "known to half a unit of its last digit. Default: standard gravity, known to 0.015 m/s².",
         ),
     ] = None
-    latitude: Annotated[
-        float | None, arg(metavar="DEG", help="Latitude, for gravity (WGS-84) and the Earth's rotation.")
-    ] = None
-    height: Annotated[float, arg(metavar="M", help="Height above sea level, with --latitude.")] = 0.0
+    latitude: Annotated[float | None, option("DEG", "Latitude, for gravity (WGS-84) and the Earth's rotation.")] = None
+    height: Annotated[float, option("M", "Height above sea level, with --latitude.")] = 0.0
 
     def value(self) -> LocalGravity:
         """Return the gravity that was asked for."""
@@ -248,9 +248,9 @@ class PoseOptions:
     title: ClassVar[str] = "Options"
     threshold: Annotated[
         float | None,
-        arg(metavar="X", help="A window is stationary below X times the noise floor's variance (default: found)."),
+        option("X", "A window is stationary below X times the noise floor's variance (default: found)."),
     ] = None
-    minimum_duration: Annotated[float, arg(metavar="S", help="Shortest pose, in seconds.")] = 0.8
+    minimum_duration: Annotated[float, option("S", "Shortest pose, in seconds.")] = 0.8
 
     def value(self) -> SegmentationOptions:
         """Return what the library asks for."""
@@ -266,17 +266,14 @@ class TraceOptions:
     title: ClassVar[str] = "Traceability"
     trace: Annotated[
         Path | None,
-        arg(
-            metavar="FILE",
-            help="File with serial number, operator, references and more; `jaximu accept --explain` shows one.",
-        ),
+        option("FILE", "File with serial number, operator, references and more; `jaximu accept --explain` shows one."),
     ] = None
-    serial: Annotated[str | None, arg(metavar="TEXT", help="Serial number of the unit.")] = None
-    lot: Annotated[str | None, arg(metavar="TEXT", help="Production lot.")] = None
-    operator: Annotated[str | None, arg(metavar="TEXT", help="Who calibrates.")] = None
-    station: Annotated[str | None, arg(metavar="TEXT", help="Where the unit is calibrated.")] = None
-    fixture: Annotated[str | None, arg(metavar="TEXT", help="What the unit is mounted in.")] = None
-    date: Annotated[str | None, arg(metavar="DATE", help="Date of the calibration, such as 2026-03-04.")] = None
+    serial: Annotated[str | None, option("TEXT", "Serial number of the unit.")] = None
+    lot: Annotated[str | None, option("TEXT", "Production lot.")] = None
+    operator: Annotated[str | None, option("TEXT", "Who calibrates.")] = None
+    station: Annotated[str | None, option("TEXT", "Where the unit is calibrated.")] = None
+    fixture: Annotated[str | None, option("TEXT", "What the unit is mounted in.")] = None
+    date: Annotated[str | None, option("DATE", "Date of the calibration, such as 2026-03-04.")] = None
 
     def value(self, logs: tuple[Path, ...]) -> dict[str, Any] | None:
         """Return what the file, the file beside the first log and the options say; None where nothing is said."""
@@ -285,7 +282,7 @@ class TraceOptions:
         path = self.trace if self.trace is not None or not logs else sidecar(logs[0])
         if path is not None and self.trace is None:
             say(f"{path} is read: it lies beside the log.")
-        stated = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "trace"}
+        stated = {option.name: getattr(self, option.name) for option in fields(self) if option.name != "trace"}
         return read_trace(path, stated) or None
 
 
@@ -294,9 +291,7 @@ class Results:
     """Where results go: to a folder, and to the terminal as prose or as one JSON document."""
 
     title: ClassVar[str] = "Output"
-    output: Annotated[
-        Path | None, arg(aliases=["-o"], metavar="DIR", help="Folder for the results and the report.")
-    ] = None
+    output: Annotated[Path | None, option("DIR", "Folder for the results and the report.", aliases=["-o"])] = None
     as_json: JsonFlag = False
     force: ForceFlag = False
 
@@ -328,17 +323,19 @@ class Results:
 
     def give(
         self,
-        text: Callable[[], str],
         show: Callable[[], object],
         write: Callable[[Path], Path | Iterable[Path]],
         names: str = "calibration.json and report.html",
         files: Mapping[str, bytes] = MappingProxyType({}),
+        text: Callable[[], str] | None = None,
         **documents: Document,
     ) -> None:
         """Write the documents, each as NAME.json, and `files`; draw the report; only then print the result.
 
-        `write` draws into the folder. A report that cannot be drawn costs nothing else: a page says so in its place.
+        `write` draws into the folder; `text` makes the document to print, the first of `documents` if None. A report
+        that cannot be drawn costs nothing else: a page says so in its place.
         """
+        text = text or next(iter(documents.values())).text
         printed = text() if self.as_json else ""
         written: list[Path] = []
         try:
@@ -393,8 +390,8 @@ def print_json(value: Any) -> None:
     print(json.dumps(value, indent=1, allow_nan=False))
 
 
-def effects_of(stated: tuple[str, ...]) -> tuple[list[str], dict[str, float]]:
-    """Return the effects that options name, and the standard deviations of those stated as NAME+-SIGMA."""
+def effects_of(stated: tuple[str, ...]) -> dict[str, Any]:
+    """Return, as the library's arguments, the effects that options name and the deviations stated as NAME+-SIGMA."""
     names, sigmas = [], {}
     for text in stated:
         name, known, sigma = text.partition("+-")
@@ -404,7 +401,7 @@ def effects_of(stated: tuple[str, ...]) -> tuple[list[str], dict[str, float]]:
                 sigmas[name.strip()] = float(sigma)
             except ValueError:
                 raise InputError(f"--effect {text}: {sigma!r} is not a number.") from None
-    return names, sigmas
+    return {"effects": names, "effect_sigmas": sigmas}
 
 
 Reading = Annotated[LogOptions, arg(name="")]

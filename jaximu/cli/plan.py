@@ -11,16 +11,17 @@ from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
-    from jaximu.planning import Equipment, Known, Proposal
+    from jaximu.planning import Known, Proposal
 
 __all__ = ["run"]
 
 
 def run(
-    source: Annotated[Path, Positional, arg(metavar="CALIBRATION|LOG|SPEC", help="What is known about the unit.")],
+    source: Annotated[Path, Positional, option("CALIBRATION|LOG|SPEC", "What is known about the unit.")],
     /,
     *,
     log: options.Reading = options.READING,
@@ -34,28 +35,24 @@ def run(
         arg(name="for", help="What evaluates it. filter: a sequence of positions on a table, for `jaximu filter`."),
     ] = "fit",
     effect: options.EffectNames = (),
-    poses: Annotated[
-        int | None, arg(metavar="N", help="Number of poses (default: 12, and 19 positions for the filter).")
-    ] = None,
-    turns: Annotated[
-        int | None, arg(metavar="N", help="Number of turns of the table (default: as many as poses).")
-    ] = None,
+    poses: Annotated[int | None, option("N", "Number of poses (default: 12, and 19 positions for the filter).")] = None,
+    turns: Annotated[int | None, option("N", "Number of turns of the table (default: as many as poses).")] = None,
     criterion: Annotated[
         Literal["D", "A"], arg(help="What to minimise. D: the volume of the uncertainty; A: the mean variance.")
     ] = "D",
     parameter: Annotated[
         str | None,
-        arg(metavar="NAME", help="Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."),
+        option("NAME", "Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."),
     ] = None,
-    rest: Annotated[float | None, arg(metavar="S", help="Seconds at rest in each pose.")] = None,
-    turn: Annotated[float | None, arg(metavar="S", help="Seconds of each turn.")] = None,
-    fastest: Annotated[float | None, arg(metavar="DEG/S", help="Largest rate of the table or robot.")] = None,
+    rest: Annotated[float | None, option("S", "Seconds at rest in each pose.")] = None,
+    turn: Annotated[float | None, option("S", "Seconds of each turn.")] = None,
+    fastest: Annotated[float | None, option("DEG/S", "Largest rate of the table or robot.")] = None,
     accuracy: Annotated[
         float | None,
-        arg(metavar="DEG", help="Noise (1 σ, each axis) of the attitude that the robot or tracker reports."),
+        option("DEG", "Noise (1 σ, each axis) of the attitude that the robot or tracker reports."),
     ] = None,
-    step: Annotated[float | None, arg(metavar="DEG", help="Round angles to multiples of this.")] = None,
-    seed: Annotated[int, arg(metavar="N", help="Random seed of the search.")] = 0,
+    step: Annotated[float | None, option("DEG", "Round angles to multiples of this.")] = None,
+    seed: Annotated[int, option("N", "Random seed of the search.")] = 0,
     results: options.Output = options.RESULTS,
 ) -> None:
     """Plan which poses and turns to record next, to reduce the largest uncertainties.
@@ -84,7 +81,7 @@ def run(
         raise InputError("--effect names states of the filter: add --for filter.")
     chosen = FILTERED if filtered else EQUIPMENT[equipment]
     poses = (19 if filtered else 12) if poses is None else poses
-    given = {"rest": rest, "turn": turn, "fastest": fastest, "step": step, "accuracy": accuracy}
+    stated = {"rest": rest, "turn": turn, "fastest": fastest, "step": step, "accuracy": accuracy}
     if fastest is not None and (chosen.by_hand or not 0 < fastest < math.inf):
         raise InputError("--fastest is the largest rate of a table, in °/s: greater than zero, and not for hands.")
     if accuracy is not None and chosen.accuracy is None:
@@ -92,7 +89,7 @@ def run(
     if turns is not None and chosen.chained:
         how = "by hand" if chosen.by_hand else "on a robot"
         raise InputError(f"--turns goes with a table: {how} each pose but the first is reached by one turn.")
-    chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
+    chosen = replace(chosen, **{name: value for name, value in stated.items() if value is not None})
     results.prepare()
     known, magnetometer = _known(source, log, local)
     if known is None:  # a magnetometer by itself
@@ -100,15 +97,15 @@ def run(
         return
     with progress("planning") as report:
         if filtered:
-            names, _ = options.effects_of(effect)
-            proposal = propose_sequence(known, chosen, poses, criterion, parameter, names, report=report)
+            effects = options.effects_of(effect)["effects"]
+            proposal = propose_sequence(known, chosen, poses, criterion, parameter, effects, report=report)
         else:
             proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
     if magnetometer is not None:
         proposal = replace(proposal, notes=(*proposal.notes, magnetometer))
     write, names = options.drawn("plan", "write_plan", proposal), "plan.json, report.html and the poses drawn"
     files = {} if chosen.by_hand else {"schedule.csv": proposal.schedule.encode()}
-    results.give(proposal.text, lambda: _print(proposal), write, names, files, plan=proposal)
+    results.give(lambda: _print(proposal), write, names, files, plan=proposal)
 
 
 def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[Known | None, str | None]:
@@ -146,21 +143,16 @@ def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[K
 
 
 def _print(proposal: Proposal) -> None:
-    from jaximu.cli.shown import console, table
+    from jaximu.cli.shown import print_all
     from jaximu.report.plan import gain_words, pose_rows, sigma_rows, turn_rows
 
-    screen = console()
-    chained, equipment = proposal.equipment.chained, proposal.equipment
-    table(screen, ("", "pose", *(["turn to it"] if chained else [])), pose_rows(proposal), _title(equipment, proposal))
-    if turns := turn_rows(proposal):
-        table(screen, ("", "axis up, rate, angle and sense"), turns, f"{len(turns)} turns")
-    table(screen, ("± is 95 %", "known", "after these", "times smaller"), [*sigma_rows(proposal)])
-    screen.print(gain_words(proposal))
-    for weak in proposal.open:
-        screen.print(f"stays open: {weak.text}")
-    for note in proposal.notes:
-        screen.print(f"note: {note}")
-
-
-def _title(equipment: Equipment, proposal: Proposal) -> str:
-    return f"{len(proposal.poses)} poses {equipment.words}, {equipment.rest:g} s each"
+    equipment, turns = proposal.equipment, turn_rows(proposal)
+    title = f"{len(proposal.poses)} poses {equipment.words}, {equipment.rest:g} s each"
+    print_all(
+        (("", "pose", *(["turn to it"] if equipment.chained else [])), pose_rows(proposal), title),
+        *([(("", "axis up, rate, angle and sense"), turns, f"{len(turns)} turns")] if turns else []),
+        (("± is 95 %", "known", "after these", "times smaller"), sigma_rows(proposal)),
+        gain_words(proposal),
+        *(f"stays open: {weak.text}" for weak in proposal.open),
+        notes=proposal.notes,
+    )

@@ -7,11 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import UseAppendAction
 
 from jaximu.cli import options
-from jaximu.cli.calibrate import print_calibration
+from jaximu.cli.calibrate import give_calibration
 from jaximu.cli.messages import progress, say
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,23 +32,23 @@ def run(
     *,
     source: Annotated[
         str,
-        arg(
+        option(
+            "COMMAND|PORT|FILE|-",
+            "Where lines come from: a command's output, a serial port, a file to play again, or standard input.",
             name="from",
-            metavar="COMMAND|PORT|FILE|-",
-            help="Where lines come from: a command's output, a serial port, a file to play again, or standard input.",
         ),
     ],
-    baud: Annotated[int, arg(metavar="N", help="Speed of a serial port.")] = 115200,
+    baud: Annotated[int, option("N", "Speed of a serial port.")] = 115200,
     goal: Annotated[
         tuple[str, ...],
         UseAppendAction,
-        arg(
-            metavar="GOAL",
-            help='Record until this standard uncertainty is reached, as "accelerometer.bias 0.2 mg" or '
+        option(
+            "GOAL",
+            'Record until this standard uncertainty is reached, as "accelerometer.bias 0.2 mg" or '
             '"gyroscope.scale 0.1 %"; may be repeated. Default: a dozen poses.',
         ),
     ] = (),
-    rest: Annotated[float, arg(metavar="S", help="How long a pose must rest to count, in seconds.")] = 4.0,
+    rest: Annotated[float, option("S", "How long a pose must rest to count, in seconds.")] = 4.0,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
     traced: options.Traced = options.TRACED,
@@ -99,8 +100,7 @@ def run(
 
         calibration = calibrate(log.read(path, gravity), gravity)
     calibration = replace(calibration, trace=traced.value((path,)))
-    write = options.drawn("html", "write_report", calibration)
-    results.give(calibration.text, lambda: print_calibration(calibration), write, calibration=calibration)
+    give_calibration(calibration, results)
 
 
 def _record(lines: Lines, path: Path, log: options.LogOptions, guide: Guide) -> bool:
@@ -119,7 +119,7 @@ def _record(lines: Lines, path: Path, log: options.LogOptions, guide: Guide) -> 
             _tell(moment, last, guide.rest)
             last = moment
             if moment.done:
-                return all(each.reached for each in moment.goals)
+                return all(goal.reached for goal in moment.goals)
     return False
 
 
@@ -138,7 +138,7 @@ def _tell(moment: Moment, last: Moment | None, rest: float) -> None:
     before = 0 if last is None else len(last.taken)
     if len(moment.taken) > before:
         bell = "\a" if sys.stderr.isatty() else ""
-        goals = "".join(f" {_goal_words(each)}." for each in moment.goals)
+        goals = "".join(f" {_goal_words(goal)}." for goal in moment.goals)
         say(f"{bell}Pose {len(moment.taken)} counts.{goals}" + ("" if moment.done else f" Next: {moment.words}."))
     elif len(moment.taken) < before:
         say(f"The unit moved in a pose: {len(moment.taken)} count. Next: {moment.words or 'hold it still'}.")

@@ -6,11 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
@@ -21,14 +22,14 @@ __all__ = ["read_reference", "run"]
 
 
 def run(
-    log_path: Annotated[Path, Positional, arg(name="log", metavar="LOG", help="The recording of the unit.")],
+    log_path: Annotated[Path, Positional, option("LOG", "The recording of the unit.", name="log")],
     /,
     *,
     reference: Annotated[
         Path | None,
-        arg(
-            metavar="REF",
-            help="The reference: a table with time and quaternion, Euler angles, rotation vectors or a table's angles "
+        option(
+            "REF",
+            "The reference: a table with time and quaternion, Euler angles, rotation vectors or a table's angles "
             "(table_angle_z, table_angle_x …, outermost axis first), and velocity or position if known; LOG itself if "
             "left out. Clocks, mounting and sense are found from the data.",
         ),
@@ -57,15 +58,15 @@ def run(
     from jaximu.calibration import calibrate_against_attitude
 
     attitude = read_reference(log_path if reference is None else reference, log_path, recording)
-    names, sigmas = options.effects_of(effect)
     with progress("calibrating"):
         calibration, measurement = calibrate_against_attitude(
-            recording, attitude, gravity, static=noise, effects=names, effect_sigmas=sigmas, loss=loss, repair=repair
+            recording, attitude, gravity, static=noise, loss=loss, repair=repair, **options.effects_of(effect)
         )
     results.give(
-        calibration.text, lambda: _print(calibration),
-        options.drawn("attitude", "write_attitude_report", calibration, measurement), calibration=calibration,
-    )  # fmt: skip
+        lambda: _print(calibration),
+        options.drawn("attitude", "write_attitude_report", calibration, measurement),
+        calibration=calibration,
+    )
 
 
 def read_reference(path: Path, log_path: Path, recording: Recording) -> Attitude:
@@ -78,11 +79,8 @@ def read_reference(path: Path, log_path: Path, recording: Recording) -> Attitude
 
 
 def _print(calibration: Calibration) -> None:
-    from jaximu.cli.shown import console
+    from jaximu.cli.shown import print_all
     from jaximu.report.attitude import mounting_words, share_words
 
     print_calibration(replace(calibration, excess={}))
-    screen = console()
-    for text in mounting_words(calibration):
-        screen.print(text)
-    screen.print(f"The misfit is made of: {'; '.join(share_words(calibration))}.")
+    print_all(*mounting_words(calibration), f"The misfit is made of: {'; '.join(share_words(calibration))}.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from rich import box
@@ -13,7 +13,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from jaximu.ground.summary import Summary
 
-__all__ = ["console", "show", "table"]
+__all__ = ["console", "print_all", "show", "table"]
 
 
 def console(width: int = 100) -> Console:
@@ -23,16 +23,21 @@ def console(width: int = 100) -> Console:
     return made if made.is_terminal else Console(highlight=False, markup=False, width=width, color_system=colors)
 
 
+def print_all(*parts: str | tuple, notes: Iterable[str] = (), width: int = 100) -> None:
+    """Print sentences and tables, each as (headers, rows) or (headers, rows, title), in their order; then the notes."""
+    screen = console(width)
+    for part in (*parts, *(f"note: {note}" for note in notes)):
+        if isinstance(part, str):
+            screen.print(part)
+        else:
+            table(screen, *part)
+
+
 def show(summary: Summary) -> None:
     """Print a summary: its title, the verdict, the table, and notes."""
-    screen = console()
-    screen.print(summary.title, style="bold")
-    for text in summary.verdict:
-        screen.print(text)
-    if summary.table is not None:
-        table(screen, summary.table.headers, summary.table.rows)
-    for note in summary.notes:
-        screen.print(f"- {note}")
+    console().print(summary.title, style="bold")
+    tables = [] if summary.table is None else [(summary.table.headers, summary.table.rows)]
+    print_all(*summary.verdict, *tables, *(f"- {note}" for note in summary.notes))
 
 
 def table(screen: Console, headers: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> None:

@@ -12,18 +12,19 @@ from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 __all__ = ["run"]
 
 
 def run(
-    specification_file: Annotated[Path | None, arg(metavar="SPEC", help="TOML file; --explain describes it.")] = None,
+    specification_file: Annotated[Path | None, option("SPEC", "TOML file; --explain describes it.")] = None,
     /,
     *,
     output: Annotated[
         Path | None,
-        arg(name="output", aliases=["-o"], metavar="LOG", help="Recording to write; the suffix sets the format."),
+        option("LOG", "Recording to write; the suffix sets the format.", name="output", aliases=["-o"]),
     ] = None,
     protocols: Annotated[bool, arg(help="List the protocols with their keys and exit.")] = False,
     explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False,
@@ -54,14 +55,14 @@ def run(
     from jaximu.simulation import read_specification, write_case
 
     check_suffix(output)
-    found = read_specification(specification_file)
-    cases = found.cases()  # all of them are checked before anything is written
+    task = read_specification(specification_file)
+    cases = task.cases()  # all of them are checked before anything is written
     if not output.parent.is_dir():
         raise InputError(f"{output}: the folder {output.parent} does not exist.")
     written = []
     for unit, recordings in enumerate(cases):
         for number, case in enumerate(recordings):
-            path = _numbered(output, unit if found.units > 1 else None, number if found.recordings > 1 else None)
+            path = _numbered(output, unit if task.units > 1 else None, number if task.recordings > 1 else None)
             with progress(f"simulating {path}"):
                 truth = write_case(case, path)
             truth.save(f"{path}.truth.json")
@@ -69,17 +70,11 @@ def run(
                 truth.save_schedule(f"{path}.schedule.csv")
             for note in truth.notes:
                 say(f"{path}: {note}")
-            written.append(
-                {
-                    "file": str(path),
-                    "truth": f"{path}.truth.json",
-                    "samples": case.samples,
-                    "duration": case.plan.motion.length,
-                    "notes": list(truth.notes),
-                }
-            )
+            duration, notes = case.plan.motion.length, list(truth.notes)
+            entry = {"file": str(path), "truth": f"{path}.truth.json", "samples": case.samples}
+            written.append(entry | {"duration": duration, "notes": notes})
             if not as_json:
-                say(f"{path}: {case.samples} samples, {case.plan.motion.length:g} s")
+                say(f"{path}: {case.samples} samples, {duration:g} s")
     if as_json:
         options.print_json({"specification": str(specification_file), "recordings": written})
 
@@ -99,9 +94,9 @@ def _print_protocols() -> None:
         console.print(f"[bold]{kind}[/bold]")
         for paragraph in (inspect.getdoc(protocol) or "").split("\n\n"):
             console.print(" ".join(paragraph.split()), markup=False)
-        for each in fields(protocol):
-            default = "" if each.default is MISSING else f" = {_toml(each.default)}"
-            console.print(f"    {each.name}{default}", markup=False)
+        for key in fields(protocol):
+            default = "" if key.default is MISSING else f" = {_toml(key.default)}"
+            console.print(f"    {key.name}{default}", markup=False)
         console.print()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,11 +11,15 @@ from tyro.conf import UseAppendAction, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
+from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.calibration import ThermalCalibration
     from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
+    from jaximu.ground.gravity import LocalGravity
+    from jaximu.recordings.recording import Recording
     from jaximu.report.export.thermal_autopilot import AutopilotParameters
 
 __all__ = ["run"]
@@ -28,10 +33,10 @@ def run(
     local: options.Local = options.LOCAL,
     static: options.StaticLog = None,
     calibration: Annotated[
-        Path | None, arg(metavar="CALIBRATION", help="Add the thermal part to this calibration of the unit.")
+        Path | None, option("CALIBRATION", "Add the thermal part to this calibration of the unit.")
     ] = None,
     block: Annotated[
-        float | None, arg(metavar="SECONDS", help="Average over blocks this long (default: about 600 blocks).")
+        float | None, option("SECONDS", "Average over blocks this long (default: about 600 blocks).")
     ] = None,
     to: Annotated[
         tuple[Literal["px4", "ardupilot"], ...],
@@ -39,10 +44,10 @@ def run(
         arg(help="Also write an autopilot's parameters into DIR, and report what they lose. May be repeated."),
     ] = (),
     sensor: Annotated[
-        int | None, arg(metavar="N", help="The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot.")
+        int | None, option("N", "The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot.")
     ] = None,
-    accel_id: Annotated[int, arg(metavar="ID", help="PX4's device ID of the accelerometer.")] = 0,
-    gyro_id: Annotated[int, arg(metavar="ID", help="PX4's device ID of the gyroscope.")] = 0,
+    accel_id: Annotated[int, option("ID", "PX4's device ID of the accelerometer.")] = 0,
+    gyro_id: Annotated[int, option("ID", "PX4's device ID of the gyroscope.")] = 0,
     results: options.Output = options.RESULTS,
 ) -> None:
     """Fit bias over temperature from LOGs of a unit at rest while its temperature changes.
@@ -62,79 +67,86 @@ def run(
     results.prepare(*options.INERTIAL)
     options.require_files(calibration)
     from jaximu.calibration import calibrate_thermal, load_calibration
-    from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
+    from jaximu.diagnosis.thermal_hand_held import turned_by_hand
     from jaximu.recordings.flags import without_flagged
     from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
 
     base = None if calibration is None else load_calibration(calibration).inertial()
     recordings, noise = log.alike(base).read_unit(logs, gravity, static)
-    recordings = [without_flagged(each, path) for each, path in zip(recordings, logs, strict=True)]
-    by_hand = [turned_by_hand(each) for each in recordings]
+    recordings = [without_flagged(recording, path) for recording, path in zip(recordings, logs, strict=True)]
+    by_hand = [turned_by_hand(recording) for recording in recordings]
     if all(by_hand):
         if base is not None or block is not None or to:
             raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
-        with progress("fitting"):
-            moved = calibrate_thermal_by_hand(recordings, noise, gravity)
-        page = options.drawn("thermal_hand_held", "write_thermal_by_hand", moved)
-        results.give(moved.text, lambda: _print_by_hand(moved), page, calibration=moved.calibration, thermal=moved)
+        _give_by_hand(recordings, noise, gravity, results)
         return
     if any(by_hand):
         first = str(logs[by_hand.index(True)])
         raise InputError(f"{first} is poses by hand and others are a unit at rest: give one kind at a time.")
     with progress("fitting"):
-        found = calibrate_thermal(recordings, static=noise, base=base, block=block)
-        exports = {"px4.params": px4_parameters(found, sensor or 0, accel_id, gyro_id)} if "px4" in to else {}
+        thermal = calibrate_thermal(recordings, static=noise, base=base, block=block)
+        exports = {"px4.params": px4_parameters(thermal, sensor or 0, accel_id, gyro_id)} if "px4" in to else {}
         if "ardupilot" in to:
-            exports["ardupilot.param"] = ardupilot_parameters(found, 1 if sensor is None else sensor)
+            exports["ardupilot.param"] = ardupilot_parameters(thermal, 1 if sensor is None else sensor)
     parameters = tuple(exports.values())
-
-    def write(folder: Path) -> Path:
-        from jaximu.report.thermal import write_thermal
-
-        return write_thermal(found, folder, parameters)
-
     results.give(
-        found.text,
-        lambda: _print(found, parameters),
-        write,
-        files={name: each.text.encode() for name, each in exports.items()},
-        calibration=found.calibration,
-        thermal=found,
+        lambda: _print(thermal, parameters),
+        lambda folder: later("report.thermal", "write_thermal")(thermal, folder, parameters),
+        text=thermal.text,
+        files={name: export.text.encode() for name, export in exports.items()},
+        calibration=thermal.calibration,
+        thermal=thermal,
     )
 
 
-def _print_by_hand(found: HandHeldThermal) -> None:
-    from jaximu.cli.shown import console, table
+def _give_by_hand(
+    recordings: list[Recording], noise: Recording | None, gravity: LocalGravity, results: options.Results
+) -> None:
+    """Fit poses and turns by hand over temperature, print the result and write it where asked."""
+    from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand
+
+    with progress("fitting"):
+        thermal = calibrate_thermal_by_hand(recordings, noise, gravity)
+    page = options.drawn("thermal_hand_held", "write_thermal_by_hand", thermal)
+    show = partial(_print_by_hand, thermal)
+    results.give(show, page, text=thermal.text, calibration=thermal.calibration, thermal=thermal)
+
+
+_EFFECTS = "Effects, ± half of the 95 % interval"
+
+
+def _print_by_hand(thermal: HandHeldThermal) -> None:
+    from jaximu.cli.shown import print_all
     from jaximu.report.thermal import EFFECTS, effect_rows
     from jaximu.report.thermal_hand_held import headline, limit_rows, undetermined
 
-    screen = console()
-    for sentence in headline(found):
-        screen.print(sentence)
-    if found.steps:
-        table(screen, EFFECTS, effect_rows(found.calibration), "Effects, ± half of the 95 % interval")
-    if found.limits:
-        title = "Smaller than this, others could hide (90 % power)"
-        table(screen, ("effect", "size", "at the end"), limit_rows(found), title)
-    for text in (*undetermined(found), *(f"note: {note}" for note in found.notes)):
-        screen.print(text)
+    effects = (EFFECTS, effect_rows(thermal.calibration), _EFFECTS)
+    limits = (
+        ("effect", "size", "at the end"),
+        limit_rows(thermal),
+        "Smaller than this, others could hide (90 % power)",
+    )
+    print_all(
+        *headline(thermal),
+        *([effects] if thermal.steps else []),
+        *([limits] if thermal.limits else []),
+        *undetermined(thermal),
+        notes=thermal.notes,
+    )
 
 
-def _print(found: ThermalCalibration, exports: Sequence[AutopilotParameters]) -> None:
-    from jaximu.cli.shown import console, table
+def _print(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters]) -> None:
+    from jaximu.cli.shown import print_all
     from jaximu.report import thermal as report
 
-    screen = console()
-    for sentence in report.headline(found):
-        screen.print(sentence)
-    for name in found.fits:
-        headers = ("axis", "over temperature", "left", "held out")
-        unit, rows = report.rms_rows(found, name)
-        table(screen, headers, rows, f"{name}, rms in {unit}")
-        table(screen, ("model", "effects", "held out, rms", "score, nats"), report.candidate_rows(found, name))
-    table(screen, report.EFFECTS, report.effect_rows(found.calibration), "Effects, ± half of the 95 % interval")
-    said = [*report.words(found), *(f"note: {note}" for note in found.notes)]
-    for each in exports:
-        said += [report.loss_words(each, found), *(f"{each.name}: {note}" for note in each.notes)]
-    for text in said:
-        screen.print(text)
+    print_all(*report.headline(thermal))
+    for name in thermal.fits:
+        unit, rows = report.rms_rows(thermal, name)
+        print_all(
+            (("axis", "over temperature", "left", "held out"), rows, f"{name}, rms in {unit}"),
+            (("model", "effects", "held out, rms", "score, nats"), report.candidate_rows(thermal, name)),
+        )
+    effects = (report.EFFECTS, report.effect_rows(thermal.calibration), _EFFECTS)
+    print_all(effects, *report.words(thermal), notes=thermal.notes)
+    for export in exports:
+        print_all(report.loss_words(export, thermal), *(f"{export.name}: {note}" for note in export.notes))

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import UseAppendAction, arg
 
 from jaximu.cli import options
-from jaximu.cli.calibrate import print_calibration
+from jaximu.cli.calibrate import give_calibration
 from jaximu.cli.messages import progress
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,9 +29,9 @@ def run(
     reference: Annotated[
         tuple[Path, ...],
         UseAppendAction,
-        arg(
-            metavar="REF",
-            help="A schedule (CSV), named sections (JSON, or a column part), or a file with "
+        option(
+            "REF",
+            "A schedule (CSV), named sections (JSON, or a column part), or a file with "
             "reference columns; once for each LOG. Without it the log's own reference columns are used.",
         ),
     ] = (),
@@ -40,9 +41,7 @@ def run(
     fit: Annotated[
         tuple[str, ...],
         UseAppendAction,
-        arg(
-            metavar="EFFECT", help="Also fit this effect, such as setup.table_tilt or accel.quadratic. May be repeated."
-        ),
+        option("EFFECT", "Also fit this effect, such as setup.table_tilt or accel.quadratic. May be repeated."),
     ] = (),
     earth_rotation: Annotated[
         Literal["known", "fit"] | None,
@@ -80,12 +79,16 @@ def run(
 
         wanted = (*fit, GyroEarthRotation.name) if earth_rotation == "fit" else fit
         calibration = calibrate_turntable(
-            recordings, references, gravity, static=noise, effects=list(dict.fromkeys(wanted)),
-            latitude=local.latitude if earth_rotation == "known" else None, loss=loss, repair=repair,
-        )  # fmt: skip
-    calibration = replace(calibration, trace=trace)
-    write = options.drawn("stations", "write_station_report", calibration)
-    results.give(calibration.text, lambda: print_calibration(calibration), write, calibration=calibration)
+            recordings,
+            references,
+            gravity,
+            static=noise,
+            effects=list(dict.fromkeys(wanted)),
+            latitude=local.latitude if earth_rotation == "known" else None,
+            loss=loss,
+            repair=repair,
+        )
+    give_calibration(replace(calibration, trace=trace), results, "stations", "write_station_report")
 
 
 def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Sequence[Entry]]:
@@ -94,11 +97,11 @@ def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Se
     from jaximu.recordings.recording import Recording
     from jaximu.recordings.reference import entries_of_columns
 
-    found = []
-    for place, recording in enumerate(recordings):
-        read = read_reference(paths[place], recording) if paths else recording
+    entries = []
+    for index, recording in enumerate(recordings):
+        read = read_reference(paths[index], recording) if paths else recording
         if isinstance(read, Recording):
-            recordings[place] = read
+            recordings[index] = read
             read = entries_of_columns(read)
-        found.append(read)
-    return found
+        entries.append(read)
+    return entries

@@ -16,8 +16,17 @@ from types import UnionType
 
 from jaximu.ground.errors import InputError
 
-__all__ = ["COMMON", "EXIT_STATUS", "OptionHelp", "check_options", "completion", "help_text", "listed", "options_of",
-           "usage_mistake"]  # fmt: skip
+__all__ = [
+    "COMMON",
+    "EXIT_STATUS",
+    "OptionHelp",
+    "check_options",
+    "completion",
+    "help_text",
+    "listed",
+    "options_of",
+    "usage_mistake",
+]
 
 EXIT_STATUS = (
     "Exit status: 0 done; 1 understood but not possible (the message says what to record); 2 bad input or usage."
@@ -57,31 +66,31 @@ COMMON = (
 def options_of(run: Callable[..., None]) -> list[OptionHelp]:
     """Return what a verb takes, in the order of its signature."""
     hints = typing.get_type_hints(run, include_extras=True)
-    found: list[OptionHelp] = []
+    helps: list[OptionHelp] = []
     for name, parameter in inspect.signature(run).parameters.items():
         default = parameter.default
         if is_dataclass(default):
             group_hints = typing.get_type_hints(type(default), include_extras=True)
             title = getattr(default, "title", "Options")
             options = [field for field in fields(default) if field.repr]  # the others are no options
-            found += [_option(field.name, group_hints[field.name], field.default, title) for field in options]
+            helps += [_option(field.name, group_hints[field.name], field.default, title) for field in options]
         else:
             positional = parameter.kind is inspect.Parameter.POSITIONAL_ONLY
-            found.append(_option(name, hints[name], default, "Output" if name in _IN_OUTPUT else "Options", positional))
-    return found
+            helps.append(_option(name, hints[name], default, "Output" if name in _IN_OUTPUT else "Options", positional))
+    return helps
 
 
 def _option(name: str, hint: object, default: object, group: str, positional: bool = False) -> OptionHelp:
     arguments = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
-    said = next((each for each in arguments[1:] if hasattr(each, "metavar")), None)
+    stated = next((argument for argument in arguments[1:] if hasattr(argument, "metavar")), None)
     positional |= any(
-        getattr(each, "__name__", "") == "Positional" or str(each) == "Positional" for each in arguments[1:]
+        getattr(argument, "__name__", "") == "Positional" or str(argument) == "Positional" for argument in arguments[1:]
     )
-    option = "--" + str(getattr(said, "name", None) or name).replace("_", "-")
-    metavar = getattr(said, "metavar", None) or ("" if arguments[0] is bool else _metavariable(arguments[0]))
-    aliases = tuple(getattr(said, "aliases", None) or ())
+    option = "--" + str(getattr(stated, "name", None) or name).replace("_", "-")
+    metavar = getattr(stated, "metavar", None) or ("" if arguments[0] is bool else _metavariable(arguments[0]))
+    aliases = tuple(getattr(stated, "aliases", None) or ())
     names = () if positional else (*aliases, option)
-    return OptionHelp(names, metavar, getattr(said, "help", None) or "", group, default)
+    return OptionHelp(names, metavar, getattr(stated, "help", None) or "", group, default)
 
 
 def _metavariable(hint: object) -> str:
@@ -98,20 +107,20 @@ def help_text(name: str, run: Callable[..., None]) -> str:
     width = min(shutil.get_terminal_size().columns, 100)
     text, _, examples = (inspect.getdoc(run) or "").partition("\n\nExamples:\n")
     options = options_of(run)
-    positional = [each for each in options if each.positional]
-    lines = [f"usage: jaximu {name} [OPTIONS] {' '.join(each.metavar for each in positional)}".rstrip(), ""]
+    positional = [option for option in options if option.positional]
+    lines = [f"usage: jaximu {name} [OPTIONS] {' '.join(option.metavar for option in positional)}".rstrip(), ""]
     for paragraph in text.split("\n\n"):
         lines += [*textwrap.wrap(" ".join(paragraph.split()), width), ""]
-    for each in positional:
-        lines += [*_lines(each.metavar, each.help, width), ""] if each.help else []
+    for option in positional:
+        lines += [*_lines(option.metavar, option.help, width), ""] if option.help else []
     for group in _GROUPS:
-        shown = [each for each in (*options, *COMMON) if each.group == group and not each.positional]
+        shown = [option for option in (*options, *COMMON) if option.group == group and not option.positional]
         if shown:
             lines.append(f"{group}:")
-            for each in shown:
-                stated = each.default not in (None, False, (), inspect.Parameter.empty)
-                default = f" (default: {each.default})" if stated else ""
-                lines += _lines(f"{', '.join(each.names)} {each.metavar}".rstrip(), each.help + default, width)
+            for option in shown:
+                stated = option.default not in (None, False, (), inspect.Parameter.empty)
+                default = f" (default: {option.default})" if stated else ""
+                lines += _lines(f"{', '.join(option.names)} {option.metavar}".rstrip(), option.help + default, width)
             lines.append("")
     if examples:
         lines += ["Examples:", examples, ""]
@@ -145,7 +154,7 @@ def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], Callable[.
     return "\n".join([*lines, *textwrap.wrap(EXIT_STATUS, width)])
 
 
-def check_options(name: str, run: Callable[..., None], given: Sequence[str]) -> list[str]:
+def check_options(name: str, run: Callable[..., None], arguments: Sequence[str]) -> list[str]:
     """Return the command line, with `--option=value` where a value begins with a minus, as the axes -x,-y,z do.
 
     Raises `InputError` for an option that the verb has not, naming the nearest that it has.
@@ -154,7 +163,7 @@ def check_options(name: str, run: Callable[..., None], given: Sequence[str]) -> 
     known = [text for option in options for text in option.names]
     valued = [text for option in options if option.metavar for text in option.names if text.startswith("--")]
     line: list[str] = []
-    for text in given:
+    for text in arguments:
         option = text.partition("=")[0]
         if re.fullmatch(r"--[a-z][\w-]*", option) and option.replace("_", "-") not in known:
             near = difflib.get_close_matches(option, known, 1, 0.5)
@@ -176,14 +185,14 @@ def usage_mistake(name: str, run: Callable[..., None], printed: str) -> InputErr
     _, *lines = [line for line in lines if line]  # a title, and perhaps a rule; what follows the next rule is advice
     rule = re.compile("[─-]{9,}")
     lines = list(itertools.dropwhile(rule.fullmatch, lines))
-    said = list(itertools.takewhile(lambda line: not rule.fullmatch(line), lines))
-    text = " ".join(said)
+    message = list(itertools.takewhile(lambda line: not rule.fullmatch(line), lines))
+    text = " ".join(message)
     if match := _VALUE.search(text):
-        kinds = {each: option.metavar for option in options_of(run) for each in option.names}
+        kinds = {spelling: option.metavar for option in options_of(run) for spelling in option.names}
         kind = "a number" if "FLOAT" in text or "INT" in text else kinds.get(match["option"], "what it takes")
         text = f"{match['option']}: {match['value']} is not {kind}."
     if text.startswith("Missing from"):
-        text = f"{said[1]} is missing."
+        text = f"{message[1]} is missing."
     text = re.sub(r"Unrecognized options: (.*)", r"unexpected: \1.", text)
     return InputError(f"{text} See `jaximu {name} --help`.")
 
@@ -196,7 +205,7 @@ def completion(shell: str, verbs: Sequence[str], verb: Callable[[str], Callable[
     if shell == "fish":
         lines = [f"complete -c jaximu -n __fish_use_subcommand -f -a '{' '.join(verbs)}'"]
         for name, options in names.items():
-            long = " ".join(f"-l {each[2:]}" for each in options)
+            long = " ".join(f"-l {option[2:]}" for option in options)
             lines.append(f"complete -c jaximu -n '__fish_seen_subcommand_from {name}' {long}")
         return "\n".join(lines)
     cases = "\n".join(f"    {name}) words='{' '.join(options)}' ;;" for name, options in names.items())

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from jaximu.cli import options
+from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 __all__ = ["run"]
@@ -17,11 +18,11 @@ def run(
     documents: Annotated[
         tuple[Path, ...],
         Positional,
-        arg(name="documents", metavar="DOCUMENT [DOCUMENT ...]", help="calibration.json or acceptance.json."),
+        option("DOCUMENT [DOCUMENT ...]", "calibration.json or acceptance.json.", name="documents"),
     ],
     /,
     *,
-    folder: Annotated[Path | None, arg(metavar="DIR", help="Look for moved recordings here, too.")] = None,
+    folder: Annotated[Path | None, option("DIR", "Look for moved recordings here, too.")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Check a calibration.json or an acceptance.json, and every file behind it, against the hashes they carry.
@@ -47,10 +48,12 @@ def run(
     else:
         for link in links:
             print(f"{link.state}: {link.what} {link.file}")
-        print({
-            "changed": "Changed: at least one file is not what it was when the result was written.",
-            "intact": "Intact: every file is what it was.",
-            "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
-        }[verdict])  # fmt: skip
+        print(
+            {
+                "changed": "Changed: at least one file is not what it was when the result was written.",
+                "intact": "Intact: every file is what it was.",
+                "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
+            }[verdict]
+        )
     if verdict != "intact":
         raise SystemExit(3 if changed else 4)

@@ -17,7 +17,15 @@ from jaximu.ground.quantities import listed, number, unit_text
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
 from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.analysis import NoiseAnalysis
-from jaximu.noise.filter_noise import filter_numbers, mean_terms, random_walk_only, recorded_seconds, white_noise_only
+from jaximu.noise.filter_noise import (
+    FLICKER,
+    FilterNumbers,
+    filter_numbers,
+    mean_terms,
+    random_walk_only,
+    recorded_seconds,
+    white_noise_only,
+)
 from jaximu.noise.identification import Identified, Term
 from jaximu.recordings.readers.kalibr import kalibr_yaml
 from jaximu.recordings.recording import Source
@@ -29,66 +37,97 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["TermRow", "allan_figure", "hours", "kalibr_text", "lead", "noise_report", "repeatability_rows", "term_rows",
-           "unresolved", "unseen_notes"]  # fmt: skip
+__all__ = [
+    "TermRow",
+    "allan_figure",
+    "filter_rows",
+    "hours",
+    "kalibr_text",
+    "lead",
+    "noise_report",
+    "repeatability_rows",
+    "term_rows",
+    "unresolved",
+    "unseen_notes",
+]
 
-_DISCRETE_UNITS = {"angular_rate": ("deg/s", "rad/s"), "specific_force": ("mg", "m/s^2"),
-                   "magnetic_field": ("nT", "uT")}  # fmt: skip
+_DISCRETE_UNITS = {
+    "angular_rate": ("deg/s", "rad/s"),
+    "specific_force": ("mg", "m/s^2"),
+    "magnetic_field": ("nT", "uT"),
+}
 Cell = tuple[float, float, float] | float
 
 
 @dataclass(frozen=True)
 class TermRow:
-    """One term in one unit: value, low and high for x, y, z and their mean; where not seen, how large it may be."""
+    """One term in one unit: value, low and high for x, y, z and their mean; where not seen, how large it may be.
+
+    first: whether it is the first row of its term.
+    """
 
     term: str
     meaning: str
     unit: str
     cells: tuple[Cell, ...]
+    first: bool
 
     def texts(self) -> list[tuple[str, str]]:
         """Return value and interval as a person reads them."""
-        return [(number(cell[0], 4), f"{number(cell[1])} … {number(cell[2])}") if isinstance(cell, tuple)
-                else ("not seen", f"up to {number(cell)}") for cell in self.cells]  # fmt: skip
+        return [
+            (number(cell[0], 4), f"{number(cell[1])} … {number(cell[2])}")
+            if isinstance(cell, tuple)
+            else ("not seen", f"up to {number(cell)}")
+            for cell in self.cells
+        ]
 
 
-def _in_unit(value: float, quantity: str, term: str, unit: str, digits: int = 3) -> str:
-    """Return an SI value of a term in a unit."""
-    return f"{number(float(convert(value, SI_UNITS[quantity][term], unit)), digits)} {unit_text(unit)}"
+def _factor(quantity: str, term: str, unit: str) -> float:
+    """Return how many of a unit the SI unit of a term is."""
+    return float(convert(1.0, SI_UNITS[quantity][term], unit))
+
+
+def _in_unit(value: float, quantity: str, term: str, digits: int = 3) -> str:
+    """Return an SI value of a term in the unit of data sheets."""
+    unit = DATASHEET_UNITS[quantity][term]
+    return f"{number(value * _factor(quantity, term, unit), digits)} {unit_text(unit)}"
+
+
+def _units(quantity: str, term: str) -> Sequence[str]:
+    """Return the unit of data sheets, then SI; one unit where they are the same."""
+    return list(dict.fromkeys((DATASHEET_UNITS[quantity][term], SI_UNITS[quantity][term])))
 
 
 def term_rows(axes: Sequence[Identified], quantity: str) -> list[TermRow]:
     """Return two rows for each term that any axis supports: in the unit of data sheets, then in SI; continuous."""
-    made = []
+    rows = []
     mean = mean_terms(axes)
     for term, meaning in TERM_NAMES.items():
-        found: list[Term | None] = [*(axis.terms.get(term) for axis in axes), mean.get(term)]
-        if all(each is None for each in found):
-            continue
-        si = SI_UNITS[quantity][term]
-        for unit in dict.fromkeys((DATASHEET_UNITS[quantity][term], si)):
-            factor = float(convert(1.0, si, unit))
+        estimates: list[Term | None] = [*(axis.terms.get(term) for axis in axes), mean.get(term)]
+        for unit in _units(quantity, term) if any(estimates) else ():
+            factor = _factor(quantity, term, unit)
             cells = tuple(
-                factor * axes[place].limits[term] if each is None
-                else (factor * each.value, factor * each.low, factor * each.high)
-                for place, each in enumerate(found)
-            )  # fmt: skip
-            made.append(TermRow(term, meaning, unit, cells))
-    return made
+                factor * axes[column].limits[term]
+                if estimate is None
+                else (factor * estimate.value, factor * estimate.low, factor * estimate.high)
+                for column, estimate in enumerate(estimates)
+            )
+            rows.append(TermRow(term, meaning, unit, cells, unit == DATASHEET_UNITS[quantity][term]))
+    return rows
 
 
 def unseen_notes(axes: Sequence[Identified], quantity: str) -> list[str]:
     """Return a sentence for each term that only some axes show, and one for those that none does."""
     letters = "xyz"[: len(axes)]
     notes = [
-        f"{term} is supported by the data on {', '.join(each.axes)} alone and counts as zero on the other axes in the "
-        "mean."
-        for term, each in mean_terms(axes).items()
-        if each is not None and each.axes != letters
+        f"{term} is supported by the data on {', '.join(estimate.axes)} alone and counts as zero on the other axes "
+        "in the mean."
+        for term, estimate in mean_terms(axes).items()
+        if estimate is not None and estimate.axes != letters
     ]
     missing = [
-        f"{TERM_NAMES[term]} {term} (up to {_in_unit(max(limits), quantity, term, unit, 2)})"
-        for term, unit in DATASHEET_UNITS[quantity].items()
+        f"{TERM_NAMES[term]} {term} (up to {_in_unit(max(limits), quantity, term, 2)})"
+        for term in DATASHEET_UNITS[quantity]
         if len(limits := [axis.limits[term] for axis in axes if term in axis.limits]) == len(axes)
     ]
     return [*notes, f"Not seen on any axis: {listed(missing)}."] if missing else notes
@@ -105,7 +144,7 @@ def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
     """Return by triad what the length of the recording cannot resolve."""
     made = {}
     for name, axes in analysis.axes.items():
-        length, longest = recorded_seconds(axes[0]), float(axes[0].deviation.tau[-1])
+        length, longest = recorded_seconds(axes[0]), axes[0].deviation.tau[-1]
         text = (
             f"{hours(length)} at rest resolve averages up to {hours(longest)}; what the bias does more slowly, and "
             "from one power-on to the next, does not show."
@@ -120,20 +159,23 @@ def lead(analysis: NoiseAnalysis) -> str:
     for name in ("gyroscope", "accelerometer", "magnetometer"):
         if name in analysis.axes:
             quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
-            said = [f"{TERM_NAMES[term]} of {_in_unit(each.value, quantity, term, DATASHEET_UNITS[quantity][term])}"
-                    for term in "NBK" if (each := mean.get(term)) is not None]  # fmt: skip
-            parts.append(f"the {name} has {listed(said) if said else 'none of N, B and K'}")
+            sizes = [
+                f"{TERM_NAMES[term]} of {_in_unit(estimate.value, quantity, term)}"
+                for term in "NBK"
+                if (estimate := mean.get(term)) is not None
+            ]
+            parts.append(f"the {name} has {listed(sizes) if sizes else 'none of N, B and K'}")
     axes = next(iter(analysis.axes.values()))
     return f"In {hours(recorded_seconds(axes[0]))} at rest, {'; '.join(parts)} (mean of the axes)."
 
 
 def _lowest(axes: Sequence[Identified]) -> tuple[float, float]:
     """Return the lowest point of the mean of the fitted Allan variances: averaging time (s) and deviation (SI)."""
-    each = axes[0].deviation
-    tau = np.geomspace(each.tau[0], each.tau[-1], 400)
+    deviation = axes[0].deviation
+    tau = np.geomspace(deviation.tau[0], deviation.tau[-1], 400)
     total = _mean_deviation(axes, tau)
-    place = int(np.argmin(total))
-    return float(tau[place]), float(total[place])
+    index = int(np.argmin(total))
+    return tau[index], total[index]
 
 
 def _mean_deviation(axes: Sequence[Identified], tau: FloatArray) -> FloatArray:
@@ -142,8 +184,13 @@ def _mean_deviation(axes: Sequence[Identified], tau: FloatArray) -> FloatArray:
 
 def _line(term: str, value: float, tau: FloatArray) -> FloatArray:
     """Return the Allan deviation of one term alone (SI)."""
-    shapes = {"Q": math.sqrt(3) / tau, "N": 1 / np.sqrt(tau), "K": np.sqrt(tau / 3), "R": tau / math.sqrt(2),
-              "B": math.sqrt(2 * math.log(2) / math.pi) * np.ones_like(tau)}  # fmt: skip
+    shapes = {
+        "Q": math.sqrt(3) / tau,
+        "N": 1 / np.sqrt(tau),
+        "K": np.sqrt(tau / 3),
+        "R": tau / math.sqrt(2),
+        "B": math.sqrt(FLICKER) * np.ones_like(tau),
+    }
     return value * shapes[term]
 
 
@@ -163,31 +210,44 @@ def allan_figure(analysis: NoiseAnalysis) -> Figure:
         Line2D([], [], color="0.3", linewidth=1.2, label="fitted: all terms"),
         Line2D([], [], color="0.3", linewidth=0.9, linestyle="--", label="each term (mean of the axes)"),
     ]
-    figure.legend(handles=handles, loc="lower center", ncols=7 if len(panels) > 1 else 4, fontsize=8.5,
-                  frameon=False, columnspacing=1.4, handlelength=1.8)  # fmt: skip
+    figure.legend(
+        handles=handles,
+        loc="lower center",
+        ncols=7 if len(panels) > 1 else 4,
+        fontsize=8.5,
+        frameon=False,
+        columnspacing=1.4,
+        handlelength=1.8,
+    )
     return figure
 
 
 def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    from matplotlib.ticker import LogLocator
 
     quantity = SENSOR_QUANTITIES[name]
-    factor = float(convert(1.0, SI_UNITS[quantity]["B"], unit))
+    factor = _factor(quantity, "B", unit)
     tau = axes[0].deviation.tau
-    longest, length = float(tau[-1]), max(recorded_seconds(axes[0]), 2 * float(tau[-1]))
+    longest, length = tau[-1], max(recorded_seconds(axes[0]), 2 * tau[-1])
     fine = np.geomspace(tau[0], longest, 200)
     least, most = math.inf, 0.0
-    for colour, found in zip(AXES.values(), axes, strict=True):
-        each = found.deviation
+    for colour, fit in zip(AXES.values(), axes, strict=True):
+        deviation = fit.deviation
         panel.fill_between(
-            each.tau, factor * each.low, factor * each.high, color=colour, alpha=0.18, linewidth=0, zorder=2
+            deviation.tau,
+            factor * deviation.low,
+            factor * deviation.high,
+            color=colour,
+            alpha=0.18,
+            linewidth=0,
+            zorder=2,
         )
-        panel.plot(each.tau, factor * each.value, ".", color=colour, markersize=6, zorder=4)
-        panel.plot(fine, factor * found.allan_deviation(fine), color=colour, linewidth=1.2, zorder=3)
-        least = min(least, factor * float(each.low.min()), factor * float(each.value.min()))
-        most = max(most, factor * float(each.value.max()))
+        panel.plot(deviation.tau, factor * deviation.value, ".", color=colour, markersize=6, zorder=4)
+        panel.plot(fine, factor * fit.allan_deviation(fine), color=colour, linewidth=1.2, zorder=3)
+        least = min(least, factor * deviation.low.min(), factor * deviation.value.min())
+        most = max(most, factor * deviation.value.max())
     bottom, top = least / 4, most * 1.8
-    left, right = float(tau[0]) / 1.4, length
+    left, right = tau[0] / 1.4, length
     panel.set(xscale="log", yscale="log", xlim=(left, right), ylim=(bottom, top))
     whole = np.geomspace(left, right, 600)
     total = factor * _mean_deviation(axes, np.clip(whole, tau[0], longest))
@@ -196,29 +256,23 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
             continue
         line = factor * _line(term, mean.value, whole)
         panel.plot(whole, line, "--", color="0.3", linewidth=0.9, zorder=2.5)
-        inside = np.flatnonzero((line > bottom * 1.25) & (line < top / 1.25))
-        if not len(inside):
-            continue
-        # the letter stands where the term is farthest below the whole: there it covers no data
-        end = inside[np.argmax((total / line)[inside])]
-        room = line[-1] < line[0] and end < 0.7 * len(whole)
-        spot, align = end, "left" if room else "right"  # beside a line that leaves at the bottom
-        if end < 12 or end > len(whole) - 12:  # on a line that leaves at the side
-            spot, align = (8, "left") if end < 12 else (len(whole) - 8, "right")
-        panel.annotate(
-            f" {term}  {TERM_NAMES[term]} ", (whole[spot], line[spot]), fontsize=8.5, color="0.15", zorder=5, ha=align,
-            va="center", bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
-        )  # fmt: skip
+        _letter(panel, term, whole, line, total, bottom, top)
     panel.axvspan(longest, right, color="0.88", zorder=1)
     narrow = math.log(right / longest) < 0.19 * math.log(right / left)
     panel.text(
-        math.sqrt(longest * right), top / 1.15, f"not resolved\nby {hours(recorded_seconds(axes[0]))}", ha="center",
-        va="top", fontsize=8.5, color="0.35", rotation=90 if narrow else 0,
-    )  # fmt: skip
+        math.sqrt(longest * right),
+        top / 1.15,
+        f"not resolved\nby {hours(recorded_seconds(axes[0]))}",
+        ha="center",
+        va="top",
+        fontsize=8.5,
+        color="0.35",
+        rotation=90 if narrow else 0,
+    )
     panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if top / bottom < 300 else (1.0,)))
-    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    panel.yaxis.set_minor_formatter(NullFormatter())
-    panel.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.yaxis.set_major_formatter("{x:g}")
+    panel.yaxis.set_minor_formatter("")
+    panel.xaxis.set_major_formatter("{x:g}")
     panel.set(xlabel="averaging time τ [s]", ylabel=f"Allan deviation σ(τ) [{unit_text(unit)}]")
     si = panel.secondary_yaxis(
         "right", functions=(lambda value: np.asarray(value) / factor, lambda value: np.asarray(value) * factor)
@@ -229,12 +283,28 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
     panel.grid(True, which="both", color="#EBEBEB", linewidth=0.6)
 
 
+def _letter(
+    panel: Axes, term: str, tau: FloatArray, line: FloatArray, total: FloatArray, bottom: float, top: float
+) -> None:
+    """Name a term's line where it is farthest below the whole: there the letter covers no data."""
+    inside = np.flatnonzero((line > bottom * 1.25) & (line < top / 1.25))
+    if not len(inside):
+        return
+    end = inside[np.argmax((total / line)[inside])]
+    room = line[-1] < line[0] and end < 0.7 * len(tau)
+    spot, align = end, "left" if room else "right"  # beside a line that leaves at the bottom
+    if end < 12 or end > len(tau) - 12:  # on a line that leaves at the side
+        spot, align = (8, "left") if end < 12 else (len(tau) - 8, "right")
+    box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+    text = f" {term}  {TERM_NAMES[term]} "
+    panel.annotate(text, (tau[spot], line[spot]), fontsize=8.5, color="0.15", zorder=5, ha=align, va="center", bbox=box)
+
+
 def _headline(name: str, axes: Sequence[Identified]) -> str:
     quantity, white = SENSOR_QUANTITIES[name], mean_terms(axes).get("N")
     at, size = _lowest(axes)
-    units = DATASHEET_UNITS[quantity]
-    bottom = f"lowest {_in_unit(size, quantity, 'B', units['B'], 2)} at {number(at, 2)} s"
-    first = "" if white is None else f"N = {_in_unit(white.value, quantity, 'N', units['N'])}, "
+    bottom = f"lowest {_in_unit(size, quantity, 'B', 2)} at {number(at, 2)} s"
+    first = "" if white is None else f"N = {_in_unit(white.value, quantity, 'N')}, "
     return f"{name.capitalize()}: {first}{bottom}"
 
 
@@ -251,8 +321,10 @@ def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
     }
 
     def comment(origin: tuple[str, ...]) -> str:
-        axes = {each: [a for a, o in zip("xyz", origin, strict=False) if o == each] for each in dict.fromkeys(origin)}
-        return "; ".join(f"{', '.join(letters)}: {words[each]}" for each, letters in axes.items())
+        axes = {
+            source: [a for a, o in zip("xyz", origin, strict=False) if o == source] for source in dict.fromkeys(origin)
+        }
+        return "; ".join(f"{', '.join(letters)}: {words[source]}" for source, letters in axes.items())
 
     inertial = [name for name in INERTIAL_QUANTITIES if name in analysis.axes]
     for name in inertial:
@@ -284,67 +356,87 @@ def noise_report(
     """
     names = ", ".join(Path(path).name for path in analysis.files) or "a recording"
     return page(
-        "allan", {"allan": partial(allan_figure, analysis)},
-        title=title or f"Noise at rest: {names}", lead=lead(analysis),
+        "allan",
+        {"allan": partial(allan_figure, analysis)},
+        title=title or f"Noise at rest: {names}",
+        lead=lead(analysis),
         alternative="Allan deviation against averaging time for " + " and ".join(analysis.axes),
         triads=[_triad(analysis, name) for name in analysis.axes],
         caution=[name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)],
         missing=[name for name in INERTIAL_QUANTITIES if name not in analysis.axes],
         unresolved=[(name.capitalize(), text) for name, text in unresolved(analysis).items()],
-        yaml=kalibr_text(analysis), recordings=len(analysis.files), notes=[note for note in analysis.notes if note],
+        yaml=kalibr_text(analysis),
+        recordings=len(analysis.files),
+        notes=[note for note in analysis.notes if note],
         repeatability=[(row.meaning, unit_text(row.unit), row.texts()) for row in repeatability_rows(analysis)],
-        sources=[(each.path, str(each.rows or ""), each.sha256)
-                 for each in sources or [Source(path, "", 0) for path in analysis.files]],
+        sources=[
+            (source.path, str(source.rows or ""), source.sha256)
+            for source in sources or [Source(path, "", 0) for path in analysis.files]
+        ],
         facts=[
             ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
-            ("Method", "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data supports "
-             "(jaximu.noise.identify); picture: overlapping Allan deviation at octaves"),
+            (
+                "Method",
+                "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data supports "
+                "(jaximu.noise.identify); picture: overlapping Allan deviation at octaves",
+            ),
             ("Software", f"jaximu {__version__}"),
             ("Report written", written_now()),
         ],
-    )  # fmt: skip
+    )
 
 
 def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
     """Return what the page says of one triad, as text."""
     axes, quantity, rate = analysis.axes[name], SENSOR_QUANTITIES[name], analysis.rates[name]
-    terms, last = [], ""
+    terms = []
     for row in term_rows(axes, quantity):
-        si, first = row.unit == SI_UNITS[quantity][row.term], row.term != last
-        kind = "SI and data sheets" if si and first else "SI" if si else "data sheets"
-        terms.append({"term": row.term, "meaning": row.meaning, "first": first, "unit": unit_text(row.unit),
-                      "kind": kind, "cells": row.texts()})  # fmt: skip
-        last = row.term
-    found: list[dict[str, Any]] = [*(dict(axis.terms) for axis in axes), dict(mean_terms(axes))]
+        kinds = ["SI"] * (row.unit == SI_UNITS[quantity][row.term]) + ["data sheets"] * row.first
+        terms.append((row, unit_text(row.unit), " and ".join(kinds)))
+    columns: list[dict[str, Any]] = [*(dict(axis.terms) for axis in axes), dict(mean_terms(axes))]
     discrete = []
     for term, words in (("N", "white noise of one sample, σ = N √rate"), ("K", "step of the bias walk, σ = K/√rate")):
-        sizes = [None if each.get(term) is None else float(to_discrete(term, each[term].value, rate)) for each in found]
+        sizes = [
+            None if column.get(term) is None else float(to_discrete(term, column[term].value, rate))
+            for column in columns
+        ]
         for unit in _DISCRETE_UNITS[quantity] if any(size is not None for size in sizes) else ():
-            factor = float(convert(1.0, SI_UNITS[quantity]["B"], unit))
+            factor = _factor(quantity, "B", unit)
             cells = [None if size is None else number(factor * size, 4) for size in sizes]
             discrete.append((words, unit_text(unit), cells))
     per_axis, mean = filter_numbers(analysis, name)
     numbers = [
-        (row[0][1], row[0][2], unit_text(row[0][4]),
-         [None if each[3] is None else number(each[3], 4 if each[0] != "decay" else 8) for each in row])
-        for row in zip(*(each.rows() for each in (*per_axis, mean)), strict=True)
-        if any(each[3] is not None for each in row)
-    ]  # fmt: skip
+        (*row[0][:2], row[0][3], [text for _, _, text, _ in row])
+        for row in zip(*map(filter_rows, (*per_axis, mean)), strict=True)
+        if any(text for _, _, text, _ in row)
+    ]
     at, size = _lowest(axes)
     return {
-        "name": name, "rate": f"{rate:.6g}", "terms": terms, "discrete": discrete, "numbers": numbers,
+        "name": name,
+        "rate": f"{rate:.6g}",
+        "terms": terms,
+        "discrete": discrete,
+        "numbers": numbers,
         "notes": unseen_notes(axes, quantity),
-        "lowest": f"{_in_unit(size, quantity, 'B', DATASHEET_UNITS[quantity]['B'], 2)} at {hours(at)}",
-        "flat": None if mean.flat is None else [hours(each) for each in sorted(mean.flat)],
-    }  # fmt: skip
+        "lowest": f"{_in_unit(size, quantity, 'B', 2)} at {hours(at)}",
+        "flat": None if mean.flat is None else [hours(end) for end in sorted(mean.flat)],
+    }
+
+
+def filter_rows(numbers: FilterNumbers) -> list[tuple[str, str, str | None, str]]:
+    """Return formula, words, value as text and unit of each number that a filter takes; None where there is none."""
+    return [
+        (formula, words, None if value is None else number(value, 8 if key == "decay" else 4), unit_text(unit))
+        for key, formula, words, value, unit in numbers.rows()
+    ]
 
 
 def repeatability_rows(analysis: NoiseAnalysis) -> list[TermRow]:
     """Return how the bias scatters over recordings, by triad: a row in the unit of data sheets, then one in SI."""
-    made = []
+    rows = []
     for name, table in analysis.repeatability.items():
-        si = SI_UNITS[SENSOR_QUANTITIES[name]]["B"]
-        for unit in (DATASHEET_UNITS[SENSOR_QUANTITIES[name]]["B"], si):
-            cells = tuple((float(v), float(low), float(high)) for v, low, high in np.asarray(convert(table, si, unit)))
-            made.append(TermRow("B", name, unit, cells))
-    return made
+        quantity = SENSOR_QUANTITIES[name]
+        for unit in _units(quantity, "B"):
+            cells = tuple(map(tuple, _factor(quantity, "B", unit) * np.asarray(table)))
+            rows.append(TermRow("B", name, unit, cells, unit == DATASHEET_UNITS[quantity]["B"]))
+    return rows

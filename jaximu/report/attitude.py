@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.ground.quantities import number, unit_text
+from jaximu.ground.quantities import Z95, number, unit_text
 from jaximu.ground.summary import sentence
 from jaximu.model.mounting import Mounting
-from jaximu.report.figures import AFTER, BEFORE, dressed, new_figure
-from jaximu.report.html import write_calibration
+from jaximu.report.figures import AFTER, BEFORE, dressed, legend, new_figure, zero_line
+from jaximu.report.html import Folder, write_calibration
 from jaximu.report.words import Lead, Statement, gravity_statement, how_much_smaller, weak_statements
 
 if TYPE_CHECKING:
@@ -24,8 +24,10 @@ if TYPE_CHECKING:
 
 __all__ = ["mounting_words", "share_words", "write_attitude_report"]
 
-_PANELS = {"rotation": "Rate off the reference's, mean of each interval",
-           "specific_force": "Specific force off gravity and the reference's acceleration"}  # fmt: skip
+_PANELS = {
+    "rotation": "Rate off the reference's, mean of each interval",
+    "specific_force": "Specific force off gravity and the reference's acceleration",
+}
 _SIZES = {
     "gyroscope": ("white noise of the gyroscope", 1e-4, 60 * np.degrees(1.0), "°/√h"),
     "reference attitude": ("noise of the reference's attitude", 1e-3, np.degrees(1.0), "°"),
@@ -36,39 +38,39 @@ _SIZES = {
 """What each component is in words, its standard deviation at an excess of one, and how a person reads it."""
 
 
-def mounting_words(calibration: Calibration) -> list[str]:
+def mounting_words(calibration: Calibration) -> Iterator[str]:
     """Say how the reference is mounted, how late and smoothed it is, and how its vertical stands."""
-    found = calibration.reference
-    assert found is not None
-    offset = found["time_offset"]
-    angle = np.degrees(2 * np.arccos(min(1.0, abs(found["rotation"][0]))))
-    late = 1e3 * offset["value"]
-    said = [
-        f"The reference's stamps are {abs(late):.3g} ± {1.96e3 * offset['sigma']:.2g} ms "
-        f"{'late' if late > 0 else 'early'}.",
+    alignment = calibration.reference
+    assert alignment is not None
+    offset = alignment["time_offset"]
+    angle = np.degrees(2 * np.arccos(min(1.0, abs(alignment["rotation"][0]))))
+    delay = 1e3 * offset["value"]
+    yield from [
+        f"The reference's stamps are {abs(delay):.3g} ± {1.96e3 * offset['sigma']:.2g} ms "
+        f"{'late' if delay > 0 else 'early'}.",
         f"The unit is turned by {angle:.3g}° relative to the body of the reference.",
     ]
-    drift = 1e6 * (found["clock_scale"] - 1)
+    drift = 1e6 * (alignment["clock_scale"] - 1)
     if drift:
-        said.append(
-            f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's."
-        )
-    wide, sigma = found["filter"]["variance"], found["filter"]["sigma"]
-    most, least = (1e3 * np.sqrt(max(abs(wide) + times * 1.96 * sigma, 0.0)) for times in (1, -1))
+        yield (f"The log's clock runs {abs(drift):.3g} ppm {'fast' if drift > 0 else 'slow'} against the reference's.")
+    wide, sigma = alignment["filter"]["variance"], alignment["filter"]["sigma"]
+    most, least = (1e3 * np.sqrt(max(abs(wide) + times * Z95 * sigma, 0.0)) for times in (1, -1))
     if least and wide > 0:
-        said.append(f"The reference is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %).")
+        yield f"The reference is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %)."
     elif least:
-        said.append(f"The gyroscope is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %) beyond "
-                    "the reference.")  # fmt: skip
+        yield (
+            f"The gyroscope is smoothed as by a first-order lag of {least:.3g} to {most:.3g} ms (95 %) beyond "
+            "the reference."
+        )
     else:
-        said.append(f"No filter of the reference shows; a first-order lag is below {most:.3g} ms.")
-    if arm := found["lever_arm"]:
-        places = ", ".join(f"{1e3 * value:.3g} ± {1.96e3 * sigma:.2g}"
-                           for value, sigma in zip(arm["value"], arm["sigma"], strict=True))  # fmt: skip
-        said.append(f"The unit lies {places} mm (95 %) from the point that is tracked, along the reference's x, y, z.")
+        yield f"No filter of the reference shows; a first-order lag is below {most:.3g} ms."
+    if arm := alignment["lever_arm"]:
+        places = ", ".join(
+            f"{1e3 * value:.3g} ± {1.96e3 * sigma:.2g}" for value, sigma in zip(arm["value"], arm["sigma"], strict=True)
+        )
+        yield f"The unit lies {places} mm (95 %) from the point that is tracked, along the reference's x, y, z."
     tilt = np.linalg.norm(Mounting.of(calibration.imu).tilt)
-    said.append(f"The reference's vertical is off by {np.degrees(tilt):.2g}°.")
-    return said
+    yield f"The reference's vertical is off by {np.degrees(tilt):.2g}°."
 
 
 def share_words(calibration: Calibration) -> list[str]:
@@ -80,9 +82,7 @@ def share_words(calibration: Calibration) -> list[str]:
     ]
 
 
-def write_attitude_report(
-    calibration: Calibration, measurement: AgainstAttitude, folder: str | os.PathLike[str]
-) -> Path:
+def write_attitude_report(calibration: Calibration, measurement: AgainstAttitude, folder: Folder) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     before, after, unit = calibration.rms["rotation"]
     old, new, force = calibration.rms["specific_force"]
@@ -93,7 +93,7 @@ def write_attitude_report(
         f"rms error of the mean rate between stamps of the reference, {how_much_smaller(before, after)} than before",
     )
     parts = "; ".join(share_words(calibration))
-    said = [
+    trust = [
         Statement("The reference", " ".join(mounting_words(calibration))),
         Statement("What the misfit is made of", f"{sentence(parts)}. The intervals contain all of it."),
         gravity_statement(calibration),
@@ -106,7 +106,7 @@ def write_attitude_report(
         "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
     )
     drawn = {"residuals": partial(_figure, calibration, measurement)}
-    return write_calibration(calibration, folder, first, said, unknown, drawn, picture)
+    return write_calibration(calibration, folder, first, trust, unknown, drawn, picture)
 
 
 def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
@@ -114,14 +114,14 @@ def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
     nominal = calibration.nominal.with_effects(*calibration.imu.setup)
     figure = new_figure(5.2)
     panels = figure.subplots(2, 1, sharex=True)
-    found = [measurement.errors(each) for each in (nominal, calibration.imu)]
+    before_after = [measurement.errors(imu) for imu in (nominal, calibration.imu)]
     for panel, (name, title) in zip(panels, _PANELS.items(), strict=True):
-        for errors, colour, label in zip(found, (BEFORE, AFTER), ("before", "calibrated"), strict=True):
+        for errors, colour, label in zip(before_after, (BEFORE, AFTER), ("before", "calibrated"), strict=True):
             time, values, unit = errors[name]
             panel.plot(time, values, ".", color=colour, markersize=4)
             panel.plot([], [], ".", color=colour, label=label)
             dressed(panel, title, ylabel=f"error [{unit_text(unit)}]")
-        panel.axhline(0.0, color="0.6", linewidth=0.8)
-    panels[0].legend(ncols=2, fontsize=8, frameon=False, loc="upper right")
+        zero_line(panel)
+    legend(panels[0], 2, "upper right")
     panels[-1].set_xlabel("time [s]")
     return figure

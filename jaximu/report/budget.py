@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,36 +12,54 @@ import numpy as np
 
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.quantities import number, size
+from jaximu.ground.quantities import Z95, number, size
 from jaximu.planning.budget import Budget, Goal
 from jaximu.planning.setup_errors import ErrorSource
 from jaximu.report import figures
-from jaximu.report.figures import OTHERS, PALETTE, dressed
-from jaximu.report.html import write_page
+from jaximu.report.figures import LEAST_SHARE, OTHERS, PALETTE, dressed, legend_below
+from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["amount", "check_words", "goal_words", "headline", "nonlinear_words", "parameter_rows", "source_rows",
-           "write_budget"]  # fmt: skip
+__all__ = [
+    "amount",
+    "check_words",
+    "goal_words",
+    "headline",
+    "nonlinear_words",
+    "parameter_rows",
+    "source_rows",
+    "write_budget",
+]
 
-_LEAST = 0.01  # of a parameter's variance: a source that has it nowhere is drawn among the others
 _GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": "Set-up"}
 
 
-def write_budget(budget: Budget, folder: str | os.PathLike[str]) -> Path:
+def write_budget(budget: Budget, folder: Folder) -> Path:
     """Write `report.html`, whose path is returned, and `budget.png`. Raises `InputError` where they cannot be."""
-    goals = [("Reached" if goal.reached else "Not reached", goal_words(budget, goal), not goal.reached)
-             for goal in budget.goals]  # fmt: skip
+    goals = [
+        ("Reached" if goal.reached else "Not reached", goal_words(budget, goal), not goal.reached)
+        for goal in budget.goals
+    ]
     return write_page(
-        folder, "budget", {"budget": partial(_figure, budget)}, title=f"Error budget of {Path(budget.source).name}",
-        lead=headline(budget), goals=goals, sources=source_rows(budget), check=check_words(budget),
-        rows=[(words, sigma, *([drawn] if budget.check else []), made, not made)
-              for words, sigma, made, drawn in parameter_rows(budget)],
+        folder,
+        "budget",
+        {"budget": partial(_figure, budget)},
+        title=f"Error budget of {Path(budget.source).name}",
+        lead=headline(budget),
+        goals=goals,
+        sources=source_rows(budget),
+        check=check_words(budget),
+        rows=[
+            (words, sigma, *([drawn] if budget.check else []), made, not made)
+            for words, sigma, made, drawn in parameter_rows(budget)
+        ],
         nonlinear=[("Not linear", text) for text in nonlinear_words(budget)],
-        open=[("Weak or open", text) for text in budget.open], notes=budget.notes,
-    )  # fmt: skip
+        open=[("Weak or open", text) for text in budget.open],
+        notes=budget.notes,
+    )
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -55,11 +73,11 @@ def amount(value: float, unit: str) -> str:
 
 def _reading_order(budget: Budget) -> list[int]:
     """Scales, misalignments and biases of each triad together."""
-    kinds = {unit: place for place, unit in enumerate(("1", "rad", "m/s^2", "rad/s"))}
+    kinds = {unit: rank for rank, unit in enumerate(("1", "rad", "m/s^2", "rad/s"))}
 
-    def key(place: int):
-        name = budget.names[place]
-        return name.owner, kinds.get(budget.units[place], len(kinds)) if name.effect is None else len(kinds)
+    def key(index: int):
+        name = budget.names[index]
+        return name.owner, kinds.get(budget.units[index], len(kinds)) if name.effect is None else len(kinds)
 
     return sorted(range(len(budget.names)), key=key)
 
@@ -83,32 +101,32 @@ def headline(budget: Budget) -> str:
     return text + (f" {lost} more are not determined by this scheme." if lost else "")
 
 
-def parameter_rows(budget: Budget) -> list[tuple[str, str, str, str]]:
+def parameter_rows(budget: Budget) -> TextRows:
     """Return each parameter in words, its 1σ, what it is made of (dominant first), and its 1σ by Monte Carlo."""
     part, total, off = shares(budget), budget.total, budget.nonlinear()
     rows = []
-    for place in _reading_order(budget):
-        words, unit = describe(budget.names[place], budget.imu), budget.units[place]
-        if not budget.determined[place]:
+    for index in _reading_order(budget):
+        words, unit = describe(budget.names[index], budget.imu), budget.units[index]
+        if not budget.determined[index]:
             rows.append((words, "not determined", "", ""))
             continue
-        ranked = [int(row) for row in np.argsort(-part[:, place], kind="stable") if part[row, place] >= 0.01][:3]
-        made = [f"{budget.sources[row].words} {100 * part[row, place]:.0f} %" for row in ranked]
-        wrong = [budget.sources[row].words for row, column in off if column == place]
-        made += [f"not linear in {each}" for each in wrong]
-        drawn = "" if budget.check is None else amount(float(budget.check.rms[place]), unit)
-        rows.append((words, amount(float(total[place]), unit), ", ".join(made), drawn))
+        ranked = [int(row) for row in np.argsort(-part[:, index], kind="stable") if part[row, index] >= LEAST_SHARE][:3]
+        made = [f"{budget.sources[row].words} {100 * part[row, index]:.0f} %" for row in ranked]
+        wrong = [budget.sources[row].words for row, column in off if column == index]
+        made += [f"not linear in {source}" for source in wrong]
+        drawn = "" if budget.check is None else amount(budget.check.rms[index], unit)
+        rows.append((words, amount(total[index], unit), ", ".join(made), drawn))
     return rows
 
 
-def source_rows(budget: Budget) -> list[tuple[str, str, str, str]]:
+def source_rows(budget: Budget) -> TextRows:
     """Return each source, dominant first: in words, its size, its mean share, and the parameter it has most of."""
     part, known = shares(budget), np.flatnonzero(budget.determined)
     rows = []
     for row in budget.order():
         source = budget.sources[row]
         most = int(known[np.argmax(part[row, known])]) if len(known) else 0
-        mean = float(np.mean(part[row, known])) if len(known) else 0.0
+        mean = np.mean(part[row, known]) if len(known) else 0.0
         where = f"{describe(budget.names[most], budget.imu)}: {_percent(part[row, most])}"
         rows.append((source.words, source.size, _percent(mean), where if part[row, most] >= 1e-3 else "nowhere"))
     return rows
@@ -118,19 +136,17 @@ def _percent(share: float) -> str:
     return "below 0.1 %" if share < 1e-3 else f"{100 * share:.{0 if share >= 0.1 else 1}f} %"
 
 
-def nonlinear_words(budget: Budget) -> list[str]:
+def nonlinear_words(budget: Budget) -> Iterator[str]:
     """Say where the linear budget is off by more than 5 %."""
-    off, found = budget.off, []
-    for row, place in budget.nonlinear():
-        source, unit = budget.sources[row], budget.units[place]
-        linear, actual = float(budget.sigma[row, place]), float(budget.actual[row, place])
-        change = 100 * float(off[row, place])
-        found.append(
-            f"{describe(budget.names[place], budget.imu)}: {source.words} reaches it with "
+    for row, index in budget.nonlinear():
+        source, unit = budget.sources[row], budget.units[index]
+        linear, actual = budget.sigma[row, index], budget.actual[row, index]
+        change = 100 * budget.off[row, index]
+        yield (
+            f"{describe(budget.names[index], budget.imu)}: {source.words} reaches it with "
             f"{amount(actual, unit)} in the whole fit, {amount(linear, unit)} to first order; its total of "
-            f"{amount(float(budget.total[place]), unit)} is {_wrong(change)}."
+            f"{amount(budget.total[index], unit)} is {_wrong(change)}."
         )
-    return found
 
 
 def _wrong(change: float) -> str:
@@ -141,25 +157,25 @@ def _wrong(change: float) -> str:
 
 def goal_words(budget: Budget, goal: Goal) -> str:
     """Say whether a goal is reached, and if not, how good each source must become."""
-    place = budget.names.index(goal.worst)
+    index = budget.names.index(goal.worst)
     worst = describe(goal.worst, budget.imu)
     wanted = f"{goal.name} to {goal.text}"
-    if not budget.determined[place]:
+    if not budget.determined[index]:
         return f"{wanted}: out of reach, because the scheme does not determine the {worst}."
-    reached = f"the {worst} is known to {amount(float(budget.total[place]), goal.unit)}"
+    reached = f"the {worst} is known to {amount(budget.total[index], goal.unit)}"
     if goal.reached:
         return f"{wanted}: reached, {reached}."
     sources = {source.name: source for source in budget.sources}
     able = [_smaller(sources[need.sources[0]], need.times) for need in goal.alone if need.times is not None]
     unable = [sources[need.sources[0]].words for need in goal.alone if need.times is None]
-    said = f"{wanted}: not reached, {reached}. "
+    text = f"{wanted}: not reached, {reached}. "
     if able:
-        said += f"{'One of these alone would do' if len(able) > 1 else 'One source alone would do'}: {'; '.join(able)}."
-        return said + (f" Not enough by themselves: {', '.join(unable)}." if unable else "")
+        text += f"{'One of these alone would do' if len(able) > 1 else 'One source alone would do'}: {'; '.join(able)}."
+        return text + (f" Not enough by themselves: {', '.join(unable)}." if unable else "")
     if goal.together is None or goal.together.times is None:
-        return said + "Improving all sources together is not enough."
+        return text + "Improving all sources together is not enough."
     both = [_smaller(sources[name], goal.together.times) for name in goal.together.sources]
-    return said + f"No single source is enough. Improve together: {'; '.join(both)}."
+    return text + f"No single source is enough. Improve together: {'; '.join(both)}."
 
 
 def _smaller(source: ErrorSource, times: float) -> str:
@@ -180,12 +196,12 @@ def check_words(budget: Budget) -> str:
     known = np.flatnonzero(budget.determined)
     ratio = check.rms[known] / budget.total[known]
     worst = int(np.argmax(np.abs(ratio - 1)))
-    chance = 1.96 / np.sqrt(2 * check.draws)
+    chance = Z95 / np.sqrt(2 * check.draws)
     failed = f" {check.failed} of them did not converge and are left out." if check.failed else ""
     return (
         f"{check.draws} sessions with all errors at once, through the whole estimator, scatter on average "
         f"{_compared(float(np.mean(ratio)))} as the budget says; farthest from it is the "
-        f"{describe(budget.names[known[worst]], budget.imu)}, {_compared(float(ratio[worst]))}. One ratio is off by "
+        f"{describe(budget.names[known[worst]], budget.imu)}, {_compared(ratio[worst])}. One ratio is off by "
         f"up to {100 * chance:.1f} % by chance (95 %).{failed}"
     )
 
@@ -202,7 +218,7 @@ def _figure(budget: Budget) -> Figure:
     owners = [name.owner for name in budget.names]
     columns = [group for group in _GROUPS if group in owners]
     part, order = shares(budget), budget.order()
-    visible = [row for row in order if np.any(part[row, budget.determined] >= _LEAST)][: len(PALETTE)]
+    visible = [row for row in order if np.any(part[row, budget.determined] >= LEAST_SHARE)][: len(PALETTE)]
     stacked = [(budget.sources[row].words, part[row], color) for row, color in zip(visible, PALETTE, strict=False)]
     if others := [row for row in order if row not in visible]:
         stacked.append(("others", part[others].sum(axis=0), OTHERS))
@@ -210,9 +226,9 @@ def _figure(budget: Budget) -> Figure:
     if len(columns) > 2:
         figure.set_figwidth(figure.get_figwidth() * 1.35)
     for axes, group in zip(figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True):
-        _draw_bars(axes, budget, [place for place in _reading_order(budget) if owners[place] == group], stacked)
+        _draw_bars(axes, budget, [index for index in _reading_order(budget) if owners[index] == group], stacked)
         axes.set_title(_GROUPS[group], loc="left", fontsize=11, fontweight="bold")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="lower center", ncols=4, fontsize=8.5, frameon=False)
+    legend_below(figure, figure.axes[0], 4)
     dominant = budget.sources[order[0]].words if order else "nothing"
     figure.suptitle(
         f"Where the uncertainty comes from: most of all {dominant}", x=0.01, ha="left", fontsize=12, fontweight="bold"
@@ -228,10 +244,10 @@ def _draw_bars(axes: Axes, budget: Budget, places: list[int], stacked: list[tupl
         axes.barh(rows, width, left=left, height=0.72, color=color, edgecolor="white", linewidth=0.6, label=label)
         left += width
     curved = {column for _, column in budget.nonlinear()}
-    for row, place in enumerate(places):
-        said = amount(float(budget.total[place]), budget.units[place]) + " *" * (place in curved)
-        axes.text(102 if known[row] else 2, row, said if known[row] else "not determined", va="center", fontsize=8.5)
-    names = [budget.names[place] for place in places]
+    for row, index in enumerate(places):
+        text = amount(budget.total[index], budget.units[index]) + " *" * (index in curved)
+        axes.text(102 if known[row] else 2, row, text if known[row] else "not determined", va="center", fontsize=8.5)
+    names = [budget.names[index] for index in places]
     note = "   (*: not linear)" if curved & set(places) else ""
     dressed(axes, xlim=(0, 135), ylim=(len(places) - 0.4, -0.6), xticks=[0, 25, 50, 75, 100])
     axes.set_xlabel(f"share of the variance (%); right: 1σ{note}", fontsize=9)

@@ -17,7 +17,7 @@ from jaximu.ground.summary import sentence
 from jaximu.report.html import page
 from jaximu.report.tables import provenance
 
-__all__ = ["item_row", "write_certificate"]
+__all__ = ["item_row", "remarks", "sources", "write_certificate"]
 
 _COLUMNS = ("name", "value", "limits", "probability", "verdict", "coverage", "freedom", "recording", "gravity")
 _MEANINGS = {
@@ -46,37 +46,63 @@ def _certificate(acceptance: Acceptance, calibration: Calibration) -> bytes:
     facts += [("Received", trace["received"])] if "received" in trace else []
     facts += [("Calibrated", f"{trace['date']} by {trace['operator']}"), ("Conditions", conditions)]
     facts += [(name, known[name]) for name in ("Method", "Gravity", "Used", "Sample rate", "Software") if name in known]
-    open_items: dict[str, list[str]] = {}
-    for each in acceptance.items:
-        if text := each.said():
-            open_items.setdefault(text, []).append(spoken(each.name))
-    sources = list(dict.fromkeys(each.source for each in acceptance.items if each.source))
-    hashes = [(f"Recording {Path(str(each.get('file', ''))).name}", str(each.get("sha256", "")))
-              for each in calibration.data.get("files", ())]  # fmt: skip
+    hashes = [
+        (f"Recording {Path(str(file.get('file', ''))).name}", str(file.get("sha256", "")))
+        for file in calibration.data.get("files", ())
+    ]
     hashes += [("Calibration", acceptance.digest or "not sealed"), ("Limits", acceptance.limits["sha256"])]
     hashes += [("Verdict (acceptance.json)", digest(acceptance.document()))]
     return page(
-        "certificate", {},
+        "certificate",
+        {},
         title=f"Certificate of calibration {stated['number']}",
         laboratory=f"{stated['laboratory']}, {stated['address']}",
         verdict=acceptance.verdict.capitalize(),
         meaning=_MEANINGS[acceptance.verdict],
         facts=facts,
         rows=[(*(row[key] for key in _COLUMNS), row["verdict"] != "pass") for row in map(item_row, acceptance.items)],
-        open=[(sentence(", ".join(names)), text) for text, names in open_items.items()],
+        open=[(sentence(", ".join(names)), text) for text, names in remarks(acceptance).items()],
         remarks=" ".join(sentence(note) for note in acceptance.notes),
         rule=acceptance.rule.words(),
-        limits=f"{'; '.join(sources) or 'as stated'} ({Path(acceptance.limits['file']).name})",
+        limits=f"{sources(acceptance) or 'as stated'} ({Path(acceptance.limits['file']).name})",
         statement="The accelerometer's scale is traced to the local gravity stated above, the gyroscope's scale to the "
         "angles of turns, as gravity or a table shows them, and to the clock of the recording, by the references below;"
         " the results are in SI units. The hashes let anyone check with `jaximu verify` that no file was changed.",
-        references=[(each["name"], ", ".join(filter(None, (
-            f"certificate {each['certificate']}", f"valid to {each['expires']}" if "expires" in each else "",
-            each.get("value", ""), each.get("uncertainty", ""))))) for each in trace["reference"]],
+        references=[
+            (
+                reference["name"],
+                ", ".join(
+                    filter(
+                        None,
+                        (
+                            f"certificate {reference['certificate']}",
+                            f"valid to {reference['expires']}" if "expires" in reference else "",
+                            reference.get("value", ""),
+                            reference.get("uncertainty", ""),
+                        ),
+                    )
+                ),
+            )
+            for reference in trace["reference"]
+        ],
         hashes=hashes,
         closing=f"Issued {issued}. Authorised by {stated['authorised_by']}. The results hold for this item as it was "
         "calibrated. The certificate may not be reproduced except in full without approval of the laboratory.",
-    )[0]  # fmt: skip
+    )[0]
+
+
+def remarks(acceptance: Acceptance) -> dict[str, list[str]]:
+    """Return what is to be said of items beside their row, each text with the items that it is about."""
+    texts: dict[str, list[str]] = {}
+    for item in acceptance.items:
+        if text := item.said():
+            texts.setdefault(text, []).append(spoken(item.name))
+    return texts
+
+
+def sources(acceptance: Acceptance) -> str:
+    """Return where the limits come from, as far as they say it."""
+    return "; ".join(dict.fromkeys(item.source for item in acceptance.items if item.source))
 
 
 def item_row(item: Item) -> dict[str, str]:
@@ -91,7 +117,7 @@ def item_row(item: Item) -> dict[str, str]:
     value = f"{factor * item.value:z.{digits}f} ± {expanded:.{digits}f} {shown}".replace("-", "−")
     return row | {
         "value": value,
-        "coverage": f"{100 * float(coverage(item.freedom)):.1f} %",
+        "coverage": f"{100 * coverage(item.freedom):.1f} %",
         "freedom": f"{item.freedom:.0f}" if item.freedom < 1e4 else "∞",
         "probability": probability_words(item.probability),
         "recording": amount(2 * item.recording, item.unit, 2),

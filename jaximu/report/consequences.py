@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,11 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.quantities import number
+from jaximu.ground.quantities import Z95, number
 from jaximu.navigation.consequences import Consequences, position
 from jaximu.report import figures
-from jaximu.report.figures import OTHERS, PALETTE, dressed
-from jaximu.report.html import write_page
+from jaximu.report.figures import LEAST_SHARE, OTHERS, PALETTE, dressed, legend, legend_below
+from jaximu.report.html import Folder, TextRows, write_page
+from jaximu.report.words import Statement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,25 +22,32 @@ if TYPE_CHECKING:
 __all__ = ["budget_rows", "headers", "headline", "statements", "total_rows", "write_consequences"]
 
 _SHOWN = (1.0, 10.0, 60.0, 600.0)  # s
-_LEAST = 0.01  # of the variance at a time that is shown: a term below it everywhere is drawn among the others
 _COMMON = 0.1  # by how much the calibration's terms together may differ from their root sum of squares unsaid
 
 
-def write_consequences(found: Consequences, folder: str | os.PathLike[str]) -> Path:
+def write_consequences(consequences: Consequences, folder: Folder) -> Path:
     """Write `report.html`, whose path is returned, `budget.png` and, with draws, `tracks.png`.
 
     Raises `InputError` where they cannot be written.
     """
-    drawn = {"budget": partial(_budget_figure, found)}
-    if found.check:
-        drawn["tracks"] = partial(_tracks_figure, found)
+    drawn = {"budget": partial(_budget_figure, consequences)}
+    if consequences.check:
+        drawn["tracks"] = partial(_tracks_figure, consequences)
     return write_page(
-        folder, "consequences", drawn, title=f"What the errors of {Path(found.calibration_file).name} do",
-        lead=headline(found), number=_metres(float(position(found.total)[-1])),
-        meaning=f"error of position after {_seconds(float(found.times[-1]))} (1σ)", path=found.trajectory.words,
-        statements=statements(found), headers=headers(found), rows=budget_rows(found), totals=total_rows(found),
-        notes=found.notes,
-    )  # fmt: skip
+        folder,
+        "consequences",
+        drawn,
+        title=f"What the errors of {Path(consequences.calibration_file).name} do",
+        lead=headline(consequences),
+        number=_metres(_at_end(consequences.total)),
+        meaning=f"error of position after {_end(consequences)} (1σ)",
+        path=consequences.trajectory.words,
+        statements=statements(consequences),
+        headers=headers(consequences),
+        rows=budget_rows(consequences),
+        totals=total_rows(consequences),
+        notes=consequences.notes,
+    )
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -57,158 +64,187 @@ def _seconds(value: float) -> str:
     return f"{round(value, 1):g} s"
 
 
-def _places(found: Consequences) -> list[int]:
+def _at_end(variances: FloatArray) -> float:
+    """Return the error of position at the end of the path."""
+    return position(variances)[-1]
+
+
+def _end(consequences: Consequences) -> str:
+    return _seconds(consequences.times[-1])
+
+
+def _places(consequences: Consequences) -> list[int]:
     """Rows of the times that are shown: 1, 10, 60, 600 s and the last, as far as the path goes."""
-    wanted = [each for each in _SHOWN if each < found.times[-1]]
-    nearest = [int(np.argmin(np.abs(found.times - each))) for each in wanted]
-    return list(dict.fromkeys([*nearest, len(found.times) - 1]))
+    wanted = [time for time in _SHOWN if time < consequences.times[-1]]
+    nearest = [int(np.argmin(np.abs(consequences.times - time))) for time in wanted]
+    return list(dict.fromkeys([*nearest, len(consequences.times) - 1]))
 
 
-def headers(found: Consequences) -> list[str]:
+def headers(consequences: Consequences) -> list[str]:
     """Return the times that are shown, in words."""
-    return [f"after {_seconds(float(found.times[row]))}" for row in _places(found)]
+    return [f"after {_seconds(consequences.times[row])}" for row in _places(consequences)]
 
 
-def _order(found: Consequences) -> list[str]:
+def _order(consequences: Consequences) -> list[str]:
     """Names of the terms, the largest at the end of the path first."""
-    return sorted(found.terms, key=lambda name: -float(position(found.terms[name])[-1]))
+    return sorted(consequences.terms, key=lambda name: -_at_end(consequences.terms[name]))
 
 
-def headline(found: Consequences) -> str:
+def headline(consequences: Consequences) -> str:
     """Say how far position is off at the end, and why."""
-    name = _order(found)[0]
-    largest, total = float(position(found.terms[name])[-1]), float(position(found.total)[-1])
+    name = _order(consequences)[0]
+    largest, total = _at_end(consequences.terms[name]), _at_end(consequences.total)
     return (
         f"Navigating by this unit alone, position is off by {_metres(total)} (1σ) after "
-        f"{_seconds(float(found.times[-1]))}. The largest term is {name}: {_metres(largest)} by itself."
+        f"{_end(consequences)}. The largest term is {name}: {_metres(largest)} by itself."
     )
 
 
-def budget_rows(found: Consequences) -> list[tuple[str, ...]]:
+def budget_rows(consequences: Consequences) -> TextRows:
     """Return each term and its position error at the times that are shown, the largest first, then the total."""
-    rows = _places(found)
+    rows = _places(consequences)
 
     def row(name: str, variances: FloatArray) -> tuple[str, ...]:
-        return name, *(_metres(float(each)) for each in position(variances)[rows])
+        return name, *(_metres(error) for error in position(variances)[rows])
 
-    shown = [row(name, found.terms[name]) for name in _order(found)]
-    shown.append(row("calibration, all together", found.calibration))
-    shown.append(row("everything", found.total))
-    if found.check is not None:
-        shown.append(row(f"everything, {len(found.check.errors)} draws", found.check.sigma**2))
+    shown = [row(name, consequences.terms[name]) for name in _order(consequences)]
+    shown.append(row("calibration, all together", consequences.calibration))
+    shown.append(row("everything", consequences.total))
+    if consequences.check is not None:
+        shown.append(row(f"everything, {len(consequences.check.errors)} draws", consequences.check.sigma**2))
     return shown
 
 
-def total_rows(found: Consequences) -> list[tuple[str, ...]]:
+def total_rows(consequences: Consequences) -> TextRows:
     """Return the errors of position, velocity and attitude by direction at the times that are shown."""
-    rows, sigma = _places(found), np.sqrt(found.total)
+    rows, sigma = _places(consequences), np.sqrt(consequences.total)
     shown = []
     for part, what in enumerate(("position", "velocity", "attitude")):
         for axis, direction in enumerate(("east", "north", "up")):
             values = sigma[rows, 3 * part + axis]
-            words = [f"{number(float(np.degrees(each)), 2)}°" if part == 2 else _metres(float(each)) for each in values]
+            words = [f"{number(np.degrees(value), 2)}°" if part == 2 else _metres(value) for value in values]
             about = "about " if part == 2 else ""
-            shown.append((f"{what}, {about}{direction}", *(f"{each}/s" if part == 1 else each for each in words)))
+            shown.append((f"{what}, {about}{direction}", *(f"{word}/s" if part == 1 else word for word in words)))
     return shown
 
 
-def statements(found: Consequences) -> list[tuple[str, str]]:
+def statements(consequences: Consequences) -> list[Statement]:
     """Return what the budget means, each with what it is about."""
-    total, end = position(found.total), _seconds(float(found.times[-1]))
-    last = float(total[-1])
-    parts = [f"{name} from {round(start, 1):g} to {round(stop, 1):g} s" for name, start, stop in found.dominant()]
+    total, end = position(consequences.total), _end(consequences)
+    last = total[-1]
+    parts = [
+        f"{name} from {round(start, 1):g} to {round(stop, 1):g} s" for name, start, stop in consequences.dominant()
+    ]
     more = f" and {len(parts) - 6} changes more" if len(parts) > 6 else ""
-    said = [("What dominates when", f"{'; '.join(parts[:6])}{more}.")]
+    texts = {"What dominates when": f"{'; '.join(parts[:6])}{more}."}
 
     def better(variances: FloatArray) -> float:
-        return float(position(variances + found.noise)[-1])
+        return _at_end(variances + consequences.noise)
 
-    best = min(found.known, key=lambda name: better(found.known[name]))
-    floor = better(np.zeros_like(found.noise))
+    best = min(consequences.known, key=lambda name: better(consequences.known[name]))
+    floor = better(np.zeros_like(consequences.noise))
     buys = (
         f"Were {best} known exactly, the error after {end} would fall from {_metres(last)} to "
-        f"{_metres(better(found.known[best]))}; with the whole calibration ten times better, to "
-        f"{_metres(better(found.calibration / 100))}."
+        f"{_metres(better(consequences.known[best]))}; with the whole calibration ten times better, to "
+        f"{_metres(better(consequences.calibration / 100))}."
     )
-    if found.noise.any():
+    if consequences.noise.any():
         buys += f" Noise alone leaves {_metres(floor)}, which no calibration can undo."
-    said.append(("What a better calibration buys", buys))
-    apart = float(np.sqrt(sum(position(found.terms[name])[-1] ** 2 for name in found.known)))
-    together = float(position(found.calibration)[-1])
+    texts["What a better calibration buys"] = buys
+    apart = np.sqrt(sum(_at_end(consequences.terms[name]) ** 2 for name in consequences.known))
+    together = _at_end(consequences.calibration)
     if abs(together / apart - 1) > _COMMON:
-        said.append((
-            "Correlation",
+        texts["Correlation"] = (
             f"The calibration's terms are not independent: together they make {_metres(together)} after {end}, where "
-            f"their root sum of squares would be {_metres(apart)}.",
-        ))  # fmt: skip
-    if found.left_out:
-        lost = sorted(found.left_out.items(), key=lambda pair: -pair[1][-1])
-        listed = "; ".join(f"{name} {_metres(float(error[-1]))}" for name, error in lost)
-        said.append(
-            ("What a simpler model costs", f"Left out of the correction, each by itself, after {end}: {listed}.")
+            f"their root sum of squares would be {_metres(apart)}."
         )
-    if found.check is not None:
-        ratio = float(position(found.check.sigma**2)[-1]) / last
-        chance = 1.96 / np.sqrt(2 * len(found.check.errors))
-        said.append((
-            "Check",
-            f"{len(found.check.errors)} draws of all errors, through the whole mechanisation, scatter {ratio:.2f} "
-            f"times as much as the budget says after {end} (by chance {1 - chance:.2f} to {1 + chance:.2f}).",
-        ))  # fmt: skip
-    if found.against is not None and found.apart is not None:
-        other = float(position(found.against.total)[-1])
-        off = float(np.linalg.norm(found.apart[-1, :3]))
-        said.append((
-            "The other calibration",
-            f"With {Path(found.against.calibration_file).name} position is off by {_metres(other)} (1σ) after {end} if "
-            f"it is right, and it puts the unit {_metres(off)} from where this one does.",
-        ))  # fmt: skip
-    return said
+    if consequences.left_out:
+        lost = sorted(consequences.left_out.items(), key=lambda pair: -pair[1][-1])
+        listed = "; ".join(f"{name} {_metres(error[-1])}" for name, error in lost)
+        texts["What a simpler model costs"] = f"Left out of the correction, each by itself, after {end}: {listed}."
+    if consequences.check is not None:
+        ratio = _at_end(consequences.check.sigma**2) / last
+        draws = len(consequences.check.errors)
+        chance = Z95 / np.sqrt(2 * draws)
+        texts["Check"] = (
+            f"{draws} draws of all errors, through the whole mechanisation, scatter {ratio:.2f} times as much as the "
+            f"budget says after {end} (by chance {1 - chance:.2f} to {1 + chance:.2f})."
+        )
+    if consequences.against is not None and consequences.apart is not None:
+        other = _at_end(consequences.against.total)
+        off = float(np.linalg.norm(consequences.apart[-1, :3]))
+        texts["The other calibration"] = (
+            f"With {Path(consequences.against.calibration_file).name} position is off by {_metres(other)} (1σ) after "
+            f"{end} if it is right, and it puts the unit {_metres(off)} from where this one does."
+        )
+    return [Statement(about, text) for about, text in texts.items()]
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def _budget_figure(found: Consequences) -> Figure:
-    variances = {name: position(each) ** 2 for name, each in found.terms.items()}
+def _budget_figure(consequences: Consequences) -> Figure:
+    variances = {name: position(term) ** 2 for name, term in consequences.terms.items()}
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
-    visible = [name for name in _order(found) if np.max(variances[name] / whole) >= _LEAST]
-    drawn, end = visible[: len(PALETTE)], f"after {_seconds(float(found.times[-1]))}"
+    visible = [name for name in _order(consequences) if np.max(variances[name] / whole) >= LEAST_SHARE]
+    drawn, end = visible[: len(PALETTE)], f"after {_end(consequences)}"
     figure = figures.new_figure(7.2)
     above, below = figure.subplots(2, 1, sharex=True)
     for name, color in zip(drawn, PALETTE, strict=False):
-        above.plot(found.times, np.sqrt(variances[name]), color=color, linewidth=1.4)
-    above.plot(found.times, position(found.total), color="black", linewidth=2.4, linestyle="--", label="everything")
-    if found.check is not None:
-        above.plot(found.times, position(found.check.sigma**2), color="#8A8A8A", linewidth=1.2, label="draws")
+        above.plot(consequences.times, np.sqrt(variances[name]), color=color, linewidth=1.4)
+    above.plot(
+        consequences.times,
+        position(consequences.total),
+        color="black",
+        linewidth=2.4,
+        linestyle="--",
+        label="everything",
+    )
+    if consequences.check is not None:
+        above.plot(
+            consequences.times, position(consequences.check.sigma**2), color="#8A8A8A", linewidth=1.2, label="draws"
+        )
     figures.logarithmic(above, "y")
-    above.legend(frameon=False, fontsize=9, loc="lower right")
-    dressed(above, f"Position is off by {_metres(float(position(found.total)[-1]))} {end}",
-            ylabel="position error, 1σ (m)")  # fmt: skip
+    legend(above, where="lower right")
+    dressed(
+        above,
+        f"Position is off by {_metres(_at_end(consequences.total))} {end}",
+        ylabel="position error, 1σ (m)",
+    )
     shares = [100 * variances[name] / whole for name in drawn]
     rest = np.maximum(100 - np.sum(shares, axis=0), 0.0) if shares else 100 + 0 * whole
-    below.stackplot(found.times, *shares, rest, colors=[*PALETTE[: len(drawn)], OTHERS], labels=[*drawn, "others"])
-    dressed(below, "What it is made of", xlabel="time (s)", ylabel="share of the terms' squares (%)", ylim=(0, 100),
-            xlim=(found.times[0], found.times[-1]))  # fmt: skip
-    figure.legend(*below.get_legend_handles_labels(), loc="lower center", ncols=3, frameon=False, fontsize=9)
+    below.stackplot(
+        consequences.times, *shares, rest, colors=[*PALETTE[: len(drawn)], OTHERS], labels=[*drawn, "others"]
+    )
+    dressed(
+        below,
+        "What it is made of",
+        xlabel="time (s)",
+        ylabel="share of the terms' squares (%)",
+        ylim=(0, 100),
+        xlim=(consequences.times[0], consequences.times[-1]),
+    )
+    legend_below(figure, below, 3)
     return figure
 
 
-def _tracks_figure(found: Consequences) -> Figure:
-    check = found.check
+def _tracks_figure(consequences: Consequences) -> Figure:
+    check = consequences.check
     assert check is not None
     figure = figures.new_figure(4.6)
     plane, height = figure.subplots(1, 2)
     for track in check.errors[:100]:
         plane.plot(track[:, 0], track[:, 1], color="#0072B2", linewidth=0.6, alpha=0.4)
-        height.plot(found.times, track[:, 2], color="#0072B2", linewidth=0.6, alpha=0.4)
-    east, north = 2.45 * np.sqrt(found.total[-1, :2])  # of two components, 95 % lie within 2.45 standard deviations
-    angle, sigma = np.linspace(0, 2 * np.pi, 100), 1.96 * np.sqrt(found.total[:, 2])
+        height.plot(consequences.times, track[:, 2], color="#0072B2", linewidth=0.6, alpha=0.4)
+    east, north = 2.45 * np.sqrt(
+        consequences.total[-1, :2]
+    )  # of two components, 95 % lie within 2.45 standard deviations
+    angle, sigma = np.linspace(0, 2 * np.pi, 100), Z95 * np.sqrt(consequences.total[:, 2])
     plane.plot(east * np.cos(angle), north * np.sin(angle), color=figures.FLAGGED, linewidth=1.6)
     plane.set_aspect("equal", "datalim")
     for side in (-1, 1):
-        height.plot(found.times, side * sigma, color=figures.FLAGGED, linewidth=1.6)
-    title = f"{min(100, len(check.errors))} draws over {_seconds(float(found.times[-1]))}"
+        height.plot(consequences.times, side * sigma, color=figures.FLAGGED, linewidth=1.6)
+    title = f"{min(100, len(check.errors))} draws over {_end(consequences)}"
     dressed(plane, title, xlabel="error east (m)", ylabel="error north (m)")
     dressed(height, "and their heights", xlabel="time (s)", ylabel="error up (m)")
     return figure

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -23,21 +22,21 @@ from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.noise.deviations import deviation
 from jaximu.report import figures
-from jaximu.report.figures import band, dressed
-from jaximu.report.html import write_page
+from jaximu.report.figures import band, dressed, legend, zero_line
+from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["write_diagnosis"]
+__all__ = ["limit_rows", "write_diagnosis"]
 
 _MEASURED, _TWIN, _EXTENDED = figures.FLAGGED, figures.BEFORE, figures.AFTER
 _SHOWN = 12
 _AN_ERROR = 1e-3  # m/s², rad/s: sizes that errors have, whose unit the axes take
 
 
-def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Path:
+def write_diagnosis(diagnosis: Diagnosis, folder: Folder) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     twin = twin_of(diagnosis)
     copied = twin.fit(asking=())  # its errors alone are shown
@@ -51,10 +50,10 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
     if learned is not None:
         drawn["learned"], gain = partial(_learned, learned), learned.gain
     words = {kind.name: kind.words for kind in diagnosis.experiment.real.kinds}
-    place = _shown_kind(diagnosis)
-    shown = diagnosis.experiment.real.kinds[place]
+    index = _shown_kind(diagnosis)
+    shown = diagnosis.experiment.real.kinds[index]
     measured, simulated = (
-        size(float(np.sqrt(np.mean(np.square(errors[place])))), shown.unit, 2)
+        size(np.sqrt(np.mean(np.square(errors[index]))), shown.unit, 2)
         for errors in (diagnosis.experiment.errors(diagnosis.base), twin.errors(copied))
     )
     number, meaning = measured, f"rms of {shown.words}: no more than noise, drift and handling leave"
@@ -74,23 +73,30 @@ def write_diagnosis(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> Pat
         meaning=meaning,
         diagnosis=diagnosis,
         notes=diagnosis.notes,
-        effects=[(each, CATALOGUE.get(each.name), each.numbers()) for each in diagnosis.effects],
+        effects=[(effect, CATALOGUE.get(effect.name), effect.numbers()) for effect in diagnosis.effects],
         gain=gain,
         gains=[] if gain is None else [(words[kind], gain.errors(kind)) for kind in gain.before.rms],
         options=_option_rows(diagnosis),
-        limits=[(effect_title(name), size(*limit, 2)) for name, limit in sorted(diagnosis.detection_limits.items())],
+        limits=limit_rows(diagnosis),
         checks=[
-            (each.text, probability(each.adjusted).removeprefix("= "), bool(each.adjusted < 0.01))
-            for each in diagnosis.checks
+            (check.text, probability(check.adjusted).removeprefix("= "), bool(check.adjusted < 0.01))
+            for check in diagnosis.checks
         ],
         not_observable=_by_reason(diagnosis.not_observable),
     )
 
 
-def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, str]]:
+def limit_rows(diagnosis: Diagnosis) -> TextRows:
+    """Return each effect with the size up to which it could be there unnoticed."""
+    return [(effect_title(name), size(*limit, 2)) for name, limit in sorted(diagnosis.detection_limits.items())]
+
+
+def _by_reason(reasons: Mapping[str, str]) -> TextRows:
     """Return each reason once, with the effects that it hides."""
-    return [(sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))
-            for reason in dict.fromkeys(reasons.values())]  # fmt: skip
+    return [
+        (sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))
+        for reason in dict.fromkeys(reasons.values())
+    ]
 
 
 def _option_rows(diagnosis: Diagnosis) -> list[list[str]]:
@@ -98,9 +104,11 @@ def _option_rows(diagnosis: Diagnosis) -> list[list[str]]:
     if not diagnosis.options:
         return []
     first = diagnosis.options[0]
-    lines = [("this recording", first.before), *((each.text, each.powers) for each in diagnosis.options)]
-    return [[effect_title(name) for name in first.powers],
-            *([text, *(f"{100 * power:.0f} %" for power in powers.values())] for text, powers in lines)]  # fmt: skip
+    lines = [("this recording", first.before), *((option.text, option.powers) for option in diagnosis.options)]
+    return [
+        [effect_title(name) for name in first.powers],
+        *([text, *(f"{100 * power:.0f} %" for power in powers.values())] for text, powers in lines),
+    ]
 
 
 def _shown_kind(diagnosis: Diagnosis) -> int:
@@ -128,9 +136,9 @@ def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
     for label, colour, source, state in series:
         time = source.real.dependences(kind)[TIME]  # a twin need not have as many poses and turns
         left.plot(time, factor * source.errors(state)[kind], "o", color=colour, markersize=4, label=label)
-    left.axhline(0.0, color="0.7", linewidth=0.8)
+    zero_line(left)
     dressed(left, shown.words, xlabel="time [s]", ylabel=f"error [{unit}]")
-    left.legend(fontsize=8)
+    legend(left)
     _ranking(right, diagnosis)
     return figure
 
@@ -142,10 +150,10 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
     for k, block in enumerate(evidence.blocks):
         if block.kind == "effect" and scores.freedom[k]:
             best[block.name] = min(best.get(block.name, 1.0), max(float(scores.p_value[k]), 1e-300))
-    named = {each.name for each in diagnosis.effects}
+    named = {effect.name for effect in diagnosis.effects}
     # many may reach the end of the axis: what was named comes first among them
     order = sorted(best, key=lambda name: (best[name], name not in named))[:_SHOWN][::-1]
-    rivals = {name for each in diagnosis.effects for name in each.rivals}
+    rivals = {name for effect in diagnosis.effects for name in effect.rivals}
     colours = [_EXTENDED if n in named else ("#56B4E9" if n in rivals else "#C4C4C4") for n in order]
     labels = [effect_title(name).replace(" (", "\n(") for name in order]
     panel.barh(labels, [-np.log10(best[name]) for name in order], color=colours)
@@ -159,7 +167,7 @@ def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure
     rows = [int(kind) for kind in np.unique(real.kind)]
     covariates, shadow = ({row: source.dependences(row) for row in rows} for source in (real, twin.real))
     figure = figures.new_figure(2.1 * len(rows) + 0.4)
-    panels = figure.subplots(len(rows), max(len(each) for each in covariates.values()), squeeze=False, sharey="row")
+    panels = figure.subplots(len(rows), max(len(table) for table in covariates.values()), squeeze=False, sharey="row")
     measured, simulated = diagnosis.experiment.errors(diagnosis.base), twin.errors(copied)
     for line, row in zip(panels, rows, strict=True):
         kind = real.kinds[row]
@@ -182,14 +190,14 @@ def _learned(learned: LearnedTerm) -> Figure:
     if learned.effect.words == "temperature":
         unit, shift = "°C", ZERO_CELSIUS
     elif unit == "rad/s":
-        unit, factor = "°/s", float(np.degrees(1.0))
+        unit, factor = "°/s", np.degrees(1.0)
     size, label = readable(SENSOR_UNITS[learned.triad], _AN_ERROR)
     figure = figures.new_figure(2.8)
     x = factor * learned.x - shift
     panels = figure.subplots(1, 3, sharey=True)
     for axis, panel in enumerate(panels):
         band(panel, x, size * learned.y[:, axis], size * learned.half_width[:, axis], _EXTENDED)
-        panel.axhline(0.0, color="0.7", linewidth=0.8)
+        zero_line(panel)
         dressed(panel, f"{learned.triad} {'xyz'[axis]}", xlabel=f"{learned.covariate} [{unit.replace('^2', '²')}]")
         panel.xaxis.label.set_size(8)
     panels[0].set_ylabel(f"[{label}]")
@@ -207,13 +215,18 @@ def _noise(diagnosis: Diagnosis, twin: Experiment) -> Figure:
             tau, value, low, high = _allan(experiment, name)
             allan.plot(tau, value, "o-", color=colour, linewidth=1, markersize=4, label=label)
             allan.fill_between(tau, low, high, color=colour, alpha=0.2, linewidth=0)
-        middle = float(np.sqrt(np.median(density)))
+        middle = np.sqrt(np.median(density))
         low, high = spectrum.get_ylim()
         for panel in (spectrum, allan):
             figures.logarithmic(panel)
-            panel.legend(fontsize=8)
-        dressed(spectrum, name, xlabel="frequency [Hz]", ylabel=f"density [{unit}/√Hz]",
-                ylim=(min(low, middle / 3), max(high, middle * 3)))  # fmt: skip
+            legend(panel)
+        dressed(
+            spectrum,
+            name,
+            xlabel="frequency [Hz]",
+            ylabel=f"density [{unit}/√Hz]",
+            ylim=(min(low, middle / 3), max(high, middle * 3)),
+        )
         dressed(allan, xlabel="averaging time [s]", ylabel=f"Allan deviation [{unit}]")
     return figure
 
@@ -222,21 +235,23 @@ def _allan(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray, F
     """Averaging times (k,), s, Allan deviation of a triad over its longest pose, root mean square of axes; interval."""
     parts, rate = experiment.still_parts(name)
     longest = max(parts, key=len)
-    found = deviation(longest.T, rate)
-    value = np.sqrt(np.mean(found.value**2, axis=0))
+    curve = deviation(longest.T, rate)
+    value = np.sqrt(np.mean(curve.value**2, axis=0))
     # three axes, taken as independent and alike, know their mean √3 times as well as each its own
-    known = (found.value > 0).all(axis=0)  # output may not change at all
+    known = (curve.value > 0).all(axis=0)  # output may not change at all
     low, high = (
-        value[known] * np.exp(np.mean(np.log(edge[:, known] / found.value[:, known]), axis=0) / np.sqrt(3))
-        for edge in (found.low, found.high)
+        value[known] * np.exp(np.mean(np.log(edge[:, known] / curve.value[:, known]), axis=0) / np.sqrt(3))
+        for edge in (curve.low, curve.high)
     )
-    return found.tau[known], value[known], low, high
+    return curve.tau[known], value[known], low, high
 
 
 def _density(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray]:
     """Two-sided density (k,) of a triad at rest, mean of axes and poses, and its frequencies, Hz."""
     segments, rate = experiment.still_parts(name)
-    length = max(16, int(np.quantile([len(each) for each in segments], 0.25)))
-    whole = np.stack([each[:length] - each[:length].mean(axis=0) for each in segments if len(each) >= length])
+    length = max(16, int(np.quantile([len(segment) for segment in segments], 0.25)))
+    whole = np.stack(
+        [segment[:length] - segment[:length].mean(axis=0) for segment in segments if len(segment) >= length]
+    )
     power = np.mean(np.abs(np.fft.rfft(whole, axis=1)) ** 2, axis=(0, 2)) / (length * rate)
     return np.asarray(np.fft.rfftfreq(length, 1 / rate)[1:-1], np.float64), power[1:-1]

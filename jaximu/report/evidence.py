@@ -43,7 +43,7 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
     if fit is None or nominal is None or observations is None:
         return None
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
-    used = turns if calibration.imu.gyroscope is not None else np.zeros_like(turns)
+    used = turns if "gyroscope" in calibration.triads() else np.zeros_like(turns)
     force_before, angle_before = forces_and_angles(nominal, observations)
     force, angle_after = forces_and_angles(fit.imu, observations)
     length = np.linalg.norm(force, axis=1)
@@ -63,10 +63,10 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
         return tilt[1:] + tilt[:-1]
 
     noise, total = tilts(covariance), tilts(extended)
-    if used.any() and fit.imu.gyroscope is not None:
+    if used.any():
         # rotating the rate's white noise along the turn keeps its mean over the three axes
-        inverse = np.linalg.inv(np.asarray(fit.imu.gyroscope.gain))
-        density = float(np.trace(inverse @ np.asarray(observations.turns.noise) @ inverse.T)) / 3
+        inverse = np.linalg.inv(np.asarray(fit.imu.triads()["gyroscope"].gain))
+        density = np.trace(inverse @ np.asarray(observations.turns.noise) @ inverse.T) / 3
         turned = density * np.asarray(observations.turns.interval).sum(axis=1)
         noise, total = noise + turned, total + turned + excess[1] * turned[used].mean()
 
@@ -98,4 +98,4 @@ def largest_gap(directions: FloatArray) -> tuple[float, FloatArray]:
     points = spiral(4000)  # one every 3°
     angles = nearest_angles(points, directions)
     worst = int(np.argmax(angles))
-    return float(angles[worst]), points[worst]
+    return angles[worst], points[worst]

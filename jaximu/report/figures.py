@@ -6,6 +6,7 @@ Figures are objects; pyplot is not touched.
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -28,8 +29,27 @@ if TYPE_CHECKING:  # matplotlib takes half a second to import: only drawing need
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["AFTER", "AXES", "BEFORE", "FLAGGED", "OTHERS", "PALETTE", "band", "dressed", "hemispheres", "logarithmic",
-           "new_figure", "png", "recording_of", "residuals_of", "signals_figure"]  # fmt: skip
+__all__ = [
+    "AFTER",
+    "AXES",
+    "BEFORE",
+    "FLAGGED",
+    "LEAST_SHARE",
+    "OTHERS",
+    "PALETTE",
+    "band",
+    "dressed",
+    "hemispheres",
+    "legend",
+    "legend_below",
+    "logarithmic",
+    "new_figure",
+    "png",
+    "recording_of",
+    "residuals_of",
+    "signals_figure",
+    "zero_line",
+]
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 AXES = {"x": "#0072B2", "y": "#D55E00", "z": "#009E73"}
@@ -38,6 +58,8 @@ PALETTE, OTHERS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E
 NOISE, SCATTER = "#56B4E9", "#CFE8F7"
 GAPS = ("white", "#E6E6E6", "#C4C4C4", "#9C9C9C")
 
+LEAST_SHARE = 0.01
+"""Of a variance: what is below it everywhere is drawn among the others."""
 _WIDTH = 9.6  # inches
 _MOST_POINTS = 3000  # drawn of one trace: more than there are pixels
 
@@ -86,6 +108,21 @@ def dressed(axes: Axes, title: str = "", **labels: Any) -> None:
     if title:
         axes.set_title(title, loc="left", fontsize=11, fontweight="bold")
     axes.set(**labels)
+
+
+def zero_line(axes: Axes, value: float = 0.0) -> None:
+    """Draw the level that errors lie about."""
+    axes.axhline(value, color="0.6", linewidth=0.8)
+
+
+def legend(axes: Axes, columns: int = 1, where: Any = "best") -> None:
+    """Draw the key of a panel in it."""
+    axes.legend(loc=where, ncols=columns, fontsize=8, frameon=False)
+
+
+def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
+    """Draw the key of a panel at the bottom of its figure."""
+    figure.legend(*axes.get_legend_handles_labels(), loc="lower center", ncols=columns, fontsize=9, frameon=False)
 
 
 def band(axes: Axes, x: FloatArray, value: FloatArray, half: FloatArray, color: str, **style: Any) -> None:
@@ -151,7 +188,7 @@ def signals_figure(recording: Recording) -> Figure:
         dressed(axes)
         axes.set_ylabel(f"{name.replace('_', ' ')}\n({unit})" if unit else name, fontsize=8)
         if signal.values.shape[1] == len(AXES):
-            axes.legend(loc="upper right", ncols=3, fontsize=7, frameon=False)
+            legend(axes, 3, "upper right")
     grid[-1].set_xlabel("time (s)")
     return figure
 
@@ -163,7 +200,7 @@ def recording_of(calibration: Calibration) -> Figure:
         raise InputError(
             "this calibration holds no recording with poses: files and fits to several kinds of data do not keep it."
         )
-    rows = 1 if parts[0].recording.gyroscope is None else 2
+    rows = 1 + ("gyroscope" in parts[0].recording.signals)
     figure = new_figure(2.0 + 2.0 * rows)
     grid = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     shift, still, spans = 0.0, 0.0, []
@@ -175,27 +212,45 @@ def recording_of(calibration: Calibration) -> Figure:
             if shift:
                 axes.axvline(shift, color="black", linewidth=1.2, linestyle=":")
         spans += [(start + offset, stop - start) for start, stop in intervals]
-        still += float(np.sum(intervals[:, 1] - intervals[:, 0]))
+        still += np.sum(intervals[:, 1] - intervals[:, 0])
         shift += time[-1] - time[0]
     for axes, label in zip(grid, ("specific force (m/s²)", "angular rate (rad/s)"), strict=False):
-        axes.broken_barh(spans, (0, 1), transform=axes.get_xaxis_transform(), color=POSE, alpha=0.35, zorder=0.5,
-                         linewidth=0, label="pose (at rest)")  # fmt: skip
+        axes.broken_barh(
+            spans,
+            (0, 1),
+            transform=axes.get_xaxis_transform(),
+            color=POSE,
+            alpha=0.35,
+            zorder=0.5,
+            linewidth=0,
+            label="pose (at rest)",
+        )
         dressed(axes, ylabel=label)
-    every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 1000, 10**9) if len(spans) <= 25 * step)
-    for place, (start, length) in enumerate(spans, start=1):
-        if place == 1 or place % every == 0:
-            grid[0].text(start + length / 2, 1.01, str(place), transform=grid[0].get_xaxis_transform(), fontsize=7,
-                         ha="center", va="bottom", color="#444444")  # fmt: skip
+    _number_poses(grid[0], spans)
     several = f" in {len(parts)} recordings" if len(parts) > 1 else ""
-    grid[0].set_title(f"{len(spans)} poses found{several}: at rest for {still:.0f} of {shift:.0f} s", loc="left",
-                      fontsize=11, fontweight="bold", pad=16)  # fmt: skip
+    grid[0].set_title(
+        f"{len(spans)} poses found{several}: at rest for {still:.0f} of {shift:.0f} s",
+        loc="left",
+        fontsize=11,
+        fontweight="bold",
+        pad=16,
+    )
     if rows == 2:
         right = grid[1].secondary_yaxis("right", functions=(np.degrees, np.radians))
         right.set_ylabel("(°/s)")
         right.spines["right"].set_visible(False)
     grid[-1].set_xlabel("time (s)" + (", one recording after another" if several else ""))
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="lower center", ncols=4, frameon=False, fontsize=9)
+    legend_below(figure, grid[0], 4)
     return figure
+
+
+def _number_poses(axes: Axes, spans: Sequence[tuple[float, float]]) -> None:
+    """Write the numbers of poses above them, as many as there is room for."""
+    every = next(step for step in (1, 2, 5, 10, 20, 50, 100, 1000, 10**9) if len(spans) <= 25 * step)
+    style = {"fontsize": 7, "ha": "center", "va": "bottom", "color": "#444444"}
+    for pose, (start, length) in enumerate(spans, start=1):
+        if pose == 1 or pose % every == 0:
+            axes.text(start + length / 2, 1.01, str(pose), transform=axes.get_xaxis_transform(), **style)
 
 
 # --- residuals --------------------------------------------------------------------------------------------------------
@@ -203,52 +258,52 @@ def recording_of(calibration: Calibration) -> Figure:
 
 def residuals_of(calibration: Calibration) -> Figure:
     """Draw the errors of a calibration by pose and turn. Raises `InputError` where they are not kept."""
-    found = evidence(calibration)
-    if found is None:
+    errors = evidence(calibration)
+    if errors is None:
         raise InputError(
             "this calibration holds no errors by pose: files and fits to several kinds of data do not keep them."
         )
-    return residual_figure(found)
+    return residual_figure(errors)
 
 
 def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    return np.sqrt(np.mean(values**2))
 
 
-def residual_figure(found: PoseAndTurnErrors) -> Figure:
+def residual_figure(errors: PoseAndTurnErrors) -> Figure:
     """Draw the errors by pose and by turn, before and after, with what the noise explains."""
-    rows = 3 if len(found.turn) else 2
+    rows = 3 if len(errors.turn) else 2
     figure = new_figure(2.35 * rows)
     grid = figure.subplots(rows, 1, sharex=True, height_ratios=(0.7, 1, 1)[:rows])
-    pose, turn = np.arange(1, len(found.norm_after) + 1), found.turn + 1.5  # a turn lies between its two poses
+    pose, turn = np.arange(1, len(errors.norm_after) + 1), errors.turn + 1.5  # a turn lies between its two poses
 
-    before, after = _rms(found.norm_before), _rms(found.norm_after)
-    grid[0].stem(pose, found.norm_before, linefmt=BEFORE, markerfmt="o", basefmt=" ")
+    before, after = _rms(errors.norm_before), _rms(errors.norm_after)
+    grid[0].stem(pose, errors.norm_before, linefmt=BEFORE, markerfmt="o", basefmt=" ")
     title = f"At rest the accelerometer missed gravity by {size(before, 'm/s^2')} (rms) before calibration …"
     dressed(grid[0], title, ylabel="before (m/s²)")
 
     factor, unit = readable("m/s^2", after)
     edges = np.repeat(np.append(pose - 0.5, pose[-1] + 0.5), 2)[1:-1]
-    for sigma, color, label in _explained(found.norm_noise, found.norm_sigma, "±2σ", " (“excess”)"):
+    for sigma, color, label in _explained(errors.norm_noise, errors.norm_sigma, "±2σ", " (“excess”)"):
         half = 2 * factor * np.repeat(sigma, 2)
         grid[1].fill_between(edges, -half, half, color=color, alpha=0.7, linewidth=0, label=label)
-    grid[1].plot(pose, factor * found.norm_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5)
+    grid[1].plot(pose, factor * errors.norm_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5)
     title = f"… and misses it by {size(after, 'm/s^2', 2)} after: {how_much_smaller(before, after)}"
     dressed(grid[1], title, ylabel=f"after ({unit})")
     for axes in grid[:2]:
-        axes.axhline(0, color="black", linewidth=0.8)
+        zero_line(axes)
 
     if rows == 3:
         axes = grid[2]
-        for limit, color, label in _explained(found.angle_noise, found.angle_limit, "95 % of turns"):
+        for limit, color, label in _explained(errors.angle_noise, errors.angle_limit, "95 % of turns"):
             axes.bar(turn, limit, 1.0, color=color, alpha=0.7, linewidth=0, label=label)
-        axes.plot(turn, found.angle_before, "o", color="white", markeredgecolor=BEFORE, markersize=5, label="before")
-        axes.plot(turn, found.angle_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5, label="after")
-        everything = np.concatenate([found.angle_before, found.angle_after, found.angle_noise])
-        lowest = max(float(everything[everything > 0].min(initial=1.0)), 1e-4 * float(everything.max()))
-        axes.set_ylim(0.6 * lowest, 2 * float(everything.max()))
+        axes.plot(turn, errors.angle_before, "o", color="white", markeredgecolor=BEFORE, markersize=5, label="before")
+        axes.plot(turn, errors.angle_after, "o", color=AFTER, markeredgecolor="white", markersize=5.5, label="after")
+        everything = np.concatenate([errors.angle_before, errors.angle_after, errors.angle_noise])
+        lowest = max(everything[everything > 0].min(initial=1.0), 1e-4 * everything.max())
+        axes.set_ylim(0.6 * lowest, 2 * everything.max())
         logarithmic(axes, "y")
-        lost = f"by {number(_rms(found.angle_after), 2)}° (rms), before by {number(_rms(found.angle_before))}°"
+        lost = f"by {number(_rms(errors.angle_after), 2)}° (rms), before by {number(_rms(errors.angle_before))}°"
         dressed(axes, f"Over a turn the gyroscope loses gravity's direction {lost}", ylabel="angle error (°)")
     from jaximu.report.layout import BELOW
 
@@ -290,14 +345,17 @@ def correlation_figure(calibration: Calibration) -> Figure:
             color = "white" if abs(matrix[row, column]) > 0.7 else "black"
             text = f"{matrix[row, column]:+.2f}".replace("-", "−").replace("0.", ".")
             axes.text(column, row, text, ha="center", va="center", fontsize=6.5, color=color)
-    for place, (before, after) in enumerate(pairwise(parameters)):
+    for index, (before, after) in enumerate(pairwise(parameters)):
         if (before.owner, before.effect, before.part) != (after.owner, after.effect, after.part):
             for line in (axes.axhline, axes.axvline):
-                line(place + 0.5, color="black", linewidth=1.4 if before.owner != after.owner else 0.5)
+                line(index + 0.5, color="black", linewidth=1.4 if before.owner != after.owner else 0.5)
     figure.colorbar(image, cax=scale, label="correlation (−1 to 1)")
     # scales of the accelerometer share the uncertainty of gravity: no pair of them is named as the closest
-    scales = [place for place, name in enumerate(parameters) if name.startswith("accelerometer.gain")
-              and name.axes[0] == name.axes[1]]  # fmt: skip
+    scales = [
+        index
+        for index, name in enumerate(parameters)
+        if name.startswith("accelerometer.gain") and name.axes[0] == name.axes[1]
+    ]
     others = matrix - np.eye(count)
     others[np.ix_(scales, scales)] = 0.0
     first, second = sorted(np.unravel_index(int(np.argmax(np.abs(others))), others.shape))
@@ -347,7 +405,7 @@ def hemispheres(
         here = directions[:, 2] >= 0 if sign > 0 else directions[:, 2] < 0
         spot = _flat(directions[here])
         drawn = axes.scatter(*spot.T, c=values[here], cmap="PuOr_r", vmin=-span, vmax=span, zorder=3, **dots)
-        named(drawn, [f"{called} {place}: {number(values[place - 1], 2)} {unit}" for place in np.flatnonzero(here) + 1])
+        named(drawn, [f"{called} {index}: {number(values[index - 1], 2)} {unit}" for index in np.flatnonzero(here) + 1])
         axes.plot(np.cos(circle), np.sin(circle), color="black", linewidth=1)
         for px, py, text in ((1.14, 0, "+x"), (-1.14, 0, "−x"), (0, 1.12, "+y"), (0, -1.12, "−y")):
             axes.text(px, py, text, ha="center", va="center", fontsize=9)
@@ -360,38 +418,60 @@ def hemispheres(
     return panels, grid
 
 
-def orientation_figure(found: PoseAndTurnErrors) -> Figure:
+def _number_dots(axes: Axes, spots: FloatArray, numbers: NDArray[np.intp]) -> None:
+    """Write one label for all poses on nearly the same spot: their numbers, the first three of them."""
+    left = list(range(len(spots)))
+    while left:
+        near = [dot for dot in left if np.linalg.norm(spots[dot] - spots[left[0]]) < 0.07]
+        text = ", ".join(map(str, numbers[near[:3]])) + (" …" if len(near) > 3 else "")
+        axes.annotate(text, spots[left[0]], (5, 4), textcoords="offset points", fontsize=7, color="#333333", zorder=5)
+        left = [dot for dot in left if dot not in near]
+
+
+def orientation_figure(poses: PoseAndTurnErrors) -> Figure:
     """Draw which way was up in each pose, and where no pose was."""
     figure = new_figure(5.4)
-    errors, label = 1000 * found.norm_after, "error of gravity's magnitude after calibration (mm/s²)"
-    panels, _ = hemispheres(figure, 2, found.directions, errors, float(np.max(np.abs(errors))), label, "pose",
-                            s=70, edgecolors="black", linewidths=0.8)  # fmt: skip
-    gap, where = largest_gap(found.directions)
+    errors, label = 1000 * poses.norm_after, "error of gravity's magnitude after calibration (mm/s²)"
+    panels, _ = hemispheres(
+        figure,
+        2,
+        poses.directions,
+        errors,
+        np.max(np.abs(errors)),
+        label,
+        "pose",
+        s=70,
+        edgecolors="black",
+        linewidths=0.8,
+    )
+    gap, where = largest_gap(poses.directions)
     ticks = np.linspace(-1, 1, 161)
-    x, y = (each.ravel() for each in np.meshgrid(ticks, ticks))
+    x, y = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
     radius = np.hypot(x, y)
     height = 1 - np.minimum(radius, 1.0) ** 2
     scale = np.sqrt(1 - height**2) / np.maximum(radius, 1e-12)
     circle = np.linspace(0, 2 * np.pi, 200)
     for axes, sign, here, spot in panels:
         points = np.stack([scale * x, scale * y, sign * height], axis=1)
-        angles = np.where(radius <= 1, nearest_angles(points, found.directions), np.nan).reshape(161, 161)
+        angles = np.where(radius <= 1, nearest_angles(points, poses.directions), np.nan).reshape(161, 161)
         axes.contourf(ticks, ticks, angles, levels=[0, 30, 45, 60, 181], colors=GAPS)
         for tilt in (30, 60):
             ring = np.sqrt(1 - np.cos(np.radians(tilt)))
             axes.plot(ring * np.cos(circle), ring * np.sin(circle), color="#BBBBBB", linewidth=0.5)
-        left, numbers = list(range(len(spot))), np.flatnonzero(here) + 1
-        while left:  # one label for all poses on nearly the same spot: their numbers, the first three of them
-            near = [place for place in left if np.linalg.norm(spot[place] - spot[left[0]]) < 0.07]
-            text = ", ".join(map(str, numbers[near[:3]])) + (" …" if len(near) > 3 else "")
-            axes.annotate(text, spot[left[0]], (5, 4), textcoords="offset points", fontsize=7, color="#333333",
-                          zorder=5)  # fmt: skip
-            left = [place for place in left if place not in near]
+        _number_dots(axes, spot, np.flatnonzero(here) + 1)
         if (where[2] >= 0) == (sign > 0):
             px, py = _flat(where[None])[0]
             axes.plot(px, py, "x", color="#CC0033", markersize=10, markeredgewidth=2.2, zorder=4)
-            axes.annotate(f"{gap:.0f}°", (px, py), (8, -11), textcoords="offset points", fontsize=9, color="#CC0033",
-                          fontweight="bold", zorder=4)  # fmt: skip
+            axes.annotate(
+                f"{gap:.0f}°",
+                (px, py),
+                (8, -11),
+                textcoords="offset points",
+                fontsize=9,
+                color="#CC0033",
+                fontweight="bold",
+                zorder=4,
+            )
         axes.plot(0, 0, "+", color="#666666", markersize=7)
         middle, way = ("+z", "up") if sign > 0 else ("−z", "down")
         axes.set_title(f"{middle} in the middle: poses with z pointing {way}", fontsize=9)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,11 +11,12 @@ import numpy as np
 
 from jaximu.calibration import Calibration, History
 from jaximu.estimation.uncertainty import label
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import Z95, number
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.effects.magnetic_field import SetupMagneticField
-from jaximu.report.figures import AXES, band, dressed, logarithmic, new_figure
-from jaximu.report.html import write_calibration
+from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, new_figure, zero_line
+from jaximu.report.html import Folder, write_calibration
 from jaximu.report.words import Lead, Statement, gravity_statement, sentence, weak_statements
 
 if TYPE_CHECKING:
@@ -23,19 +24,20 @@ if TYPE_CHECKING:
 
 __all__ = ["statements", "write_filter_report"]
 
-_PANELS = (("gyroscope", "bias", "Gyroscope bias less its last value [°/s]", np.degrees(1.0)),
-           ("accelerometer", "bias", "Accelerometer bias less its last value [mm/s²]", 1e3),
-           ("gyroscope", "gain", "Gyroscope scale less its last value [%]", 100.0),
-           ("accelerometer", "gain", "Accelerometer scale less its last value [%]", 100.0))  # fmt: skip
+_PANELS = (
+    ("gyroscope", "bias", "Gyroscope bias less its last value [°/s]", np.degrees(1.0)),
+    ("accelerometer", "bias", "Accelerometer bias less its last value [mm/s²]", 1e3),
+    ("gyroscope", "gain", "Gyroscope scale less its last value [%]", 100.0),
+    ("accelerometer", "gain", "Accelerometer scale less its last value [%]", 100.0),
+)
 _HOUR = np.degrees(3600.0)
 
 
-def statements(calibration: Calibration, history: History) -> list[Statement]:
+def statements(calibration: Calibration, history: History) -> Iterator[Statement]:
     """Say whether the innovations are noise, when each kind of number was known, and what the Earth's rotation is."""
     assert calibration.filter is not None
-    said = []
     if (text := calibration.filter.get("diverged")) is not None:
-        said.append(Statement("Diverged", sentence(text), True))
+        yield Statement("Diverged", sentence(text), True)
     nis = calibration.filter["nis"]
     measured = int(np.sum(history.freedom > 0))
     fits = 0.7 < nis < 1.4
@@ -43,23 +45,24 @@ def statements(calibration: Calibration, history: History) -> list[Statement]:
         f"Over {measured} updates the squared innovations are {number(nis, 2)} times what their uncertainty "
         f"expects: {'noise explains them' if fits else 'an unmodelled effect, or the noise stated is not this unit’s'}."
     )
-    said.append(Statement("Innovations", text, not fits))
-    said.append(Statement("Convergence", _convergence(history)))
+    yield Statement("Innovations", text, not fits)
+    yield Statement("Convergence", _convergence(history))
     if (earth := _earth(history)) is not None:
-        said.append(earth)
-    if (place := np.asarray(calibration.imu.coefficients(SetupMagneticField))).any():
-        strength = float(np.linalg.norm(place))
-        said.append(Statement(
-            "Magnetic field", f"{number(strength)} µT, {np.degrees(np.arcsin(-place[2] / strength)):.1f}° below the "
-            "level: it shows the heading of every rest."))  # fmt: skip
-    return said
+        yield earth
+    if (field := np.asarray(calibration.imu.coefficients(SetupMagneticField))).any():
+        strength = float(np.linalg.norm(field))
+        yield Statement(
+            "Magnetic field",
+            f"{number(strength)} µT, {np.degrees(np.arcsin(-field[2] / strength)):.1f}° below the "
+            "level: it shows the heading of every rest.",
+        )
 
 
 def _convergence(history: History) -> str:
     """Say after how long each kind of number was known to twice its last uncertainty."""
     parts, never = [], []
     for owner, part, *_ in _PANELS:
-        times = [history.converged(place) for place in _places(history, owner, part)]
+        times = [history.converged(state) for state in _places(history, owner, part)]
         if times and None not in times:
             parts.append(f"{owner} {part} after {max(time for time in times if time is not None):.0f} s")
         elif times:
@@ -72,8 +75,9 @@ def _convergence(history: History) -> str:
 
 def _places(history: History, owner: str, part: str) -> list[int]:
     """Return the places of a triad's gains or biases among the states."""
-    return [place for place, name in enumerate(history.names)
-            if (name.owner, name.part, name.effect) == (owner, part, None)]  # fmt: skip
+    return [
+        state for state, name in enumerate(history.names) if (name.owner, name.part, name.effect) == (owner, part, None)
+    ]
 
 
 def _earth(history: History) -> Statement | None:
@@ -82,8 +86,8 @@ def _earth(history: History) -> Statement | None:
     if not places:
         return None
     value, sigma = history.values[-1, places], history.sigmas[-1, places]
-    total = float(np.linalg.norm(value))
-    spread = float(np.linalg.norm(value * sigma) / max(total, 1e-30))
+    total = np.linalg.norm(value)
+    spread = np.linalg.norm(value * sigma) / max(total, 1e-30)
     near = abs(total - EARTH_RATE) < 4 * spread + 0.02 * EARTH_RATE
     if total < 4 * spread or (near and spread > 0.1 * EARTH_RATE):
         text = (
@@ -91,32 +95,32 @@ def _earth(history: History) -> Statement | None:
             "intervals of the gyroscope's bias include it."
         )
         return Statement("Earth's rotation", text)
-    seen = f"{number(total * _HOUR)} ± {number(Z95 * spread * _HOUR, 2)} °/h"
+    rate = f"{number(total * _HOUR)} ± {number(Z95 * spread * _HOUR, 2)} °/h"
     if not near:
         text = (
-            f"What turns with the level frame is {seen}, and the Earth's rotation is 15.04 °/h: a rate that depends on "
+            f"What turns with the level frame is {rate}, and the Earth's rotation is 15.04 °/h: a rate that depends on "
             "orientation, such as gyroscope g-sensitivity, is in it. Run `jaximu diagnose`."
         )
         return Statement("Earth's rotation", text, True)
     latitude = np.degrees(np.arcsin(np.clip(value[2] / total, -1, 1)))
     return Statement(
-        "Earth's rotation", f"Found as {seen} (15.04 °/h), which puts the unit at latitude {latitude:.2f}°."
+        "Earth's rotation", f"Found as {rate} (15.04 °/h), which puts the unit at latitude {latitude:.2f}°."
     )
 
 
-def write_filter_report(calibration: Calibration, history: History, folder: str | os.PathLike[str]) -> Path:
+def write_filter_report(calibration: Calibration, history: History, folder: Folder) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     assert calibration.filter is not None
     bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
-    scale = float(np.mean(np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)))
+    scale = np.mean(np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1))
     worst = np.degrees(Z95 * max(bias) / scale)
     minutes = (history.time[-1] - history.time[0]) / 60
-    said = statements(calibration, history)
+    entries = statements(calibration, history)
     verdict = "diverged" if calibration.filter.get("diverged") else "followed the unit"
     first = Lead(
         f"The filter {verdict} through {minutes:.1f} min of rests and motion and determines {len(calibration.names)} "
         "numbers of the unit.",
-        f"±{number(float(worst), 2)} °/s",
+        f"±{number(worst, 2)} °/s",
         "how well the gyroscope's bias is known at the end (95 %, the worst axis)",
     )
     left = calibration.filter["open"] or ["This sequence leaves no number of the unit open."]
@@ -129,61 +133,72 @@ def write_filter_report(calibration: Calibration, history: History, folder: str 
         calibration,
         folder,
         first,
-        [*said, gravity_statement(calibration)],
+        [*entries, gravity_statement(calibration)],
         weak_statements(calibration.weak, *left),
         {"residuals": partial(_figure, calibration, history)},
         picture,
     )
 
 
-def _effects(calibration: Calibration, history: History) -> dict[str, list[int]]:
-    """Return the places of the effects' numbers among the states, by what their picture is called."""
-    found: dict[str, list[int]] = {}
+_Line = tuple[FloatArray, FloatArray, str, str]
+"""A state over time, its standard deviation, colour and name."""
+
+
+def _triads(calibration: Calibration, history: History) -> Iterator[tuple[str, list[_Line]]]:
+    """Yield the title of each panel of biases and scales, and its lines, less their last values."""
+    for owner, part, title, factor in _PANELS:
+        gain, lines = np.linalg.norm(np.asarray(getattr(calibration.imu, owner).gain), axis=1), []
+        for state in _places(history, owner, part):
+            axes = history.names[state].axes
+            if len(set(axes)) == 1:
+                unit, axis = factor / gain[axes[0]], "xyz"[axes[0]]
+                value = history.values[:, state] - history.values[-1, state]
+                lines.append((unit * value, abs(unit) * history.sigmas[:, state], AXES[axis], axis))
+        yield title, lines
+
+
+def _effects(calibration: Calibration, history: History) -> Iterable[tuple[str, list[_Line]]]:
+    """Return the title of each panel of effects' numbers, and its lines."""
+    groups: dict[str, list[_Line]] = {}
     units = {name: triad.output_unit for name, triad in calibration.triads().items()}
-    for place, name in enumerate(history.names):
+    for state, name in enumerate(history.names):
         effect = calibration.imu.all_effects().get((name.owner, name.effect))
-        if effect is not None and place not in history.earth:
+        if effect is not None and state not in history.earth:
             title = f"{sentence(effect.english)} [{effect.coefficient_unit(units.get(name.owner, ''))}]"
-            found.setdefault(title, []).append(place)
-    return found
+            lines = groups.setdefault(title, [])
+            text = label(name, calibration.imu)
+            lines.append((history.values[:, state], history.sigmas[:, state], f"C{len(lines)}", text))
+    return groups.items()
 
 
 def _figure(calibration: Calibration, history: History) -> Figure:
-    effects = _effects(calibration, history)
-    count = len(_PANELS) + len(effects) + 1
-    figure = new_figure(2.4 * count)
-    panels = figure.subplots(count, 1, sharex=True)
+    drawn = [*_triads(calibration, history), *_effects(calibration, history)]
+    figure = new_figure(2.4 * (len(drawn) + 1))
+    panels = figure.subplots(len(drawn) + 1, 1, sharex=True)
     time = history.time
-    late = np.searchsorted(time, (time[0] + time[-1]) / 2)
-    for panel, (owner, part, title, factor) in zip(panels, _PANELS, strict=False):
-        gain, reach = np.linalg.norm(np.asarray(getattr(calibration.imu, owner).gain), axis=1), 0.0
-        for place in _places(history, owner, part):
-            axes = history.names[place].axes
-            if len(set(axes)) == 1:
-                unit, axis = factor / gain[axes[0]], "xyz"[axes[0]]
-                line = (history.values[:, place] - history.values[-1, place]) * unit
-                half = Z95 * history.sigmas[:, place] * abs(unit)
-                band(panel, time, line, half, AXES[axis], label=axis)
-                reach = max(reach, float(np.max(np.abs(line[late:]) + half[late:])))
-        panel.set_ylim(-1.1 * reach, 1.1 * reach)  # the data sheet's uncertainty at the start would hide the rest
-        panel.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
-        dressed(panel, title)
-    for panel, (title, places) in zip(panels[len(_PANELS) :], effects.items(), strict=False):
-        reach = 0.0
-        for colour, place in enumerate(places):
-            line, half = history.values[:, place], Z95 * history.sigmas[:, place]
-            band(panel, time, line, half, f"C{colour}", label=label(history.names[place], calibration.imu))
-            reach = max(reach, float(np.max(np.abs(line[late:]) + half[late:])))
-        panel.set_ylim(-1.1 * reach, 1.1 * reach)
-        panel.legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
+    middle = np.searchsorted(time, (time[0] + time[-1]) / 2)
+    for panel, (title, lines) in zip(panels, drawn, strict=False):
+        limit = 0.0
+        for line, sigma, color, name in lines:
+            half = Z95 * sigma
+            band(panel, time, line, half, color, label=name)
+            limit = max(limit, np.max(np.abs(line[middle:]) + half[middle:]))
+        panel.set_ylim(-1.1 * limit, 1.1 * limit)  # the data sheet's uncertainty at the start would hide the rest
+        legend(panel, 3, "upper right")
         dressed(panel, title)
     used = history.freedom > 0
-    panels[-1].plot(time[used], np.maximum((history.innovations / np.maximum(history.freedom, 1))[used], 1e-3), ".",
-                    color=AXES["x"], markersize=3)  # fmt: skip
+    panels[-1].plot(
+        time[used],
+        np.maximum((history.innovations / np.maximum(history.freedom, 1))[used], 1e-3),
+        ".",
+        color=AXES["x"],
+        markersize=3,
+    )
     logarithmic(panels[-1], "y")
-    panels[-1].axhline(1.0, color="0.4", linewidth=0.8)
+    zero_line(panels[-1], 1.0)
     dressed(panels[-1], "Squared innovations over their expectation", xlabel="time [s]")
     for panel in panels:
-        panel.fill_between(time, 0, 1, where=history.rest, color="0.93", transform=panel.get_xaxis_transform(),
-                           step="pre", zorder=-1)  # fmt: skip
+        panel.fill_between(
+            time, 0, 1, where=history.rest, color="0.93", transform=panel.get_xaxis_transform(), step="pre", zorder=-1
+        )
     return figure

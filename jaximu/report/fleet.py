@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,21 +14,29 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
 from jaximu.fleets.population import Difference, Fleet, Population, write_shrunk
 from jaximu.ground.atomic import write_files
-from jaximu.ground.quantities import number, probability
+from jaximu.ground.quantities import Z95, number, probability
 from jaximu.ground.summary import sentence
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
 from jaximu.report.figures import dressed
+from jaximu.report.html import MOST_ROWS
 from jaximu.report.html import page as page_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["amount", "difference_words", "failure_words", "headline", "lot_figure", "population_figure", "prior_figure",
-           "write_fleet"]  # fmt: skip
+__all__ = [
+    "amount",
+    "difference_words",
+    "failure_words",
+    "headline",
+    "lot_figure",
+    "population_figure",
+    "prior_figure",
+    "write_fleet",
+]
 
-_SHOWN = 50  # strangers in the table
 _UNIT, _STRANGER, _PRIOR = figures.AXES.values()
 _KINDS = (
     ("accelerometer", "gain", True, "accelerometer scale", "%", 100.0),
@@ -59,26 +68,38 @@ def _page(fleet: Fleet, document: str) -> bytes:
     drawn = {}
     if fleet.population is not None:
         drawn = {"population": partial(population_figure, fleet), "prior": partial(prior_figure, fleet)}
-        if told := [each for each in fleet.differences if each.kind == "lot"]:
-            drawn["lots"] = partial(lot_figure, fleet, told[0])
+        if lots := [difference for difference in fleet.differences if difference.kind == "lot"]:
+            drawn["lots"] = partial(lot_figure, fleet, lots[0])
     strangers = [
-        (each.device, "; ".join(f"{describe(name)} ({z:+.1f}σ)" for name, _, z in each.parameters if abs(z) > 2)
-         or "no single parameter: in how they go together", probability(each.p_value).removeprefix("= "), each.file)
-        for each in fleet.strangers[:_SHOWN]
-    ]  # fmt: skip
-    statuses = sorted(fleet.statuses.items(), key=lambda each: (each[0] != "ok", -each[1]))
+        (
+            stranger.device,
+            "; ".join(f"{describe(name)} ({z:+.1f}σ)" for name, _, z in stranger.parameters if abs(z) > 2)
+            or "no single parameter: in how they go together",
+            probability(stranger.p_value).removeprefix("= "),
+            stranger.file,
+        )
+        for stranger in fleet.strangers[:MOST_ROWS]
+    ]
+    statuses = sorted(fleet.statuses.items(), key=lambda item: (item[0] != "ok", -item[1]))
     return page_of(
-        "fleet", drawn, title=f"Fleet of {fleet.recordings} recordings, {Path(fleet.table).name}", lead=headline(fleet),
-        number=f"{fleet.statuses['ok']} of {fleet.recordings}", meaning="recordings calibrated",
+        "fleet",
+        drawn,
+        title=f"Fleet of {fleet.recordings} recordings, {Path(fleet.table).name}",
+        lead=headline(fleet),
+        number=f"{fleet.statuses['ok']} of {fleet.recordings}",
+        meaning="recordings calibrated",
         statuses=[(status, count, status != "ok") for status, count in statuses],
         failures=[(reason, count, files, True) for reason, files, count in failure_words(fleet, 20, 10)],
         verdicts=", ".join(f"{count} {name}" for name, count in fleet.verdicts.most_common()),
         effects=[(effect_title(name), count) for name, count in fleet.effects.most_common()],
-        differences=[(_about(each), difference_words(each), True) for each in fleet.differences]
+        differences=[(_about(difference), difference_words(difference), True) for difference in fleet.differences]
         or [("Lots, dates, devices recorded again", _nothing(fleet))],
-        strangers=strangers, more=max(0, len(fleet.strangers) - _SHOWN), document=document, rows=_rows(fleet),
+        strangers=strangers,
+        more=max(0, len(fleet.strangers) - MOST_ROWS),
+        document=document,
+        rows=_rows(fleet),
         notes=fleet.notes,
-    )[0]  # fmt: skip
+    )[0]
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -91,15 +112,26 @@ def headline(fleet: Fleet) -> str:
     if fleet.population is None:
         return f"{text}; too few to speak of a population."
     count = len(fleet.strangers)
-    text += "; no unit falls out of the population" if not count else (
-        f"; {count} unit{'s do' if count > 1 else ' does'} not belong to the population")  # fmt: skip
-    groups = list(dict.fromkeys(f"{each.kind} {each.group}" for each in fleet.differences if each.kind != "date"))
+    text += (
+        "; no unit falls out of the population"
+        if not count
+        else (f"; {count} unit{'s do' if count > 1 else ' does'} not belong to the population")
+    )
+    groups = list(
+        dict.fromkeys(
+            f"{difference.kind} {difference.group}" for difference in fleet.differences if difference.kind != "date"
+        )
+    )
     if groups:
-        shown = ", ".join(groups[:3]) + (f" and {len(groups) - 3} more" if len(groups) > 3 else "")
-        text += f"; different from the rest: {shown}"
-    if any(each.kind == "date" for each in fleet.differences):
+        text += f"; different from the rest: {_first(groups, 3)}"
+    if any(difference.kind == "date" for difference in fleet.differences):
         text += "; parameters drift with the date"
     return f"{text}."
+
+
+def _first(names: Sequence[str], most: int) -> str:
+    """Return the first of some names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def failure_words(fleet: Fleet, reasons: int, files: int) -> list[tuple[str, str, int]]:
@@ -107,14 +139,13 @@ def failure_words(fleet: Fleet, reasons: int, files: int) -> list[tuple[str, str
 
     What is left out is counted, too.
     """
-    found = []
+    rows = []
     for reason, met in list(fleet.failed.items())[:reasons]:
-        more = len(met) - files
-        found.append((sentence(reason), ", ".join(met[:files]) + (f" and {more} more" if more > 0 else ""), len(met)))
+        rows.append((sentence(reason), _first(met, files), len(met)))
     rest = list(fleet.failed.values())[reasons:]
     if rest:
-        found.append((f"{len(rest)} other reasons, in the table's column `message`.", "", sum(map(len, rest))))
-    return found
+        rows.append((f"{len(rest)} other reasons, in the table's column `message`.", "", sum(map(len, rest))))
+    return rows
 
 
 def _about(difference: Difference) -> str:
@@ -125,8 +156,10 @@ def _about(difference: Difference) -> str:
 def difference_words(difference: Difference) -> str:
     """Say what a group changes, with 95 % intervals."""
     rate = " a year" if difference.kind == "date" else ""
-    parts = [f"{describe(name)} by {amount(name, value, 1.96 * sigma)}{rate}"
-             for name, value, sigma in difference.parameters[:5]]  # fmt: skip
+    parts = [
+        f"{describe(name)} by {amount(name, value, Z95 * sigma)}{rate}"
+        for name, value, sigma in difference.parameters[:5]
+    ]
     more = len(difference.parameters) - 5
     if more > 0:
         parts.append(f"{more} more parameters")
@@ -155,14 +188,20 @@ def _rows(fleet: Fleet) -> list[tuple[str, str, str, str, str, bool]]:
     if fleet.population is None:
         return []
     rows = []
-    alone, prior = (np.quantile(each, 0.9, axis=0) for each in (fleet.sigma, fleet.shrunk_sigma))
+    alone, prior = (np.quantile(sigma, 0.9, axis=0) for sigma in (fleet.sigma, fleet.shrunk_sigma))
     for k, name in enumerate(fleet.population.names):
         scale = name.part == "gain" and name.axes[0] == name.axes[1]
         mean = fleet.population.mean[k] - (1.0 if scale else 0.0)
         rows.append(
-            (describe(name), amount(name, mean), amount(name, fleet.population.spread[k]), amount(name, alone[k]),
-             amount(name, prior[k]), bool(prior[k] < 0.8 * alone[k]))
-        )  # fmt: skip
+            (
+                describe(name),
+                amount(name, mean),
+                amount(name, fleet.population.spread[k]),
+                amount(name, alone[k]),
+                amount(name, prior[k]),
+                bool(prior[k] < 0.8 * alone[k]),
+            )
+        )
     return rows
 
 
@@ -172,11 +211,11 @@ def _rows(fleet: Fleet) -> list[tuple[str, str, str, str, str, bool]]:
 def _panels(population: Population, title: str) -> tuple[Figure, list[tuple[Axes, tuple, list[int]]]]:
     """Return a figure with a panel for each kind of parameter, its kind, and which parameters are of it."""
     places = {kind: [k for k, name in enumerate(population.names) if _is(name, kind)] for kind in _KINDS}
-    there = [(kind, own) for kind, own in places.items() if own]
+    there = [(kind, columns) for kind, columns in places.items() if columns]
     rows = (len(there) + 2) // 3
     figure = figures.new_figure(0.4 + 2.9 * rows)
     figure.suptitle(title, fontsize=11)
-    return figure, [(figure.add_subplot(rows, 3, place), *each) for place, each in enumerate(there, 1)]
+    return figure, [(figure.add_subplot(rows, 3, position), *panel) for position, panel in enumerate(there, 1)]
 
 
 def population_figure(fleet: Fleet) -> Figure:
@@ -185,26 +224,38 @@ def population_figure(fleet: Fleet) -> Figure:
     assert population is not None
     figure, panels = _panels(population, f"{len(fleet.values)} units about the mean of the fleet")
     spread_out, opaque = np.random.default_rng(0), 0.7 if len(fleet.values) < 200 else 0.35
-    for axes, kind, own in panels:
-        for column, k in enumerate(own):
+    for axes, kind, columns in panels:
+        for column, k in enumerate(columns):
             values = kind[-1] * (fleet.values[:, k] - population.mean[k])
             width = 0.3 * spread_out.uniform(-1, 1, len(values))
             axes.plot(column + width, values, ".", color=_UNIT, alpha=opaque, markersize=5, markeredgewidth=0)
             two = 2 * kind[-1] * population.spread[k]
             axes.plot([column, column], [-two, two], color="black", linewidth=2.2, solid_capstyle="butt")
             axes.plot([column - 0.12, column + 0.12], [0, 0], color="black", linewidth=2.2)
-            marked = [(kind[-1] * (value - population.mean[k]), each.device)
-                      for each in fleet.strangers for name, value, _ in each.parameters[:1]
-                      if name == population.names[k]]  # fmt: skip
+            marked = [
+                (kind[-1] * (value - population.mean[k]), stranger.device)
+                for stranger in fleet.strangers
+                for name, value, _ in stranger.parameters[:1]
+                if name == population.names[k]
+            ]
             for value, device in marked[:5]:
                 axes.plot(column, value, "D", color=_STRANGER, markersize=5)
-                last = column == len(own) - 1  # its name goes towards the middle of the panel
-                axes.annotate(device, (column, value), (5 - 10 * last, 0), textcoords="offset points", fontsize=7,
-                              color=_STRANGER, va="center", ha="right" if last else "left")  # fmt: skip
+                last = column == len(columns) - 1  # its name goes towards the middle of the panel
+                axes.annotate(
+                    device,
+                    (column, value),
+                    (5 - 10 * last, 0),
+                    textcoords="offset points",
+                    fontsize=7,
+                    color=_STRANGER,
+                    va="center",
+                    ha="right" if last else "left",
+                )
         axes.set_xticks(
-            range(len(own)), ["".join("xyz"[axis] for axis in dict.fromkeys(population.names[k].axes)) for k in own]
+            range(len(columns)),
+            ["".join("xyz"[axis] for axis in dict.fromkeys(population.names[k].axes)) for k in columns],
         )
-        axes.set_xlim(-0.6, len(own) - 0.4)
+        axes.set_xlim(-0.6, len(columns) - 0.4)
         dressed(axes, kind[3], ylabel=f"off the mean [{kind[4]}]")
     return figure
 
@@ -214,9 +265,9 @@ def prior_figure(fleet: Fleet) -> Figure:
     population = fleet.population
     assert population is not None
     figure, panels = _panels(population, "How well a unit is known, alone and with the fleet as prior")
-    for axes, kind, own in panels:
-        alone, prior = (kind[-1] * each[:, own].ravel() for each in (fleet.sigma, fleet.shrunk_sigma))
-        ends = float(min(alone.min(), prior.min())) / 1.3, float(alone.max()) * 1.3
+    for axes, kind, columns in panels:
+        alone, prior = (kind[-1] * sigma[:, columns].ravel() for sigma in (fleet.sigma, fleet.shrunk_sigma))
+        ends = min(alone.min(), prior.min()) / 1.3, alone.max() * 1.3
         axes.plot(ends, ends, color="#8A8A8A", linewidth=1)
         axes.plot(alone, prior, ".", color=_PRIOR, alpha=0.4, markersize=4, markeredgewidth=0)
         figures.logarithmic(axes)
@@ -232,19 +283,26 @@ def lot_figure(fleet: Fleet, difference: Difference) -> Figure:
     kind = next(kind for kind in _KINDS if _is(name, kind))
     values = kind[-1] * (fleet.values[:, population.names.index(name)] - population.mean[population.names.index(name)])
     lots = np.array(fleet.lots)
-    names = [each for each in sorted(set(fleet.lots)) if each]
-    different = [each.group for each in fleet.differences if each.kind == "lot"]
+    names = [lot for lot in sorted(set(fleet.lots)) if lot]
+    different = [difference.group for difference in fleet.differences if difference.kind == "lot"]
     if len(names) > 40:
-        names = [*different[:10], *[each for each in names if each not in different][:30]]
+        names = [*different[:10], *[lot for lot in names if lot not in different][:30]]
     figure = figures.new_figure(3.2)
     axes = figure.add_subplot()
     spread_out = np.random.default_rng(0)
     for column, lot in enumerate(names):
-        own = values[lots == lot]
+        points = values[lots == lot]
         color = _STRANGER if lot in different else _UNIT
-        axes.plot(column + 0.25 * spread_out.uniform(-1, 1, len(own)), own, ".", color=color, alpha=0.5, markersize=5,
-                  markeredgewidth=0)  # fmt: skip
-        axes.plot([column - 0.3, column + 0.3], [np.median(own)] * 2, color="black", linewidth=2)
+        axes.plot(
+            column + 0.25 * spread_out.uniform(-1, 1, len(points)),
+            points,
+            ".",
+            color=color,
+            alpha=0.5,
+            markersize=5,
+            markeredgewidth=0,
+        )
+        axes.plot([column - 0.3, column + 0.3], [np.median(points)] * 2, color="black", linewidth=2)
     dressed(axes, ylabel=f"off the mean [{kind[4]}]")
     axes.set_xticks(range(len(names)), names, rotation=0 if len(names) < 15 else 90, fontsize=8)
     figure.suptitle(f"{describe(name)} by lot", fontsize=11)

@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from html import escape
 from importlib.resources import files
@@ -29,10 +29,27 @@ if TYPE_CHECKING:
     Drawn = Mapping[str, Callable[[], Figure]]
     """Figures by name, each drawn when its turn comes: one that fails takes nothing else with it."""
 
-__all__ = ["page", "write_calibration", "write_failure", "write_page", "write_report"]
+__all__ = [
+    "MOST_ROWS",
+    "Folder",
+    "TextRows",
+    "page",
+    "write_calibration",
+    "write_failure",
+    "write_page",
+    "write_report",
+]
 
 
-def write_report(calibration: Calibration, folder: str | os.PathLike[str], title: str | None = None) -> Path:
+Folder = str | os.PathLike[str]
+"""Where the files of a report go; made if it is missing."""
+TextRows = list[tuple[str, ...]]
+"""The rows of a table, as texts."""
+MOST_ROWS = 50
+"""Rows of a table that may grow with the number of units: what is beyond is counted."""
+
+
+def write_report(calibration: Calibration, folder: Folder, title: str | None = None) -> Path:
     """Write `report.html` and its pictures as PNGs into `folder`, which is made if it is missing.
 
     **Arguments:** `title`: the report's heading; the names of the recordings if None. A calibration that was loaded
@@ -43,54 +60,65 @@ def write_report(calibration: Calibration, folder: str | os.PathLike[str], title
     """
     if "poses" not in calibration.data:
         raise InputError("a calibration of several kinds of data has no page: its summary() says what was found.")
-    found, drawn = evidence(calibration), {}
-    if found is not None:
-        drawn["residuals"] = partial(figures.residual_figure, found)
-        drawn["orientations"] = partial(figures.orientation_figure, found)
+    errors, drawn = evidence(calibration), {}
+    if errors is not None:
+        drawn["residuals"] = partial(figures.residual_figure, errors)
+        drawn["orientations"] = partial(figures.orientation_figure, errors)
     if calibration.segmentations:
         drawn["recording"] = partial(figures.recording_of, calibration)
-    said = (
+    picture = (
         "Errors of each pose and turn, before and after calibration",
         "“Before” is where the fit started: the nominal scale and offset, no misalignment. The inner band is what the "
         "noise, measured while the unit was still, explains; where a wider one surrounds it, the errors scatter more "
         "than that, and the intervals below count with the wider one.",
     )
-    return write_calibration(calibration, folder, words.lead(calibration), words.trust(calibration),
-                             words.limits(calibration, found), drawn, said, title)  # fmt: skip
+    return write_calibration(
+        calibration,
+        folder,
+        words.lead(calibration),
+        words.trust(calibration),
+        words.limits(calibration, errors),
+        drawn,
+        picture,
+        title,
+    )
 
 
 def write_calibration(
     calibration: Calibration,
-    folder: str | os.PathLike[str],
+    folder: Folder,
     lead: tuple[str, str, str],
-    said: Sequence[words.Statement],
-    unknown: Sequence[words.Statement],
+    trust: Iterable[words.Statement],
+    unknown: Iterable[words.Statement],
     drawn: Drawn,
     residuals: tuple[str, str] = ("", ""),
     title: str | None = None,
 ) -> Path:
     """Write the report of any calibration into a folder; return its path.
 
-    **Arguments:** `lead`: the one sentence, the one number and what it means; `said`, `unknown`: what to trust, what
+    **Arguments:** `lead`: the one sentence, the one number and what it means; `trust`, `unknown`: what to trust, what
     the data cannot show; `drawn`: its figures by name, `residuals` for one with these alternative text and caption.
 
     Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
     """
-    sources = [[str(each.get(key, "")) for key in ("file", "rows", "sha256")]
-               for each in calibration.data.get("files", [])]  # fmt: skip
-    triads = calibration.triads()
+    sources = [
+        [str(file.get(key, "")) for key in ("file", "rows", "sha256")] for file in calibration.data.get("files", [])
+    ]
+    triads, trust = calibration.triads(), [*trust]
     return write_page(
         folder,
         "calibration",
         {**drawn, "correlation": partial(figures.correlation_figure, calibration)},
-        title=title or f"Calibration from {', '.join(Path(each[0]).name for each in sources) or 'a recording'}",
+        title=title or f"Calibration from {', '.join(Path(source[0]).name for source in sources) or 'a recording'}",
         lead=lead[0],
         number=lead[1],
         meaning=lead[2],
-        trust=said,
-        limits=unknown,
+        trust=trust,
+        limits=[*unknown],
         weak=len(calibration.weak),
-        warnings=[each.about for each in said if each.caution and not each.about.startswith("What")],
+        warnings=[
+            statement.about for statement in trust if statement.caution and not statement.about.startswith("What")
+        ],
         residuals=residuals,
         shared_gravity=calibration.gravity.sigma > 0 and "accelerometer" in triads,
         equations=tables.equations(calibration),
@@ -102,7 +130,7 @@ def write_calibration(
     )
 
 
-def write_page(folder: str | os.PathLike[str], template: str, drawn: Drawn, **values: Any) -> Path:
+def write_page(folder: Folder, template: str, drawn: Drawn, **values: Any) -> Path:
     """Write a page as `report.html` and its pictures as PNGs into a folder, all or none; return the page's path.
 
     Raises `InputError` where the folder cannot be made or written to.
@@ -127,9 +155,11 @@ def page(template: str, drawn: Drawn, *, notes: Sequence[str] = (), **values: An
             sources[name] = vector.drawing(figure, name)
         except Exception as error:
             sources[name] = _failure(f"The figure “{name}”", error)
-    text = _environment().get_template(f"{template}.html.jinja").render(
-        pictures=sources, notes=[words.sentence(each) for each in notes], **values
-    )  # fmt: skip
+    text = (
+        _environment()
+        .get_template(f"{template}.html.jinja")
+        .render(pictures=sources, notes=[words.sentence(note) for note in notes], **values)
+    )
     text = _TABLE.sub(_labelled, _FOLDERS.sub("", text))
     return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
 
@@ -163,9 +193,12 @@ def _environment() -> jinja2.Environment:
 
     made = jinja2.Environment(
         loader=jinja2.FunctionLoader(_file),
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
         keep_trailing_newline=True,
-    )  # fmt: skip
+    )
     script = _file("figure.js")
     made.globals |= {
         "script": script,
@@ -179,10 +212,10 @@ _FOLDERS = re.compile(r"""(?<=[\s>("'])(?:/|[A-Za-z]:[\\/])(?:[^\s<>"'/\\;&]+[/\
 _TABLE = re.compile(r'<div class="scroll"><table.*?</table>', re.DOTALL)
 
 
-def _labelled(found: re.Match[str]) -> str:
+def _labelled(match: re.Match[str]) -> str:
     """Write into each cell of a table which column it is in: a telephone shows rows one below the other."""
-    head, separator, body = found[0].partition("</thead>")
-    labels = [re.sub("<[^>]*>", "", each) for each in re.findall(r"<th\b[^>]*>(.*?)</th>", head, re.DOTALL)]
+    head, separator, body = match[0].partition("</thead>")
+    labels = [re.sub("<[^>]*>", "", label) for label in re.findall(r"<th\b[^>]*>(.*?)</th>", head, re.DOTALL)]
 
     def row(line: re.Match[str]) -> str:
         cells = iter(labels)

@@ -30,8 +30,8 @@ def place_panels(figure: Figure) -> None:
     margins = [_margins(axes) for axes, _ in panels]
     above = _lines(figure.get_suptitle(), 12.0) + _EDGE
     below = _lines(figure.get_supxlabel(), 9.0) + _EDGE + sum(map(_height, figure.legends))
-    columns = [(span.colspan, *each[:2]) for (_, span), each in zip(panels, margins, strict=True)]
-    rows = [(span.rowspan, *each[2:]) for (_, span), each in zip(panels, margins, strict=True)]
+    columns = [(span.colspan, *margin[:2]) for (_, span), margin in zip(panels, margins, strict=True)]
+    rows = [(span.rowspan, *margin[2:]) for (_, span), margin in zip(panels, margins, strict=True)]
     across = _edges(width, _EDGE, _EDGE, np.asarray(grid.get_width_ratios()), columns)
     down = _edges(height, above, below, np.asarray(grid.get_height_ratios()), rows)
     for (axes, span), (*_, bottom) in zip(panels, margins, strict=True):

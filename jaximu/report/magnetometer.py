@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.ground.quantities import number
+from jaximu.ground.quantities import Z95, number
 from jaximu.ground.summary import sentence
-from jaximu.report.figures import dressed, hemispheres, new_figure
-from jaximu.report.html import write_calibration
+from jaximu.report.figures import dressed, hemispheres, legend, new_figure
+from jaximu.report.html import Folder, write_calibration
 from jaximu.report.words import Lead, Statement, weak_statements
 
 if TYPE_CHECKING:
@@ -33,9 +32,9 @@ _ENOUGH = 0.6
 
 def lead(calibration: Calibration) -> Lead:
     """Say how good a heading becomes, or how much the field's strength still scatters."""
-    found = calibration.magnetic
-    assert found is not None
-    spread, heading = found["norm_spread"], found["heading_error"]
+    facts = calibration.magnetic
+    assert facts is not None
+    spread, heading = facts["norm_spread"], facts["heading_error"]
     strength = (
         f"the field's strength scatters by {100 * spread['after']:.2g} % instead of {100 * spread['before']:.2g} % on "
         "parts left out"
@@ -51,55 +50,55 @@ def lead(calibration: Calibration) -> Lead:
     )
 
 
-def statements(calibration: Calibration) -> list[Statement]:
+def statements(calibration: Calibration) -> Iterator[Statement]:
     """Say what the field is, what the iron does, and where the field was seen."""
-    found, triad = calibration.magnetic, calibration.imu.magnetometer
-    assert found is not None and triad is not None
+    facts, triad = calibration.magnetic, calibration.imu.magnetometer
+    assert facts is not None and triad is not None
     gain, bias = np.asarray(triad.gain), np.asarray(triad.bias)
-    strength, dip = found["field"]["strength"], found["field"]["dip"]
+    strength, dip = facts["field"]["strength"], facts["field"]["dip"]
     # a field's image is an ellipsoid; how far from round it is, is soft iron and scale
     axes = np.linalg.svd(gain, compute_uv=False)
     iron = float(np.linalg.norm(np.linalg.solve(gain, bias)))
-    text = f"{number(strength['value'], 3)} ± {number(1.96 * strength['sigma'], 2)} µT"
+    text = f"{number(strength['value'], 3)} ± {number(Z95 * strength['sigma'], 2)} µT"
     if dip is not None:
         way = "below" if dip["value"] > 0 else "above"
-        text += f", pointing {number(abs(dip['value']), 3)} ± {number(1.96 * dip['sigma'], 2)}° {way} the level"
+        text += f", pointing {number(abs(dip['value']), 3)} ± {number(Z95 * dip['sigma'], 2)}° {way} the level"
     known = " (95 %)"
     if strength["sigma"] > 0.01 * strength["value"]:
         known += "; every gain shares the uncertainty of the strength, which --field or --longitude would narrow"
-    said = [
+    yield from [
         Statement("The field", f"{text}{known}."),
         Statement("Hard iron", f"{number(iron, 3)} µT, {number(100 * iron / strength['value'], 2)} % of the field."),
         Statement(
             "Soft iron and scale",
-            f"the output changes {number(100 * (axes[0] / axes[-1] - 1), 2)} % more with a field along one direction "
+            f"The output changes {number(100 * (axes[0] / axes[-1] - 1), 2)} % more with a field along one direction "
             "than along another.",
         ),
     ]
-    share = found["coverage"]
+    share = facts["coverage"]
     words = "all round" if share > 0.9 else "from most directions" if share > _ENOUGH else "from some directions only"
-    said.append(
-        Statement("Directions", f"the field was seen {words}: {100 * share:.0f} % of the sphere lies within 15° of "
-                  "a measured direction.", share < _ENOUGH)
-    )  # fmt: skip
-    if found.get("next") is not None:
-        said.append(Statement("Next", next_words(found["next"])))
-    if found["heading_error"] is not None:
-        worst = found["heading_error"]
-        said.append(Statement(
+    yield Statement(
+        "Directions",
+        f"The field was seen {words}: {100 * share:.0f} % of the sphere lies within 15° of a measured direction.",
+        share < _ENOUGH,
+    )
+    if facts.get("next") is not None:
+        yield Statement("Next", sentence(next_words(facts["next"])))
+    if facts["heading_error"] is not None:
+        worst = facts["heading_error"]
+        yield Statement(
             "Heading in other attitudes",
-            f"rolled or pitched by 45°, or upside down, it is good to {number(worst['worst'], 2)}° at the worst "
+            f"Rolled or pitched by 45°, or upside down, it is good to {number(worst['worst'], 2)}° at the worst "
             f"(before: off by up to {number(worst['before']['worst'], 2)}°).",
-        ))  # fmt: skip
-    spread = found["norm_spread"]
+        )
+    spread = facts["norm_spread"]
     if spread["algebraic"] is not None:
-        said.append(Statement(
+        yield Statement(
             "Other tools",
-            f"an algebraic ellipsoid, as most tools fit it, leaves {number(100 * spread['algebraic'], 2)} % of the "
-            f"strength on the same parts left out, this calibration {number(100 * spread['after'], 2)} %; the sensor's "
-            f"noise alone makes {number(100 * spread['noise'], 2)} %.",
-        ))  # fmt: skip
-    return [each._replace(text=sentence(each.text)) for each in said]
+            f"An algebraic ellipsoid, as most tools fit it, leaves {number(100 * spread['algebraic'], 2)} % of the "
+            f"strength on the same parts left out, this calibration {number(100 * spread['after'], 2)} %; the "
+            f"sensor's noise alone makes {number(100 * spread['noise'], 2)} %.",
+        )
 
 
 def next_words(plan: dict[str, Any]) -> str:
@@ -107,7 +106,7 @@ def next_words(plan: dict[str, Any]) -> str:
     now, then = (number(plan[key], 2) for key in ("heading_now", "heading_then"))
     if plan["heading_then"] >= _PAYS * plan["heading_now"]:
         return f"no orientation is missing: six more would take a level heading from {now}° to {then}° only."
-    listed = ", ".join(dict.fromkeys(_along(each) for each in plan["directions"]))
+    listed = ", ".join(dict.fromkeys(_along(direction) for direction in plan["directions"]))
     return (
         f"hold the unit so that the field points along its {listed}: {len(plan['directions'])} such directions, a "
         f"second each, take what is uncertain of a level heading from {now}° to {then}°."
@@ -116,16 +115,21 @@ def next_words(plan: dict[str, Any]) -> str:
 
 def _along(direction: Sequence[float]) -> str:
     """Name a direction by the axes that it lies between."""
-    return "".join(("+" if each > 0 else "−") + axis for each, axis in zip(direction, "xyz", strict=True)
-                   if abs(each) > 0.4)  # fmt: skip
+    return "".join(
+        ("+" if part > 0 else "−") + axis for part, axis in zip(direction, "xyz", strict=True) if abs(part) > 0.4
+    )
 
 
 def write_magnetometer_report(
-    calibration: Calibration, measurement: MagneticField, heading: Heading | None, folder: str | os.PathLike[str]
+    calibration: Calibration, measurement: MagneticField, heading: Heading | None, folder: Folder
 ) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
-    own = [each for each in calibration.weak if any(name.startswith("magnetometer") for name, _ in each.parameters)]
-    unknown = weak_statements(own, "All parameters of the magnetometer are determined by this recording.")
+    weak = [
+        direction
+        for direction in calibration.weak
+        if any(name.startswith("magnetometer") for name, _ in direction.parameters)
+    ]
+    unknown = weak_statements(weak, "All parameters of the magnetometer are determined by this recording.")
     caption = (
         "Left and middle: the directions that the field had, in the unit's axes, the two halves of the sphere seen "
         "along z; colours show how far the strength is off after calibration."
@@ -133,9 +137,14 @@ def write_magnetometer_report(
     if heading is not None:
         caption += " Right: how good a heading is, one standard deviation, by where the unit points."
     return write_calibration(
-        calibration, folder, lead(calibration), statements(calibration), unknown,
-        {"residuals": partial(_figure, calibration, measurement, heading)}, ("Directions and headings", caption),
-    )  # fmt: skip
+        calibration,
+        folder,
+        lead(calibration),
+        statements(calibration),
+        unknown,
+        {"residuals": partial(_figure, calibration, measurement, heading)},
+        ("Directions and headings", caption),
+    )
 
 
 def _figure(calibration: Calibration, measurement: MagneticField, heading: Heading | None) -> Figure:
@@ -145,9 +154,17 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
     off, span = 100 * (length / measurement.strength - 1), 0.98
     figure = new_figure(3.6)
     panels, grid = hemispheres(
-        figure, 2 if heading is None else 3, field / length[:, None], off, float(np.quantile(np.abs(off), span)),
-        "strength off after calibration (%)", "window", s=18, edgecolors="#555555", linewidths=0.3,
-    )  # fmt: skip
+        figure,
+        2 if heading is None else 3,
+        field / length[:, None],
+        off,
+        np.quantile(np.abs(off), span),
+        "strength off after calibration (%)",
+        "window",
+        s=18,
+        edgecolors="#555555",
+        linewidths=0.3,
+    )
     for axes, sign, *_ in panels:
         axes.set_title(f"field along {'+z' if sign > 0 else '−z'}", fontsize=10)
     if heading is not None:
@@ -158,5 +175,5 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
         dressed(axes)
         axes.set(title="heading good to [°]", xlabel="heading [°]", ylim=(0, None))
         axes.set_xticks([0, 90, 180, 270, 360], ["N", "E", "S", "W", "N"])
-        axes.legend(fontsize=7, frameon=False)
+        legend(axes)
     return figure

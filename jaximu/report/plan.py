@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import textwrap
 from functools import partial
 from pathlib import Path
@@ -14,9 +13,10 @@ from scipy.spatial.transform import Rotation
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe, spoken_amount
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import Z95
 from jaximu.planning import Proposal
 from jaximu.report import figures
-from jaximu.report.html import write_page
+from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,38 +33,46 @@ _CRITERIA = {
 }
 
 
-def write_plan(proposal: Proposal, folder: str | os.PathLike[str]) -> Path:
+def write_plan(proposal: Proposal, folder: Folder) -> Path:
     """Write `report.html`, whose path is returned, and `poses.png`. Raises `InputError` where they cannot be."""
     return write_page(
-        folder, "plan", {"poses": partial(_poses_figure, proposal)},
-        title=f"{len(proposal.poses)} poses to record next", lead=gain_words(proposal), number=f"{proposal.gain:.3g}×",
-        meaning=f"smaller uncertainty than with {Path(proposal.source).name} alone", proposal=proposal,
-        poses=pose_rows(proposal), turns=turn_rows(proposal), rows=sigma_rows(proposal), notes=proposal.notes,
-        open=[("Weak" if each.determined else "Not determined", each.text) for each in proposal.open],
-    )  # fmt: skip
+        folder,
+        "plan",
+        {"poses": partial(_poses_figure, proposal)},
+        title=f"{len(proposal.poses)} poses to record next",
+        lead=gain_words(proposal),
+        number=f"{proposal.gain:.3g}×",
+        meaning=f"smaller uncertainty than with {Path(proposal.source).name} alone",
+        proposal=proposal,
+        poses=pose_rows(proposal),
+        turns=turn_rows(proposal),
+        rows=sigma_rows(proposal),
+        notes=proposal.notes,
+        open=[("Weak" if weak.determined else "Not determined", weak.text) for weak in proposal.open],
+    )
 
 
-def pose_rows(proposal: Proposal) -> list[tuple[str, ...]]:
+def pose_rows(proposal: Proposal) -> TextRows:
     """Return each pose's number, words and, by hand and on a robot, the turn to it."""
-    turns = ["", *(each.words for each in proposal.turns)]
+    turns = ["", *(turn.words for turn in proposal.turns)]
     return [
-        (str(place + 1), pose.words, *([turns[place] if proposal.turns else ""] if proposal.equipment.chained else []))
-        for place, pose in enumerate(proposal.poses)
+        (str(row + 1), pose.words, *([turns[row] if proposal.turns else ""] if proposal.equipment.chained else []))
+        for row, pose in enumerate(proposal.poses)
     ]
 
 
-def turn_rows(proposal: Proposal) -> list[tuple[str, str]]:
+def turn_rows(proposal: Proposal) -> TextRows:
     """Return each turn of a table, its number and words; else they stand beside the poses."""
     turns = () if proposal.equipment.chained else proposal.turns
-    return [(str(place), each.words) for place, each in enumerate(turns, 1)]
+    return [(str(row), turn.words) for row, turn in enumerate(turns, 1)]
 
 
-def sigma_rows(proposal: Proposal) -> list[tuple[str, str, str, str]]:
+def sigma_rows(proposal: Proposal) -> TextRows:
     """Return each parameter in words, its 95 % interval before and after, and how many times smaller it becomes."""
     sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
 
     def interval(name: Name, sigma: float) -> str:
-        return f"± {spoken_amount(name, 1.96 * sigma, proposal.imu)}"
+        return f"± {spoken_amount(name, Z95 * sigma, proposal.imu)}"
 
     return [
         (describe(name, proposal.imu), interval(name, before), interval(name, after), f"{before / after:.3g}")
@@ -74,11 +82,11 @@ def sigma_rows(proposal: Proposal) -> list[tuple[str, str, str, str]]:
 
 def gain_words(proposal: Proposal) -> str:
     """Say what the criterion was, becomes, and what rounding the angles costs."""
-    asked = proposal.criterion
+    criterion = proposal.criterion
     what = (
-        f"the standard deviation of the {describe(asked, proposal.imu)}"
-        if isinstance(asked, Name)
-        else _CRITERIA[asked]
+        f"the standard deviation of the {describe(criterion, proposal.imu)}"
+        if isinstance(criterion, Name)
+        else _CRITERIA[criterion]
     )
     loss = 100 * proposal.rounding_loss
     cost = f"makes it larger by {loss:.2g} %" if loss > 0.005 else "costs nothing"
@@ -105,8 +113,10 @@ def _poses_figure(proposal: Proposal) -> Figure:
         axes.text(0.0, -1.75, _folded(pose.words), ha="center", va="top", fontsize=9.5)
     figure.suptitle(
         f"{count} poses {proposal.equipment.words}: {proposal.equipment.rest:g} s at rest in each",
-        fontsize=12, fontweight="bold", y=1 - _ABOVE / figure.get_figheight(),
-    )  # fmt: skip
+        fontsize=12,
+        fontweight="bold",
+        y=1 - _ABOVE / figure.get_figheight(),
+    )
     return figure
 
 
@@ -159,9 +169,20 @@ def _draw_unit(axes: Axes, rotation: FloatArray) -> None:
         start, _ = _view(rotation[:, axis] * half[axis])
         stop, depth = _view(rotation[:, axis] * 1.15)
         behind = depth > 0
-        axes.annotate("", xy=tuple(stop), xytext=tuple(start), zorder=1 if behind else 4,
-                      arrowprops={"arrowstyle": "-|>", "color": color, "linewidth": 1.8,
-                                  "linestyle": "--" if behind else "-", "shrinkA": 0, "shrinkB": 0})  # fmt: skip
+        axes.annotate(
+            "",
+            xy=tuple(stop),
+            xytext=tuple(start),
+            zorder=1 if behind else 4,
+            arrowprops={
+                "arrowstyle": "-|>",
+                "color": color,
+                "linewidth": 1.8,
+                "linestyle": "--" if behind else "-",
+                "shrinkA": 0,
+                "shrinkB": 0,
+            },
+        )
         axes.text(
             1.12 * stop[0], 1.12 * stop[1], name, color=color, ha="center", va="center", fontsize=10, fontweight="bold"
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,12 +11,13 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.data.stations import station_errors
-from jaximu.ground.quantities import number
-from jaximu.report.figures import AXES, dressed, new_figure
-from jaximu.report.html import write_calibration
+from jaximu.ground.quantities import Z95, number
+from jaximu.report.figures import AXES, dressed, legend, new_figure, zero_line
+from jaximu.report.html import Folder, write_calibration
 from jaximu.report.words import (
     Lead,
     Statement,
+    counts,
     gravity_statement,
     how_much_smaller,
     scatter_statements,
@@ -39,10 +40,12 @@ _WORDS = {
 def _lead(calibration: Calibration) -> Lead:
     if calibration.exact:
         return without_freedom(calibration)
-    parts = [f"{_WORDS[name]} from {number(before)} to {number(after, 2)} {unit}"
-             for name, (before, after, unit) in calibration.rms.items()]  # fmt: skip
+    parts = [
+        f"{_WORDS[name]} from {number(before)} to {number(after, 2)} {unit}"
+        for name, (before, after, unit) in calibration.rms.items()
+    ]
     name, (before, after, unit) = next(iter(calibration.rms.items()))
-    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    poses, turns = counts(calibration)
     return Lead(
         f"Against what the set-up says of {poses} poses and {turns} turns the errors fall (rms): {'; '.join(parts)}.",
         f"{number(after, 2)} {unit}",
@@ -50,21 +53,20 @@ def _lead(calibration: Calibration) -> Lead:
     )
 
 
-def _trust(calibration: Calibration) -> list[Statement]:
+def _trust(calibration: Calibration) -> Iterator[Statement]:
     """Say what to trust: where noise explains the errors, and what no interval contains."""
-    said = [*scatter_statements(calibration), gravity_statement(calibration)]
+    yield from [*scatter_statements(calibration), gravity_statement(calibration)]
     text = (
         "The intervals are sampling error and the uncertainty of gravity. What the set-up gets wrong every time (a "
         "table that is not level, axes that are not square, a wrong angle) shifts the parameters by as much and is in "
         "no interval; `jaximu budget` computes how much."
     )
-    said.append(Statement("The set-up", text, not calibration.imu.setup))
-    return said
+    yield Statement("The set-up", text, not calibration.imu.setup)
 
 
-def _limits(calibration: Calibration) -> list[Statement]:
+def _limits(calibration: Calibration) -> Iterator[Statement]:
     """Say what the data cannot tell."""
-    said = weak_statements(
+    yield from weak_statements(
         calibration.weak,
         f"All {len(calibration.names)} parameters are determined by these poses and turns; none is weak.",
     )
@@ -72,7 +74,7 @@ def _limits(calibration: Calibration) -> list[Statement]:
         "The body frame is the fixture's, in which the reference states its directions; how the fixture is turned "
         "against the table cannot be distinguished from misalignment."
     )
-    return [*said, Statement("The fixture", text)]
+    yield Statement("The fixture", text)
 
 
 def _figure(calibration: Calibration) -> Figure:
@@ -86,18 +88,18 @@ def _figure(calibration: Calibration) -> Figure:
         for shift, (axis, color), error, sigma in zip(
             (-0.2, 0.0, 0.2), AXES.items(), panel.error, panel.sigma, strict=True
         ):
-            axes.errorbar(panel.station + shift, error, 1.96 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
-        axes.axhline(0, color="#888888", lw=0.8)
+            axes.errorbar(panel.station + shift, error, Z95 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
+        zero_line(axes)
         dressed(axes, f"Error of the {_WORDS[panel.name]}", ylabel=panel.unit)
-    grid[0].legend(ncols=3, fontsize=8, frameon=False, loc="upper right")
+    legend(grid[0], 3, "upper right")
     grid[-1].set_xlabel("pose or turn, in order of time (bars: 95 % of the noise)")
     return figure
 
 
-def write_station_report(calibration: Calibration, folder: str | os.PathLike[str]) -> Path:
+def write_station_report(calibration: Calibration, folder: Folder) -> Path:
     """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
     working = calibration.fit is not None and calibration.stations is not None
-    said = (
+    picture = (
         "Errors of each pose and turn after calibration",
         "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI.",
     )
@@ -108,5 +110,5 @@ def write_station_report(calibration: Calibration, folder: str | os.PathLike[str
         _trust(calibration),
         _limits(calibration),
         {"residuals": partial(_figure, calibration)} if working else {},
-        said,
+        picture,
     )

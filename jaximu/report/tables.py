@@ -30,9 +30,11 @@ class _Input(NamedTuple):
     output: str
 
 
-_INPUTS = {"accelerometer": _Input("f", "specific force", "m/s²", "m/s^2", "f", "y_accel"),
-           "gyroscope": _Input("ω", "angular rate", "rad/s", "rad/s", "w", "y_gyro"),
-           "magnetometer": _Input("h", "magnetic field", "µT", "uT", "h", "y_mag")}  # fmt: skip
+_INPUTS = {
+    "accelerometer": _Input("f", "specific force", "m/s²", "m/s^2", "f", "y_accel"),
+    "gyroscope": _Input("ω", "angular rate", "rad/s", "rad/s", "w", "y_gyro"),
+    "magnetometer": _Input("h", "magnetic field", "µT", "uT", "h", "y_mag"),
+}
 _MILLI_G = 1e-3 * STANDARD_GRAVITY
 
 
@@ -90,16 +92,16 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     unit, si = unit_text(triad.output_unit), _INPUTS[name].si
     counts = unit != si
     per = f"{unit} per {si}" if counts else ""
-    weak = {parameter for each in calibration.weak for parameter, _ in each.parameters}
+    weak = {parameter for direction in calibration.weak for parameter, _ in direction.parameters}
     scale = np.diagonal(gain)
 
     def scale_words(i: int) -> str:
         if nominal is None and counts:
             return ""
-        start = 1.0 if nominal is None else float(np.asarray(nominal.gain)[i, i])
+        start = 1.0 if nominal is None else np.asarray(nominal.gain)[i, i]
         change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / abs(start), "%", sign=True)
-        begun = "nominal" if _started_nominal(calibration, name) else "where the fit started,"
-        return f"{change} from {begun}" + (f" {plain(start)}" if counts else "")
+        origin = "nominal" if _started_nominal(calibration, name) else "where the fit started,"
+        return f"{change} from {origin}" + (f" {plain(start)}" if counts else "")
 
     def misalignment_words(i: int, j: int) -> str:
         if not (gain[i, j] or gain_sigma[i, j]):
@@ -110,7 +112,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
 
     def bias_words(i: int) -> str:
         if counts:
-            offset = 0.0 if nominal is None else float(np.asarray(nominal.bias)[i])
+            offset = 0.0 if nominal is None else np.asarray(nominal.bias)[i]
             change = with_interval((bias[i] - offset) / scale[i], bias_sigma[i] / scale[i], si, sign=True)
             return change + (f" from nominal {plain(offset)}" if nominal is not None else "")
         if name == "magnetometer":
@@ -120,7 +122,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
 
     def row(part: str, axes: tuple[int, ...], meaning: str) -> tuple[str, str, str, str, bool]:
         parameter = Name(name, part, axes)
-        value, sigma = (float(each[axes]) for each in fitted[part])
+        value, sigma = (matrix[axes] for matrix in fitted[part])
         fixed = meaning.startswith("by convention")
         shown = "0" if fixed else with_interval(value, sigma, per) if part == "gain" else with_interval(value, sigma)
         if (not counts or part == "gain") and 0 < abs(value) <= Z95 * sigma:
@@ -160,16 +162,24 @@ def equations(calibration: Calibration) -> list[dict[str, Any]]:
     for name, triad in calibration.triads().items():
         gain, known, effects = np.asarray(triad.gain), _INPUTS[name], []
         for effect in triad.effects:
-            coefficients = [number(float(each), 6) for each in np.asarray(effect.coefficients)]
+            coefficients = [number(coefficient, 6) for coefficient in np.asarray(effect.coefficients)]
             unit = unit_text(effect.coefficient_unit(triad.output_unit))
-            for inner, each in effect.inner.items():  # time constants and the like, after the coefficients
-                unit += f"; {inner.replace('_', ' ')} {number(float(getattr(effect, inner)), 6)} {each.unit}"
+            for inner, parameter in effect.inner.items():  # time constants and the like, after the coefficients
+                unit += f"; {inner.replace('_', ' ')} {number(float(getattr(effect, inner)), 6)} {parameter.unit}"
             effects.append((effect.title, effect.formula, coefficients, unit))
-        made.append({
-            "name": name, "input": known.symbol, "quantity": known.words, "si": known.si, "effects": effects,
-            "unit": unit_text(triad.output_unit), "gain": _scaled(gain), "inverse": _scaled(np.linalg.inv(gain)),
-            "bias": _scaled(np.asarray(triad.bias)[:, None]),
-        })  # fmt: skip
+        made.append(
+            {
+                "name": name,
+                "input": known.symbol,
+                "quantity": known.words,
+                "si": known.si,
+                "effects": effects,
+                "unit": unit_text(triad.output_unit),
+                "gain": _scaled(gain),
+                "inverse": _scaled(np.linalg.inv(gain)),
+                "bias": _scaled(np.asarray(triad.bias)[:, None]),
+            }
+        )
     return made
 
 
@@ -185,16 +195,20 @@ _METHODS = {
 def provenance(calibration: Calibration) -> list[tuple[str, str]]:
     """Return facts about the data, the method and the software, by name."""
     data, gravity = calibration.data, calibration.gravity
-    rates = [f"{name} {data[key]:.6g} Hz" for name, key in (("accelerometer", "rate"), ("gyroscope", "gyroscope_rate"))
-             if key in data]  # fmt: skip
-    found = [
+    rates = [
+        f"{name} {data[key]:.6g} Hz"
+        for name, key in (("accelerometer", "rate"), ("gyroscope", "gyroscope_rate"))
+        if key in data
+    ]
+    poses = [
         f"{len(part.intervals)}; still is a variance up to {part.threshold:g} times the noise floor (intervals at "
-        f"each threshold tried: {part.table()})" for part in calibration.segmentations
-    ]  # fmt: skip
+        f"each threshold tried: {part.table()})"
+        for part in calibration.segmentations
+    ]
     return [
         *([("Sample rate", ", ".join(rates))] if rates else []),
         ("Used", f"{data.get('poses', 0)} poses at rest, {data.get('turns', 0)} turns between them"),
-        *(("Poses found", text) for text in found),
+        *(("Poses found", text) for text in poses),
         ("Gravity", f"{gravity.value:.7g} m/s², standard deviation {gravity.sigma:g} m/s²"),
         ("Method", _METHODS.get(calibration.method, calibration.method)),
         ("Loss", "least squares" if calibration.loss == "linear" else f"robust ({calibration.loss})"),

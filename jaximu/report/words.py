@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +13,18 @@ from jaximu.ground.quantities import Z95, listed, number, readable, size
 from jaximu.ground.summary import sentence
 from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
-__all__ = ["Lead", "Statement", "gravity_statement", "how_much_smaller", "lead", "limits", "scatter_statements",
-           "trust", "weak_statements", "without_freedom"]  # fmt: skip
+__all__ = [
+    "Lead",
+    "Statement",
+    "gravity_statement",
+    "how_much_smaller",
+    "lead",
+    "limits",
+    "scatter_statements",
+    "trust",
+    "weak_statements",
+    "without_freedom",
+]
 
 _BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
 
@@ -34,6 +44,14 @@ class Statement(NamedTuple):
     text: str
     caution: bool = False
 
+    def __str__(self) -> str:
+        return f"{self.about}: {self.text}"
+
+
+def counts(calibration: Calibration) -> tuple[int, int]:
+    """Return the number of poses and of turns that a calibration was made from."""
+    return calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+
 
 def how_much_smaller(before: float, after: float) -> str:
     """Say how much smaller `after` is, in two digits."""
@@ -50,7 +68,7 @@ def how_much_smaller(before: float, after: float) -> str:
 
 def without_freedom(calibration: Calibration) -> Lead:
     """Say that a fit passes through its conditions by construction."""
-    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    poses, turns = counts(calibration)
     return Lead(
         f"{poses} poses and {turns} turns leave no degrees of freedom: the fit passes through them by construction, "
         "and nothing is left to check it by. Record more of them.",
@@ -63,7 +81,7 @@ def lead(calibration: Calibration) -> Lead:
     """Say how far the errors against gravity fall."""
     if calibration.exact:
         return without_freedom(calibration)
-    poses, turns = calibration.data.get("poses", 0), calibration.data.get("turns", 0)
+    poses, turns = counts(calibration)
     before, after, _ = calibration.rms["gravity_norm"]
     factor, unit = readable("m/s^2", after)
     text = (
@@ -100,49 +118,48 @@ _SCATTER = {
 }
 
 
-def trust(calibration: Calibration) -> list[Statement]:
+def trust(calibration: Calibration) -> Iterator[Statement]:
     """Say what to trust: where noise explains the errors, where not, and what no interval contains."""
-    said = scatter_statements(calibration)
-    said += [_new_poses(calibration), gravity_statement(calibration)]
+    yield from scatter_statements(calibration)
+    yield from [_new_poses(calibration), gravity_statement(calibration)]
     if calibration.method.startswith("two-step"):
         text = (
             "The gyroscope was fitted with the accelerometer held fixed: its intervals leave out what the "
             "accelerometer's uncertainty adds."
         )
-        said.append(Statement("Method", text))
+        yield Statement("Method", text)
     text = (
         "The intervals are sampling error: how far the numbers would scatter if the same unit were recorded again in "
         "the same way. Model error is another thing: what this model (scale, misalignment and bias, near "
         f"{_temperature(calibration)}, at these rates and accelerations) leaves out. No interval contains it."
     )
-    said.append(Statement("Two kinds of error", text))
-    return said
+    yield Statement("Two kinds of error", text)
 
 
 def scatter_statements(calibration: Calibration) -> list[Statement]:
     """Say of each kind of error how much it scatters, in multiples of the noise."""
-    said = []
+    entries = []
     for name, (about, subject, causes) in _SCATTER.items():
         excess = calibration.excess.get(name)
-        if excess is None or (name == "turns" and not calibration.data.get("turns", 0)):
+        if excess is None or (name == "turns" and not counts(calibration)[1]):
             continue
-        times = float(np.sqrt(1 + excess))
+        times = np.sqrt(1 + excess)
         large = times >= _BEYOND
         how = "as much as" if times < 1.1 else f"{times:.1f} times as much as"
         why = f"something beyond noise is there, {causes}." if large else "noise explains what the model leaves."
-        said.append(Statement(about, f"{sentence(subject)} scatter {how} their measured noise: {why}", large))
-    if any(each.caution for each in said):
+        entries.append(Statement(about, f"{sentence(subject)} scatter {how} their measured noise: {why}", large))
+    if any(entry.caution for entry in entries):
         text = (
             "The intervals below include it as if it were random. A cause that repeats may have shifted the parameters "
             "by more than they say, and will act again when the calibration is used."
         )
-        said.append(Statement("What scatter beyond noise means", text, True))
-    return said
+        entries.append(Statement("What scatter beyond noise means", text, True))
+    return entries
 
 
 def _new_poses(calibration: Calibration) -> Statement:
     """Say what the errors of the fitted poses tell about others: with n poses and p parameters √((n + p)/(n − p))."""
-    poses = int(calibration.data.get("poses", 0))
+    poses, _ = counts(calibration)
     fitted = sum(name.owner == "accelerometer" for name in calibration.names)
     if poses <= fitted + 2:
         text = (
@@ -150,7 +167,7 @@ def _new_poses(calibration: Calibration) -> Statement:
             "do not show that the calibration is right. Record more poses."
         )
         return Statement("New poses", text, True)
-    grown = float(np.sqrt((poses + fitted) / (poses - fitted)))
+    grown = np.sqrt((poses + fitted) / (poses - fitted))
     text = (
         f"The errors above are those of the poses that were fitted. {fitted} numbers of the accelerometer were chosen "
         f"to suit {poses} poses, so poses that were not fitted should show roughly {grown:.1f} times as much, about "
@@ -182,50 +199,48 @@ def _temperature(calibration: Calibration) -> str:
     warmth = [signal.values for signal in logged if signal is not None and len(signal)]
     if not warmth:
         return "the temperature of the recording, which is not known"
-    low, high = min(float(each.min()) for each in warmth), max(float(each.max()) for each in warmth)
+    low, high = min(values.min() for values in warmth), max(values.max() for values in warmth)
     return f"{low:.1f} °C" if high - low < 0.1 else f"{low:.1f} to {high:.1f} °C"
 
 
 def weak_statements(weak: Sequence[WeakDirection], *otherwise: str) -> list[Statement]:
     """Say which directions are weak, or what is to be said where none is."""
     return [
-        Statement("Weakly known" if each.determined else "Not determined", sentence(each.text), True) for each in weak
+        Statement("Weakly known" if direction.determined else "Not determined", sentence(direction.text), True)
+        for direction in weak
     ] or [Statement("Parameters", text) for text in otherwise]
 
 
-def limits(calibration: Calibration, found: PoseAndTurnErrors | None) -> list[Statement]:
+def limits(calibration: Calibration, errors: PoseAndTurnErrors | None) -> Iterator[Statement]:
     """Say what the data cannot tell."""
-    said = weak_statements(
+    yield from weak_statements(
         calibration.weak,
         f"All {len(calibration.names)} parameters are determined by the recording; no combination of them is weak.",
     )
-    if found is not None:
-        gap, where = largest_gap(found.directions)
+    if errors is not None:
+        gap, where = largest_gap(errors.directions)
         if gap > 60:
             text = (
                 f"The direction {_direction(where)} is {gap:.0f}° away from every direction that pointed up in a pose: "
                 "what the accelerometer does there is extrapolated. Record poses there."
             )
-            said.append(Statement("Orientations", text, True))
+            yield Statement("Orientations", text, True)
     text = (
         "The body frame is the accelerometer's own: x along its x axis, y in the plane of its x and y axes. How it is "
         "turned against the case cannot be seen without a reference; three entries of the accelerometer's gain are "
         "zero for this reason."
     )
-    said.append(Statement("The case", text))
+    yield Statement("The case", text)
     missing = "temperature, nonlinearity, time lags, ageing"
-    if calibration.imu.gyroscope is None:
-        said.append(
-            Statement("Gyroscope", "It is not part of this calibration: the accelerometer alone was calibrated.")
-        )
+    if "gyroscope" not in calibration.triads():
+        yield (Statement("Gyroscope", "It is not part of this calibration: the accelerometer alone was calibrated."))
     else:
         missing += ", the gyroscope's sensitivity to acceleration"
     text = f"Effects beyond scale, misalignment and bias were not tested ({missing})."
     effects = [effect.title for triad in calibration.triads().values() for effect in triad.effects]
     if effects:
         text = f"Effects other than {', '.join(effects)} were not tested."
-    said.append(Statement("Not modelled", text))
-    return said
+    yield Statement("Not modelled", text)
 
 
 def _direction(vector: np.ndarray) -> str:

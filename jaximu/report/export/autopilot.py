@@ -57,13 +57,16 @@ class Autopilot:
                 written = {self.offset: triad.bias, self.scale: diagonal_scale(triad)}
                 corrections[name] = Correction(np.diag(written[self.scale]), triad.bias)
                 equation += [f"a = (y - {self.offset}) * {self.scale}, axis by axis"]
-                equation += [f"{word} = {vector_text(each)}" for word, each in written.items()]
+                equation += [f"{word} = {vector_text(part)}" for word, part in written.items()]
             else:
                 written = {self.offset: triad.bias}
                 corrections[name] = Correction(np.eye(3), triad.bias)
                 equation += [f"w = y - {self.offset}", f"{self.offset} = {vector_text(triad.bias)}"]
-            values += [(self.patterns[name].format(word=word, axis=axis), float(each))
-                       for word, part in written.items() for axis, each in zip("XYZ", part, strict=True)]  # fmt: skip
+            values += [
+                (self.patterns[name].format(word=word, axis=axis), float(value))
+                for word, part in written.items()
+                for axis, value in zip("XYZ", part, strict=True)
+            ]
         return values, "\n".join(equation), corrections, words
 
 
@@ -87,5 +90,5 @@ def symmetric_matrix(triad: LinearTriad, axes: np.ndarray) -> np.ndarray:
     Its normal equation is S A + A S = axesᵀ Kᵀ + K axes with A = K Kᵀ.
     """
     known = triad.gain @ axes
-    found = scipy.linalg.solve_continuous_lyapunov(triad.gain @ triad.gain.T, known + known.T)
-    return 0.5 * (found + found.T)
+    matrix = scipy.linalg.solve_continuous_lyapunov(triad.gain @ triad.gain.T, known + known.T)
+    return 0.5 * (matrix + matrix.T)

@@ -107,9 +107,13 @@ class ExportedUnit:
 
     @classmethod
     def of(
-        cls, calibration: Calibration, axes: str | None = None, noise: Mapping[str, float] | None = None,
-        instance: int = 0, device: int | None = None,
-    ) -> ExportedUnit:  # fmt: skip
+        cls,
+        calibration: Calibration,
+        axes: str | None = None,
+        noise: Mapping[str, float] | None = None,
+        instance: int = 0,
+        device: int | None = None,
+    ) -> ExportedUnit:
         """Take the linear parts out of a calibration, for the outputs as the logger has them.
 
         Answers are in the logger's axes, too, where its sensors share right-handed ones but for the sign of an
@@ -169,20 +173,10 @@ class ExportedUnit:
             raise InputError("this calibration holds a magnetometer alone, and no accelerometer or gyroscope.")
         return self.triads["accelerometer"]
 
-    @property
-    def magnetometer(self) -> LinearTriad | None:
-        """The magnetometer's, or None."""
-        return self.triads.get("magnetometer")
-
-    @property
-    def gyroscope(self) -> LinearTriad | None:
-        """The gyroscope's, or None."""
-        return self.triads.get("gyroscope")
-
     def kalibr(self) -> dict[str, FloatArray]:
         """The fields of `conventions.Kalibr` on the host; an accelerometer alone gets a perfect gyroscope."""
         self._require("rotations alone", lambda turn: np.linalg.det(turn) > 0)
-        gyroscope = self.gyroscope or LinearTriad(np.eye(3), np.zeros(3), "rad/s")
+        gyroscope = self.triads.get("gyroscope") or LinearTriad(np.eye(3), np.zeros(3), "rad/s")
         view = Kalibr.from_gains(
             self.accelerometer.gain, self.accelerometer.bias, gyroscope.gain, gyroscope.bias, gyroscope.g_sensitivity
         )
@@ -223,13 +217,13 @@ class ExportedUnit:
     def equation(self, symbol: str = "T", sensitive: bool = False) -> str:
         """The equation u = T (y − b) of each triad, with its numbers."""
         lines = []
-        for name, each in self.corrections(sensitive).items():
+        for name, correction in self.corrections(sensitive).items():
             u = SYMBOLS[name]
-            extra = " - G f" if np.any(each.g_sensitivity) else ""
+            extra = " - G f" if np.any(correction.g_sensitivity) else ""
             lines.append(
                 f"{name}: {u} [{SENSOR_UNITS[name]}] = {symbol} (y - b{extra}), y in {self.triads[name].unit}\n"
-                f"{symbol} = {matrix_text(each.matrix)}\nb = {vector_text(each.offset)}"
-                + (f"\nG = {matrix_text(each.g_sensitivity)}" if extra else "")
+                f"{symbol} = {matrix_text(correction.matrix)}\nb = {vector_text(correction.offset)}"
+                + (f"\nG = {matrix_text(correction.g_sensitivity)}" if extra else "")
             )
         return "\n".join(lines)
 
@@ -251,14 +245,17 @@ def matrix_text(values: FloatArray) -> str:
 
 def yaml_matrices(named: Mapping[str, FloatArray], indent: int, rows: int) -> list[str]:
     """Named matrices as lines of YAML, lists of lists; `rows`: how far their rows are indented."""
-    return [line for name, each in named.items()
-            for line in (f"{' ' * indent}{name}:", *(f"{' ' * rows}- {vector_text(row)}" for row in each))]  # fmt: skip
+    return [
+        line
+        for name, matrix in named.items()
+        for line in (f"{' ' * indent}{name}:", *(f"{' ' * rows}- {vector_text(row)}" for row in matrix))
+    ]
 
 
 def comments(parameters: ExportedUnit, sign: str = "#") -> str:
     """Where the numbers come from and what axes they are for, for the head of a file."""
     calibration = parameters.calibration
-    files = [str(each["file"]) for each in calibration.data.get("files", ())]
+    files = [str(file["file"]) for file in calibration.data.get("files", ())]
     safe = "".join(letter if letter.isprintable() else "?" for letter in ", ".join(files) or "a recording")
     version = calibration.software.get("version", "")
     return f"{sign} Calibrated by jaximu {version} from {safe}. {parameters.axes}"

@@ -21,10 +21,20 @@ __all__ = ["WRITERS", "export", "writer"]
 WRITERS = {
     name: f"jaximu.report.export.{name.replace('-', '_')}"
     for name in (
-        "kalibr", "imu_tk", "vins", "openvins", "px4", "ardupilot", "realsense", "ros-yaml", "c-header", "fusion",
-        "csv", "npz",
+        "kalibr",
+        "imu_tk",
+        "vins",
+        "openvins",
+        "px4",
+        "ardupilot",
+        "realsense",
+        "ros-yaml",
+        "c-header",
+        "fusion",
+        "csv",
+        "npz",
     )
-}  # fmt: skip
+}
 """The module of each format: `write`, `SUFFIX` and `SUMMARY`, `MAGNETIC` where it takes a magnetometer, `NOISE`
 where it takes noise."""
 
@@ -52,5 +62,9 @@ def export(parameters: ExportedUnit, to: str, path: str | os.PathLike[str]) -> t
     target = Path(path)
     if target.is_dir():
         raise InputError(f"{target} is a folder: name the file to write, -o {target / 'FILE'}.")
-    return written, write_files({target.with_name(f"{target.stem}{ending}{target.suffix}"): content
-                                 for ending, content in written.files.items()})  # fmt: skip
+    return written, write_files(
+        {
+            target.with_name(f"{target.stem}{ending}{target.suffix}"): content
+            for ending, content in written.files.items()
+        }
+    )

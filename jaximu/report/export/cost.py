@@ -83,10 +83,17 @@ class Range:
     def _stimulus(self, time, force, rate, acceleration, temperature, slope) -> Stimulus:
         level = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(time), 4))
         return Stimulus(
-            np.array(force), np.array(rate), np.array(acceleration), np.array(temperature), np.array(slope), time,
-            np.array(level), np.full(len(time), self.vibration), (self.field or 0.0) / self.gravity * np.array(force),
+            np.array(force),
+            np.array(rate),
+            np.array(acceleration),
+            np.array(temperature),
+            np.array(slope),
+            time,
+            np.array(level),
+            np.full(len(time), self.vibration),
+            (self.field or 0.0) / self.gravity * np.array(force),
             self.current * np.sin(0.4 * np.arange(len(time))),
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)
@@ -104,8 +111,9 @@ class Loss:
         """The loss as one line."""
         costs = [
             f"{size(worst, SENSOR_UNITS[name])} at worst, {size(self.rms[name], SENSOR_UNITS[name])} rms"
-            for name, worst in self.worst.items() if worst
-        ]  # fmt: skip
+            for name, worst in self.worst.items()
+            if worst
+        ]
         return f"{self.what}: {'; '.join(costs) or 'costs nothing here'}"
 
 
@@ -120,14 +128,16 @@ def losses(parameters: ExportedUnit, written: Written, extent: Range) -> tuple[L
     imu = parameters.calibration.imu.transferable()
     paths = extent.paths()
     plain = [_outputs(imu.with_effects(), path) for path in paths]
-    found = [
+    parts = [
         _loss(f"the {name}'s calibration", {name: _gap(parameters, written, name, plain, paths)})
         for name in parameters.triads
         if name not in written.corrections
     ]
-    flat = {name: replace(each, g_sensitivity=np.zeros((3, 3))) for name, each in written.corrections.items()}
+    flat = {
+        name: replace(correction, g_sensitivity=np.zeros((3, 3))) for name, correction in written.corrections.items()
+    }
     flattened = replace(written, corrections=flat)
-    found.append(
+    parts.append(
         _loss(
             "scale, misalignment and offset, as far as the file has no place for them",
             {name: _gap(parameters, flattened, name, plain, paths) for name in flat},
@@ -139,13 +149,13 @@ def losses(parameters: ExportedUnit, written: Written, extent: Range) -> tuple[L
             if effect.name not in written.carried:
                 one = [_outputs(imu.with_effects(effect), path) for path in paths]
                 shift = [(with_[name] - without[name]) @ inverse.T for with_, without in zip(one, plain, strict=True)]
-                found.append(_loss(f"the effect {effect.name}", {name: np.concatenate(shift)}))
-    found = [each for each in found if any(worst > _NOTHING for worst in each.worst.values())]
-    if len(found) > 1:
+                parts.append(_loss(f"the effect {effect.name}", {name: np.concatenate(shift)}))
+    parts = [part for part in parts if any(worst > _NOTHING for worst in part.worst.values())]
+    if len(parts) > 1:
         whole = [_outputs(imu, path) for path in paths]
         gaps = {name: _gap(parameters, written, name, whole, paths) for name in parameters.triads}
-        found.append(_loss("all of this together", gaps))
-    return (*found, *(() if written.uncertainty else (_uncertainty(parameters.calibration, extent),)))
+        parts.append(_loss("all of this together", gaps))
+    return (*parts, *(() if written.uncertainty else (_uncertainty(parameters.calibration, extent),)))
 
 
 @eqx.filter_jit
@@ -163,7 +173,7 @@ def _gap(
     """(samples, 3) the tool's answer less the truth, in the tool's frame."""
     gaps = []
     for output, path in zip(outputs, paths, strict=True):
-        logged = {each: values @ parameters.maps[each] for each, values in output.items()}  # y_log = Aᵀ y_body
+        logged = {triad: values @ parameters.maps[triad] for triad, values in output.items()}  # y_log = Aᵀ y_body
         truth = np.asarray(getattr(path, SENSOR_QUANTITIES[name])) @ parameters.frames[name]
         correction = written.corrections.get(name)
         if correction is None:  # only tools that take SI leave a triad as it is
@@ -178,8 +188,8 @@ def _gap(
 
 def _loss(what: str, gaps: dict[str, FloatArray]) -> Loss:
     lengths = {name: np.linalg.norm(gap, axis=1) for name, gap in gaps.items()}
-    worst = {name: float(each.max()) for name, each in lengths.items()}
-    return Loss(what, worst, {name: float(np.sqrt(np.mean(each**2))) for name, each in lengths.items()})
+    worst = {name: float(length.max()) for name, length in lengths.items()}
+    return Loss(what, worst, {name: float(np.sqrt(np.mean(length**2))) for name, length in lengths.items()})
 
 
 def _uncertainty(calibration: Calibration, extent: Range) -> Loss:
@@ -189,19 +199,19 @@ def _uncertainty(calibration: Calibration, extent: Range) -> Loss:
     """
     directions = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    place = {name: at for at, name in enumerate(calibration.names)}
+    index = {name: at for at, name in enumerate(calibration.names)}
     worst, rms = {}, {}
     for name, triad in calibration.imu.triads().items():
         inverse = np.linalg.inv(np.asarray(triad.gain))
-        reach = {"accelerometer": extent.gravity, "gyroscope": extent.rate, "magnetometer": extent.field or 0.0}[name]
-        inputs = reach * directions
+        largest = {"accelerometer": extent.gravity, "gyroscope": extent.rate, "magnetometer": extent.field or 0.0}[name]
+        inputs = largest * directions
         inputs = np.vstack([np.zeros(3), inputs]) if name == "gyroscope" else inputs
-        jacobian = np.zeros((len(inputs), 3, len(place)))
+        jacobian = np.zeros((len(inputs), 3, len(index)))
         for row in range(3):
             for column in range(3):
-                if (at := place.get(Name(name, "gain", (row, column)))) is not None:
+                if (at := index.get(Name(name, "gain", (row, column)))) is not None:
                     jacobian[:, :, at] -= inputs[:, column, None] * inverse[:, row]
-            if (at := place.get(Name(name, "bias", (row,)))) is not None:
+            if (at := index.get(Name(name, "bias", (row,)))) is not None:
                 jacobian[:, :, at] -= inverse[:, row]
         variance = np.einsum("nip,pq,niq->n", jacobian, calibration.covariance, jacobian)
         worst[name], rms[name] = float(np.sqrt(variance.max())), float(np.sqrt(variance.mean()))

@@ -16,8 +16,8 @@ def write(parameters: ExportedUnit) -> Written:
     """Write `triad,parameter,row,column,value,sigma,unit`: gain, bias, the matrix to apply, effects (row: place)."""
     rows = ["triad,parameter,row,column,value,sigma,unit"]
 
-    def add(triad: str, name: str, place: tuple[int, ...], value: float, sigma: float | None, unit: str) -> None:
-        row, column = (*map(str, place), "", "")[:2]
+    def add(triad: str, name: str, index: tuple[int, ...], value: float, sigma: float | None, unit: str) -> None:
+        row, column = (*map(str, index), "", "")[:2]
         rows.append(
             f"{triad},{name},{row},{column},{float(value)!r},{'' if sigma is None else repr(float(sigma))},{unit}"
         )
@@ -28,18 +28,18 @@ def write(parameters: ExportedUnit) -> Written:
         map_, frame = (np.abs(axes[name]) for axes in (parameters.maps, parameters.frames))
         sigma = dict(zip(("gain", "bias"), parameters.calibration.sigma(name), strict=True))
         gain_sigma, bias_sigma = map_.T @ sigma["gain"] @ frame, map_.T @ sigma["bias"]
-        for place, value in np.ndenumerate(triad.gain):
-            add(name, "gain", place, value, float(gain_sigma[place]), f"{triad.unit}/({SENSOR_UNITS[name]})")
-        for place, value in np.ndenumerate(triad.bias):
-            add(name, "bias", place, value, float(bias_sigma[place]), triad.unit)
-        for place, value in np.ndenumerate(triad.inverse):
-            add(name, "inverse_gain", place, value, None, f"({SENSOR_UNITS[name]})/{triad.unit}")
+        for index, value in np.ndenumerate(triad.gain):
+            add(name, "gain", index, value, float(gain_sigma[index]), f"{triad.unit}/({SENSOR_UNITS[name]})")
+        for index, value in np.ndenumerate(triad.bias):
+            add(name, "bias", index, value, float(bias_sigma[index]), triad.unit)
+        for index, value in np.ndenumerate(triad.inverse):
+            add(name, "inverse_gain", index, value, None, f"({SENSOR_UNITS[name]})/{triad.unit}")
         add(name, "temperature_reference", (), document[name]["temperature_reference"], None, "degC")
-        for effect, each in document[name]["effects"].items():
-            spread = each["sigma"] or [None] * len(each["coefficients"])
-            for place, (value, one) in enumerate(zip(each["coefficients"], spread, strict=True)):
-                add(name, effect, (place,), value, one, each["unit"])
-            for inner, item in each["inner"].items():
+        for effect, entry in document[name]["effects"].items():
+            spread = entry["sigma"] or [None] * len(entry["coefficients"])
+            for index, (value, one) in enumerate(zip(entry["coefficients"], spread, strict=True)):
+                add(name, effect, (index,), value, one, entry["unit"])
+            for inner, item in entry["inner"].items():
                 add(name, f"{effect}.{inner}", (), item["value"], item["sigma"], item["unit"])
     convention = (
         "forward: y = gain u + bias + effects; inverse_gain is inverse(gain), ready to apply. Effects' formulas: "

@@ -32,17 +32,28 @@ def write(parameters: ExportedUnit) -> Written:
             unit, factor = _FED[name]
             sensitivity = np.diagonal(inverse) * factor
             misalignment = inverse * factor / sensitivity
-            lines += [f"// {name}: y in {triad.unit}, the answer in {unit}",
-                      _matrix(f"{name}Misalignment", misalignment), _vector(f"{name}Sensitivity", sensitivity),
-                      _vector(f"{name}Offset", offset), ""]  # fmt: skip
-            equation.append(f"{name}: u [{unit}] = M s (y - b), y in {triad.unit}\nM = {matrix_text(misalignment)}\n"
-                            f"s = diag {vector_text(sensitivity)}\nb = {vector_text(offset)}")  # fmt: skip
+            lines += [
+                f"// {name}: y in {triad.unit}, the answer in {unit}",
+                _matrix(f"{name}Misalignment", misalignment),
+                _vector(f"{name}Sensitivity", sensitivity),
+                _vector(f"{name}Offset", offset),
+                "",
+            ]
+            equation.append(
+                f"{name}: u [{unit}] = M s (y - b), y in {triad.unit}\nM = {matrix_text(misalignment)}\n"
+                f"s = diag {vector_text(sensitivity)}\nb = {vector_text(offset)}"
+            )
             made[name] = Correction(misalignment * sensitivity / factor, offset)
         else:
-            lines += [f"// {name}: y in {triad.unit}, the answer in uT",
-                      _matrix("softIronMatrix", inverse), _vector("hardIronOffset", offset), ""]  # fmt: skip
-            equation.append(f"{name}: h [uT] = S (y - b), y in {triad.unit}\nS = {matrix_text(inverse)}\n"
-                            f"b = {vector_text(offset)}")  # fmt: skip
+            lines += [
+                f"// {name}: y in {triad.unit}, the answer in uT",
+                _matrix("softIronMatrix", inverse),
+                _vector("hardIronOffset", offset),
+                "",
+            ]
+            equation.append(
+                f"{name}: h [uT] = S (y - b), y in {triad.unit}\nS = {matrix_text(inverse)}\nb = {vector_text(offset)}"
+            )
             made[name] = Correction(inverse, offset)
     convention = (
         "inverse: u = M s (y - b), M with a unit diagonal, s diagonal, in g and deg/s as Fusion is fed; h = S (y - b) "

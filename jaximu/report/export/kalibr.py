@@ -44,7 +44,7 @@ def write(parameters: ExportedUnit) -> Written:
         "accelerometer": Correction(np.asarray(np.linalg.inv(accel), np.float64), view["accel_bias"], frame=frame)
     }
     equation = f"f = inverse(M) (y - b)\nM = {matrix_text(accel)}\nb = {accel_bias}"
-    if parameters.gyroscope is not None:
+    if "gyroscope" in parameters.triads:
         gyro, rotation, sensitivity = view["gyro_matrix"], view["gyro_rotation"], view["g_sensitivity"]
         blocks, bias = {"M": gyro, "A": sensitivity, "C_gyro_i": rotation}, vector_text(view["gyro_bias"])
         lines += ["  gyroscopes:", *yaml_matrices(blocks, 4, 4), f"    bias: {bias}"]

@@ -71,17 +71,17 @@ def write_messages(
         raise InputError(f"{target} exists: name a new folder for the bag, or a file NAME.mcap.")
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}")
     streams = [*_streams("/imu/raw", raw), *_streams("/imu/corrected", corrected), *_residual(calibration, corrected)]
-    start, first = round(Fraction(raw.start) * 10**9), round(1e9 * min(float(each.time[0]) for each in streams))
+    start, first = round(Fraction(raw.start) * 10**9), round(1e9 * min(float(stream.time[0]) for stream in streams))
     start = max(start, -first)  # stamps of ROS are not negative
     first += start
     try:
         with ExitStack() as cleaned:
             cleaned.callback(shutil.rmtree, temporary, ignore_errors=True)
             with Writer(temporary, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
-                kinds = {each.topic: each.kind for each in streams} | {"/diagnostics": _STATUS}
+                kinds = {stream.topic: stream.kind for stream in streams} | {"/diagnostics": _STATUS}
                 topics = {topic: bag.add_connection(topic, kind, typestore=types) for topic, kind in kinds.items()}
                 bag.write(topics["/diagnostics"], first, _status(calibration, types, first))
-                messages = (_messages(each, types, start) for each in streams)
+                messages = (_messages(stream, types, start) for stream in streams)
                 for stamp, topic, content in heapq.merge(*messages, key=itemgetter(0)):
                     bag.write(topics[topic], stamp, content)
             (next(temporary.glob("*.mcap")) if one_file else temporary).replace(target)
@@ -122,11 +122,11 @@ def _imu(topic: str, signals: dict[str, Signal]) -> _Stream:
     time = next(iter(signals.values())).time
     numbers = np.zeros((len(time), 37))
     numbers[:, 3], numbers[:, 4] = 1.0, _NOT_HELD  # no attitude
-    for name, place in (("gyroscope", _RATE), ("accelerometer", _FORCE)):
+    for name, column in (("gyroscope", _RATE), ("accelerometer", _FORCE)):
         if name in signals:
-            numbers[:, place : place + 3] = signals[name].values
+            numbers[:, column : column + 3] = signals[name].values
         else:
-            numbers[:, place + 3] = _NOT_HELD
+            numbers[:, column + 3] = _NOT_HELD
     return _Stream(topic, "sensor_msgs/msg/Imu", time, numbers)
 
 
@@ -142,8 +142,8 @@ def _messages(stream: _Stream, types: Any, start: int) -> Iterator[tuple[int, st
     size = 8 * stream.numbers.shape[1]
     example = bytes(types.serialize_cdr(_example(stream, types), stream.kind))
     stamps = start + np.round(1e9 * stream.time).astype(np.int64)
-    for place in range(0, len(stamps), _BLOCK):
-        some, numbers = stamps[place : place + _BLOCK], stream.numbers[place : place + _BLOCK]
+    for first in range(0, len(stamps), _BLOCK):
+        some, numbers = stamps[first : first + _BLOCK], stream.numbers[first : first + _BLOCK]
         rows = np.tile(np.frombuffer(example, np.uint8), (len(some), 1))
         rows[:, len(example) - size :] = np.ascontiguousarray(numbers, "<f8").view(np.uint8)
         if stream.kind != "std_msgs/msg/Float64":  # it has no header
@@ -179,12 +179,17 @@ def _header(types: Any, stamp: int) -> Any:
 def _status(calibration: Calibration, types: Any, stamp: int) -> bytes:
     """Return the message that says which calibration it is, and the verdict of its diagnosis if there was one."""
     known = types.types
-    found = calibration.diagnosis or {}
-    verdict = str(found.get("verdict", "not diagnosed"))
+    diagnosis = calibration.diagnosis or {}
+    verdict = str(diagnosis.get("verdict", "not diagnosed"))
     level = 0 if verdict in ("adequate", "effects") else 1
-    told = {"verdict": verdict, "method": calibration.method, "local gravity, m/s^2": calibration.gravity.value,
-            "hash of calibration.json": calibration.digest, **(calibration.trace or {})}  # fmt: skip
-    values = [known["diagnostic_msgs/msg/KeyValue"](key, str(value)) for key, value in told.items() if value]
+    facts = {
+        "verdict": verdict,
+        "method": calibration.method,
+        "local gravity, m/s^2": calibration.gravity.value,
+        "hash of calibration.json": calibration.digest,
+        **(calibration.trace or {}),
+    }
+    values = [known["diagnostic_msgs/msg/KeyValue"](key, str(value)) for key, value in facts.items() if value]
     serial = str((calibration.trace or {}).get("serial", ""))
     status = known["diagnostic_msgs/msg/DiagnosticStatus"](level, "jaximu calibration", verdict, serial, values)
     return bytes(types.serialize_cdr(known[_STATUS](_header(types, stamp), [status]), _STATUS))

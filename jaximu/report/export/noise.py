@@ -33,8 +33,11 @@ from jaximu.recordings.readers.kalibr import KALIBR_UNITS, kalibr_yaml
 __all__ = ["TARGETS", "Key", "Target", "noise_files", "noise_values", "target"]
 
 _DENSITIES = _ACCEL, _GYRO, _, _ = (
-    "accelerometer_noise_density", "gyroscope_noise_density", "accelerometer_random_walk", "gyroscope_random_walk",
-)  # fmt: skip
+    "accelerometer_noise_density",
+    "gyroscope_noise_density",
+    "accelerometer_random_walk",
+    "gyroscope_random_walk",
+)
 INTEGRATION = "integration_covariance"
 """Beside the densities: what GTSAM's integrationCovariance stands for, m²/s."""
 
@@ -80,43 +83,77 @@ def _keys(
     )
 
 
-_CONTINUOUS = tuple(KALIBR_UNITS[each] for each in _DENSITIES)
+_CONTINUOUS = tuple(KALIBR_UNITS[name] for name in _DENSITIES)
 _SAMPLED = ("m/s^2", "rad/s", "m/s^3", "rad/s^2")
 _KALIBR = _keys(" ".join(_DENSITIES), _CONTINUOUS)
 TARGETS = {
     "kalibr": Target("Kalibr", "imu.yaml", _KALIBR, "continuous densities"),
-    "openvins": Target("OpenVINS", "kalibr_imu_chain.yaml", _KALIBR, "continuous densities",
-                       row="  {key}: {value:.6e}  # {unit}", opening="%YAML:1.0", head="imu0:",
-                       tail="  update_rate: {rate:.6g}  # Hz"),
-    "vins": Target("VINS-Fusion", "vins.yaml", _keys("acc_n gyr_n acc_w gyr_w", _SAMPLED, math.sqrt(2), power=0.5),
-                   "standard deviations per sample, sqrt(2) more for white noise", opening="%YAML:1.0",
-                   tail="g_norm: {gravity!r}  # m/s^2"),
-    "gtsam": Target("GTSAM", "gtsam_noise.py",
-                    _keys("setAccelerometerCovariance setGyroscopeCovariance setBiasAccCovariance "
-                          "setBiasOmegaCovariance", tuple(f"({each})^2" for each in _CONTINUOUS), exponent=2),
-                    "continuous covariances"),
-    "lio-sam": Target("LIO-SAM", "params.yaml", _keys("imuAccNoise imuGyrNoise imuAccBiasN imuGyrBiasN", _CONTINUOUS),
-                      "continuous densities", row="  {key}: {value:.6e}  # {unit}", head="lio_sam:",
-                      tail="  imuGravity: {gravity!r}  # m/s^2"),
-    "px4": Target("PX4", "ekf2.params",
-                  _keys("EKF2_ACC_NOISE EKF2_GYR_NOISE EKF2_ACC_B_NOISE EKF2_GYR_B_NOISE", _SAMPLED, power=0.5),
-                  "standard deviations per step of 10 ms (EKF2_PREDICT_US)", 100.0,
-                  row="1\t1\t{key}\t{value:.6g}\t9", head="# Vehicle-Id Component-Id Name Value Type"),
-    "ardupilot": Target("ArduPilot", "ek3.param",
-                        _keys("EK3_ACC_P_NSE EK3_GYRO_P_NSE EK3_ABIAS_P_NSE EK3_GBIAS_P_NSE", _SAMPLED, power=0.5),
-                        "standard deviations per step of 12 ms", 1 / 0.012, row="{key},{value:.6g}"),
-}  # fmt: skip
+    "openvins": Target(
+        "OpenVINS",
+        "kalibr_imu_chain.yaml",
+        _KALIBR,
+        "continuous densities",
+        row="  {key}: {value:.6e}  # {unit}",
+        opening="%YAML:1.0",
+        head="imu0:",
+        tail="  update_rate: {rate:.6g}  # Hz",
+    ),
+    "vins": Target(
+        "VINS-Fusion",
+        "vins.yaml",
+        _keys("acc_n gyr_n acc_w gyr_w", _SAMPLED, math.sqrt(2), power=0.5),
+        "standard deviations per sample, sqrt(2) more for white noise",
+        opening="%YAML:1.0",
+        tail="g_norm: {gravity!r}  # m/s^2",
+    ),
+    "gtsam": Target(
+        "GTSAM",
+        "gtsam_noise.py",
+        _keys(
+            "setAccelerometerCovariance setGyroscopeCovariance setBiasAccCovariance setBiasOmegaCovariance",
+            tuple(f"({unit})^2" for unit in _CONTINUOUS),
+            exponent=2,
+        ),
+        "continuous covariances",
+    ),
+    "lio-sam": Target(
+        "LIO-SAM",
+        "params.yaml",
+        _keys("imuAccNoise imuGyrNoise imuAccBiasN imuGyrBiasN", _CONTINUOUS),
+        "continuous densities",
+        row="  {key}: {value:.6e}  # {unit}",
+        head="lio_sam:",
+        tail="  imuGravity: {gravity!r}  # m/s^2",
+    ),
+    "px4": Target(
+        "PX4",
+        "ekf2.params",
+        _keys("EKF2_ACC_NOISE EKF2_GYR_NOISE EKF2_ACC_B_NOISE EKF2_GYR_B_NOISE", _SAMPLED, power=0.5),
+        "standard deviations per step of 10 ms (EKF2_PREDICT_US)",
+        100.0,
+        row="1\t1\t{key}\t{value:.6g}\t9",
+        head="# Vehicle-Id Component-Id Name Value Type",
+    ),
+    "ardupilot": Target(
+        "ArduPilot",
+        "ek3.param",
+        _keys("EK3_ACC_P_NSE EK3_GYRO_P_NSE EK3_ABIAS_P_NSE EK3_GBIAS_P_NSE", _SAMPLED, power=0.5),
+        "standard deviations per step of 12 ms",
+        1 / 0.012,
+        row="{key},{value:.6g}",
+    ),
+}
 
 
 def target(name: str) -> str:
     """Return a tool's key in `TARGETS`. Raises `InputError` naming the ones there are."""
     plain = name.strip().lower().replace("_", "-")
-    found = {"vins-fusion": "vins", "vins-mono": "vins", "liosam": "lio-sam"}.get(plain, plain)
-    if found not in TARGETS:
-        near = difflib.get_close_matches(found, TARGETS, 1)
+    key = {"vins-fusion": "vins", "vins-mono": "vins", "liosam": "lio-sam"}.get(plain, plain)
+    if key not in TARGETS:
+        near = difflib.get_close_matches(key, TARGETS, 1)
         hint = f" (did you mean {near[0]}?)" if near else ""
         raise InputError(f"{name!r} is no estimator known here{hint}; there are {', '.join(TARGETS)}.")
-    return found
+    return key
 
 
 def noise_values(name: str, densities: Mapping[str, float], rate: float | None) -> dict[str, float]:
@@ -126,9 +163,9 @@ def noise_values(name: str, densities: Mapping[str, float], rate: float | None) 
     known.
     """
     made = TARGETS[name]
-    missing = [each.density for each in made.keys if not densities.get(each.density, 0.0) > 0]
+    missing = [key.density for key in made.keys if not densities.get(key.density, 0.0) > 0]
     step = made.rate or rate
-    if any(each.power for each in made.keys) and not step:
+    if any(key.power for key in made.keys) and not step:
         missing.append("the rate")
     if missing:
         raise NotPossibleError(
@@ -136,8 +173,8 @@ def noise_values(name: str, densities: Mapping[str, float], rate: float | None) 
             "run jaximu allan LOG -o DIR, or state the data sheet's figures in a Kalibr imu.yaml."
         )
     return {
-        each.name: each.factor * densities[each.density] ** each.exponent * (step**each.power if step else 1.0)
-        for each in made.keys
+        key.name: key.factor * densities[key.density] ** key.exponent * (step**key.power if step else 1.0)
+        for key in made.keys
     }
 
 
@@ -154,11 +191,12 @@ def noise_files(
     if name == "gtsam":
         return _gtsam(values, made, densities.get(INTEGRATION), head, gravity)
     if name == "kalibr":
-        return {made.file: kalibr_yaml({key: (value, "") for key, value in values.items()}, rate,
-                                       comments=head).encode()}  # fmt: skip
+        return {
+            made.file: kalibr_yaml({key: (value, "") for key, value in values.items()}, rate, comments=head).encode()
+        }
     rows = [made.row.format(key=key.name, value=values[key.name], unit=key.unit) for key in made.keys]
     tail = made.tail.format(rate=rate, gravity=gravity)
-    lines = [made.opening, *(f"# {each}" for each in head), made.head, *rows, tail]
+    lines = [made.opening, *(f"# {text}" for text in head), made.head, *rows, tail]
     return {made.file: ("\n".join(filter(None, lines)) + "\n").encode()}
 
 
@@ -172,21 +210,31 @@ def _gtsam(
     values: Mapping[str, float], made: Target, integration: float | None, head: Sequence[str], gravity: float
 ) -> dict[str, bytes]:
     """Return a function in Python and one in C++ that make the parameters of combined IMU factors."""
-    units = {each.name: each.unit for each in made.keys}
+    units = {key.name: key.unit for key in made.keys}
     rows = [(key, value, units[key]) for key, value in values.items()]
     rows.append(("setIntegrationCovariance", 1e-8 if integration is None else integration, "m^2/s"))
     known = _INTEGRATION[:1] if integration is None else _INTEGRATION
-    head = [*head, *known, "The plain ImuFactor takes the same without the two setBias lines: between two states it",
-            "wants a BetweenFactor on the bias with sigma = sqrt(covariance * time)."]  # fmt: skip
-    python = [f"# {each}" for each in head] + ["import gtsam", "import numpy as np", "", ""]
-    python += [f"def imu_parameters(gravity={gravity!r}):  # of a frame whose z points up",
-               "    parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)"]  # fmt: skip
+    head = [
+        *head,
+        *known,
+        "The plain ImuFactor takes the same without the two setBias lines: between two states it",
+        "wants a BetweenFactor on the bias with sigma = sqrt(covariance * time).",
+    ]
+    python = [f"# {text}" for text in head] + ["import gtsam", "import numpy as np", "", ""]
+    python += [
+        f"def imu_parameters(gravity={gravity!r}):  # of a frame whose z points up",
+        "    parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)",
+    ]
     python += [f"    parameters.{key}({value:.6e} * np.eye(3))  # {unit}" for key, value, unit in rows]
     python += ["    return parameters"]
-    cpp = [f"// {each}" for each in head]
-    cpp += ["#pragma once", "#include <gtsam/navigation/CombinedImuFactor.h>", "",
-            f"inline auto imuParameters(double gravity = {gravity!r}) {{  // of a frame whose z points up",
-            "  auto parameters = gtsam::PreintegrationCombinedParams::MakeSharedU(gravity);"]  # fmt: skip
+    cpp = [f"// {text}" for text in head]
+    cpp += [
+        "#pragma once",
+        "#include <gtsam/navigation/CombinedImuFactor.h>",
+        "",
+        f"inline auto imuParameters(double gravity = {gravity!r}) {{  // of a frame whose z points up",
+        "  auto parameters = gtsam::PreintegrationCombinedParams::MakeSharedU(gravity);",
+    ]
     cpp += [f"  parameters->{key}({value:.6e} * gtsam::I_3x3);  // {unit}" for key, value, unit in rows]
     cpp += ["  return parameters;", "}"]
     return {"gtsam_noise.py": ("\n".join(python) + "\n").encode(), "gtsam_noise.h": ("\n".join(cpp) + "\n").encode()}

@@ -25,6 +25,9 @@ def write(parameters: ExportedUnit) -> Written:
     np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
     convention = "forward: y = gain u + bias, so u = inverse_gain (y - bias); covariance in the order of parameters."
     return Written(
-        {"": buffer.getvalue()}, convention, parameters.equation("inverse_gain"), parameters.corrections(),
+        {"": buffer.getvalue()},
+        convention,
+        parameters.equation("inverse_gain"),
+        parameters.corrections(),
         uncertainty=True,
-    )  # fmt: skip
+    )

@@ -44,7 +44,7 @@ def write(parameters: ExportedUnit) -> Written:
     accel_bias, gyro_bias = vector_text(view["accel_bias"]), vector_text(view["gyro_bias"])
     biases = [f"  # accelerometer bias {accel_bias} m/s^2: OpenVINS estimates it, see init_dyn_bias_a"]
     corrections = {"accelerometer": Correction(np.linalg.inv(blocks["Ta"]), zero, frame=frame)}
-    if parameters.gyroscope is not None:
+    if "gyroscope" in parameters.triads:
         biases.append(f"  # gyroscope bias {gyro_bias} rad/s: OpenVINS estimates it, see init_dyn_bias_g")
         corrections["gyroscope"] = Correction(rotation.T @ np.linalg.inv(blocks["Tw"]), zero, sensitivity, frame)
     lines = ["%YAML:1.0", "", comments(parameters), "imu0:", *yaml_matrices({"T_i_b": np.eye(4)}, 2, 4)]

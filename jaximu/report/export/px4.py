@@ -23,19 +23,24 @@ def write(parameters: ExportedUnit) -> Written:
     """Write offsets and scales of sensor `instance`; its device's ID only if it was stated."""
     parameters = parameters.for_autopilot("PX4")
     parameters.require_si("PX4")
-    place = parameters.instance
+    number = parameters.instance
     tool = Autopilot(
-        {name: f"CAL_{sensor}{place}_{{axis}}{{word}}" for name, sensor in _SENSORS.items()}, "OFF", "SCALE",
-        ("OFF", "SCALE", "ODIAG"), f"CAL_MAG{place}_ROT", ("gauss", 0.01), rotated=False,
-    )  # fmt: skip
+        {name: f"CAL_{sensor}{number}_{{axis}}{{word}}" for name, sensor in _SENSORS.items()},
+        "OFF",
+        "SCALE",
+        ("OFF", "SCALE", "ODIAG"),
+        f"CAL_MAG{number}_ROT",
+        ("gauss", 0.01),
+        rotated=False,
+    )
     values, equation, corrections, rotation = tool.values(parameters)
     devices = [_SENSORS[name] for name in ("accelerometer", "gyroscope") if name in parameters.triads]
     mine = devices or ["MAG"]  # a magnetometer is a device of its own
     left = [] if parameters.device is not None else [*mine]
-    left += ["MAG"] if devices and parameters.magnetometer is not None else []
+    left += ["MAG"] if devices and "magnetometer" in parameters.triads else []
     rows = [f"1\t1\t{name}\t{value!r}\t{_REAL}" for name, value in values]
     if parameters.device is not None:
-        rows += [f"1\t1\tCAL_{each}{place}_ID\t{parameters.device}\t{_INTEGER}" for each in mine]
+        rows += [f"1\t1\tCAL_{sensor}{number}_ID\t{parameters.device}\t{_INTEGER}" for sensor in mine]
     head = [comments(parameters), "# Vehicle-Id Component-Id Name Value Type"]
     convention = (
         "PX4 subtracts the offset, then scales, in the sensor's own axes before its rotation; parameters are single "
@@ -45,7 +50,7 @@ def write(parameters: ExportedUnit) -> Written:
     convention += rotation
     if left:
         convention += (
-            f" PX4 uses them only where {' and '.join(f'CAL_{each}{place}_ID' for each in left)} are the sensor's: "
-            "these are left as they are; state --device to write one device's."
+            f" PX4 uses them only where {' and '.join(f'CAL_{sensor}{number}_ID' for sensor in left)} are the sensor's:"
+            " these are left as they are; state --device to write one device's."
         )
     return Written(text_file([*head, *rows]), convention, equation, corrections, parameters=parameters)

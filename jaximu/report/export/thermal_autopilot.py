@@ -68,8 +68,13 @@ def px4_parameters(
             continue
         cubic = targets.cubic(name, reference, 1.0)
         stem = f"TC_{letter}{instance}"
-        parameters |= {f"TC_{letter}_ENABLE": 1, f"{stem}_ID": number, f"{stem}_TREF": reference,
-                       f"{stem}_TMIN": targets.low, f"{stem}_TMAX": targets.high}  # fmt: skip
+        parameters |= {
+            f"TC_{letter}_ENABLE": 1,
+            f"{stem}_ID": number,
+            f"{stem}_TREF": reference,
+            f"{stem}_TMIN": targets.low,
+            f"{stem}_TMAX": targets.high,
+        }
         parameters |= {f"{stem}_X{power}_{axis}": float(cubic[power, axis]) for power in range(4) for axis in range(3)}
     notes = [
         *targets.notes(),
@@ -78,8 +83,11 @@ def px4_parameters(
     ]
     if not (accelerometer_id and gyroscope_id):
         notes.append("TC_…_ID are 0: put in the sensors' device ids (listener sensor_accel, sensor_gyro).")
-    lines = ["# PX4 sensor thermal compensation", *(f"# {note}" for note in notes),
-             "# Vehicle-Id Component-Id Name Value Type"]  # fmt: skip
+    lines = [
+        "# PX4 sensor thermal compensation",
+        *(f"# {note}" for note in notes),
+        "# Vehicle-Id Component-Id Name Value Type",
+    ]
     for key, value in parameters.items():
         whole = key.endswith(("_ID", "_ENABLE"))
         lines.append(f"1\t1\t{key}\t{int(value) if whole else f'{value:.9g}'}\t{6 if whole else 9}")
@@ -97,16 +105,20 @@ def ardupilot_parameters(calibration: Calibration | ThermalCalibration, instance
     targets = _Targets(calibration)
     low, high = targets.low, targets.high
     if low < _ARDUPILOT_RANGE[0] or high > _ARDUPILOT_RANGE[1]:
-        raise NotPossibleError(f"ArduPilot takes temperatures from -70 to 80 °C, the calibration has {low:.0f} to "
-                               f"{high:.0f} °C.")  # fmt: skip
+        raise NotPossibleError(
+            f"ArduPilot takes temperatures from -70 to 80 °C, the calibration has {low:.0f} to {high:.0f} °C."
+        )
     stem = f"INS_TCAL{instance}"
     parameters: dict[str, float] = {f"{stem}_ENABLE": 1, f"{stem}_TMIN": low, f"{stem}_TMAX": high}
     for name, short in (("accelerometer", "ACC"), ("gyroscope", "GYR")):
         if name not in targets.calibration.triads():
             continue
         cubic = targets.cubic(name, _ARDUPILOT_REFERENCE, 1e-6, constant=False)
-        parameters |= {f"{stem}_{short}{power}_{axis}": float(cubic[power, k])
-                       for power in range(1, 4) for k, axis in enumerate("XYZ")}  # fmt: skip
+        parameters |= {
+            f"{stem}_{short}{power}_{axis}": float(cubic[power, k])
+            for power in range(1, 4)
+            for k, axis in enumerate("XYZ")
+        }
     notes = [
         *targets.notes(),
         "ArduPilot has no constant: calibrate the offsets afterwards on the autopilot, which keeps the temperature of "
@@ -124,15 +136,15 @@ class _Targets:
     axis that the calibration does not correct is not corrected.
     """
 
-    def __init__(self, given: Calibration | ThermalCalibration):
-        self.working = None if isinstance(given, Calibration) else given
-        self.calibration = given if isinstance(given, Calibration) else given.calibration
-        found = self.calibration.data.get("temperature_range")
-        if found is None:
+    def __init__(self, calibration: Calibration | ThermalCalibration):
+        by_itself = isinstance(calibration, Calibration)
+        self.working, self.calibration = (None, calibration) if by_itself else (calibration, calibration.calibration)
+        span = self.calibration.data.get("temperature_range")
+        if span is None:
             raise NotPossibleError(
                 "the calibration does not say over which temperatures it was made: make one with jaximu thermal."
             )
-        self.low, self.high = (float(np.float32(each)) for each in found)
+        self.low, self.high = (float(np.float32(end)) for end in span)
         self.loss: dict[str, FloatArray] = {}
         self.left: dict[str, FloatArray] = {}
 
@@ -170,18 +182,18 @@ class _Targets:
     def notes(self) -> list[str]:
         """Say what a cubic of temperature cannot hold."""
         effects = [effect for triad in self.calibration.triads().values() for effect in triad.effects]
-        found = []
+        texts = []
         lost = [effect.name for effect in effects if effect.plain in (*RATES, SCALE, NETWORK)]
         lagging = [effect.name for effect in effects if memories([effect.plain])]
         if lost:
-            found.append(f"a cubic of temperature cannot hold {', '.join(lost)}: left out.")
+            texts.append(f"a cubic of temperature cannot hold {', '.join(lost)}: left out.")
         if lagging:
-            found.append(f"a cubic of temperature has no memory: {', '.join(lagging)} taken as if at once.")
+            texts.append(f"a cubic of temperature has no memory: {', '.join(lagging)} taken as if at once.")
         if self.calibration.reading is None:
             axes = "axes and units are those of the recording: it must be the autopilot's own log, in its axes."
         else:
             axes = "axes are the autopilot's own: forward, right, down; units must be those of its log."
-        return [*found, axes]
+        return [*texts, axes]
 
     def parameters(
         self, name: str, parameters: dict[str, float], lines: list[str], notes: list[str]
