@@ -67,19 +67,27 @@ def find(samples: Samples) -> list[Finding]:
     rest = samples.quiet_at(sensor)
     if share is not None:
         first = int(np.argmax((sensor.signal.values == 0.0).all(axis=1)))
-        return [Finding(
-            "data.auto_zero", sensor.rows([first]),
-            f"gyroscope: {100 * share:.0f} % of its samples at rest are exactly zero, but it moves freely in turns: "
-            "its driver zeroes it at rest, so its bias in turns is unknown. Switch the automatic zero off and record "
-            "again.", spoils=True,
-        )]  # fmt: skip
+        return [
+            Finding(
+                "data.auto_zero",
+                sensor.rows([first]),
+                f"gyroscope: {100 * share:.0f} % of its samples at rest are exactly zero, but it moves freely in "
+                "turns: its driver zeroes it at rest, so its bias in turns is unknown. Switch the automatic zero off "
+                "and record again.",
+                spoils=True,
+            )
+        ]
     held = _held(samples, sensor, rest)
     if held is not None:
-        return [Finding(
-            "data.auto_zero", sensor.rows([int(np.argmax(rest))]),
-            f"gyroscope: its noise at rest is {100 * held:.2g} % of that in motion: its driver holds it at rest, so "
-            "its bias in turns is unknown. Switch the automatic zero off and record again.", spoils=True,
-        )]  # fmt: skip
+        return [
+            Finding(
+                "data.auto_zero",
+                sensor.rows([int(np.argmax(rest))]),
+                f"gyroscope: its noise at rest is {100 * held:.2g} % of that in motion: its driver holds it at rest, "
+                "so its bias in turns is unknown. Switch the automatic zero off and record again.",
+                spoils=True,
+            )
+        ]
     return _high_passed(samples, sensor)
 
 
@@ -111,31 +119,33 @@ def _high_passed(samples: Samples, sensor: Sensor) -> list[Finding]:
     edges = edges[edges[:, 1] - edges[:, 0] > 5]
     if len(edges) < 2 * _FEWEST:
         return []
-    rate, turned = (
-        np.stack([values[a:b].mean(axis=0) for a, b in edges]) for values in (sensor.values, angle)
-    )  # fmt: skip
+    rate, turned = (np.stack([values[a:b].mean(axis=0) for a, b in edges]) for values in (sensor.values, angle))
     rate, turned = rate - rate.mean(axis=0), turned - turned.mean(axis=0)
     power = float(np.sum(turned**2))
     if not power > 0:
         return []
     slope = float(np.sum(rate * turned)) / power
-    left = float(np.sum((rate - slope * turned) ** 2))
-    total = float(np.sum(rate**2))
-    each = np.sum(rate * turned, axis=0) / np.maximum(np.sum(turned**2, axis=0), 1e-300)
+    unexplained = np.sum((rate - slope * turned) ** 2)
+    slopes = np.sum(rate * turned, axis=0) / np.maximum(np.sum(turned**2, axis=0), 1e-300)
     # one time constant for all axes, and nearly all of what the means do at rest
-    if not -10.0 < slope < -1e-3 or left > 0.1 * total or np.any(np.abs(each / slope - 1) > 0.35):
+    if not -10.0 < slope < -1e-3 or unexplained > 0.1 * np.sum(rate**2) or np.any(np.abs(slopes / slope - 1) > 0.35):
         return []
 
     def apply(recording: Recording) -> Recording:
-        signal = recording.gyroscope
-        assert signal is not None
+        signal = recording.signals["gyroscope"]
         # as the usual recursion y_k = a (y_{k−1} + ω_k − ω_{k−1}) has it, a = τ/(τ + Δt)
         mean = np.cumsum(signal.si() * np.median(np.diff(signal.time)), axis=0)
         return with_signal(recording, "gyroscope", values=signal.values - slope * mean * signal.nominal_scale)
 
-    return [Finding(
-        "data.auto_zero", sensor.rows(edges[:1, 0]),
-        f"gyroscope: at rest it reads minus the angle turned so far over {-1 / slope:.3g} s, on all axes: a high-pass "
-        "filter takes its running mean off. --repair adds the mean back; better switch the automatic zero off and "
-        "record again.", repair="--repair", spoils=True, apply=apply,
-    )]  # fmt: skip
+    return [
+        Finding(
+            "data.auto_zero",
+            sensor.rows(edges[:1, 0]),
+            f"gyroscope: at rest it reads minus the angle turned so far over {-1 / slope:.3g} s, on all axes: a "
+            "high-pass filter takes its running mean off. --repair adds the mean back; better switch the automatic "
+            "zero off and record again.",
+            repair="--repair",
+            spoils=True,
+            apply=apply,
+        )
+    ]

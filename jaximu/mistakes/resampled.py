@@ -14,7 +14,7 @@ TITLES = {"data.resampled": "resampled output"}
 
 def find(samples: Samples) -> list[Finding]:
     """Return the sensors whose real rate is lower than the log's."""
-    found = []
+    findings = []
     for name, sensor in samples.sensors.items():
         if len(sensor) < 200:
             continue
@@ -25,13 +25,17 @@ def find(samples: Samples) -> list[Finding]:
             continue
         real = (len(kept) - 1) / (sensor.time[kept[-1]] - sensor.time[kept[0]])
         rows = np.setdiff1d(np.arange(len(sensor)), kept)
-        found.append(Finding(
-            "data.resampled", sensor.rows(rows),
-            f"{name}: the log has {sensor.rate:.4g} Hz but {how}: the sensor's real rate is {real:.4g} Hz. The rows in "
-            "between are no measurements and are left out; log at the sensor's rate, and choose one of 50 Hz or more.",
-            without={name: rows},
-        ))  # fmt: skip
-    return found
+        findings.append(
+            Finding(
+                "data.resampled",
+                sensor.rows(rows),
+                f"{name}: the log has {sensor.rate:.4g} Hz but {how}: the sensor's real rate is {real:.4g} Hz. The "
+                "rows in between are no measurements and are left out; log at the sensor's rate, and choose one of "
+                "50 Hz or more.",
+                without={name: rows},
+            )
+        )
+    return findings
 
 
 def held_at(sensor: Sensor) -> Rows | None:

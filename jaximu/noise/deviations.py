@@ -77,23 +77,25 @@ def averaging_factors(samples: int, kind: str = "overlapping", spacing: str | in
     if longest < 1:
         raise NotPossibleError(f"{samples} samples are too few for the {kind} deviation.")
     if spacing == "octave":
-        found = 2 ** np.arange(int(np.log2(longest)) + 1)
+        factors = 2 ** np.arange(int(np.log2(longest)) + 1)
     elif spacing == "decade":
-        found = np.sort(np.concatenate([base * 10 ** np.arange(1 + int(np.log10(longest))) for base in (1, 2, 4)]))
+        factors = np.multiply.outer((1, 2, 4), 10 ** np.arange(1 + int(np.log10(longest)))).ravel()
     elif isinstance(spacing, int) and spacing > 0:
-        found = np.round(np.geomspace(1, longest, spacing))
+        factors = np.round(np.geomspace(1, longest, spacing))
     else:
         raise InputError(f"spacing must be 'octave', 'decade' or a number of averaging times, found {spacing!r}.")
-    found = np.unique(found.astype(np.int64))
-    return found[found <= longest]
+    factors = np.unique(factors.astype(np.int64))
+    return factors[factors <= longest]
 
 
 def _longest(samples: int, kind: str) -> int:
-    each = _kind(kind)
-    if each.total:
+    difference = _kind(kind)
+    if difference.total:
         return samples // 2
     # two differences at least: phase points less what one difference spans
-    return (samples - 1) // (each.order + each.modified) if each.overlapping else samples // (each.order + 1)
+    if difference.overlapping:
+        return (samples - 1) // (difference.order + difference.modified)
+    return samples // (difference.order + 1)
 
 
 def _kind(kind: str) -> _DeviationKind:
@@ -347,17 +349,17 @@ def degrees_of_freedom(kind: str, points: int, factor: int, exponent: int) -> fl
 
 def _freedom(kind: str, points: int, factor: int, exponent: int, lag: int) -> float:
     """The same with only `lag` differences an averaging time, evenly spaced; as many as samples where they overlap."""
-    each = _kind(kind)
-    if each.total and factor >= 8 and exponent <= 0:
+    difference = _kind(kind)
+    if difference.total and factor >= 8 and exponent <= 0:
         slope, offset = {0: (1.50, 0.0), -1: (1.17, 0.22), -2: (0.93, 0.36)}[max(exponent, -2)]
         return max(1.0, slope * (points - 1) / factor - offset)
-    d = each.order
+    d = difference.order
     exponent = max(exponent, 1 - 2 * d + 1)  # differences of this order need α + 2d > 1
     # The phase here is the integral itself, not a mean of it over a sample, which the algorithm takes to bound the
     # power of white and flicker phase; it matters for averages of few samples only.
-    averaged = each.modified and factor > 1
+    averaged = difference.modified and factor > 1
     filtering = 1.0 if averaged else (np.inf if exponent <= 0 or factor > _FINE else float(factor))
-    stride = float(lag) if each.overlapping else 1.0
+    stride = float(lag) if difference.overlapping else 1.0
     length = (factor if averaged else 1) + factor * d  # phase points that one difference spans
     terms = 1 + np.floor(stride * (points - length) / factor)
     terms = max(terms, 1.0)
@@ -385,8 +387,17 @@ def _correlation(d: int, exponent: int, filtering: float, stride: float, highest
         with np.errstate(divide="ignore", invalid="ignore"):
             logarithm = np.where(t > 0, np.log(np.where(t > 0, t, 1.0)), 0.0)
         power = exponent + (2 if filtering > _FINE else 0)
-        forms = {4: t**0 * 0, 3: t * 0, 2: -t, 1: t**2 * logarithm, 0: t**3, -1: -(t**4) * logarithm, -2: -(t**5),
-                 -3: t**6 * logarithm, -4: t**7}  # fmt: skip
+        forms = {
+            4: t**0 * 0,
+            3: t * 0,
+            2: -t,
+            1: t**2 * logarithm,
+            0: t**3,
+            -1: -(t**4) * logarithm,
+            -2: -(t**5),
+            -3: t**6 * logarithm,
+            -4: t**7,
+        }
         return forms[power]
 
     def filtered(t):  # s_x
