@@ -15,7 +15,18 @@ from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turn
 from jaximu.recordings.finding import Rows
 from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["BRIDGED", "TITLES", "Samples", "Sensor", "coarse_step", "runs_of", "scale_around", "spans_of", "steps_of"]
+__all__ = [
+    "BRIDGED",
+    "HUNG",
+    "TITLES",
+    "Samples",
+    "Sensor",
+    "coarse_step",
+    "runs_of",
+    "scale_around",
+    "spans_of",
+    "steps_of",
+]
 
 TITLES = {
     "data.bumped_pose": "bumped pose",
@@ -30,6 +41,8 @@ TITLES = {
 
 BRIDGED = 3
 """Samples in a row that may be missing in a turn: interpolation across them costs less than the noise does."""
+HUNG = 10
+"""Rows for which a sensor may repeat all of its values: beyond, it hung, unless all of its axes are at limits."""
 _SHOWN = 5
 _ZEROS, _BESIDE, _FINER = 0.2, 20, 8
 """Share of zeros from which on a dead band is sought; samples within twice its size that must be there, and how many
@@ -199,6 +212,11 @@ class Samples:
             self.sensors[name] = same if same and same.signal is signal else Sensor(name, signal, origin[name])
 
     @property
+    def first(self) -> Sensor:
+        """The accelerometer, or what there is instead."""
+        return next(iter(self.sensors.values()))
+
+    @property
     def accelerometer(self) -> Sensor | None:
         """The accelerometer, where it has enough samples."""
         return self.sensors.get("accelerometer")
@@ -307,18 +325,18 @@ def leave_out_both(calm: NDArray[np.bool_], moved: NDArray[np.bool_]) -> None:
     calm[:-1] &= ~moved
 
 
-def scale_around(misfit: FloatArray) -> FloatArray:
+def scale_around(misfit: FloatArray, before: bool = True) -> FloatArray:
     """Return the robust standard deviation (n, 3) around each sample: the largest of a block of 16 and its neighbours.
 
-    **Arguments:** `misfit`: what is no motion (n, 3).
+    **Arguments:** `misfit`: what is no motion (n, 3). `before`: look at the block before as well as at the one after.
     """
     size = 16
     blocks = max(1, len(misfit) // size)
     columns = np.abs(np.ascontiguousarray(misfit[: blocks * size].T))
     scale = 1.4826 * np.stack([np.median(axis.reshape(blocks, -1), axis=1) for axis in columns], axis=1)
-    wide = scale.copy()
-    wide[1:] = np.maximum(wide[1:], scale[:-1])
-    wide[:-1] = np.maximum(wide[:-1], scale[1:])
+    wide = np.maximum(scale, np.concatenate([scale[1:], scale[-2:][:1]]))  # the last one has none after it
+    if before:
+        wide[1:-1] = np.maximum(wide[1:-1], scale[:-2])
     return wide[np.minimum(np.arange(len(misfit)) // size, blocks - 1)]
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
-from jaximu.mistakes.base import Samples, Sensor, runs_of
+from jaximu.mistakes.base import HUNG, Samples, Sensor, runs_of
 from jaximu.recordings.finding import Finding, Rows
 
 __all__ = ["TITLES", "at_limits", "find", "stops"]
@@ -25,8 +25,6 @@ _CURE = (
 """What to do about it: of an accelerometer or gyroscope, of a magnetometer."""
 _BY_CHANCE = 0.3
 """Share of samples like the one before up to which noise and steps make them alike."""
-_HELD = 10
-"""Rows from which on a sensor of which no axis changes hung, unless all are at limits."""
 _FEWEST = 10
 """Excursions near the limit from which on it is a soft one."""
 
@@ -55,7 +53,7 @@ def _clipped(sensor: Sensor) -> list[Finding]:
         shared = sensor.name == "gyroscope" and sum(length > 1 for length in longest) > 1
         runs = runs_of(values == extreme) if shared else stops(values, extreme)
         # a sensor that gave one row over and over, in which not every axis is at a limit, hung
-        runs = runs[[b - a < _HELD or all_out[a] or bool(np.any(sensor.difference[a : b - 1])) for a, b in runs]]
+        runs = runs[[b - a < HUNG or bool(all_out[a]) or bool(np.any(sensor.difference[a : b - 1])) for a, b in runs]]
         if len(runs):
             axes.append("xyz"[axis])
             ends.append(runs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Samples, Sensor, with_signal
@@ -47,51 +48,41 @@ def find(samples: Samples) -> list[Finding]:
     sensor = samples.gyroscope
     if sensor is None:
         return []
+    zero = sensor.signal.values == 0.0
     if sensor.dead_band is not None:
         share, least = sensor.dead_band
-        first = int(np.argmax((sensor.signal.values == 0.0).any(axis=1)))
-        return [
-            Finding(
-                "data.auto_zero",
-                sensor.rows([first]),
-                f"gyroscope: {100 * share:.0f} % of an axis's samples are exactly zero, and none of the others is "
-                f"smaller than {size(least, 'rad/s', 2)}: its driver zeroes it at rest (a dead band), so neither its "
-                "bias nor its noise is known. Switch the dead band off and record again.",
-                spoils=True,
-                refuses="gyroscope" if samples.rested else "",
-            )
-        ]
+        text = (
+            f"gyroscope: {100 * share:.0f} % of an axis's samples are exactly zero, and none of the others is "
+            f"smaller than {size(least, 'rad/s', 2)}: its driver zeroes it at rest (a dead band), so neither its "
+            "bias nor its noise is known. Switch the dead band off and record again."
+        )
+        return [_finding(sensor, zero.any(axis=1), text, "gyroscope" if samples.rested else "")]
     if samples.accelerometer is None:
         return []
     share = zeroed_at_rest(samples)
-    rest = samples.quiet_at(sensor)
     if share is not None:
-        first = int(np.argmax((sensor.signal.values == 0.0).all(axis=1)))
-        return [
-            Finding(
-                "data.auto_zero",
-                sensor.rows([first]),
-                f"gyroscope: {100 * share:.0f} % of its samples at rest are exactly zero, but it moves freely in "
-                "turns: its driver zeroes it at rest, so its bias in turns is unknown. Switch the automatic zero off "
-                "and record again.",
-                spoils=True,
-            )
-        ]
+        text = (
+            f"gyroscope: {100 * share:.0f} % of its samples at rest are exactly zero, but it moves freely in turns: "
+            "its driver zeroes it at rest, so its bias in turns is unknown. Switch the automatic zero off and record "
+            "again."
+        )
+        return [_finding(sensor, zero.all(axis=1), text)]
+    rest = samples.quiet_at(sensor)
     held = _held(samples, sensor, rest)
     if held is not None:
-        return [
-            Finding(
-                "data.auto_zero",
-                sensor.rows([int(np.argmax(rest))]),
-                f"gyroscope: its noise at rest is {100 * held:.2g} % of that in motion: its driver holds it at rest, "
-                "so its bias in turns is unknown. Switch the automatic zero off and record again.",
-                spoils=True,
-            )
-        ]
+        text = (
+            f"gyroscope: its noise at rest is {100 * held:.2g} % of that in motion: its driver holds it at rest, so "
+            "its bias in turns is unknown. Switch the automatic zero off and record again."
+        )
+        return [_finding(sensor, rest, text)]
     return _high_passed(samples, sensor)
 
 
-def _held(samples: Samples, sensor: Sensor, rest: np.ndarray) -> float | None:
+def _finding(sensor: Sensor, concerned: NDArray[np.bool_], text: str, refuses: str = "") -> Finding:
+    return Finding("data.auto_zero", sensor.rows([np.argmax(concerned)]), text, spoils=True, refuses=refuses)
+
+
+def _held(samples: Samples, sensor: Sensor, rest: NDArray[np.bool_]) -> float | None:
     """Return the noise at rest as a share of that in motion, where it is hardly any."""
     if rest.sum() < 100 or (~rest).sum() < 100 or any(sensor.coarse):
         return None

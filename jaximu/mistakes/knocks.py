@@ -37,7 +37,7 @@ def find(samples: Samples) -> list[Finding]:
         without[name] = np.flatnonzero(np.cumsum(marked)[:-1] > 0)
     if any(len(rows) > _MOST * len(samples.sensors[name]) for name, rows in without.items()):
         return []
-    first = next(iter(samples.sensors.values()))
+    first = samples.first
     rows = without[first.name]
     starts = rows[np.concatenate([[True], np.diff(rows) > 1])]
     return [

@@ -40,7 +40,7 @@ def find(samples: Samples) -> list[Finding]:
     if common is None:
         return []
     findings = _singles(common) or _reported(common, _jumps(*common.sensors.values()))
-    time = next(iter(common.sensors.values())).time
+    time = common.first.time
 
     def rows_of(name: str, rows: Rows) -> Rows:
         return np.searchsorted(samples.sensors[name].time, time[rows])
@@ -100,7 +100,7 @@ def _evidence(samples: Samples, lost: FloatArray, wanted: Rows, half: int) -> tu
 
 def _quickly(samples: Samples, wanted: Rows, half: int) -> tuple[FloatArray, FloatArray]:
     """The same for evenly sampled sensors, by filters over what is near the intervals: nothing is known lost yet."""
-    near = np.zeros(len(next(iter(samples.sensors.values()))), bool)
+    near = np.zeros(len(samples.first), bool)
     for shift in range(1 - half, 1 + half):
         near[wanted + shift] = True
     index = np.cumsum(near)[wanted] - half  # of the filters' outputs
@@ -159,7 +159,7 @@ def _pairs(samples: Samples, lost: FloatArray, intervals: Rows, half: int, sure:
 
 def _in_motion(samples: Samples, half: int) -> Rows:
     """Return the intervals around which a sensor changes from sample to sample; none near gaps and ends."""
-    first = next(iter(samples.sensors.values()))
+    first = samples.first
     moving = np.zeros(len(first) - 1, bool)
     for sensor in samples.sensors.values():
         width = 2 * half + 1
@@ -184,7 +184,7 @@ class _Losses(NamedTuple):
 
 def _losses(samples: Samples, wanted: Rows, half: int) -> _Losses | None:
     """Find the lost samples, the clearest first: a place that is known shows its neighbours. None for too few."""
-    lost = np.zeros(len(next(iter(samples.sensors.values()))) - 1)
+    lost = np.zeros(len(samples.first) - 1)
     sure, least = _SURE, _CLEAR
     powers, products = _quickly(samples, wanted, half)
     for turn in range(_ROUNDS):
@@ -230,7 +230,7 @@ def _losses(samples: Samples, wanted: Rows, half: int) -> _Losses | None:
 
 def _singles(samples: Samples) -> list[Finding]:
     """Return the single samples lost in motion."""
-    sensor = next(iter(samples.sensors.values()))
+    sensor = samples.first
     half = int(np.clip(round(_BESIDE / sensor.period), 4, 24))
     wanted = _in_motion(samples, half)
     losses = _losses(samples, wanted, half) if len(wanted) >= 50 else None
@@ -289,7 +289,7 @@ def steps(sensor: Sensor) -> FloatArray:
     broken = np.flatnonzero(~sensor.even)
     for shift in range(-4, 5):
         miss[np.clip(broken + shift, 0, len(miss) - 1)] = 0.0
-    scale = np.maximum(scale_around(miss), 1.8 * sensor.noise)
+    scale = np.maximum(scale_around(miss, before=False), 1.8 * sensor.noise)
     return np.max(np.abs(miss) / np.maximum(scale, 1e-300), axis=1)
 
 
@@ -337,7 +337,7 @@ def _clean(sensor: Sensor, index: int) -> bool:
 
 
 def _reported(samples: Samples, jumps: Rows) -> list[Finding]:
-    sensor = next(iter(samples.sensors.values()))
+    sensor = samples.first
     if not 0 < len(jumps) <= max(20, 1e-3 * len(sensor)):
         return []
     # wide enough that the turn counts as interrupted

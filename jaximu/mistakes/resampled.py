@@ -41,21 +41,19 @@ def find(samples: Samples) -> list[Finding]:
 def held_at(sensor: Sensor) -> Rows | None:
     """Return the rows at which new values come, where the log holds them for an even number of rows."""
     change = (sensor.difference != 0).any(axis=1)
-    share = float(change.mean())
-    if not 0.005 < share < 0.7:
-        return None
-    # held rows repeat in motion as well as at rest; coarse steps repeat at rest alone
-    moving = np.abs(sensor.difference).sum(axis=1) > 0
-    if moving.sum() < 50:
+    if not 0.005 < change.mean() < 0.7 or change.sum() < 50:
         return None
     new = np.concatenate([[0], np.flatnonzero(change) + 1])
     gaps = np.diff(new)
-    usual = float(np.median(gaps))
-    if usual < 2:
+    if np.median(gaps) < 2:
         return None
-    # a ratio of rates that is no whole number alternates between two neighbours
-    near = np.abs(gaps - np.mean(gaps[np.abs(gaps - usual) <= 1])) <= 1.01
-    return new if near.mean() > 0.85 else None
+    return new if _alike(gaps) > 0.85 else None
+
+
+def _alike(gaps: Rows) -> float:
+    """The share of numbers of rows that are the usual one: of rates without a whole ratio two neighbours alternate."""
+    usual = np.mean(gaps[np.abs(gaps - np.median(gaps)) <= 1])
+    return float(np.mean(np.abs(gaps - usual) <= 1.01))
 
 
 def interpolated_at(sensor: Sensor) -> Rows | None:
@@ -73,12 +71,10 @@ def interpolated_at(sensor: Sensor) -> Rows | None:
         return None
     knots = np.flatnonzero(bent) + 1
     gaps = np.diff(knots)
-    usual = float(np.median(gaps))
     # a knot between two rows bends the line twice
-    if usual < 2 and np.mean(gaps == 1) < 0.6:
+    if np.median(gaps) < 2 and np.mean(gaps == 1) < 0.6:
         knots = knots[np.concatenate([[True], gaps > 1])]
         gaps = np.diff(knots)
-        usual = float(np.median(gaps))
-    if usual < 2 or np.mean(np.abs(gaps - np.mean(gaps[np.abs(gaps - usual) <= 1])) <= 1.01) < 0.8:
+    if np.median(gaps) < 2 or _alike(gaps) < 0.8:
         return None
     return np.unique(np.concatenate([[0], knots]))

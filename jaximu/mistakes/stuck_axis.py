@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.mistakes.base import Samples, Sensor, runs_of
+from jaximu.mistakes.base import HUNG, Samples, Sensor, runs_of
 from jaximu.mistakes.clipping import at_limits, stops
 from jaximu.mistakes.resampled import held_at
 from jaximu.recordings.finding import Finding
@@ -16,8 +16,8 @@ TITLES = {"data.stuck_axis": "stuck output"}
 
 _STUCK = 0.5
 """Seconds for which an axis may repeat one value while others change."""
-_HUNG, _LEAST_ROWS = 0.2, 10
-"""Seconds, and rows, for which a sensor may repeat all of its values."""
+_SHORTEST = 0.2
+"""Seconds for which a sensor may repeat all of its values, of `HUNG` rows at least."""
 
 
 def find(samples: Samples) -> list[Finding]:
@@ -115,9 +115,7 @@ def _stuck(sensor: Sensor) -> list[Finding]:
 def _hung(sensor: Sensor, same: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the long runs of rows that repeat the row before them, where few others do."""
     long = [
-        (int(start), int(stop))
-        for start, stop in runs_of(same)
-        if stop - start >= max(_LEAST_ROWS, _HUNG * sensor.rate)
+        (int(start), int(stop)) for start, stop in runs_of(same) if stop - start >= max(HUNG, _SHORTEST * sensor.rate)
     ]
     rows = sum(stop - start for start, stop in long)
     others = (same.sum() - rows) / max(len(same) - rows, 1)

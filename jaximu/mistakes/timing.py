@@ -137,13 +137,13 @@ def _smoother_evenly(sensor: Sensor) -> bool:
     number = _numbered(sensor.time)
     if number is None or len(sensor) < 200:
         return False
-    size = []
+    bends = []
     for time in (number * sensor.period, sensor.time):
         slope = sensor.difference / np.diff(time)[:, None]
         bend = np.abs(np.diff(slope, axis=0)).sum(axis=1) * sensor.period
         moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * float(np.sum(sensor.noise))
-        size.append(float(np.median(bend[moving])) if moving.sum() > 50 else np.inf)
-    return size[0] < 0.8 * size[1]
+        bends.append(float(np.median(bend[moving])) if moving.sum() > 50 else np.inf)
+    return bends[0] < 0.8 * bends[1]
 
 
 def in_bursts(interval: FloatArray) -> bool:

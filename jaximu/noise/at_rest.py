@@ -70,5 +70,5 @@ def _of_ready(ready: Prepared) -> NoiseModel:
 
 
 def _longest_whole(values: FloatArray) -> FloatArray:
-    first, last = max(runs_of(~np.isnan(values).any(axis=0)), key=np.ptp)
+    first, last = max(runs_of(np.asarray(np.isfinite(values).all(axis=0))), key=np.ptp)
     return values[:, first:last]

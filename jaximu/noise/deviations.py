@@ -185,7 +185,7 @@ def deviation(
     freedom = np.zeros(value.shape)
     for row, column in np.ndindex(*value.shape):
         m, lag, a = (int(number) for number in (grid.factor[column], grid.lag[column], alpha[row, column]))
-        freedom[row, column] = _freedom(kind, samples + 1, m, a, lag)
+        freedom[row, column] = degrees_of_freedom(kind, samples + 1, m, a, lag)
     freedom *= np.minimum(1.0, count / np.maximum(1, grid.count))
     tail = (1 - confidence) / 2
     distinct, index = np.unique(freedom, return_inverse=True)
@@ -338,17 +338,13 @@ def _lag_one(points: FloatArray, order: int) -> float:
     return product / power if power > 0 else 0.0
 
 
-def degrees_of_freedom(kind: str, points: int, factor: int, exponent: int) -> float:
+def degrees_of_freedom(kind: str, points: int, factor: int, exponent: int, lag: int | None = None) -> float:
     """Return the equivalent degrees of freedom of a deviation of `points` phase points (Greenhall and Riley 2003).
 
     `exponent` is α of S(f) ∝ f^α. The total deviation has those of SP 1065, table 7, for white, flicker and random walk
     noise; for short averages, where the mirrored ends add nothing, and for other noise those of the overlapping one.
+    `lag`: differences an averaging time, evenly spaced; as many as samples (`factor`) if None.
     """
-    return _freedom(kind, points, factor, exponent, factor)
-
-
-def _freedom(kind: str, points: int, factor: int, exponent: int, lag: int) -> float:
-    """The same with only `lag` differences an averaging time, evenly spaced; as many as samples where they overlap."""
     difference = _kind(kind)
     if difference.total and factor >= 8 and exponent <= 0:
         slope, offset = {0: (1.50, 0.0), -1: (1.17, 0.22), -2: (0.93, 0.36)}[max(exponent, -2)]
@@ -359,7 +355,7 @@ def _freedom(kind: str, points: int, factor: int, exponent: int, lag: int) -> fl
     # power of white and flicker phase; it matters for averages of few samples only.
     averaged = difference.modified and factor > 1
     filtering = 1.0 if averaged else (np.inf if exponent <= 0 or factor > _FINE else float(factor))
-    stride = float(lag) if difference.overlapping else 1.0
+    stride = float(lag or factor) if difference.overlapping else 1.0
     length = (factor if averaged else 1) + factor * d  # phase points that one difference spans
     terms = 1 + np.floor(stride * (points - length) / factor)
     terms = max(terms, 1.0)
