@@ -134,7 +134,7 @@ def deviation(
       next. White phase noise (quantisation, α > 0) does change: where it rules averages of 64 samples and more, take
       the full one.
 
-    Memory beside the input is that of two phases of a row for each processor. Raises `InputError` for shapes, rates
+    Memory beside the input is that of three rows for each processor. Raises `InputError` for shapes, rates
     and factors that make no sense, `NotPossibleError` where the data is too short or gaps leave fewer than two
     differences.
     """
