@@ -154,18 +154,38 @@ class FilterNumbers:
             ("white_density", "N²", "white noise, continuous", self.white**2 or None, f"{squared}/Hz"),
             ("walk_density", "K²", "bias random walk, continuous", self.walk**2 or None, f"({walk})^2/Hz"),
             ("driving_density", "2B²/T", "Gauss–Markov drive, continuous", self.driving_density, f"({walk})^2/Hz"),
-            ("measurement_variance", "R = N²/Δt", "one sample as a measurement", self.measurement_variance or None,
-             squared),
-            *([] if word is None else [
-                ("integral_variance", "Q = N²Δt", f"{word} a step, if integrated", self.integral_variance or None,
-                 f"({integral})^2" if "/" in integral else f"{integral}^2")]),
+            (
+                "measurement_variance",
+                "R = N²/Δt",
+                "one sample as a measurement",
+                self.measurement_variance or None,
+                squared,
+            ),
+            *(
+                []
+                if word is None
+                else [
+                    (
+                        "integral_variance",
+                        "Q = N²Δt",
+                        f"{word} a step, if integrated",
+                        self.integral_variance or None,
+                        f"({integral})^2" if "/" in integral else f"{integral}^2",
+                    )
+                ]
+            ),
             ("walk_variance", "Q = K²Δt", "bias random walk a step", self.walk_variance or None, squared),
             ("bias_sigma", "B", "Gauss–Markov bias, std. deviation", self.sigma or None, signal),
-            ("correlation_time", "T", "its correlation time, chosen", self.correlation_time if self.sigma else None,
-             "s"),
+            (
+                "correlation_time",
+                "T",
+                "its correlation time, chosen",
+                self.correlation_time if self.sigma else None,
+                "s",
+            ),
             ("decay", "φ = exp(−Δt/T)", "its decay a step", self.decay, "1"),
             ("driving_variance", "Q = B²(1−φ²)", "its drive a step", self.driving_variance, squared),
-        ]  # fmt: skip
+        ]
 
     def document(self) -> dict[str, Any]:
         """Return the numbers with their units for JSON; null where the data supports no such term."""
