@@ -11,7 +11,7 @@ from scipy.stats import binom
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model import Noise, Quantisation, RandomWalk, White
 from jaximu.noise import averaging_factors, deviation
-from jaximu.noise.deviations import _LANES, _SEGMENT, _UNROLLED, KINDS, degrees_of_freedom
+from jaximu.noise.deviations import _BLOCK, KINDS, degrees_of_freedom
 
 EVERY = pytest.mark.parametrize("kind", KINDS)
 FILES = {
@@ -236,7 +236,7 @@ def test_averaging_factors(kind):
         assert (deviation(np.random.default_rng(0).standard_normal(1000), 1.0, kind, found[-1:]).count >= 2).all()
 
 
-# --- speed without loss: blocks, threads, few phase points ----------------------------------------------------------
+# --- blocks, threads, few phase points ----------------------------------------------------------
 
 
 def plain(phase, factors, spoiled=None):
@@ -258,13 +258,13 @@ def integrated(signal):
     return phase, np.concatenate([[0], np.cumsum(lost)])
 
 
-EDGES = [_LANES - 1, _LANES + 1, _LANES * _UNROLLED + 3, _SEGMENT, _SEGMENT + 2, 2 * _SEGMENT + _LANES + 5]
+EDGES = [2047, _BLOCK - 1, _BLOCK, _BLOCK + 2, 2 * _BLOCK + 1, 4 * _BLOCK + 2053]
 
 
 @pytest.mark.parametrize("samples", EDGES)
 @pytest.mark.parametrize("gaps", [False, True])
 def test_blocks_hold_every_difference_once(samples, gaps):
-    """At the edges of blocks and segments, of several axes with more than there are threads; gaps in some axes."""
+    """At the edges of blocks, of several axes with more than there are threads; gaps in some axes."""
     rng = np.random.default_rng(samples)
     signal = rng.standard_normal((5, samples)) + 0.01 * np.cumsum(rng.standard_normal((5, samples)), axis=1)
     if gaps:

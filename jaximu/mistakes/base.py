@@ -15,7 +15,18 @@ from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turn
 from jaximu.recordings.finding import Rows
 from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["BRIDGED", "TITLES", "Samples", "Sensor", "block_medians", "coarse_step", "runs_of"]
+__all__ = [
+    "BRIDGED",
+    "HUNG",
+    "TITLES",
+    "Samples",
+    "Sensor",
+    "coarse_step",
+    "runs_of",
+    "scale_around",
+    "spans_of",
+    "steps_of",
+]
 
 TITLES = {
     "data.bumped_pose": "bumped pose",
@@ -30,6 +41,8 @@ TITLES = {
 
 BRIDGED = 3
 """Samples in a row that may be missing in a turn: interpolation across them costs less than the noise does."""
+HUNG = 10
+"""Rows for which a sensor may repeat all of its values: beyond, it hung, unless all of its axes are at limits."""
 _SHOWN = 5
 _ZEROS, _BESIDE, _FINER = 0.2, 20, 8
 """Share of zeros from which on a dead band is sought; samples within twice its size that must be there, and how many
@@ -50,11 +63,11 @@ _CURVATURE_NOISE = float(np.sqrt(1 + 34 / 36))  # of a sample's difference from 
 class Sensor:
     """The samples of one sensor with what several checks need to know of them. (n, 3) values in SI units."""
 
-    def __init__(self, name: str, signal: Signal, origin: Rows | None = None) -> None:
+    def __init__(self, name: str, signal: Signal, origin: Rows) -> None:
         self.name, self.signal = name, signal
         self.time, self.values = signal.time, signal.si()
         self.unit = _UNITS.get(name, signal.unit)
-        self.origin = np.arange(len(signal)) if origin is None else origin
+        self.origin = origin
 
     def __len__(self) -> int:
         return len(self.time)
@@ -88,24 +101,17 @@ class Sensor:
     def curvature(self) -> FloatArray:
         """(n, 3) difference of each sample from the cubic through two neighbours on either side; zero at ends, gaps."""
         values = self.values
-        found = np.zeros_like(values)
-        middle = values[2:-2]
-        found[2:-2] = middle - (4 * (values[1:-3] + values[3:-1]) - values[:-4] - values[4:]) / 6
+        misfit = np.zeros_like(values)
+        misfit[2:-2] = values[2:-2] - (4 * (values[1:-3] + values[3:-1]) - values[:-4] - values[4:]) / 6
         broken = np.flatnonzero(~self.even)
         for shift in (-1, 0, 1, 2):
-            found[np.clip(broken + shift, 0, len(values) - 1)] = 0.0
-        return found
+            misfit[np.clip(broken + shift, 0, len(values) - 1)] = 0.0
+        return misfit
 
     @cached_property
     def local(self) -> FloatArray:
         """(n, 3) robust standard deviation of `curvature` around each sample: of a block of 16 and its neighbours."""
-        size = 16
-        blocks = max(1, len(self) // size)
-        scale = 1.4826 * block_medians(np.abs(self.curvature[: blocks * size]), blocks)
-        wide = scale.copy()
-        wide[1:] = np.maximum(wide[1:], scale[:-1])
-        wide[:-1] = np.maximum(wide[:-1], scale[1:])
-        return wide[np.minimum(np.arange(len(self)) // size, blocks - 1)]
+        return scale_around(self.curvature)
 
     @cached_property
     def noise(self) -> FloatArray:
@@ -140,12 +146,7 @@ class Sensor:
     @cached_property
     def step(self) -> FloatArray:
         """(3,) the least difference of two values of an axis."""
-        found = np.zeros(3)
-        for axis, values in enumerate(self.values[:20000].T):
-            steps = np.diff(np.unique(values)).astype(np.float64)
-            steps = steps[steps > 1e-9 * max(float(np.ptp(values)), 1e-300)]
-            found[axis] = steps.min() if len(steps) else 0.0
-        return found
+        return np.array([np.min(steps) if len(steps) else 0.0 for steps in map(steps_of, self.values[:20000].T)])
 
     @cached_property
     def blocks(self) -> tuple[Rows, FloatArray, FloatArray]:
@@ -159,48 +160,61 @@ class Sensor:
     @cached_property
     def quiet(self) -> NDArray[np.bool_]:
         """(n,) whether a sample lies in a block that varies no more than the quietest do."""
-        first, mean, variance = self.blocks
+        _, mean, variance = self.blocks
         total = variance.sum(axis=1)
         lowest = max(float(np.percentile(total, 5)), 1e-30)
         floor = float(np.median(total[total <= 3 * lowest])) if (total <= 3 * lowest).any() else lowest
         floor = max(floor, float(np.sum(self.step**2)) / 12)
         calm = total <= _QUIET * floor
         if len(mean) > 2:  # slow, smooth motion varies little within a block, but from block to block
-            moved = np.sum(np.diff(mean, axis=0) ** 2, axis=1) > 36 * floor + 1e-24
-            calm[1:] &= ~moved
-            calm[:-1] &= ~moved
-        size = first[1] - first[0] if len(first) > 1 else len(self)
-        return calm[np.minimum(np.arange(len(self)) // size, len(calm) - 1)]
+            leave_out_both(calm, np.sum(np.diff(mean, axis=0) ** 2, axis=1) > 36 * floor + 1e-24)
+        return self.by_sample(calm)
 
-    def rows(self, places: Any) -> tuple[int, ...]:
+    @property
+    def block_size(self) -> int:
+        """Samples of each of `blocks`."""
+        first = self.blocks[0]
+        return int(first[1]) if len(first) > 1 else len(self)
+
+    def by_sample(self, by_block: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return for each sample (n,) what holds for its block (b,); those behind the last one belong to it."""
+        return by_block[np.minimum(np.arange(len(self)) // self.block_size, len(by_block) - 1)]
+
+    def rows(self, indices: Any) -> tuple[int, ...]:
         """Return the first few rows concerned as a person counts them in the recording as it was given."""
-        return tuple(int(self.origin[place]) + 1 for place in list(places)[:_SHOWN])
+        return tuple(int(row) + 1 for row in self.origin[list(indices)[:_SHOWN]])
 
-    def at(self, place: int) -> str:
+    def at(self, index: int) -> str:
         """Return the time of a row."""
-        return f"{self.time[place]:.1f} s"
+        return f"{self.time[index]:.1f} s"
 
 
 class Samples:
-    """A recording as the checks see it. origin: for each sensor, the row that each sample had when it was given.
+    """A recording as the checks see it. origin: for each sensor, the row that each sample had in the file.
 
     magnetometer: see its samples alone, which are compared with no other sensor's.
     """
 
     def __init__(
-        self, recording: Recording, origin: Mapping[str, Rows] | None = None, before: Samples | None = None,
+        self,
+        recording: Recording,
+        origin: Mapping[str, Rows],
+        before: Samples | None = None,
         magnetometer: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.recording = recording
-        known = {} if before is None else before.sensors
         self.sensors: dict[str, Sensor] = {}
         for name in ("magnetometer",) if magnetometer else ("accelerometer", "gyroscope"):
-            signal: Signal | None = getattr(recording, name)
+            signal = recording.signals.get(name)
             if signal is None or len(signal) < 16:
                 continue
-            same = known.get(name)
-            kept = same is not None and same.signal is signal
-            self.sensors[name] = same if same is not None and kept else Sensor(name, signal, (origin or {}).get(name))
+            same = None if before is None else before.sensors.get(name)
+            self.sensors[name] = same if same and same.signal is signal else Sensor(name, signal, origin[name])
+
+    @property
+    def first(self) -> Sensor:
+        """The accelerometer, or what there is instead."""
+        return next(iter(self.sensors.values()))
 
     @property
     def accelerometer(self) -> Sensor | None:
@@ -212,12 +226,16 @@ class Samples:
         """The gyroscope, where it has enough samples."""
         return self.sensors.get("gyroscope")
 
+    @property
+    def both(self) -> tuple[Sensor, Sensor] | None:
+        """The accelerometer and the gyroscope, where both have enough samples."""
+        force, rate = self.accelerometer, self.gyroscope
+        return None if force is None or rate is None else (force, rate)
+
     @cached_property
     def shared(self) -> bool:
         """Whether both sensors have one row for each stamp."""
-        if self.accelerometer is None or self.gyroscope is None:
-            return False
-        return np.array_equal(self.accelerometer.time, self.gyroscope.time)
+        return self.both is not None and np.array_equal(self.both[0].time, self.both[1].time)
 
     def quiet_at(self, sensor: Sensor) -> NDArray[np.bool_]:
         """(n,) whether the *other* sensor, or the sensor itself where it is alone, is at rest at a sensor's samples."""
@@ -230,29 +248,24 @@ class Samples:
     @cached_property
     def turning(self) -> BlockMeans | None:
         """How gravity turns beside the gyroscope's angle; None without a gyroscope or in a short recording."""
-        force, rate = self.accelerometer, self.gyroscope
-        if force is None or rate is None:
+        if self.both is None:
             return None
+        force, rate = self.both
         return gravity_turning(force.time, force.values, rate.time, rate.values)
 
     @cached_property
     def clocks(self) -> Clocks | None:
         """By how much the gyroscope's stamps are late, None where nothing turns or there is no gyroscope."""
-        force, rate = self.accelerometer, self.gyroscope
-        if force is None or rate is None:
+        if self.both is None:
             return None
+        force, rate = self.both
         return clocks(force.time, force.values, rate.time, rate.values)
 
     @cached_property
     def rests(self) -> FloatArray:
         """(k, 2) start and stop, s, of the stretches in which the accelerometer rests, and the gyroscope if it can."""
         sensor = self.accelerometer
-        if sensor is None:
-            return np.zeros((0, 2))
-        runs = runs_of(sensor.quiet)
-        size = len(sensor) - 1
-        spans = np.stack([sensor.time[runs[:, 0]], sensor.time[np.minimum(runs[:, 1], size)]], axis=1)
-        return spans[spans[:, 1] - spans[:, 0] >= _SHORTEST_REST]
+        return np.zeros((0, 2)) if sensor is None else spans_of(sensor.quiet, sensor.time, _SHORTEST_REST)
 
     @cached_property
     def rested(self) -> bool:
@@ -300,9 +313,37 @@ def runs_of(flags: NDArray[np.bool_]) -> Rows:
     return edges.reshape(-1, 2)
 
 
-def block_medians(values: FloatArray, blocks: int) -> FloatArray:
-    """Return the median (blocks, 3) of the values (n, 3) of each of so many blocks in a row, all of one length."""
-    return np.stack([np.median(axis.reshape(blocks, -1), axis=1) for axis in np.ascontiguousarray(values.T)], axis=1)
+def spans_of(flags: NDArray[np.bool_], time: FloatArray, shortest: float) -> FloatArray:
+    """Return start and stop (k, 2), s, of the runs of True at stamps (n,) that take so many seconds or more."""
+    spans = time[np.minimum(runs_of(flags), len(time) - 1)]
+    return spans[spans[:, 1] - spans[:, 0] >= shortest]
+
+
+def leave_out_both(calm: NDArray[np.bool_], moved: NDArray[np.bool_]) -> None:
+    """Mark as not calm, in place, the blocks (b,) on both sides of each step (b - 1,) that moved."""
+    calm[1:] &= ~moved
+    calm[:-1] &= ~moved
+
+
+def scale_around(misfit: FloatArray, before: bool = True) -> FloatArray:
+    """Return the robust standard deviation (n, 3) around each sample: the largest of a block of 16 and its neighbours.
+
+    **Arguments:** `misfit`: what is no motion (n, 3). `before`: look at the block before as well as at the one after.
+    """
+    size = 16
+    blocks = max(1, len(misfit) // size)
+    columns = np.abs(np.ascontiguousarray(misfit[: blocks * size].T))
+    scale = 1.4826 * np.stack([np.median(axis.reshape(blocks, -1), axis=1) for axis in columns], axis=1)
+    wide = np.maximum(scale, np.concatenate([scale[1:], scale[-2:][:1]]))  # the last one has none after it
+    if before:
+        wide[1:-1] = np.maximum(wide[1:-1], scale[:-2])
+    return wide[np.minimum(np.arange(len(misfit)) // size, blocks - 1)]
+
+
+def steps_of(values: FloatArray) -> FloatArray:
+    """Return the differences (k,) of neighbouring levels of an axis (n,), rounding apart."""
+    steps = np.diff(np.unique(values))
+    return steps[steps > 1e-9 * np.ptp(values)]
 
 
 def coarse_step(sensor: Sensor, axis: int, quiet: NDArray[np.bool_] | None = None) -> float | None:
@@ -315,8 +356,7 @@ def coarse_step(sensor: Sensor, axis: int, quiet: NDArray[np.bool_] | None = Non
         equal = max(equal, float(np.mean(same[quiet[1:]])))
     if equal < 0.4:
         return None
-    steps = np.diff(np.unique(values))
-    steps = steps[steps > 1e-9 * max(float(np.ptp(values)), 1e-300)]
+    steps = steps_of(values)
     if len(steps) < 2:
         return None
     step, moved = float(steps.min()), np.abs(change[~same])

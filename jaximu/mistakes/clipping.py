@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
-from jaximu.mistakes.base import Samples, Sensor, runs_of
+from jaximu.mistakes.base import HUNG, Samples, Sensor, runs_of
 from jaximu.recordings.finding import Finding, Rows
 
 __all__ = ["TITLES", "at_limits", "find", "stops"]
@@ -25,26 +25,24 @@ _CURE = (
 """What to do about it: of an accelerometer or gyroscope, of a magnetometer."""
 _BY_CHANCE = 0.3
 """Share of samples like the one before up to which noise and steps make them alike."""
-_HELD = 10
-"""Rows from which on a sensor of which no axis changes hung, unless all are at limits."""
 _FEWEST = 10
 """Excursions near the limit from which on it is a soft one."""
 
 
 def find(samples: Samples) -> list[Finding]:
     """Return the axes whose values stop at a limit, or crowd below one."""
-    found = []
+    findings = []
     for name, sensor in samples.sensors.items():
-        clipped = _clipped(sensor)
-        found += clipped or (_saturated(samples, sensor) if name == "gyroscope" else [])
-    return found
+        findings += _clipped(sensor) or (_saturated(samples, sensor) if name == "gyroscope" else [])
+    return findings
 
 
 def _clipped(sensor: Sensor) -> list[Finding]:
     """Return the ends of the range at which a sensor's axes stop."""
     extremes = np.stack([sensor.values.max(axis=0), sensor.values.min(axis=0)])
-    found: dict[int, list[Rows]] = {}
-    limits, rows, all_out = [], np.zeros(len(sensor.values), bool), at_limits(sensor)
+    axes: list[str] = []
+    ends: list[Rows] = []
+    limits, rows, all_out = [], np.zeros(len(sensor), bool), at_limits(sensor)
     for axis, extreme in zip(np.repeat(range(3), 2), extremes.T.ravel(), strict=True):
         values = sensor.values[:, axis]
         if np.ptp(values) <= 0 or sensor.coarse[axis] is not None:
@@ -55,22 +53,27 @@ def _clipped(sensor: Sensor) -> list[Finding]:
         shared = sensor.name == "gyroscope" and sum(length > 1 for length in longest) > 1
         runs = runs_of(values == extreme) if shared else stops(values, extreme)
         # a sensor that gave one row over and over, in which not every axis is at a limit, hung
-        runs = runs[[b - a < _HELD or all_out[a] or bool(np.any(sensor.difference[a : b - 1])) for a, b in runs]]
+        runs = runs[[b - a < HUNG or bool(all_out[a]) or bool(np.any(sensor.difference[a : b - 1])) for a, b in runs]]
         if len(runs):
-            found.setdefault(axis, []).append(runs)
+            axes.append("xyz"[axis])
+            ends.append(runs)
             shown = extreme * sensor.signal.nominal_scale[axis] + sensor.signal.nominal_offset[axis]
             limits.append(size(float(shown), sensor.signal.unit, 4))
             rows |= values == extreme
-    if not found:
+    if not ends:
         return []
-    every = np.concatenate([runs for ends in found.values() for runs in ends])
-    lengths = every[:, 1] - every[:, 0]
-    return [Finding(
-        "data.clipping", sensor.rows(np.sort(every[:, 0])),
-        f"{sensor.name} {', '.join('xyz'[axis] for axis in found)}: {int(np.sum(lengths))} samples stop at "
-        f"{' or '.join(dict.fromkeys(limits))}, up to {int(np.max(lengths))} in a row: its range is too small "
-        + _CURE[sensor.name == "magnetometer"], without={sensor.name: np.flatnonzero(rows)},
-    )]  # fmt: skip
+    every = np.concatenate(ends)
+    lengths = np.diff(every)
+    return [
+        Finding(
+            "data.clipping",
+            sensor.rows(np.sort(every[:, 0])),
+            f"{sensor.name} {', '.join(dict.fromkeys(axes))}: {int(np.sum(lengths))} samples stop at "
+            f"{' or '.join(dict.fromkeys(limits))}, up to {int(np.max(lengths))} in a row: its range is too small "
+            + _CURE[sensor.name == "magnetometer"],
+            without={sensor.name: np.flatnonzero(rows)},
+        )
+    ]
 
 
 def at_limits(sensor: Sensor) -> NDArray[np.bool_]:
@@ -82,32 +85,31 @@ def at_limits(sensor: Sensor) -> NDArray[np.bool_]:
 def stops(values: FloatArray, extreme: float) -> Rows:
     """Return runs (k, 2) of at least three samples at an extreme, where far more lie than at the levels next to it."""
     every = runs_of(values == extreme)
-    runs = every[every[:, 1] - every[:, 0] >= 3]
-    brief = not len(runs) and np.sum(every[:, 1] - every[:, 0]) >= 10  # peaks of a sample or two at a low rate
-    runs = every if brief else runs
+    lengths = np.diff(every)[:, 0]
+    brief = np.max(lengths, initial=0) < 3 and np.sum(lengths) >= 10  # peaks of a sample or two at a low rate
+    runs = every if brief else every[lengths >= 3]
     if not len(runs):
         return runs
+    lengths = np.diff(runs)
     near = np.unique(values)
     near = near[-4:-1] if extreme == near[-1] else near[1:4]
     usual = max((int(np.sum(values == level)) for level in near), default=0)
-    count = int(np.sum(runs[:, 1] - runs[:, 0]))
     # one value held from one sample on to the end, or from the start, is a stuck axis
     whole = len(runs) == 1 and (runs[0, 0] == 0 or runs[0, 1] == len(values))
     # where other values are held as long, holding is this signal's way (a simulation without noise, say), unless they
     # are held by chance: coarse steps at rest
     inside = (values[1:] != values.max()) & (values[1:] != values.min())
     holds = (np.diff(values) == 0) & inside
-    held = runs_of(holds)
-    held_longest = int(np.max(held[:, 1] - held[:, 0], initial=0))
-    alone = held_longest < np.max(runs[:, 1] - runs[:, 0]) / 2 or np.mean(holds) < _BY_CHANCE
-    return runs if count >= max(6, (8 if brief else 4) * usual) and (alone or brief) and not whole else runs[:0]
+    alone = np.max(np.diff(runs_of(holds)), initial=0) < np.max(lengths) / 2 or np.mean(holds) < _BY_CHANCE
+    many = np.sum(lengths) >= max(6, (8 if brief else 4) * usual)
+    return runs if many and (alone or brief) and not whole else runs[:0]
 
 
 def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
     """Excursions of all axes that end just below one limit, and are the flatter the nearer they come to it."""
     quiet = samples.quiet_at(sensor)
-    middle = np.median(sensor.values[quiet], axis=0) if quiet.any() else np.zeros(3)
-    size = np.abs(sensor.values - middle)
+    bias = np.median(sensor.values[quiet], axis=0) if quiet.any() else np.zeros(3)
+    size = np.abs(sensor.values - bias)
     limit = float(np.sort(size.max(axis=1))[-max(3, len(size) // 5000)])
     if limit < 0.2 or limit < 100 * np.max(sensor.noise):
         return []
@@ -147,15 +149,22 @@ def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
     shown = f"{np.degrees(limit):.4g} °/s"
     first = sensor.rows(np.sort(np.array(places)[crowd if hard else upper]))
     if hard:
-        return [Finding(
-            "data.saturation", first,
-            f"gyroscope: {int(crowd.sum())} quick turns end flat just below {shown}: the output was clipped there and "
-            "smoothed afterwards. These turns are left out; choose a larger range, or turn more slowly.",
-            without={"gyroscope": rows},
-        )]  # fmt: skip
-    return [Finding(
-        "data.saturation", first,
-        f"gyroscope: the tops of {int(upper.sum())} quick turns crowd below {shown}, and are the flatter the nearer "
-        "they come to it: the output saturates, and slower turns are compressed, too. Choose a larger range, or turn "
-        "more slowly, and record again.", spoils=True,
-    )]  # fmt: skip
+        return [
+            Finding(
+                "data.saturation",
+                first,
+                f"gyroscope: {int(crowd.sum())} quick turns end flat just below {shown}: the output was clipped there "
+                "and smoothed afterwards. These turns are left out; choose a larger range, or turn more slowly.",
+                without={"gyroscope": rows},
+            )
+        ]
+    return [
+        Finding(
+            "data.saturation",
+            first,
+            f"gyroscope: the tops of {int(upper.sum())} quick turns crowd below {shown}, and are the flatter the "
+            "nearer they come to it: the output saturates, and slower turns are compressed, too. Choose a larger "
+            "range, or turn more slowly, and record again.",
+            spoils=True,
+        )
+    ]

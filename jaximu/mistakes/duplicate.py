@@ -32,12 +32,15 @@ def find(samples: Samples) -> list[Finding]:
         return []
     first = sensors[0]
     blocks = runs_of(np.isin(np.arange(len(values)), rows))
-    return [Finding(
-        "data.duplicate", first.rows(blocks[:, 0]),
-        f"{counted(len(rows), 'row')} in {counted(len(blocks), 'block')} repeat earlier rows value by value, first "
-        f"from {first.at(int(rows[0]))}: they were pasted twice. The second copy is left out.",
-        without=dict.fromkeys(samples.sensors, rows),
-    )]  # fmt: skip
+    return [
+        Finding(
+            "data.duplicate",
+            first.rows(blocks[:, 0]),
+            f"{counted(len(rows), 'row')} in {counted(len(blocks), 'block')} repeat earlier rows value by value, first "
+            f"from {first.at(int(rows[0]))}: they were pasted twice. The second copy is left out.",
+            without=dict.fromkeys(samples.sensors, rows),
+        )
+    ]
 
 
 def _repeated(values: np.ndarray) -> Rows:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Samples, Sensor, with_signal
@@ -47,43 +48,41 @@ def find(samples: Samples) -> list[Finding]:
     sensor = samples.gyroscope
     if sensor is None:
         return []
+    zero = sensor.signal.values == 0.0
     if sensor.dead_band is not None:
         share, least = sensor.dead_band
-        first = int(np.argmax((sensor.signal.values == 0.0).any(axis=1)))
-        return [
-            Finding(
-                "data.auto_zero",
-                sensor.rows([first]),
-                f"gyroscope: {100 * share:.0f} % of an axis's samples are exactly zero, and none of the others is "
-                f"smaller than {size(least, 'rad/s', 2)}: its driver zeroes it at rest (a dead band), so neither its "
-                "bias nor its noise is known. Switch the dead band off and record again.",
-                spoils=True,
-                refuses="gyroscope" if samples.rested else "",
-            )
-        ]
+        text = (
+            f"gyroscope: {100 * share:.0f} % of an axis's samples are exactly zero, and none of the others is "
+            f"smaller than {size(least, 'rad/s', 2)}: its driver zeroes it at rest (a dead band), so neither its "
+            "bias nor its noise is known. Switch the dead band off and record again."
+        )
+        return [_finding(sensor, zero.any(axis=1), text, "gyroscope" if samples.rested else "")]
     if samples.accelerometer is None:
         return []
     share = zeroed_at_rest(samples)
-    rest = samples.quiet_at(sensor)
     if share is not None:
-        first = int(np.argmax((sensor.signal.values == 0.0).all(axis=1)))
-        return [Finding(
-            "data.auto_zero", sensor.rows([first]),
+        text = (
             f"gyroscope: {100 * share:.0f} % of its samples at rest are exactly zero, but it moves freely in turns: "
             "its driver zeroes it at rest, so its bias in turns is unknown. Switch the automatic zero off and record "
-            "again.", spoils=True,
-        )]  # fmt: skip
+            "again."
+        )
+        return [_finding(sensor, zero.all(axis=1), text)]
+    rest = samples.quiet_at(sensor)
     held = _held(samples, sensor, rest)
     if held is not None:
-        return [Finding(
-            "data.auto_zero", sensor.rows([int(np.argmax(rest))]),
+        text = (
             f"gyroscope: its noise at rest is {100 * held:.2g} % of that in motion: its driver holds it at rest, so "
-            "its bias in turns is unknown. Switch the automatic zero off and record again.", spoils=True,
-        )]  # fmt: skip
+            "its bias in turns is unknown. Switch the automatic zero off and record again."
+        )
+        return [_finding(sensor, rest, text)]
     return _high_passed(samples, sensor)
 
 
-def _held(samples: Samples, sensor: Sensor, rest: np.ndarray) -> float | None:
+def _finding(sensor: Sensor, concerned: NDArray[np.bool_], text: str, refuses: str = "") -> Finding:
+    return Finding("data.auto_zero", sensor.rows([np.argmax(concerned)]), text, spoils=True, refuses=refuses)
+
+
+def _held(samples: Samples, sensor: Sensor, rest: NDArray[np.bool_]) -> float | None:
     """Return the noise at rest as a share of that in motion, where it is hardly any."""
     if rest.sum() < 100 or (~rest).sum() < 100 or any(sensor.coarse):
         return None
@@ -111,31 +110,33 @@ def _high_passed(samples: Samples, sensor: Sensor) -> list[Finding]:
     edges = edges[edges[:, 1] - edges[:, 0] > 5]
     if len(edges) < 2 * _FEWEST:
         return []
-    rate, turned = (
-        np.stack([values[a:b].mean(axis=0) for a, b in edges]) for values in (sensor.values, angle)
-    )  # fmt: skip
+    rate, turned = (np.stack([values[a:b].mean(axis=0) for a, b in edges]) for values in (sensor.values, angle))
     rate, turned = rate - rate.mean(axis=0), turned - turned.mean(axis=0)
     power = float(np.sum(turned**2))
     if not power > 0:
         return []
     slope = float(np.sum(rate * turned)) / power
-    left = float(np.sum((rate - slope * turned) ** 2))
-    total = float(np.sum(rate**2))
-    each = np.sum(rate * turned, axis=0) / np.maximum(np.sum(turned**2, axis=0), 1e-300)
+    unexplained = np.sum((rate - slope * turned) ** 2)
+    slopes = np.sum(rate * turned, axis=0) / np.maximum(np.sum(turned**2, axis=0), 1e-300)
     # one time constant for all axes, and nearly all of what the means do at rest
-    if not -10.0 < slope < -1e-3 or left > 0.1 * total or np.any(np.abs(each / slope - 1) > 0.35):
+    if not -10.0 < slope < -1e-3 or unexplained > 0.1 * np.sum(rate**2) or np.any(np.abs(slopes / slope - 1) > 0.35):
         return []
 
     def apply(recording: Recording) -> Recording:
-        signal = recording.gyroscope
-        assert signal is not None
+        signal = recording.signals["gyroscope"]
         # as the usual recursion y_k = a (y_{k−1} + ω_k − ω_{k−1}) has it, a = τ/(τ + Δt)
         mean = np.cumsum(signal.si() * np.median(np.diff(signal.time)), axis=0)
         return with_signal(recording, "gyroscope", values=signal.values - slope * mean * signal.nominal_scale)
 
-    return [Finding(
-        "data.auto_zero", sensor.rows(edges[:1, 0]),
-        f"gyroscope: at rest it reads minus the angle turned so far over {-1 / slope:.3g} s, on all axes: a high-pass "
-        "filter takes its running mean off. --repair adds the mean back; better switch the automatic zero off and "
-        "record again.", repair="--repair", spoils=True, apply=apply,
-    )]  # fmt: skip
+    return [
+        Finding(
+            "data.auto_zero",
+            sensor.rows(edges[:1, 0]),
+            f"gyroscope: at rest it reads minus the angle turned so far over {-1 / slope:.3g} s, on all axes: a "
+            "high-pass filter takes its running mean off. --repair adds the mean back; better switch the automatic "
+            "zero off and record again.",
+            repair="--repair",
+            spoils=True,
+            apply=apply,
+        )
+    ]

@@ -37,7 +37,7 @@ def find(samples: Samples) -> list[Finding]:
         without[name] = np.flatnonzero(np.cumsum(marked)[:-1] > 0)
     if any(len(rows) > _MOST * len(samples.sensors[name]) for name, rows in without.items()):
         return []
-    first = next(iter(samples.sensors.values()))
+    first = samples.first
     rows = without[first.name]
     starts = rows[np.concatenate([[True], np.diff(rows) > 1])]
     return [
@@ -53,13 +53,12 @@ def find(samples: Samples) -> list[Finding]:
 
 def _knocks(sensor: Sensor) -> np.ndarray:
     """Return start and stop (k, 2), s, of the quarter seconds in which most samples are far off their middle."""
-    first = sensor.blocks[0]
-    size = int(first[1] - first[0]) if len(first) > 1 else len(sensor)
+    first, size = sensor.blocks[0], sensor.block_size
     parts = sensor.values[: len(first) * size].reshape(len(first), size, 3)
     scatter = np.median(np.abs(parts - np.median(parts, axis=1, keepdims=True)), axis=1)
-    size_of = np.log(np.maximum(scatter, np.maximum(sensor.step, 1e-300) / 2))
-    usual = np.median(size_of, axis=0)
-    spread = 1.4826 * np.median(np.abs(size_of - usual), axis=0)  # of filtered noise it is larger than of white
-    runs = runs_of(np.any(size_of - usual > np.maximum(np.log(_TIMES), _STANDS_OUT * spread), axis=1))
+    excess = np.log(np.maximum(scatter, np.maximum(sensor.step, 1e-300) / 2))
+    excess -= np.median(excess, axis=0)
+    spread = 1.4826 * np.median(np.abs(excess), axis=0)  # of filtered noise it is larger than of white
+    runs = runs_of(np.any(excess > np.maximum(np.log(_TIMES), _STANDS_OUT * spread), axis=1))
     stop = np.minimum(runs[:, 1] * size, len(sensor) - 1)
     return np.stack([sensor.time[first[runs[:, 0]]], sensor.time[stop]], axis=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
@@ -33,26 +35,31 @@ def find(samples: Samples) -> list[Finding]:
 
 def _copied(sensor: Sensor) -> list[Finding]:
     """Two axes with the same noise, or exactly proportional ones."""
-    found = []
-    difference = sensor.difference
-    for first, second in ((0, 1), (0, 2), (1, 2)):
-        a, b = difference[:, first], difference[:, second]
-        size = np.sqrt((a @ a) * (b @ b))
-        if not size > 0 or np.ptp(sensor.values[:, second]) < 20 * sensor.noise[second]:
+    findings = []
+    # in motion about one axis the others may be proportional, too: their noise is not
+    noise = sensor.curvature[sensor.quiet]
+    products, of_noise = sensor.difference.T @ sensor.difference, noise.T @ noise
+    for first, second in combinations(range(3), 2):
+        if not products[first, first] * products[second, second] > 0:
             continue
-        whole = abs(float(a @ b) / size)
-        # in motion about one axis the others may be proportional, too: their noise is not
-        noise = sensor.curvature[sensor.quiet]
-        power = np.sqrt(np.sum(noise[:, first] ** 2) * np.sum(noise[:, second] ** 2))
-        same = abs(float(noise[:, first] @ noise[:, second])) / power if power > 0 else whole
-        if whole > 0.98 and same > 0.9 and len(noise) > 50:
-            factor = float(a @ b) / float(a @ a)
-            found.append(Finding(
-                "data.copied_axis", (),
-                f"{sensor.name}: {'xyz'[second]} is {factor:.3g} times {'xyz'[first]}, noise included: one of the two "
-                "was not recorded. Check the columns, and record again.", spoils=True, refuses=sensor.name,
-            ))  # fmt: skip
-    return found
+        whole, same = (
+            abs(table[first, second]) / np.sqrt(table[first, first] * table[second, second])
+            for table in (products, of_noise if of_noise[first, first] * of_noise[second, second] > 0 else products)
+        )
+        wide = np.ptp(sensor.values[:, second]) >= 20 * sensor.noise[second]
+        if wide and whole > 0.98 and same > 0.9 and len(noise) > 50:
+            factor = products[first, second] / products[first, first]
+            findings.append(
+                Finding(
+                    "data.copied_axis",
+                    (),
+                    f"{sensor.name}: {'xyz'[second]} is {factor:.3g} times {'xyz'[first]}, noise included: one of the "
+                    "two was not recorded. Check the columns, and record again.",
+                    spoils=True,
+                    refuses=sensor.name,
+                )
+            )
+    return findings
 
 
 def _dead_force(samples: Samples) -> list[Finding]:
@@ -65,19 +72,22 @@ def _dead_force(samples: Samples) -> list[Finding]:
     mean = mean[calm]
     if len(mean) < 12:
         return []
-    reach = np.quantile(mean, 0.98, axis=0) - np.quantile(mean, 0.02, axis=0)
-    axis = int(np.argmin(reach))
-    others = np.delete(reach, axis)
-    if reach[axis] > 0.05 * STANDARD_GRAVITY or np.min(others) < 0.8 * STANDARD_GRAVITY:
+    span = np.ptp(np.quantile(mean, [0.02, 0.98], axis=0), axis=0)
+    axis = int(np.argmin(span))
+    turns = span[axis] <= 0.05 * STANDARD_GRAVITY and np.min(np.delete(span, axis)) >= 0.8 * STANDARD_GRAVITY
+    if not turns or _turned_about(mean, axis):
         return []
-    if _turned_about(mean, axis):
-        return []
-    return [Finding(
-        "data.dead_axis", (),
-        f"accelerometer {'xyz'[axis]}: it stays within {reach[axis]:.2g} m/s² while the other axes turn through "
-        "gravity, and the norm at rest does not stay that of gravity: the axis is dead. Check the sensor and the "
-        "columns.", spoils=True, refuses="accelerometer",
-    )]  # fmt: skip
+    return [
+        Finding(
+            "data.dead_axis",
+            (),
+            f"accelerometer {'xyz'[axis]}: it stays within {span[axis]:.2g} m/s² while the other axes turn through "
+            "gravity, and the norm at rest does not stay that of gravity: the axis is dead. Check the sensor and the "
+            "columns.",
+            spoils=True,
+            refuses="accelerometer",
+        )
+    ]
 
 
 def _turned_about(mean: FloatArray, axis: int) -> bool:
@@ -102,17 +112,21 @@ def _dead_rate(samples: Samples) -> list[Finding]:
     others = float(np.min(np.delete(moved, axis)))
     if others < 0.05 or moved[axis] > 0.02 * others or abs(np.median(sensor.values[:, axis])) > _NO_BIAS:
         return []
-    seen = blocks.change
-    left = seen + np.cross(blocks.turned(), blocks.force)
+    unexplained = blocks.change + np.cross(blocks.turned(), blocks.force)
     about = -np.cross(np.eye(3)[axis], blocks.force)  # what a rotation about the dead axis would do
     power = np.sum(about**2, axis=1)
     good = (power > 1e-6 * np.max(power)) & (np.linalg.norm(blocks.turned(), axis=1) < _SLOW)
-    along = np.sum(np.sum(left * about, axis=1)[good] ** 2 / power[good])
+    along = np.sum(np.sum(unexplained * about, axis=1)[good] ** 2 / power[good])
     needed = _OF_REST if moved[axis] > _LEAK * others else _OF_REST / 3
-    if along < 0.1 * np.sum(seen[good] ** 2) or along < needed * np.sum(left[good] ** 2):
+    if along < 0.1 * np.sum(blocks.change[good] ** 2) or along < needed * np.sum(unexplained[good] ** 2):
         return []
-    return [Finding(
-        "data.dead_axis", (),
-        f"gyroscope {'xyz'[axis]}: it hardly moves, but gravity turns about this axis: the axis is dead. Check the "
-        "sensor and the columns.", spoils=True, refuses="gyroscope",
-    )]  # fmt: skip
+    return [
+        Finding(
+            "data.dead_axis",
+            (),
+            f"gyroscope {'xyz'[axis]}: it hardly moves, but gravity turns about this axis: the axis is dead. Check the "
+            "sensor and the columns.",
+            spoils=True,
+            refuses="gyroscope",
+        )
+    ]

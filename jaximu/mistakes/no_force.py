@@ -29,11 +29,16 @@ def find(samples: Samples) -> list[Finding]:
     # in units of g gravity is one everywhere at rest; what is left without it varies as much as it is large
     scattered = middle < 0.11 * STANDARD_GRAVITY and high > 1.5 * low
     if 1e-4 < middle and (middle < _FREE * STANDARD_GRAVITY or scattered):
-        return [Finding(
-            "data.gravity_free", (),
-            f"accelerometer: the median of its norm is {middle:.2g} m/s², far from gravity: gravity was taken out "
-            "(a linear acceleration). Log the raw accelerometer.", spoils=True, refuses="gravity",
-        )]  # fmt: skip
+        return [
+            Finding(
+                "data.gravity_free",
+                (),
+                f"accelerometer: the median of its norm is {middle:.2g} m/s², far from gravity: gravity was taken out "
+                "(a linear acceleration). Log the raw accelerometer.",
+                spoils=True,
+                refuses="gravity",
+            )
+        ]
     noise = float(np.min(sensor.noise))
     scatter = float(np.quantile(np.abs(norm - middle), 0.995)) / 2.8
     rounding = float(np.max(sensor.step))
@@ -41,10 +46,14 @@ def find(samples: Samples) -> list[Finding]:
     if noise > 1e-9 * middle and turned > 0.5 * middle and scatter < max(_CONSTANT * noise, 1e-9 * middle):
         if scatter > 0.5 * noise - rounding and noise < 2 * rounding:
             return []
-        return [Finding(
-            "data.normalised", (),
-            f"accelerometer: the norm is constant to {100 * scatter / middle:.1g} % in every sample, also in motion: "
-            "these are directions, not forces, and hold no scale. Log the raw accelerometer.",
-            spoils=True, refuses="accelerometer",
-        )]  # fmt: skip
+        return [
+            Finding(
+                "data.normalised",
+                (),
+                f"accelerometer: the norm is constant to {100 * scatter / middle:.1g} % in every sample, also in "
+                "motion: these are directions, not forces, and hold no scale. Log the raw accelerometer.",
+                spoils=True,
+                refuses="accelerometer",
+            )
+        ]
     return []

@@ -19,41 +19,44 @@ TITLES = {"data.periodic": "periodic disturbance", "data.bandwidth": "low-pass f
 
 def find(samples: Samples) -> list[Finding]:
     """Return lines in the spectrum at rest, and a spectrum that falls off far below half the rate."""
-    found = []
+    findings = []
     for sensor in samples.sensors.values():
         parts = _still_parts(samples, sensor)
         if parts is None or len(parts) < 6:
             continue
         spectrum = np.fft.rfft(parts.swapaxes(1, 2) * np.hanning(parts.shape[1]), axis=2)
         power = np.mean(spectrum.real**2 + spectrum.imag**2, axis=0).T
-        found += _lines(sensor, parts, power)
-        found += _bandwidth(samples, sensor, power, parts.shape[1])
-    return found
+        findings += _lines(sensor, parts, power)
+        findings += _bandwidth(samples, sensor, power, parts.shape[1])
+    return findings
 
 
 def _lines(sensor: Sensor, parts: FloatArray, power: FloatArray) -> list[Finding]:
     """Sharp lines in the spectrum (f, 3) of the quieter half of the recording."""
     if len(parts) < 12:
         return []
-    values, quiet, width, found = sensor.values, parts, parts.shape[1], []
-    for axis in range(3):
-        flat = np.median(power[:, axis]) > 1e-20 * np.mean(values[:, axis] ** 2)
-        if sensor.coarse[axis] is not None or not flat:
+    width, findings = parts.shape[1], []
+    for axis, density in enumerate(power.T):
+        noisy = np.median(density) > 1e-20 * np.mean(sensor.values[:, axis] ** 2)
+        if sensor.coarse[axis] is not None or not noisy:
             continue  # rounding makes lines, too
-        around = _beside(power[:, axis])
-        peak = int(np.argmax(power[:, axis] / around))
+        ratios = density / _beside(density)
+        peak = int(np.argmax(ratios))
+        ratio = ratios[peak]
         # a bin's mean over k blocks is gamma with shape k (windowed blocks do not overlap)
-        ratio = power[peak, axis] / around[peak]
-        if ratio > 4 and gamma_mean_sf(ratio, len(quiet)) * len(power) < 1e-6:
+        if ratio > 4 and gamma_mean_sf(ratio, len(parts)) * len(power) < 1e-6:
             frequency = peak * sensor.rate / width
-            amplitude = 2 * np.sqrt(power[peak, axis]) / np.sum(np.hanning(width))
+            amplitude = 2 * np.sqrt(density[peak]) / np.sum(np.hanning(width))
             high = size(float(amplitude), sensor.unit, 2)
-            found.append(Finding(
-                "data.periodic", (),
-                f"{sensor.name} {'xyz'[axis]}: a line near {frequency:.3g} Hz of about {high} at rest, "
-                f"{ratio:.0f} times the noise around it: a motor, the mains, or an alias of one.",
-            ))  # fmt: skip
-    return found
+            findings.append(
+                Finding(
+                    "data.periodic",
+                    (),
+                    f"{sensor.name} {'xyz'[axis]}: a line near {frequency:.3g} Hz of about {high} at rest, "
+                    f"{ratio:.0f} times the noise around it: a motor, the mains, or an alias of one.",
+                )
+            )
+    return findings
 
 
 _LOBE = 2
@@ -75,10 +78,9 @@ def _beside(power: FloatArray) -> FloatArray:
             return float(whole[start])
         return float(np.median(power[start:stop])) if stop > start else 0.0
 
-    for place in range(2 * _LOBE + 2, len(power) - _LOBE):
-        low = max(_LOBE, place - _LOBE - _SIDE), place - _LOBE
-        high = place + _LOBE + 1, min(place + _LOBE + 1 + _SIDE, len(power))
-        beside[place] = max(usual(*low), usual(*high), 1e-300)
+    for index in range(2 * _LOBE + 2, len(power) - _LOBE):
+        low, high = index - _LOBE, index + _LOBE + 1
+        beside[index] = max(usual(max(_LOBE, low - _SIDE), low), usual(high, min(high + _SIDE, len(power))), 1e-300)
     return beside
 
 
@@ -102,8 +104,7 @@ def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) 
     frequency = np.arange(len(power)) * sensor.rate / width
     half = sensor.rate / 2
     corners = []
-    for axis in range(3):
-        density = power[:, axis]
+    for axis, density in enumerate(power.T):
         low = float(np.max(_running_median(density[2 : len(density) // 2], 5)[2:-2], initial=0.0))
         if not low > 30 * max(floor[axis], 1e-30):
             continue
@@ -127,12 +128,16 @@ def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) 
         cure = "What it took away is not known; a wider filter shows it."
     elif spoils:
         cure = "Turns are quicker than that: choose a filter of 20 Hz or more, and record again."
-    return [Finding(
-        "data.bandwidth", (),
-        f"{sensor.name}: its noise at rest falls off above some {corner:.2g} Hz, far below the {half:.4g} Hz that "
-        f"{sensor.rate:.4g} samples a second could show: a low-pass filter is on. {cure}", spoils=spoils,
-        numbers={sensor.name: corner},
-    )]  # fmt: skip
+    return [
+        Finding(
+            "data.bandwidth",
+            (),
+            f"{sensor.name}: its noise at rest falls off above some {corner:.2g} Hz, far below the {half:.4g} Hz that "
+            f"{sensor.rate:.4g} samples a second could show: a low-pass filter is on. {cure}",
+            spoils=spoils,
+            numbers={sensor.name: corner},
+        )
+    ]
 
 
 def _still_parts(samples: Samples, sensor: Sensor) -> FloatArray | None:
@@ -141,7 +146,7 @@ def _still_parts(samples: Samples, sensor: Sensor) -> FloatArray | None:
     runs = runs_of(still)
     for width in (256, 128, 64, 32):
         margin = width // 8
-        starts = [place for a, b in runs for place in range(a + margin, b - width - margin + 1, width)]
+        starts = [row for a, b in runs for row in range(a + margin, b - width - margin + 1, width)]
         if len(starts) >= 24 or (width == 32 and len(starts) >= 6):
             starts = np.array(starts[:: max(1, len(starts) // 200)])
             return _detrended(sensor.values[starts[:, None] + np.arange(width)]) if _rest(samples, still) else None

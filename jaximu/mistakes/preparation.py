@@ -32,7 +32,7 @@ from jaximu.mistakes import (
     wrap,
     zeros,
 )
-from jaximu.mistakes.base import BRIDGED, Samples, runs_of
+from jaximu.mistakes.base import BRIDGED, Samples, runs_of, steps_of
 from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import Defect, Recording, Signal, recordings_of
 
@@ -86,20 +86,20 @@ class Prepared:
     @property
     def spoiling(self) -> tuple[Finding, ...]:
         """The findings that stand, and while they stand no effect can be named."""
-        return tuple(each for each in self.findings if each.spoils)
+        return tuple(finding for finding in self.findings if finding.spoils)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences for a calibration's notes."""
-        return tuple(dict.fromkeys(each.text for each in self.findings))
+        return tuple(dict.fromkeys(finding.text for finding in self.findings))
 
 
-def one_or_several(given: Any, *others: type) -> list[Any]:
+def one_or_several(recordings: Any, *others: type) -> list[Any]:
     """Return one recording or several, each of which may have been looked over, as a list; else raise `InputError`.
 
     **Arguments:** `others`: what may stand among them.
     """
-    several = list(given) if isinstance(given, (list, tuple)) else [given]
+    several = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
     if not several:
         raise InputError("no recording was given.")
     return [one if isinstance(one, (Prepared, *others)) else recordings_of(one)[0] for one in several]
@@ -125,28 +125,28 @@ def prepare(recording: Recording, repair: bool = False, magnetometer: bool = Fal
     samples = Samples(recording, origin, magnetometer=magnetometer)
     for _ in range(_ROUNDS + len(stages)):
         new = [finding for check in stages[stage] for finding in check.find(samples)]
-        new = [each for each in new if (each.name, each.text.partition(":")[0]) not in handled]
-        new = [each for k, each in enumerate(new) if not _told(each, [*findings, *new[:k]])]
-        handled |= {(each.name, each.text.partition(":")[0]) for each in new}
-        findings += new
+        new = [finding for finding in new if (finding.name, _subject(finding)) not in handled]
         without: dict[str, list[Rows]] = {}
         changed = False
         for finding in new:
+            if _repeats(finding, findings):
+                continue
+            handled.add((finding.name, _subject(finding)))
             if finding.apply is not None and (repair or not finding.repair):
                 recording = finding.apply(recording)
                 changed = True
                 if finding.repair:
-                    place = findings.index(finding)
-                    findings[place] = replace(finding, text=f"{finding.text} {_REPAIRED}", spoils=False)
-                continue
-            for name, rows in finding.without.items():
-                without.setdefault(name, []).append(rows)
+                    finding = replace(finding, text=f"{finding.text} {_REPAIRED}", spoils=False)
+            else:
+                for name, rows in finding.without.items():
+                    without.setdefault(name, []).append(rows)
+            findings.append(finding)
         for name, parts in without.items():
             rows = np.unique(np.concatenate(parts))
-            signal: Signal = getattr(recording, name)
+            signal = recording.signals[name]
             if len(rows) > len(signal) - 32:
                 continue
-            fixed, kept = _without(signal, rows, bridge=not any(each.name == "data.resampled" for each in new))
+            fixed, kept = _without(signal, rows, bridge=all(finding.name != "data.resampled" for finding in new))
             recording = replace(recording, **{name: fixed})
             origin[name] = origin[name][kept]
             left_out[name] = np.sort(np.concatenate([left_out.get(name, np.zeros(0)), signal.time[rows]]))
@@ -157,7 +157,8 @@ def prepare(recording: Recording, repair: bool = False, magnetometer: bool = Fal
             stage += 1
             if stage == len(stages):
                 break
-    return Prepared(recording, tuple(_sorted(findings)), left_out)
+    # what spoils the recording first, else in the order in which it was found
+    return Prepared(recording, tuple(sorted(findings, key=lambda finding: not finding.spoils)), left_out)
 
 
 @contextmanager
@@ -179,27 +180,27 @@ def prepared(
         recording if isinstance(recording, Prepared) else prepare(recording, repair, magnetometer)
         for recording in recordings
     )
-    for each in ready:
-        for finding in each.findings:
+    for one in ready:
+        for finding in one.findings:
             if finding.refuses and finding.refuses not in unneeded:
-                raise InputError(f"{each.recording.name}: {finding.text} ({finding.name})")
+                raise InputError(f"{one.name}: {finding.text} ({finding.name})")
     if len(ready) > 1:
-        ready = tuple(_named(each, number) for number, each in enumerate(ready, 1))
+        ready = tuple(_named(one, number) for number, one in enumerate(ready, 1))
     try:
         yield ready
     except (JaximuError, ArithmeticError, ValueError) as error:
-        standing = [finding for each in ready for finding in each.spoiling if finding.refuses not in unneeded]
+        standing = [finding for one in ready for finding in one.spoiling if finding.refuses not in unneeded]
         if not isinstance(error, JaximuError):  # numbers that no recording gives whose rests scatter
-            standing = standing or [finding for each in ready for finding in each.findings]
+            standing = standing or [finding for one in ready for finding in one.findings]
         if not standing:
             emptied = [finding for one in ready for finding in one.findings if _leaves_out_much(one, finding)]
             if not emptied:
                 raise
-            texts = " ".join(finding.text for finding in emptied[:3])
-            raise type(error)(f"{error} Found in the recording: {texts}") from error
-        said = {finding.name: f"{finding.text} ({finding.name})" for finding in reversed(standing)}
+            sentences = " ".join(finding.text for finding in emptied[:3])
+            raise type(error)(f"{error} Found in the recording: {sentences}") from error
+        texts = {finding.name: f"{finding.text} ({finding.name})" for finding in reversed(standing)}
         reason = str(error) if isinstance(error, JaximuError) else "nothing can be estimated from it."
-        raise NotPossibleError(f"{' '.join(list(said.values())[::-1][:3])} Hence: {reason}") from error
+        raise NotPossibleError(f"{' '.join(list(texts.values())[::-1][:3])} Hence: {reason}") from error
 
 
 def _leaves_out_much(ready: Prepared, finding: Finding) -> bool:
@@ -210,43 +211,37 @@ def _leaves_out_much(ready: Prepared, finding: Finding) -> bool:
 def _named(ready: Prepared, number: int) -> Prepared:
     """Return one of several recordings, its name or number in all that was found in it."""
     files = " and ".join(Path(source.path).name for source in ready.recording.sources) or f"recording {number}"
-    return replace(ready, findings=tuple(replace(each, text=f"In {files}: {each.text}") for each in ready.findings))
+    return replace(ready, findings=tuple(replace(note, text=f"In {files}: {note.text}") for note in ready.findings))
 
 
 def without_rows(recording: Recording, rows: Mapping[str, Rows]) -> Recording:
     """Return the recording without rows (k,) of some of its sensors, by name."""
-    return replace(recording, **{name: _without(getattr(recording, name), gone, bridge=False)[0]
-                                 for name, gone in rows.items()})  # fmt: skip
+    changed = {name: _without(recording.signals[name], gone, bridge=False)[0] for name, gone in rows.items()}
+    return replace(recording, **changed)
 
 
-def _told(finding: Finding, before: Sequence[Finding]) -> bool:
+def _subject(finding: Finding) -> str:
+    """What a finding is about: its sentence up to the colon, a sensor and an axis or a place."""
+    return finding.text.partition(":")[0]
+
+
+def _repeats(finding: Finding, before: Sequence[Finding]) -> bool:
     """Whether a finding only repeats what an earlier one says: gaps that were made, lines that a filter makes."""
-    names = {each.name for each in before}
-    if finding.name == "data.lost_samples" and not finding.repair and "data.mixed_devices" in names:
-        return True  # the same row
     if finding.name == "data.dead_axis":
-        stuck = {each.text.partition(":")[0] for each in before if each.name == "data.stuck_axis"}
-        return finding.text.partition(":")[0] in stuck
-    if finding.name in ("data.bandwidth", "data.lost_samples") and any(
-        "repeat the row before" in e.text for e in before
-    ):
-        return True
-    return False
-
-
-def _sorted(findings: Sequence[Finding]) -> list[Finding]:
-    """What spoils the recording first, else in the order in which it was found."""
-    return sorted(findings, key=lambda each: not each.spoils)
+        return any(other.name == "data.stuck_axis" and _subject(other) == _subject(finding) for other in before)
+    if finding.name == "data.lost_samples" and not finding.repair:  # the same row
+        if any(other.name == "data.mixed_devices" for other in before):
+            return True
+    filled_in = finding.name in ("data.bandwidth", "data.lost_samples")
+    return filled_in and any("repeat the row before" in other.text for other in before)
 
 
 def _on_steps(signal: Signal, values: np.ndarray) -> np.ndarray:
     """Values rounded to the steps that the output comes in, so that a few made ones do not hide the steps."""
     rounded = values.copy()
-    for axis in range(values.shape[1]):
-        known = signal.values[:20000, axis]
-        steps = np.diff(np.unique(known))
-        steps = steps[steps > 1e-10 * np.ptp(known)] if len(steps) else steps
-        if len(steps) and len(steps) < 0.8 * len(known):
+    for axis, known in enumerate(signal.values[:20000].T):
+        steps = steps_of(known)
+        if 0 < len(steps) < 0.8 * len(known):
             step = float(steps.min())
             offset = known[0] - step * np.round(known[0] / step)
             rounded[:, axis] = step * np.round((values[:, axis] - offset) / step) + offset
@@ -258,23 +253,16 @@ def _without(signal: Signal, rows: Rows, bridge: bool) -> tuple[Signal, Rows]:
     bad = np.zeros(len(signal), bool)
     bad[rows] = True
     values = np.array(signal.values)
-    if bridge:
-        for start, stop in runs_of(bad):
-            before, after = np.arange(start - 2, start), np.arange(stop, stop + 2)
-            around = np.concatenate([before, after])
-            if stop - start > BRIDGED or before[0] < 0 or after[-1] >= len(signal) or bad[around].any():
-                continue
-            time = signal.time[around] - signal.time[start]
-            if time[-1] - time[0] > 1.5 * (len(around) + stop - start) * np.median(np.diff(signal.time[before])):
-                continue
-            place = signal.time[start:stop] - signal.time[start]
-            for k, other in enumerate(around):  # Lagrange's cubic through two samples on either side
-                factor = np.ones(stop - start)
-                for m in range(4):
-                    if m != k:
-                        factor *= (place - time[m]) / (time[k] - time[m])
-                values[start:stop] = (values[start:stop] if k else 0.0) + factor[:, None] * signal.values[other]
-            values[start:stop] = _on_steps(signal, values[start:stop])
-            bad[start:stop] = False
+    for start, stop in runs_of(bad) if bridge else ():
+        around = np.array([start - 2, start - 1, stop, stop + 1])  # a cubic goes through two samples on either side
+        if stop - start > BRIDGED or start < 2 or stop + 2 > len(signal) or bad[around].any():
+            continue
+        before, *_, last = time = signal.time[around] - signal.time[start]
+        if last - before > 1.5 * (len(around) + stop - start) * (time[1] - before):
+            continue
+        inside = (signal.time[start:stop] - signal.time[start]) / last
+        cubic = np.linalg.solve(np.vander(time / last, 4), signal.values[around])
+        values[start:stop] = _on_steps(signal, np.vander(inside, 4) @ cubic)
+        bad[start:stop] = False
     kept = np.flatnonzero(~bad)
     return replace(signal, time=signal.time[kept], values=values[kept]), kept

@@ -17,7 +17,7 @@ def find(samples: Samples) -> list[Finding]:
     """Return the axes whose steps are coarser than their noise."""
     if zeroed_at_rest(samples) is not None:
         return []
-    found = []
+    findings = []
     for name, sensor in samples.sensors.items():
         if held_at(sensor) is not None:
             continue
@@ -26,10 +26,14 @@ def find(samples: Samples) -> list[Finding]:
         if coarse:
             scale, unit = sensor.signal.nominal_scale, sensor.signal.unit
             sizes = [size(step * scale[axis], unit) for axis, step in coarse.items()]
-            found.append(Finding(
-                "data.quantisation", (),
-                f"{name} {', '.join('xyz'[axis] for axis in coarse)}: its step of {' or '.join(dict.fromkeys(sizes))} "
-                "is coarser than its noise; averages over a pose gain little. Choose a smaller range, or log unrounded "
-                "values.",
-            ))  # fmt: skip
-    return found
+            findings.append(
+                Finding(
+                    "data.quantisation",
+                    (),
+                    f"{name} {', '.join('xyz'[axis] for axis in coarse)}: its step of "
+                    f"{' or '.join(dict.fromkeys(sizes))} is coarser than its noise; averages over a pose gain "
+                    "little. Choose a smaller range, or log unrounded "
+                    "values.",
+                )
+            )
+    return findings

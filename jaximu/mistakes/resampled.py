@@ -14,7 +14,7 @@ TITLES = {"data.resampled": "resampled output"}
 
 def find(samples: Samples) -> list[Finding]:
     """Return the sensors whose real rate is lower than the log's."""
-    found = []
+    findings = []
     for name, sensor in samples.sensors.items():
         if len(sensor) < 200:
             continue
@@ -25,33 +25,35 @@ def find(samples: Samples) -> list[Finding]:
             continue
         real = (len(kept) - 1) / (sensor.time[kept[-1]] - sensor.time[kept[0]])
         rows = np.setdiff1d(np.arange(len(sensor)), kept)
-        found.append(Finding(
-            "data.resampled", sensor.rows(rows),
-            f"{name}: the log has {sensor.rate:.4g} Hz but {how}: the sensor's real rate is {real:.4g} Hz. The rows in "
-            "between are no measurements and are left out; log at the sensor's rate, and choose one of 50 Hz or more.",
-            without={name: rows},
-        ))  # fmt: skip
-    return found
+        findings.append(
+            Finding(
+                "data.resampled",
+                sensor.rows(rows),
+                f"{name}: the log has {sensor.rate:.4g} Hz but {how}: the sensor's real rate is {real:.4g} Hz. The "
+                "rows in between are no measurements and are left out; log at the sensor's rate, and choose one of "
+                "50 Hz or more.",
+                without={name: rows},
+            )
+        )
+    return findings
 
 
 def held_at(sensor: Sensor) -> Rows | None:
     """Return the rows at which new values come, where the log holds them for an even number of rows."""
     change = (sensor.difference != 0).any(axis=1)
-    share = float(change.mean())
-    if not 0.005 < share < 0.7:
-        return None
-    # held rows repeat in motion as well as at rest; coarse steps repeat at rest alone
-    moving = np.abs(sensor.difference).sum(axis=1) > 0
-    if moving.sum() < 50:
+    if not 0.005 < change.mean() < 0.7 or change.sum() < 50:
         return None
     new = np.concatenate([[0], np.flatnonzero(change) + 1])
     gaps = np.diff(new)
-    usual = float(np.median(gaps))
-    if usual < 2:
+    if np.median(gaps) < 2:
         return None
-    # a ratio of rates that is no whole number alternates between two neighbours
-    near = np.abs(gaps - np.mean(gaps[np.abs(gaps - usual) <= 1])) <= 1.01
-    return new if near.mean() > 0.85 else None
+    return new if _alike(gaps) > 0.85 else None
+
+
+def _alike(gaps: Rows) -> float:
+    """The share of numbers of rows that are the usual one: of rates without a whole ratio two neighbours alternate."""
+    usual = np.mean(gaps[np.abs(gaps - np.median(gaps)) <= 1])
+    return float(np.mean(np.abs(gaps - usual) <= 1.01))
 
 
 def interpolated_at(sensor: Sensor) -> Rows | None:
@@ -69,12 +71,10 @@ def interpolated_at(sensor: Sensor) -> Rows | None:
         return None
     knots = np.flatnonzero(bent) + 1
     gaps = np.diff(knots)
-    usual = float(np.median(gaps))
     # a knot between two rows bends the line twice
-    if usual < 2 and np.mean(gaps == 1) < 0.6:
+    if np.median(gaps) < 2 and np.mean(gaps == 1) < 0.6:
         knots = knots[np.concatenate([[True], gaps > 1])]
         gaps = np.diff(knots)
-        usual = float(np.median(gaps))
-    if usual < 2 or np.mean(np.abs(gaps - np.mean(gaps[np.abs(gaps - usual) <= 1])) <= 1.01) < 0.8:
+    if np.median(gaps) < 2 or _alike(gaps) < 0.8:
         return None
     return np.unique(np.concatenate([[0], knots]))

@@ -31,7 +31,7 @@ _LEAST, _HALF = 4.0, 0.5
 
 def find(samples: Samples) -> list[Finding]:
     """Return the samples that stand out from both sides."""
-    found = []
+    findings = []
     for name, sensor in samples.sensors.items():
         if name == "gyroscope" and sensor.dead_band is not None:  # what leaves the band is no outlier
             continue
@@ -43,13 +43,17 @@ def find(samples: Samples) -> list[Finding]:
         if not len(rows):
             continue
         largest = size(float(np.max(np.abs(sensor.curvature[rows]))), sensor.unit)
-        found.append(Finding(
-            "data.spikes", sensor.rows(rows),
-            f"{name}: {counted(len(rows), 'outlier')} of up to {largest} against the neighbours, first "
-            f"after {sensor.at(int(rows[0]))}: knocks, or errors of transfer. They are left out; up to "
-            f"{BRIDGED} in a row are bridged by interpolation.", without={name: rows},
-        ))  # fmt: skip
-    return found
+        findings.append(
+            Finding(
+                "data.spikes",
+                sensor.rows(rows),
+                f"{name}: {counted(len(rows), 'outlier')} of up to {largest} against the neighbours, first "
+                f"after {sensor.at(int(rows[0]))}: knocks, or errors of transfer. They are left out; up to "
+                f"{BRIDGED} in a row are bridged by interpolation.",
+                without={name: rows},
+            )
+        )
+    return findings
 
 
 def _outliers(sensor: Sensor) -> Rows:
@@ -65,11 +69,11 @@ def _outliers(sensor: Sensor) -> Rows:
     clusters = runs_of(flagged)
     if len(clusters) > _MOST:
         return np.zeros(0, np.int64)
-    found: list[int] = []
+    rows: list[int] = []
     for start, stop in clusters:
         if stop - start <= 2 * BRIDGED + 3:
-            found += _shortest(sensor.values, scale, int(start), int(stop), sensor.rate)
-    return np.unique(np.array(found, np.int64))
+            rows += _shortest(sensor.values, scale, int(start), int(stop), sensor.rate)
+    return np.unique(np.array(rows, np.int64))
 
 
 def _shortest(values: FloatArray, scale: FloatArray, start: int, stop: int, rate: float) -> list[int]:
@@ -121,15 +125,15 @@ def _turned(accelerometer: Sensor, gyroscope: Sensor, run: Rows) -> bool:
     bridged = logged.copy()
     bridged[run - rows[0]] += inside - gyroscope.values[run]
     beside = np.r_[:_NEAR, len(rows) - _NEAR : len(rows)]
-    place = time[beside] - time.mean()
-    estimate = np.linalg.pinv(np.stack([place > 0, place, np.ones(len(place))], axis=1))[0]
+    offset = time[beside] - time.mean()
+    estimate = np.linalg.pinv(np.stack([offset > 0, offset, np.ones(len(offset))], axis=1))[0]
     steps = []
     for rate in (logged, bridged):
         turns = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None])
         attitude, carried = Rotation.identity(), [force[0]]
-        for turn, each in zip(turns, force[1:], strict=True):
+        for turn, later in zip(turns, force[1:], strict=True):
             attitude = attitude * turn
-            carried.append(attitude.apply(each))
+            carried.append(attitude.apply(later))
         steps.append(float(np.linalg.norm(estimate @ np.array(carried)[beside])))
     noise = float(np.linalg.norm(estimate) * np.linalg.norm(accelerometer.noise))
     return steps[1] > _LEAST * noise and steps[0] < _HALF * steps[1]

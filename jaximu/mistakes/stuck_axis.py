@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.mistakes.base import Samples, Sensor, runs_of
+from jaximu.mistakes.base import HUNG, Samples, Sensor, runs_of
 from jaximu.mistakes.clipping import at_limits, stops
 from jaximu.mistakes.resampled import held_at
 from jaximu.recordings.finding import Finding
@@ -16,8 +16,8 @@ TITLES = {"data.stuck_axis": "stuck output"}
 
 _STUCK = 0.5
 """Seconds for which an axis may repeat one value while others change."""
-_HUNG, _LEAST_ROWS = 0.2, 10
-"""Seconds, and rows, for which a sensor may repeat all of its values."""
+_SHORTEST = 0.2
+"""Seconds for which a sensor may repeat all of its values, of `HUNG` rows at least."""
 
 
 def find(samples: Samples) -> list[Finding]:
@@ -28,14 +28,19 @@ def find(samples: Samples) -> list[Finding]:
 def _stuck(sensor: Sensor) -> list[Finding]:
     change = sensor.difference != 0
     if not change.any():
-        value = ", ".join(f"{each:.6g}" for each in sensor.values[0])
-        return [Finding(
-            "data.stuck_axis", (),
-            f"{sensor.name}: every row reads {value}. Nothing was measured: check its wiring and its columns, and "
-            "record again.", spoils=True, refuses=sensor.name,
-        )]  # fmt: skip
+        row = ", ".join(f"{value:.6g}" for value in sensor.values[0])
+        return [
+            Finding(
+                "data.stuck_axis",
+                (),
+                f"{sensor.name}: every row reads {row}. Nothing was measured: check its wiring and its columns, and "
+                "record again.",
+                spoils=True,
+                refuses=sensor.name,
+            )
+        ]
     length = max(20, round(_STUCK * sensor.rate))
-    found = []
+    findings = []
     for axis in range(3):
         values = sensor.values[:, axis]
         if sensor.coarse[axis] is not None:
@@ -46,9 +51,10 @@ def _stuck(sensor: Sensor) -> list[Finding]:
             continue
         limits = [tuple(run) for extreme in (values.max(), values.min()) for run in stops(values, extreme)]
         long = [
-            run for run in candidates
+            run
+            for run in candidates
             if others[run[0] : run[1]].mean() > 0.5 and not any(a <= run[0] and run[1] < b for a, b in limits)
-        ]  # fmt: skip
+        ]
         if long:
             first = np.array([run[0] for run in long])
             rows = np.concatenate([np.arange(run[0] + 1, run[1] + 1) for run in long])
@@ -64,38 +70,53 @@ def _stuck(sensor: Sensor) -> list[Finding]:
                 text += " The axis is dead for most of the recording: check its wiring, and record again."
             elif noisy:
                 text += " These rows are left out."
-            found.append(Finding("data.stuck_axis", sensor.rows(first), text, spoils=most and noisy,
-                                 without={sensor.name: rows} if noisy and not most else {}))  # fmt: skip
+            findings.append(
+                Finding(
+                    "data.stuck_axis",
+                    sensor.rows(first),
+                    text,
+                    spoils=most and noisy,
+                    without={sensor.name: rows} if noisy and not most else {},
+                )
+            )
     if held_at(sensor) is not None or sensor.dead_band is not None:
-        return found
+        return findings
     same = ~change.any(axis=1) & ~at_limits(sensor)[1:]
     coarse = [step is not None for step in sensor.coarse]
     hung = [] if all(coarse) else _hung(sensor, same)
     if hung:
         rows = np.concatenate([np.arange(start + 1, stop + 1) for start, stop in hung])
         first = np.array([start for start, _ in hung])
-        found.append(Finding(
-            "data.stuck_axis", sensor.rows(first),
-            f"{sensor.name}: all axes repeat one row for {len(rows) / sensor.rate:.3g} s in all, first after "
-            f"{sensor.at(int(first[0]))}: the sensor or its driver hung, or samples were lost and filled in. These "
-            "rows are left out.", without={sensor.name: rows},
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "data.stuck_axis",
+                sensor.rows(first),
+                f"{sensor.name}: all axes repeat one row for {len(rows) / sensor.rate:.3g} s in all, first after "
+                f"{sensor.at(int(first[0]))}: the sensor or its driver hung, or samples were lost and filled in. These "
+                "rows are left out.",
+                without={sensor.name: rows},
+            )
+        )
         same[rows - 1] = False
     alone = float(np.min(np.mean(~change, axis=0)))
     if max(0.02, 0.6 * alone) < np.mean(same) < 1 and not any(coarse):
         rows = np.flatnonzero(same) + 1
-        found.append(Finding(
-            "data.stuck_axis", sensor.rows(rows),
-            f"{sensor.name}: {100 * np.mean(same):.0f} % of the rows repeat the row before them: the log is faster "
-            "than the sensor, or samples were lost and filled in.",
-        ))  # fmt: skip
-    return found
+        findings.append(
+            Finding(
+                "data.stuck_axis",
+                sensor.rows(rows),
+                f"{sensor.name}: {100 * np.mean(same):.0f} % of the rows repeat the row before them: the log is faster "
+                "than the sensor, or samples were lost and filled in.",
+            )
+        )
+    return findings
 
 
 def _hung(sensor: Sensor, same: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the long runs of rows that repeat the row before them, where few others do."""
-    long = [(int(start), int(stop)) for start, stop in runs_of(same)
-            if stop - start >= max(_LEAST_ROWS, _HUNG * sensor.rate)]  # fmt: skip
+    long = [
+        (int(start), int(stop)) for start, stop in runs_of(same) if stop - start >= max(HUNG, _SHORTEST * sensor.rate)
+    ]
     rows = sum(stop - start for start, stop in long)
     others = (same.sum() - rows) / max(len(same) - rows, 1)
     return long if rows < 0.3 * len(same) and others < 0.1 else []

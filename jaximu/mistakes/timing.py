@@ -11,7 +11,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
-from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.recording import Recording
 
 __all__ = ["TITLES", "find", "in_bursts", "steady_clock"]
 
@@ -30,57 +30,76 @@ _SUDDEN = 0.3
 
 def find(samples: Samples) -> list[Finding]:
     """Return what is wrong with each sensor's stamps."""
-    found = []
+    findings = []
     for name, sensor in samples.sensors.items():
         if samples.shared and name == "gyroscope":
-            first = [finding for finding in found if finding.name in ("data.bursts", "data.time_scale")]
+            first = [finding for finding in findings if finding.name in ("data.bursts", "data.time_scale")]
             if first:  # said once for both
                 continue
-        found += _timing(name, sensor)
-    return found
+        findings += _timing(name, sensor)
+    return findings
 
 
 def _timing(name: str, sensor: Sensor) -> list[Finding]:
     interval = sensor.interval
     usual = sensor.period
     mean = float(np.mean(interval))
-    found = []
+    findings = []
     if in_bursts(interval):
         rate, lag = 1 / _clock(sensor.time)[1], float(np.quantile(interval, 0.99))
-        return [Finding(
-            "data.bursts", sensor.rows(np.flatnonzero(interval > 1.8 * mean)[:5] + 1),
-            f"{name}: the stamps come in bursts, {lag * 1e3:.3g} ms apart: they are the times of arrival at the host. "
-            f"A steady clock of {rate:.5g} Hz fitted to them replaces them; let the sensor's own clock be logged if it "
-            "can be.", apply=steady_clock,
-        )]  # fmt: skip
+        return [
+            Finding(
+                "data.bursts",
+                sensor.rows(np.flatnonzero(interval > 1.8 * mean)[:5] + 1),
+                f"{name}: the stamps come in bursts, {lag * 1e3:.3g} ms apart: they are the times of arrival at the "
+                f"host. A steady clock of {rate:.5g} Hz fitted to them replaces them; let the sensor's own clock be "
+                "logged if it can be.",
+                apply=steady_clock,
+            )
+        ]
     if not _SLOWEST <= 1 / mean <= _FASTEST:
-        found.append(Finding(
-            "data.time_scale", (),
-            f"{name}: {len(sensor)} samples in {sensor.time[-1] - sensor.time[0]:.4g} s are {1 / mean:.3g} a second: "
-            "the unit of the time column is wrong. Change it in the header or with --columns.", spoils=True,
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "data.time_scale",
+                (),
+                f"{name}: {len(sensor)} samples in {sensor.time[-1] - sensor.time[0]:.4g} s are {1 / mean:.3g} a "
+                "second: the unit of the time column is wrong. Change it in the header or with --columns.",
+                spoils=True,
+            )
+        )
     spread = float(np.std(interval[interval < 1.5 * usual]))
     uneven = spread > 0.1 * usual
     gaps = np.flatnonzero(interval > (2.5 if uneven else 1.6) * usual)
     if len(gaps):
         lost = int(np.sum(np.round(interval[gaps] / usual) - 1))
-        found.append(Finding(
-            "data.gap", sensor.rows(gaps + 1),
-            f"{name}: {counted(len(gaps), 'gap')}, {counted(lost, 'sample')} missing, the longest "
-            f"{interval.max():.3g} s, after "
-            f"{sensor.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across long gaps are left out.",
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "data.gap",
+                sensor.rows(gaps + 1),
+                f"{name}: {counted(len(gaps), 'gap')}, {counted(lost, 'sample')} missing, the longest "
+                f"{interval.max():.3g} s, after {sensor.time[gaps[np.argmax(interval[gaps])]]:.1f} s. Turns across "
+                "long gaps are left out.",
+            )
+        )
     if uneven:
         even = _smoother_evenly(sensor)
-        found.append(Finding(
-            "data.jitter", (),
-            f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / usual:.0f} % of "
-            + ("the interval, and the samples are smooth at even times: a steady clock fitted to the stamps replaces "
-               "them." if even else "the interval. If the sensor samples evenly, its own clock is better than the "
-               "logger's: leave the time column out (_ in --columns) and give --rate."),
-            apply=_evenly if even else None,
-        ))  # fmt: skip
-    return found
+        findings.append(
+            Finding(
+                "data.jitter",
+                (),
+                f"{name}: stamps jitter by {1e3 * spread:.2g} ms from sample to sample, {100 * spread / usual:.0f} % "
+                "of "
+                + (
+                    "the interval, and the samples are smooth at even times: a steady clock fitted to the stamps "
+                    "replaces them."
+                    if even
+                    else "the interval. If the sensor samples evenly, its own clock is better than the "
+                    "logger's: leave the time column out (_ in --columns) and give --rate."
+                ),
+                apply=_evenly if even else None,
+            )
+        )
+    return findings
 
 
 def _numbered(time: FloatArray) -> FloatArray | None:
@@ -93,10 +112,10 @@ def _numbered(time: FloatArray) -> FloatArray | None:
     if not slopes:
         return None
     period = float(np.median(slopes))
-    for place in breaks:
-        before = np.mean((time - period * number)[max(0, place - 20) : place])
-        after = np.mean((time - period * number)[place : place + 20])
-        number[place:] += max(0.0, np.round((after - before) / period))
+    for row in breaks:
+        delay = time - period * number
+        missing = np.round((np.mean(delay[row : row + 20]) - np.mean(delay[max(0, row - 20) : row])) / period)
+        number[row:] += max(0.0, missing)
     slope, start = np.polyfit(number, time, 1)
     return number if np.max(np.abs((time - start) / slope - number)) < 0.75 else None
 
@@ -105,11 +124,9 @@ def _evenly(recording: Recording) -> Recording:
     """Return the recording with jittering stamps of its triads replaced by those of a steady clock."""
     changed = {}
     for name in ("accelerometer", "gyroscope", "magnetometer"):
-        signal: Signal | None = getattr(recording, name)
-        if signal is None:
-            continue
-        number = None if len(signal) < 200 else _numbered(signal.time)
-        if number is not None:
+        signal = recording.signals.get(name)
+        number = None if signal is None or len(signal) < 200 else _numbered(signal.time)
+        if signal is not None and number is not None:
             slope, start = np.polyfit(number, signal.time, 1)
             changed[name] = replace(signal, time=start + slope * number)
     return replace(recording, **changed)
@@ -120,14 +137,13 @@ def _smoother_evenly(sensor: Sensor) -> bool:
     number = _numbered(sensor.time)
     if number is None or len(sensor) < 200:
         return False
-    size = []
-    for place in (number * sensor.period, sensor.time):
-        steps = np.diff(place)[:, None]
-        slope = sensor.difference / steps
+    bends = []
+    for time in (number * sensor.period, sensor.time):
+        slope = sensor.difference / np.diff(time)[:, None]
         bend = np.abs(np.diff(slope, axis=0)).sum(axis=1) * sensor.period
         moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * float(np.sum(sensor.noise))
-        size.append(float(np.median(bend[moving])) if moving.sum() > 50 else np.inf)
-    return size[0] < 0.8 * size[1]
+        bends.append(float(np.median(bend[moving])) if moving.sum() > 50 else np.inf)
+    return bends[0] < 0.8 * bends[1]
 
 
 def in_bursts(interval: FloatArray) -> bool:
@@ -153,25 +169,23 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
     index = np.arange(len(time), dtype=float)
     slope, start = np.polyfit(index, time, 1)
     fitted = start + slope * index
-    late = time - fitted
+    delay = time - fitted
     # what stays off the line from one sample on is a gap in the log, not a delay
     width = max(8, round(1.0 / max(slope, 1e-9)))
-    if np.ptp(late) > 20 * np.median(np.abs(late)) + 1e-9:
+    if np.ptp(delay) > 20 * np.median(np.abs(delay)) + 1e-9:
         steps = np.diff(time)
         breaks = np.flatnonzero(steps > 12 * np.quantile(steps, 0.99))
         edges = np.concatenate([[0], breaks + 1, [len(time)]])
         parts = [np.polyfit(index[a:b], time[a:b], 1) for a, b in pairwise(edges) if b - a > width]
         if parts:
             slope = float(np.median([part[0] for part in parts]))
-            fitted = np.concatenate([
-                np.median(time[a:b] - slope * index[a:b]) + slope * index[a:b]
-                for a, b in pairwise(edges)
-            ])  # fmt: skip
+            fitted = np.concatenate(
+                [np.median(time[a:b] - slope * index[a:b]) + slope * index[a:b] for a, b in pairwise(edges)]
+            )
             if np.any(np.diff(fitted) <= 0):
                 slope, start = np.polyfit(index, time, 1)
                 fitted = start + slope * index
-    late = time - fitted
-    early = [part.min() for part in np.array_split(late, max(1, len(late) // width))]
+    early = [part.min() for part in np.array_split(time - fitted, max(1, len(time) // width))]
     return fitted + float(np.median(early)), float(slope)
 
 

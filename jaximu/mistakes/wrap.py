@@ -17,7 +17,7 @@ TITLES = {"data.wrap": "integer overflow"}
 
 def find(samples: Samples) -> list[Finding]:
     """Return the axes that jump by their whole range and back."""
-    found = []
+    findings = []
     for name, sensor in samples.sensors.items():
         for axis in range(3):
             wrapped = _wrapped(sensor, axis)
@@ -34,13 +34,19 @@ def find(samples: Samples) -> list[Finding]:
                 return with_signal(recording, name, values=values)
 
             shown = f"{np.degrees(full):.4g} °/s" if name == "gyroscope" else f"{full:.4g} m/s²"
-            found.append(Finding(
-                "data.wrap", sensor.rows(rows),
-                f"{name} {'xyz'[axis]}: {counted(len(rows), 'sample')} jumped by the whole range of {shown} and back, "
-                f"first after {sensor.at(int(rows[0]))}: the integer overflowed. --repair adds the range back; without "
-                "it these rows are left out.", repair="--repair", apply=apply, without={name: rows},
-            ))  # fmt: skip
-    return found
+            findings.append(
+                Finding(
+                    "data.wrap",
+                    sensor.rows(rows),
+                    f"{name} {'xyz'[axis]}: {counted(len(rows), 'sample')} jumped by the whole range of {shown} and "
+                    f"back, first after {sensor.at(int(rows[0]))}: the integer overflowed. --repair adds the range "
+                    "back; without it these rows are left out.",
+                    repair="--repair",
+                    apply=apply,
+                    without={name: rows},
+                )
+            )
+    return findings
 
 
 def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None:

@@ -38,11 +38,15 @@ def find(samples: Samples) -> list[Finding]:
     first = samples.sensors[min(without, key=lambda name: without[name][0])]
     rows = np.unique(np.concatenate(list(without.values())))
     which = " and ".join(without)
-    return [Finding(
-        "data.zeros", first.rows(rows),
-        f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(int(rows[0]))}: the logger "
-        "wrote rows without a measurement. They are left out.", without=without,
-    )]  # fmt: skip
+    return [
+        Finding(
+            "data.zeros",
+            first.rows(rows),
+            f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(int(rows[0]))}: the "
+            "logger wrote rows without a measurement. They are left out.",
+            without=without,
+        )
+    ]
 
 
 def _interrupted(sensor: Sensor, zero: np.ndarray) -> np.ndarray:

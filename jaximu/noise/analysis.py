@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -57,45 +57,46 @@ class NoiseAnalysis(Described, Comparable):
     @property
     def lines(self) -> dict[str, list[tuple[PeriodicLine, ...]]]:
         """The periodic lines found, by triad and axis: frequency (Hz) and amplitude (SI)."""
-        return {name: [each.lines for each in found] for name, found in self.axes.items()}
+        return {name: [axis.lines for axis in axes] for name, axes in self.axes.items()}
 
     def summary(self) -> Summary:
         """Return the terms of each axis with their 95 % intervals in data-sheet units, and the notes."""
         rows = []
         for name, axes in self.axes.items():
             units, printed = SI_UNITS[SENSOR_QUANTITIES[name]], DATASHEET_UNITS[SENSOR_QUANTITIES[name]]
-            for axis, found in zip("xyz", axes, strict=True):
-                for letter, term in found.terms.items():
-                    if term is not None:
-                        value, low, high = (float(convert(each, units[letter], printed[letter]))
-                                            for each in (term.value, term.low, term.high))  # fmt: skip
-                        rows.append((f"{name} {axis}: {TERM_NAMES[letter]} ({letter})", number(value),
-                                     f"{number(low, 2)} to {number(high, 2)}", unit_text(printed[letter])))  # fmt: skip
+            for axis, identified in zip("xyz", axes, strict=True):
+                for letter, term in identified.terms.items():
+                    if term is None:
+                        continue
+                    what, unit = f"{name} {axis}: {TERM_NAMES[letter]} ({letter})", printed[letter]
+                    sizes = (term.value, term.low, term.high)
+                    value, low, high = (float(convert(size, units[letter], unit)) for size in sizes)
+                    rows.append((what, number(value), f"{number(low, 2)} to {number(high, 2)}", unit_text(unit)))
         rates = ", ".join(f"{name} {rate:.5g} Hz" for name, rate in self.rates.items())
         files = ", ".join(Path(file).name for file in self.files) or "a recording"
         table = Block(("noise term", "value", "95 % interval", "unit"), tuple(rows))
-        said = f"{len(rows)} noise terms are supported by the data ({rates})."
-        return Summary(f"Noise of {files}", (said,), table, self.notes)
+        verdict = f"{len(rows)} noise terms are supported by the data ({rates})."
+        return Summary(f"Noise of {files}", (verdict,), table, self.notes)
 
     def document(self) -> dict[str, Any]:
         """Return the analysis as the JSON document of schema `jaximu.allan/1`: SI, continuous, two-sided, 95 %."""
 
-        def axis(found: Identified, quantity: str) -> dict[str, Any]:
-            units = SI_UNITS[quantity]
+        def document(axis: Identified, units: Mapping[str, str]) -> dict[str, Any]:
             return {
-                "terms": {name: term and term.document(units[name]) for name, term in found.terms.items()},
-                "limits": {name: {"value": size, "unit": units[name]} for name, size in found.limits.items()},
-                "taus": found.deviation.tau.tolist(),
-                "deviation": found.deviation.value.tolist(),
-                "deviation_low": found.deviation.low.tolist(),
-                "deviation_high": found.deviation.high.tolist(),
-            } | ({} if found.high_pass is None else {"high_pass": found.high_pass.document("s")})
+                "terms": {name: term and term.document(units[name]) for name, term in axis.terms.items()},
+                "limits": {name: {"value": size, "unit": units[name]} for name, size in axis.limits.items()},
+                "taus": axis.deviation.tau.tolist(),
+                "deviation": axis.deviation.value.tolist(),
+                "deviation_low": axis.deviation.low.tolist(),
+                "deviation_high": axis.deviation.high.tolist(),
+            } | ({} if axis.high_pass is None else {"high_pass": axis.high_pass.document("s")})
 
-        document: dict[str, Any] = {"schema": SCHEMA}
-        for name, quantity in SENSOR_QUANTITIES.items():
-            found = self.axes.get(name)
-            document[name] = None if found is None else [axis(each, quantity) for each in found]
-        return document | {
+        return {
+            "schema": SCHEMA,
+            **{
+                name: [document(axis, SI_UNITS[quantity]) for axis in self.axes[name]] if name in self.axes else None
+                for name, quantity in SENSOR_QUANTITIES.items()
+            },
             "rate": self.rates,
             "repeatability": {
                 name: dict(zip(("value", "low", "high"), table.T.tolist(), strict=True))
@@ -151,31 +152,28 @@ def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
             continue
         corner = min((corner[name] for corner in corners if name in corner), default=None)
         try:
-            found, rate, said = _analysed(recordings, longest, name, corner and _BELOW * corner)
+            triad, rates[name], its_notes = _analysed(recordings, longest, name, corner and _BELOW * corner)
         except (InputError, NotPossibleError) as error:
             if name != "magnetometer":  # which may lie in a field that changes, or be logged in another way
                 raise
             notes.append(f"{error} The magnetometer was left out.")
             continue
-        notes += [*said, *_by_temperature(longest, name)]
-        axes[name], rates[name] = found, rate
-        notes += _taken_out(name, found)
-        strange = [
-            f"{axis} ({100 * each.excess:.0f} %)" for axis, each in zip("xyz", found, strict=True) if each.excess
-        ]
+        axes[name] = triad
+        notes += [*its_notes, *_by_temperature(longest, name), *_taken_out(name, triad)]
+        strange = [f"{axis} ({100 * it.excess:.0f} %)" for axis, it in zip("xyz", triad, strict=True) if it.excess]
         if strange:
             notes.append(
                 f"{name} {', '.join(strange)}: no combination of the five terms describes the deviation, by this "
-                "share of "
-                "its variance: a correlated process or a drift beside them. The intervals are widened for it; "
-                "look at the picture."
+                "share of its variance: a correlated process or a drift beside them. The intervals are widened for "
+                "it; look at the picture."
             )
     repeatability = {}
     if len(recordings) > 1:
         if len(recordings) < len({recording.name for recording in recordings}):
             raise InputError("a recording was given twice.")
         for name in axes:
-            means = np.array([getattr(each, name).si().mean(axis=0) for each in recordings if getattr(each, name)])
+            signals = [getattr(recording, name) for recording in recordings]
+            means = np.array([signal.si().mean(axis=0) for signal in signals if signal])
             if len(means) > 1:
                 freedom = len(means) - 1
                 spread = means.std(axis=0, ddof=1)
@@ -195,12 +193,12 @@ def _by_temperature(recording: Recording, name: str) -> list[str]:
     edges = np.linspace(0, len(signal), _SLOW + 1).astype(int)
     if celsius is None or len(signal) < 2 * _SLOW:
         return []
-    warm = np.interp(signal.time, celsius.time, celsius.values[:, 0])
-    means, warmth = (np.add.reduceat(values, edges[:-1], axis=0) / np.diff(edges).reshape(-1, *[1] * (values.ndim - 1))
-                     for values in (signal.si(), warm))  # fmt: skip
+    temperature = np.interp(signal.time, celsius.time, celsius.values[:, 0])
+    values = np.column_stack([signal.si(), temperature])
+    *means, warmth = (np.add.reduceat(values, edges[:-1], axis=0) / np.diff(edges)[:, None]).T
     if np.ptp(warmth) < _WARMED:
         return []
-    share = [float(np.corrcoef(warmth, axis)[0, 1] ** 2) for axis in means.T]
+    share = [float(np.corrcoef(warmth, axis)[0, 1] ** 2) for axis in means]
     if max(share) < _FOLLOWS:
         return []
     shares = ", ".join(f"{axis} {100 * part:.0f} %" for axis, part in zip("xyz", share, strict=True))
@@ -227,15 +225,15 @@ def _analysed(
             "before them, mirrored, and no difference of the deviation reaches over more than five in a row."
         )
     try:
-        found = identify(values, rate, highest=highest)
+        axes = identify(values, rate, highest=highest)
     except NotPossibleError as error:
         raise NotPossibleError(f"{what}: {error}") from error
-    assert isinstance(found, list)
+    assert isinstance(axes, list)
     if highest is not None:
         notes.append(
             f"{name}: its terms are those of the spectrum below {highest:.2g} Hz, where the filter does nothing."
         )
-    return found, rate, notes
+    return axes, rate, notes
 
 
 def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray, float]:
@@ -247,46 +245,46 @@ def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray
         raise NotPossibleError(f"{what} has only {len(signal)} samples.")
     interval = np.diff(signal.time)
     steps = np.maximum(1, np.round(interval / np.median(interval))).astype(np.int64)
-    place = np.concatenate([[0], np.cumsum(steps)])
-    slope, start = np.polyfit(place, signal.time, 1)
-    off = np.abs(signal.time - start - slope * place) / slope
+    index = np.concatenate([[0], np.cumsum(steps)])
+    slope, start = np.polyfit(index, signal.time, 1)
+    off = np.abs(signal.time - start - slope * index) / slope
     if np.mean(off > _UNEVEN) > 0.01:
         raise InputError(
             f"{what} is sampled unevenly: {100 * np.mean(off > _UNEVEN):.0f} % of its stamps are more than a quarter "
             "of an interval off an even grid. If the rate is steady and only the stamps are not, ignore their column "
             "(_ in --columns) and give --rate."
         )
-    values = np.full((signal.values.shape[1], place[-1] + 1), np.nan)
-    values[:, place] = signal.si().T
+    values = np.full((signal.values.shape[1], index[-1] + 1), np.nan)
+    values[:, index] = signal.si().T
     return values, float(1 / slope)
 
 
-def _taken_out(name: str, found: Sequence[Identified]) -> list[str]:
+def _taken_out(name: str, axes: Sequence[Identified]) -> list[str]:
     """Say what was found beside the noise and taken out of it before the analysis."""
     unit = SI_UNITS[SENSOR_QUANTITIES[name]]["B"]
     notes = []
-    spikes = [f"{axis} ({each.outliers})" for axis, each in zip("xyz", found, strict=True) if each.outliers]
+    spikes = [f"{axis} ({it.outliers})" for axis, it in zip("xyz", axes, strict=True) if it.outliers]
     if spikes:
         notes.append(f"{name} {', '.join(spikes)}: samples far off their neighbours are outliers and were replaced.")
-    for axis, each in zip("xyz", found, strict=True):
-        if each.lines:
-            lines = ", ".join(f"{line.frequency:.4g} Hz ({size(line.amplitude, unit, 2)})" for line in each.lines)
+    for axis, it in zip("xyz", axes, strict=True):
+        if it.lines:
+            lines = ", ".join(f"{line.frequency:.4g} Hz ({size(line.amplitude, unit, 2)})" for line in it.lines)
             notes.append(
                 f"{name} {axis}: periodic at {lines}, frequency after aliasing and amplitude; taken out. It is "
                 "vibration, the mains or a clock, and no noise of the sensor."
             )
-        if each.high_pass is not None:
-            time = each.high_pass
+        if it.high_pass is not None:
+            time = it.high_pass
             notes.append(
                 f"{name} {axis}: what is slow was taken out before it was logged, as by a high pass of "
                 f"{time.value:.2g} s ({time.low:.2g} to {time.high:.2g}): a driver that subtracts a running mean of "
                 "the bias, or zeroes it. A bias that is drawn back to its mean by itself looks alike. The terms are "
                 "those before it; the bias that is left wanders no further with time."
             )
-        if each.warm_up is not None:
+        if it.warm_up is not None:
             notes.append(
-                f"{name} {axis}: a warm-up of {size(each.warm_up.amplitude, unit, 2)} that decays in "
-                f"{each.warm_up.time_constant:.3g} s was taken out; let the unit run that long before it is used."
+                f"{name} {axis}: a warm-up of {size(it.warm_up.amplitude, unit, 2)} that decays in "
+                f"{it.warm_up.time_constant:.3g} s was taken out; let the unit run that long before it is used."
             )
     return notes
 
@@ -316,15 +314,15 @@ def _require_rest(values: FloatArray, rate: float, step: float, what: str) -> No
         return
     usual = float(np.median(scatter[scatter > 0]))
     moving = scatter > _MOVING * usual
-    said = f"{moving.sum()} of {len(moving)} seconds scatter more than {_MOVING:g} times the median one"
+    why = f"{moving.sum()} of {len(moving)} seconds scatter more than {_MOVING:g} times the median one"
     limit = 0.002
     if moving.mean() <= limit:
         steps = np.linalg.norm(np.diff(np.mean(whole, axis=2), axis=1), axis=0)
         moving = steps > max(6 * np.sqrt(2 * usual / length), step)
-        said = f"the means of {moving.sum()} of {len(moving)} pairs of seconds differ by far more than their scatter"
+        why = f"the means of {moving.sum()} of {len(moving)} pairs of seconds differ by far more than their scatter"
         limit = 0.01
     if moving.mean() > limit:
         raise NotPossibleError(
-            f"{what} did not rest: {said}, the first about {np.argmax(moving) * length / rate:.0f} s in. Record the "
+            f"{what} did not rest: {why}, the first about {np.argmax(moving) * length / rate:.0f} s in. Record the "
             "unit at rest, on something heavy, for an hour or more, and cut off the ends."
         )

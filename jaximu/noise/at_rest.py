@@ -5,10 +5,11 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes import Prepared, prepared
+from jaximu.mistakes.base import runs_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
 from jaximu.noise.analysis import at_rest
 from jaximu.noise.cleaning import BRIDGED, filled, periodic_lines
-from jaximu.recordings.recording import Recording, Signal, recordings_of
+from jaximu.recordings.recording import Recording, recordings_of
 
 __all__ = ["fit_noise", "noise_of"]
 
@@ -37,19 +38,20 @@ def fit_noise(recording: Recording) -> NoiseModel:
 
 def _of_ready(ready: Prepared) -> NoiseModel:
     """Return the noise of a recording that was looked over."""
-    recording, found = ready.recording, dict[str, AxisNoise]()
+    recording, axes = ready.recording, dict[str, AxisNoise]()
     notes = [finding.text for finding in ready.findings if finding.name not in _OF_ITS_OWN]
     for name in ("accelerometer", "gyroscope"):
-        signal: Signal | None = getattr(recording, name)
-        if signal is None:
+        if getattr(recording, name) is None:
             continue
         what = f"{recording.name}: the {name}"
         values, rate = at_rest(recording, name)
         values = np.stack([filled(axis, BRIDGED) for axis in values])
         whole = _longest_whole(values)
         if whole.shape[1] < values.shape[1]:
-            notes.append(f"{what} has gaps: its noise is that of the longest part without, "
-                         f"{whole.shape[1] / rate:.0f} of {values.shape[1] / rate:.0f} s.")  # fmt: skip
+            notes.append(
+                f"{what} has gaps: its noise is that of the longest part without, {whole.shape[1] / rate:.0f} of "
+                f"{values.shape[1] / rate:.0f} s."
+            )
         if whole.shape[1] < _FEWEST:
             raise NotPossibleError(
                 f"{what} has {whole.shape[1]} samples at rest without a gap, too few to model its noise: record "
@@ -63,12 +65,10 @@ def _of_ready(ready: Prepared) -> NoiseModel:
                 axis -= periodic
                 heard = ", ".join(f"{line.frequency:.4g} Hz" for line in lines)
                 notes.append(f"{what} is periodic at {heard} in the recording at rest; that is no noise, and left out.")
-        found[name] = fit_bank(whole, rate)
-    return NoiseModel(found["accelerometer"], found.get("gyroscope"), tuple(notes))
+        axes[name] = fit_bank(whole, rate)
+    return NoiseModel(axes["accelerometer"], axes.get("gyroscope"), tuple(notes))
 
 
 def _longest_whole(values: FloatArray) -> FloatArray:
-    lost = np.isnan(values).any(axis=0)
-    edges = np.flatnonzero(np.concatenate([[True], lost, [True]]))
-    place = int(np.argmax(np.diff(edges)))
-    return values[:, edges[place] : edges[place + 1] - 1]
+    first, last = max(runs_of(np.asarray(np.isfinite(values).all(axis=0))), key=np.ptp)
+    return values[:, first:last]

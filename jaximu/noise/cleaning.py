@@ -12,8 +12,9 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.mistakes.base import runs_of
 
-__all__ = ["BRIDGED", "PeriodicLine", "filled", "lowest", "periodic_lines", "without_outliers"]
+__all__ = ["BRIDGED", "PeriodicLine", "filled", "lowest", "periodic_lines", "without_line", "without_outliers"]
 
 BRIDGED = 5
 """Samples missing in a row that are filled in: a few in a thousand change no term, but would break long averages."""
@@ -76,8 +77,7 @@ def filled(values: FloatArray, longest: int | None = None) -> FloatArray:
     if not lost.any():
         return values
     values = values.copy()
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(int)))
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
+    for first, last in runs_of(lost):
         size = last - first
         if (longest is not None and size > longest) or first == 0 or last == len(values):
             continue
@@ -106,9 +106,7 @@ def periodic_lines(
     lines: list[PeriodicLine] = []
     spans: list[tuple[int, int]] = []
     periodic = None
-    place = np.arange(samples)
-    slope = 12 * np.dot(place - (samples - 1) / 2, values - values.mean()) / (samples * (samples**2 - 1.0))
-    rest = values - values.mean() - slope * (place - (samples - 1) / 2)
+    rest, _ = without_line(values)
     for _ in range(4):
         peaks, news = _peaks(rest, None if highest is None else round(highest / rate * samples)), False
         for low, peak, high in peaks:
@@ -132,6 +130,14 @@ def periodic_lines(
     return tuple(lines[i] for i in order), bands, periodic
 
 
+def without_line(values: FloatArray) -> tuple[FloatArray, float]:
+    """Return samples (n,) less the straight line through them, and its slope a sample."""
+    samples = len(values)
+    index, centred = np.arange(samples) - (samples - 1) / 2, values - values.mean()
+    slope = 12 * np.dot(index, centred) / (samples * (samples**2 - 1.0))
+    return centred - slope * index, float(slope)
+
+
 def _peaks(values: FloatArray, last: int | None) -> list[tuple[int, int, int]]:
     """Return first, highest and last of the ordinates of every peak of the tapered periodogram, the highest peak first.
 
@@ -149,19 +155,19 @@ def _peaks(values: FloatArray, last: int | None) -> list[tuple[int, int, int]]:
     factor = np.log(len(power) / _FALSE_LINE) / np.log(2)
     first = int(np.sqrt((edges[0] + 1.0) * (edges[1] + 1.0)))
     crude = np.repeat(median, np.diff(edges)) * (0.4 * factor)
-    place = edges[0] + np.flatnonzero(power[edges[0] : edges[-1]] > crude)
-    place = place[place >= first]
-    if not len(place):
+    high = edges[0] + np.flatnonzero(power[edges[0] : edges[-1]] > crude)
+    high = high[high >= first]
+    if not len(high):
         return []
     middle = np.log(np.sqrt((edges[:-1] + 1.0) * edges[1:]))
-    level = np.exp(np.interp(np.log(place + 1.0), middle, np.log(median)))
-    place = place[power[place] > factor * level]
-    found = []
-    for group in np.split(place, 1 + np.flatnonzero(np.diff(place) > 6)):
+    level = np.exp(np.interp(np.log(high + 1.0), middle, np.log(median)))
+    high = high[power[high] > factor * level]
+    peaks = []
+    for group in np.split(high, 1 + np.flatnonzero(np.diff(high) > 6)):
         if len(group):
-            low, high = _skirts(power, int(group[0]), int(group[-1]))
-            found.append((low + 1, int(group[np.argmax(power[group])]) + 1, high + 1))
-    return sorted(found, key=lambda each: -power[each[1] - 1])
+            low, last = _skirts(power, int(group[0]), int(group[-1]))
+            peaks.append((low + 1, int(group[np.argmax(power[group])]) + 1, last + 1))
+    return sorted(peaks, key=lambda peak: -power[peak[1] - 1])
 
 
 def _skirts(power: FloatArray, low: int, high: int) -> tuple[int, int]:
@@ -193,17 +199,18 @@ def _median_edges(count: int) -> NDArray[np.int64]:
 
 def lowest(function: Callable[[float], float], bounds: tuple[float, float], tolerance: float) -> float:
     """Return where a function is least between bounds."""
-    found = scipy.optimize.minimize_scalar(function, bounds=bounds, method="bounded", options={"xatol": tolerance})
-    return float(found["x"])  # pyright: ignore[reportIndexIssue]
+    return float(scipy.optimize.fminbound(function, *bounds, xtol=tolerance))
 
 
 def _wave(values: FloatArray, peak: int, rate: float) -> tuple[PeriodicLine, FloatArray]:
     """Return the line near ordinate `peak`, and its samples."""
     samples = len(values)
-    turn = np.exp(-2j * np.pi * peak / samples * np.arange(samples))
+    index = np.arange(samples)
+    turn = np.exp(-2j * np.pi * peak / samples * index)
+    taper = 0.5 - 0.5 * np.cos(2 * np.pi * (index + 0.5) / samples)
     size = max(1, samples // 4096)
     blocks = samples // size
-    mixed = values * turn * (0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(samples) + 0.5) / samples))
+    mixed = values * turn * taper
     coarse = mixed[: blocks * size].reshape(blocks, size).sum(axis=1)
     middle = (np.arange(blocks) * size + (size - 1) / 2) / samples
 
@@ -211,7 +218,6 @@ def _wave(values: FloatArray, peak: int, rate: float) -> tuple[PeriodicLine, Flo
         return -float(np.abs(np.sum(coarse * np.exp(-2j * np.pi * shift * middle))))
 
     shift = lowest(height, (-1.0, 1.0), 1e-7)
-    turn = turn * np.exp(-2j * np.pi * shift / samples * np.arange(samples))
-    taper = 0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(samples) + 0.5) / samples)
+    turn = turn * np.exp(-2j * np.pi * shift / samples * index)
     phasor = 2 * np.sum(values * turn * taper) / np.sum(taper)
     return PeriodicLine((peak + shift) * rate / samples, float(np.abs(phasor))), np.asarray((phasor * turn.conj()).real)

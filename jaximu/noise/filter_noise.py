@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.model.data_sheet import SI_UNITS
@@ -63,19 +64,17 @@ def mean_terms(axes: Sequence[Identified]) -> dict[str, MeanTerm | None]:
     from those of the axes, taken to be independent, each side of its own; what an axis without the term may hide is not
     in it.
     """
-    made: dict[str, MeanTerm | None] = {}
-    for name in axes[0].terms if axes else ():
-        found = [(letter, axis.terms[name]) for letter, axis in zip("xyz", axes, strict=False)]
-        seen = [(letter, term) for letter, term in found if term is not None and term.value > 0]
-        if not seen:
-            made[name] = None
-            continue
-        squares = np.array([(t.low, t.value, min(t.high, 1e20 * t.value)) for _, t in seen]) ** 2  # finite if open
-        mean = float(squares[:, 1].sum() / len(axes))
-        below, above = (float(np.sqrt(np.sum((squares[:, 1] - squares[:, end]) ** 2))) / len(axes) for end in (0, 2))
-        low, high = math.sqrt(max(mean - below, 0.0)), math.sqrt(mean + above)
-        made[name] = MeanTerm(math.sqrt(mean), low, high, "".join(letter for letter, _ in seen))
-    return made
+    return {name: _mean_term([axis.terms[name] for axis in axes]) for name in (axes[0].terms if axes else ())}
+
+
+def _mean_term(terms: Sequence[Term | None]) -> MeanTerm | None:
+    present = {axis: term for axis, term in zip("xyz", terms, strict=False) if term is not None and term.value > 0}
+    if not present:
+        return None
+    squares = np.array([(t.low, t.value, min(t.high, 1e20 * t.value)) for t in present.values()]) ** 2  # finite if open
+    mean = float(squares[:, 1].sum() / len(terms))
+    below, above = (float(np.sqrt(np.sum((squares[:, 1] - squares[:, end]) ** 2))) / len(terms) for end in (0, 2))
+    return MeanTerm(math.sqrt(mean), math.sqrt(max(mean - below, 0.0)), math.sqrt(mean + above), "".join(present))
 
 
 @dataclass(frozen=True)
@@ -155,18 +154,38 @@ class FilterNumbers:
             ("white_density", "N²", "white noise, continuous", self.white**2 or None, f"{squared}/Hz"),
             ("walk_density", "K²", "bias random walk, continuous", self.walk**2 or None, f"({walk})^2/Hz"),
             ("driving_density", "2B²/T", "Gauss–Markov drive, continuous", self.driving_density, f"({walk})^2/Hz"),
-            ("measurement_variance", "R = N²/Δt", "one sample as a measurement", self.measurement_variance or None,
-             squared),
-            *([] if word is None else [
-                ("integral_variance", "Q = N²Δt", f"{word} a step, if integrated", self.integral_variance or None,
-                 f"({integral})^2" if "/" in integral else f"{integral}^2")]),
+            (
+                "measurement_variance",
+                "R = N²/Δt",
+                "one sample as a measurement",
+                self.measurement_variance or None,
+                squared,
+            ),
+            *(
+                []
+                if word is None
+                else [
+                    (
+                        "integral_variance",
+                        "Q = N²Δt",
+                        f"{word} a step, if integrated",
+                        self.integral_variance or None,
+                        f"({integral})^2" if "/" in integral else f"{integral}^2",
+                    )
+                ]
+            ),
             ("walk_variance", "Q = K²Δt", "bias random walk a step", self.walk_variance or None, squared),
             ("bias_sigma", "B", "Gauss–Markov bias, std. deviation", self.sigma or None, signal),
-            ("correlation_time", "T", "its correlation time, chosen", self.correlation_time if self.sigma else None,
-             "s"),
+            (
+                "correlation_time",
+                "T",
+                "its correlation time, chosen",
+                self.correlation_time if self.sigma else None,
+                "s",
+            ),
             ("decay", "φ = exp(−Δt/T)", "its decay a step", self.decay, "1"),
             ("driving_variance", "Q = B²(1−φ²)", "its drive a step", self.driving_variance, squared),
-        ]  # fmt: skip
+        ]
 
     def document(self) -> dict[str, Any]:
         """Return the numbers with their units for JSON; null where the data supports no such term."""
@@ -202,14 +221,17 @@ def filter_numbers(analysis: NoiseAnalysis, name: str) -> tuple[list[FilterNumbe
     axes = analysis.axes[name]
     by_axis = [{k: term.value for k, term in axis.terms.items() if term is not None} for axis in axes]
     mean = {k: term.value for k, term in mean_terms(axes).items() if term is not None}
-    made = [_numbers(each, axes[0], SENSOR_QUANTITIES[name], analysis.rates[name]) for each in (*by_axis, mean)]
-    return made[:-1], made[-1]
+    tau = axes[0].deviation.tau
+    *numbers, of_mean = (
+        _numbers(sizes, tau, SENSOR_QUANTITIES[name], analysis.rates[name]) for sizes in (*by_axis, mean)
+    )
+    return numbers, of_mean
 
 
-def _numbers(sizes: Mapping[str, float], found: Identified, quantity: str, rate: float) -> FilterNumbers:
+def _numbers(sizes: Mapping[str, float], tau: FloatArray, quantity: str, rate: float) -> FilterNumbers:
     flat = time = None
     if sizes.get("B", 0.0) > 0:
-        flat = flat_part(sizes, float(found.deviation.tau[0]), float(found.deviation.tau[-1]))
+        flat = flat_part(sizes, float(tau[0]), float(tau[-1]))
         time = math.sqrt(flat[0] * flat[1]) / PEAK
     white, walk, sigma = (sizes.get(letter, 0.0) for letter in "NKB")
     return FilterNumbers(quantity, rate, white, walk, sigma, time, flat)
@@ -217,25 +239,23 @@ def _numbers(sizes: Mapping[str, float], found: Identified, quantity: str, rate:
 
 def filter_document(analysis: NoiseAnalysis) -> dict[str, Any]:
     """Return the key `filter` of `allan.json`: by triad the rate, the numbers of three axes and of their mean."""
-    made: dict[str, Any] = {}
-    for name in SENSOR_QUANTITIES:
-        if name not in analysis.axes:
-            made[name] = None
-            continue
+
+    def of_triad(name: str) -> dict[str, Any]:
         axes, mean = filter_numbers(analysis, name)
-        made[name] = {
+        return {
             "rate": analysis.rates[name],
-            "axes": [each.document() for each in axes],
+            "axes": [numbers.document() for numbers in axes],
             "mean": mean.document(),
         }
-    return made
+
+    return {name: of_triad(name) if name in analysis.axes else None for name in SENSOR_QUANTITIES}
 
 
-def recorded_seconds(found: Identified) -> float:
+def recorded_seconds(axis: Identified) -> float:
     """Return the length (s) that the deviation was computed from, long gaps not counted."""
-    each = found.deviation
-    samples = int(np.atleast_1d(each.count)[..., 0].max()) + 2 * int(each.factor[0]) - 1
-    return samples * float(each.tau[0]) / int(each.factor[0])
+    deviation = axis.deviation
+    samples = int(deviation.count[0]) + 2 * int(deviation.factor[0]) - 1
+    return samples * float(deviation.tau[0]) / int(deviation.factor[0])
 
 
 @dataclass(frozen=True)
@@ -256,23 +276,30 @@ def random_walk_only(analysis: NoiseAnalysis, name: str) -> Walk:
     B makes over times shorter than its correlation time T: B √(2/T). Otherwise the upper limit of K. The axes' root
     mean square is returned.
     """
-    values, origin = [], []
-    for axis, numbers in zip(analysis.axes[name], filter_numbers(analysis, name)[0], strict=True):
+
+    def walk(axis: Identified, numbers: FilterNumbers) -> tuple[float, str]:
         if numbers.walk > 0:
-            values.append(numbers.walk)
-            origin.append("measured")
-        elif numbers.driving_density:
-            values.append(math.sqrt(numbers.driving_density))
-            origin.append("from B")
-        else:
-            values.append(axis.limits["K"])
-            origin.append("upper limit")
-    return Walk(float(np.sqrt(np.mean(np.square(values)))), tuple(origin))
+            return numbers.walk, "measured"
+        if numbers.driving_density:
+            return math.sqrt(numbers.driving_density), "from B"
+        return axis.limits["K"], "upper limit"
+
+    return _root_mean_square(
+        [
+            walk(axis, numbers)
+            for axis, numbers in zip(analysis.axes[name], filter_numbers(analysis, name)[0], strict=True)
+        ]
+    )
+
+
+def _root_mean_square(axes: Sequence[tuple[float, str]]) -> Walk:
+    values, origin = zip(*axes, strict=True)
+    return Walk(float(np.sqrt(np.mean(np.square(values)))), origin)
 
 
 def white_noise_only(analysis: NoiseAnalysis, name: str) -> Walk:
     """Return one white-noise density for a triad (signal unit · √s): root mean square of N, or of its upper limit."""
     terms = [(axis, axis.terms.get("N")) for axis in analysis.axes[name]]
-    values = [axis.limits["N"] if term is None else term.value for axis, term in terms]
-    origin = tuple("upper limit" if term is None else "measured" for _, term in terms)
-    return Walk(float(np.sqrt(np.mean(np.square(values)))), origin)
+    return _root_mean_square(
+        [(axis.limits["N"], "upper limit") if term is None else (term.value, "measured") for axis, term in terms]
+    )

@@ -27,7 +27,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov
-from jaximu.noise.cleaning import BRIDGED, PeriodicLine, filled, lowest, periodic_lines, without_outliers
+from jaximu.noise.cleaning import BRIDGED, PeriodicLine, filled, lowest, periodic_lines, without_line, without_outliers
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation
 
 __all__ = ["TERMS", "GaussMarkov", "Identified", "Term", "WarmUp", "identify"]
@@ -48,6 +48,8 @@ _UNLIKELY = 1e-3
 """Probability of a misfit below which the terms do not describe the noise."""
 _OVERWHELMING = 40.0
 """Twice the gain in log likelihood from which a drift is a warm-up and no walk."""
+_NO_STRETCH = "gaps leave no stretch whole that is long enough to identify noise."
+_CONSTANT = "the signal is constant, or quantised to whole steps: there is no noise to identify."
 
 
 @dataclass(frozen=True)
@@ -110,8 +112,8 @@ class Identified:
         variance = _basis(tau * rate, rate, "".join(self.terms)) @ theta
         if self.high_pass is not None:
             variance = variance - _held_back(tau, rate, dict(zip(self.terms, theta, strict=True)), self.high_pass.value)
-        for each in self.gauss_markov:
-            process = FirstOrderGaussMarkov.of(each.sigma.value, each.correlation_time.value)
+        for markov in self.gauss_markov:
+            process = FirstOrderGaussMarkov.of(markov.sigma.value, markov.correlation_time.value)
             variance = variance + process.allan_variance(tau)
         return np.sqrt(variance)
 
@@ -152,11 +154,10 @@ def identify(
     data = np.asarray(values, float)
     if np.isinf(data).any():
         raise InputError("the signal holds infinite values.")
-    if data.ndim == 2:
-        return [_identify(axis, rate, terms, confidence, gauss_markov, highest) for axis in data]
-    if data.ndim != 1:
+    if data.ndim not in (1, 2):
         raise InputError(f"values must be (n,) or (axes, n), found shape {data.shape}.")
-    return _identify(data, rate, terms, confidence, gauss_markov, highest)
+    axes = [_identify(axis, rate, terms, confidence, gauss_markov, highest) for axis in np.atleast_2d(data)]
+    return axes if data.ndim == 2 else axes[0]
 
 
 def _identify(
@@ -167,10 +168,10 @@ def _identify(
         raise NotPossibleError(f"{samples} samples are too few to identify noise; record at least {_SHORTEST}.")
     there = np.flatnonzero(~np.isnan(values))
     if len(there) < _SHORTEST:
-        raise NotPossibleError("gaps leave no stretch whole that is long enough to identify noise.")
+        raise NotPossibleError(_NO_STRETCH)
+    if np.ptp(values[there]) == 0:
+        raise NotPossibleError(_CONSTANT)
     values = values[there[0] : there[-1] + 1]
-    if np.ptp(values[there - there[0]]) == 0:
-        raise NotPossibleError("the signal is constant, or quantised to whole steps: there is no noise to identify.")
     values, outliers = without_outliers(values)
     whole = filled(values)  # for the spectrum; the deviation leaves long gaps out
     lines, bands, periodic = periodic_lines(whole, rate, highest)
@@ -184,9 +185,9 @@ def _identify(
         drift = warm_up.amplitude * np.exp(-np.arange(len(whole)) / (rate * warm_up.time_constant))
         whole, values = whole - drift, values - drift
         spectrum = _spectrum(whole, rate, bands)
-    found = _deviation(filled(values, BRIDGED), rate, confidence)
-    if not (found.value > 0).all():
-        raise NotPossibleError("the signal is constant, or quantised to whole steps: there is no noise to identify.")
+    measured = _deviation(filled(values, BRIDGED), rate, confidence)
+    if not (measured.value > 0).all():
+        raise NotPossibleError(_CONSTANT)
     threshold = float(chi2_isf(1 - confidence, 1)) / 2
     # How far the most general model is off, octave by octave, then which of its terms are needed
     general = _fit(_Model(spectrum, terms, _times(spectrum, terms, markov)))
@@ -203,13 +204,12 @@ def _identify(
         excess = _excess(general, freedom)
     best = _select(replace(general.model, excess=excess), offered)
     result: dict[str, Term | None] = dict.fromkeys(terms)
-    for place, term in enumerate(best.model.letters):
-        result[term] = _term(best, place, threshold)
+    for index, term in enumerate(best.model.letters):
+        result[term] = _term(best, index, threshold)
     if best.model.ramp:
         low, high = _bounds(best, -1, threshold)
-        slope = best.ramp
         ends = sorted((abs(low), abs(high)))
-        result["R"] = Term(abs(slope), ends[0] if low * high > 0 else 0.0, ends[1])
+        result["R"] = Term(abs(best.ramp), ends[0] if low * high > 0 else 0.0, ends[1])
     first = len(best.model.letters)
     processes = tuple(
         GaussMarkov(_term(best, first + 2 * i, threshold), _term(best, first + 2 * i + 1, threshold, power=1.0))
@@ -217,7 +217,8 @@ def _identify(
     )
     limits = {term: _limit(best, term, threshold) for term in offered if result[term] is None}
     misfit, freedom = replace(best, model=replace(best.model, excess=0.0)).misfit()
-    return Identified(result, found, (misfit, freedom), limits, excess, lines, warm_up, outliers, high_pass, processes)
+    quality = misfit, freedom
+    return Identified(result, measured, quality, limits, excess, lines, warm_up, outliers, high_pass, processes)
 
 
 def _deviation(values: FloatArray, rate: float, confidence: float) -> Deviation:
@@ -229,7 +230,7 @@ def _deviation(values: FloatArray, rate: float, confidence: float) -> Deviation:
         except NotPossibleError:
             if not np.isnan(values).any():
                 raise
-    raise NotPossibleError("gaps leave no stretch whole that is long enough to identify noise.")
+    raise NotPossibleError(_NO_STRETCH)
 
 
 def _basis(factors: FloatArray, rate: float, terms: Sequence[str]) -> FloatArray:
@@ -253,9 +254,11 @@ def _held_back(tau: FloatArray, rate: float, theta: dict[str, float], time_const
     frequency = np.geomspace(1e-6 / tau.max(), rate / 2, 1000)
     half = np.pi * frequency / rate
     density = (
-        theta.get("N", 0.0) + theta.get("B", 0.0) / (2 * np.pi * frequency)
-        + theta.get("K", 0.0) / (4 * np.sin(half) ** 2 * rate**2) + theta.get("Q", 0.0) * rate * 4 * np.sin(half) ** 2
-    )  # fmt: skip
+        theta.get("N", 0.0)
+        + theta.get("B", 0.0) / (2 * np.pi * frequency)
+        + theta.get("K", 0.0) / (4 * np.sin(half) ** 2 * rate**2)
+        + theta.get("Q", 0.0) * rate * 4 * np.sin(half) ** 2
+    )
     density = density * (1 - _passed(2 * half * rate, time_constant))
     kernel = np.sin(np.pi * frequency * tau[:, None]) ** 4 / (tau[:, None] * rate * np.sin(half)) ** 2
     return np.asarray(4 * np.trapezoid(density * kernel, frequency))
@@ -301,18 +304,18 @@ class _Spectrum:
     def ramp(self) -> FloatArray:
         """Coefficients (J,) of a ramp of slope one per second, √density."""
         # d/dω of Σ sin ω(k + ½) = sin²(ωn/2)/sin(ω/2), at ω = πj/n
-        place = np.arange(1, len(self.coefficient) + 1)
-        half = np.pi * place / (2 * self.samples)
-        sums = np.where(place % 2 == 1, -np.cos(half) / (2 * np.sin(half) ** 2), 0.0)
+        j = np.arange(1, len(self.coefficient) + 1)
+        half = np.pi * j / (2 * self.samples)
+        sums = np.where(j % 2 == 1, -np.cos(half) / (2 * np.sin(half) ** 2), 0.0)
         return np.sqrt(2 / self.samples) * sums / self.rate**1.5
 
     def decay(self, time_constant: float) -> FloatArray:
         """Coefficients (J,) of exp(−t/time_constant), √density."""
         # the real part of Σ a^k e^{iω(k + ½)}, a geometric series
-        place = np.arange(1, len(self.coefficient) + 1)
+        j = np.arange(1, len(self.coefficient) + 1)
         p = 1 / (self.rate * time_constant)
-        half = np.pi * place / (2 * self.samples)
-        ends = 1 - (-1.0) ** place * np.exp(-p * self.samples)
+        half = np.pi * j / (2 * self.samples)
+        ends = 1 - (-1.0) ** j * np.exp(-p * self.samples)
         sums = -np.expm1(-p) * np.cos(half) * ends / (np.expm1(-p) ** 2 + 4 * np.exp(-p) * np.sin(half) ** 2)
         return np.sqrt(2 / self.samples) * sums / np.sqrt(self.rate)
 
@@ -334,11 +337,8 @@ def _bins(samples: int) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64
 
 def _spectrum(values: FloatArray, rate: float, bands: Sequence[tuple[float, float]]) -> _Spectrum:
     """Transform the samples, leaving out bands of frequency (Hz)."""
-    samples = len(values)
-    place = np.arange(samples) - (samples - 1) / 2
-    centred = values - values.mean()
-    slope = 12 * np.dot(place, centred) / (samples * (samples**2 - 1.0))
-    coefficient = np.asarray(scipy.fft.dct(centred - slope * place, norm="ortho"), np.float64) / np.sqrt(rate)
+    rest, slope = without_line(values)
+    coefficient = np.asarray(scipy.fft.dct(rest, norm="ortho"), np.float64) / np.sqrt(rate)
     return _binned(coefficient, rate, slope * rate, bands)
 
 
@@ -358,9 +358,16 @@ def _binned(coefficient: FloatArray, rate: float, slope: float, bands: Sequence[
     inside = number[np.searchsorted(edges, np.arange(1, low + 1), side="right") - 1]
     inside = np.where(keep[1 : low + 1] > 0, inside, -1)
     return _Spectrum(
-        samples, rate, count[used], sums[used] / count[used], node[used], octave[used], coefficient[1 : low + 1],
-        inside, float(slope),
-    )  # fmt: skip
+        samples,
+        rate,
+        count[used],
+        sums[used] / count[used],
+        node[used],
+        octave[used],
+        coefficient[1 : low + 1],
+        inside,
+        float(slope),
+    )
 
 
 def _column(spectrum: _Spectrum, term: str) -> FloatArray:
@@ -486,12 +493,9 @@ class _Problem:
             self.drift = spectrum.slope * spectrum.ramp()
             self.power = self.power + spectrum.products(2 * spectrum.coefficient + self.drift, self.drift)
         low = spectrum.coefficient + self.drift
-        self.cross = np.stack([spectrum.products(low, row) for row in rows], axis=1) if rows else None
-        self.gram = (
-            np.stack([np.stack([spectrum.products(a, b) for b in rows], axis=1) for a in rows], axis=1)
-            if rows
-            else None
-        )
+        bins = len(spectrum.count)
+        self.cross = np.reshape([spectrum.products(low, row) for row in rows], (-1, bins)).T
+        self.gram = np.reshape([spectrum.products(a, b) for a in rows for b in rows], (len(rows), len(rows), bins)).T
 
     def variance(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Variance (B,), and its derivative (B, parameters) over it."""
@@ -510,21 +514,16 @@ class _Problem:
 
     def sizes(self, variance: FloatArray, fixed: float | None) -> FloatArray:
         """Sizes of the drifts by least squares."""
-        if self.cross is None or self.gram is None:
-            return np.zeros(0)
         weight = self.weight / variance
         gram = np.einsum("b,bij->ij", weight, self.gram)
         cross = weight @ self.cross
         if fixed is None:
             scale = np.sqrt(np.diag(gram))
             return np.linalg.solve(gram / np.outer(scale, scale), cross / scale) / scale
-        others = np.linalg.solve(gram[1:, 1:], cross[1:] - gram[1:, 0] * fixed) if len(cross) > 1 else np.zeros(0)
-        return np.concatenate([[fixed], others])
+        return np.concatenate([[fixed], np.linalg.solve(gram[1:, 1:], cross[1:] - gram[1:, 0] * fixed)])
 
     def residual(self, sizes: FloatArray) -> FloatArray:
         """Mean squares (B,) about the drifts."""
-        if self.cross is None or self.gram is None:
-            return self.power
         power = self.power - 2 * self.cross @ sizes + np.einsum("bij,i,j->b", self.gram, sizes, sizes)
         return np.maximum(power, 0.0)
 
@@ -537,10 +536,10 @@ class _Problem:
             mean = np.bincount(spectrum.octave, spectrum.count * column)
             return float(np.log(max(np.min(power[mean > 0] / mean[mean > 0]), 1e-290)))
 
-        found = [largest(column) for column in self.columns.T]
+        theta = [largest(column) for column in self.columns.T]
         for time in self.model.times:
-            found += [largest(_markov(spectrum, time) @ _WEIGHT), float(np.log(time))]
-        return np.array(found)
+            theta += [largest(_markov(spectrum, time) @ _WEIGHT), float(np.log(time))]
+        return np.array(theta)
 
     def solve(
         self, theta: FloatArray, held: int | None = None, ramp: float | None = None, iterations: int = 80
@@ -567,10 +566,10 @@ class _Problem:
             step = np.clip(np.linalg.solve(part, slope[live]), -2.0, 2.0)
             trial = theta.copy()
             trial[free[live]] += step
-            found = evaluate(trial)
-            if found[3] <= loss:
-                gain = loss - found[3]
-                theta, (shares, sizes, ratio, loss) = trial, found
+            *parts, trial_loss = evaluate(trial)
+            if trial_loss <= loss:
+                gain = loss - trial_loss
+                theta, (shares, sizes, ratio), loss = trial, parts, trial_loss
                 damping = max(damping / 10, 1e-9)
                 if gain < 1e-7 and np.abs(step).max() < 1e-2:
                     break
@@ -588,13 +587,13 @@ def _fit(model: _Model, theta: FloatArray | None = None) -> _Fit:
 
 def _times(spectrum: _Spectrum, terms: str, count: int) -> tuple[float, ...]:
     """Correlation times of Gauss–Markov processes to start from, one after the other the best of a grid."""
-    found: tuple[float, ...] = ()
+    times: tuple[float, ...] = ()
     grid = np.geomspace(2 / spectrum.rate, spectrum.samples / spectrum.rate / 6, 16)
     for _ in range(count):
-        fits = [_fit(_Model(spectrum, terms, (*found, time))) for time in grid]
+        fits = [_fit(_Model(spectrum, terms, (*times, time))) for time in grid]
         best = min(fits, key=lambda fit: fit.loss)
-        found = tuple(np.exp(best.theta[len(best.model.letters) + 1 :: 2]).tolist())
-    return found
+        times = tuple(np.exp(best.theta[len(best.model.letters) + 1 :: 2]).tolist())
+    return times
 
 
 def _select(general: _Model, terms: str) -> _Fit:
@@ -640,59 +639,63 @@ def _root(function: Callable[[float], float], low: float, high: float, tolerance
     return float(scipy.optimize.brentq(function, low, high, xtol=tolerance))  # pyright: ignore[reportArgumentType]
 
 
-def _bounds(fit: _Fit, place: int, threshold: float) -> tuple[float, float]:
-    """Return where the profile of −log L has risen by `threshold`, for a parameter, or the ramp (place −1)."""
+def _bounds(fit: _Fit, index: int, threshold: float) -> tuple[float, float]:
+    """Return where the profile of −log L has risen by `threshold`, for a parameter, or the ramp (index −1)."""
     problem = _Problem(fit.model)
-    ramp = place < 0
+    ramp = index < 0
     if ramp:
         weight = problem.weight / problem.variance(fit.theta)[0]
-        assert problem.gram is not None
         centre, spread = fit.sizes[0], 1 / np.sqrt(weight @ problem.gram[:, 0, 0])
     else:
         fisher = 0.5 * fit.shares.T @ (problem.weight[:, None] * fit.shares)
         scale = np.sqrt(np.diag(fisher))
         inverse = np.linalg.pinv(fisher / np.outer(scale, scale))
-        centre, spread = fit.theta[place], min(np.sqrt(inverse[place, place]) / scale[place], 3.0)
+        centre, spread = fit.theta[index], min(np.sqrt(inverse[index, index]) / scale[index], 3.0)
         # a variance known from few coefficients, 2 spread⁻² of them: −2 log L scatters more than χ² (M. S. Bartlett,
         # Proc. R. Soc. A 160, 1937)
         threshold = threshold * (1 + spread**2 / 6)
     offset = fit.model.spectrum.slope if ramp else 0.0
-    found = []
-    for sign in (-1, 1):
 
-        def rise(distance: float, sign=sign) -> float:
+    def end(sign: int) -> float:
+        def rise(distance: float) -> float:
             at = centre + sign * distance * spread
-            theta = fit.theta.copy()
-            if not ramp:
-                theta[place] = at
-            return problem.solve(theta, None if ramp else place, at if ramp else None).loss - fit.loss - threshold
+            if ramp:
+                return problem.solve(fit.theta, ramp=at).loss - fit.loss - threshold
+            return _held_at(problem, fit, index, at).loss - fit.loss - threshold
 
         far = np.sqrt(2 * threshold) * 1.2
         while rise(far) < 0 and far < 200:
             far *= 1.6
-        found.append(float(centre + sign * _root(rise, 0.0, far, 1e-3) * spread + offset))
-    return found[0], found[1]
+        return float(centre + sign * _root(rise, 0.0, far, 1e-3) * spread + offset)
+
+    return end(-1), end(1)
 
 
-def _term(fit: _Fit, place: int, threshold: float, power: float = 0.5) -> Term:
-    low, value, high = np.exp(power * np.array([*_bounds(fit, place, threshold), fit.theta[place]])[[0, 2, 1]])
+def _held_at(problem: _Problem, fit: _Fit, index: int, value: float) -> _Fit:
+    """Maximise the likelihood, from a fit on, with one parameter held at a value."""
+    theta = fit.theta.copy()
+    theta[index] = value
+    return problem.solve(theta, index)
+
+
+def _term(fit: _Fit, index: int, threshold: float, power: float = 0.5) -> Term:
+    low, high = np.exp(power * np.array(_bounds(fit, index, threshold)))
+    value = np.exp(power * fit.theta[index])
     return Term(float(value), float(low) if low > 1e-3 * value else 0.0, float(high))  # open towards zero
 
 
 def _limit(fit: _Fit, term: str, threshold: float) -> float:
     """How large a term could be beside those of a fit: where the profile of −log L has risen by `threshold`."""
-    beside = _fit(replace(fit.model, terms="".join(each for each in TERMS if each in fit.model.terms + term)))
+    beside = _fit(replace(fit.model, terms="".join(letter for letter in TERMS if letter in fit.model.terms + term)))
     if term == "R":
         return max(map(abs, _bounds(beside, -1, threshold)))
-    problem, place = _Problem(beside.model), beside.model.letters.index(term)
-    most = problem.start()[place]
+    problem, index = _Problem(beside.model), beside.model.letters.index(term)
+    most = problem.start()[index]
 
     def rise(at: float) -> float:
-        theta = beside.theta.copy()
-        theta[place] = at
-        return problem.solve(theta, place).loss - beside.loss - threshold
+        return _held_at(problem, beside, index, at).loss - beside.loss - threshold
 
-    return float(np.exp(_root(rise, max(beside.theta[place], most - 25), most + 12, 1e-2) / 2))
+    return float(np.exp(_root(rise, max(beside.theta[index], most - 25), most + 12, 1e-2) / 2))
 
 
 def _high_pass(general: _Fit, threshold: float) -> Term | None:
@@ -708,23 +711,32 @@ def _high_pass(general: _Fit, threshold: float) -> Term | None:
         passed = replace(spectrum, high_pass=float(np.exp(logarithm)))
         return _fit(replace(general.model, spectrum=passed, terms=general.model.terms.replace("R", "")))
 
-    losses = [at(logarithm).loss for logarithm in grid]
-    best = int(np.argmin(losses))
-    if 2 * (general.loss - losses[best]) < chi2_isf(_UNLIKELY / len(grid), 1):
+    def loss(logarithm: float) -> float:
+        return at(logarithm).loss
+
+    losses = list(map(loss, grid))
+    if 2 * (general.loss - min(losses)) < chi2_isf(_UNLIKELY / len(grid), 1):
         return None
-    ends = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    middle = float(lowest(lambda logarithm: at(logarithm).loss, ends, 1e-3))
+    middle = lowest(loss, _around_least(grid, losses), 1e-3)
     fit = at(middle)
     misfit, freedom = fit.misfit()
     if misfit > chi2_isf(_UNLIKELY, freedom):
         return None
 
-    def rise(distance: float) -> float:
-        return at(middle + distance).loss - fit.loss - threshold
+    def end(sign: int) -> float:
+        def rise(distance: float) -> float:
+            return loss(middle + sign * distance) - fit.loss - threshold
 
-    far = float(np.ptp(grid))
-    low, high = (sign * _root(lambda distance, sign=sign: rise(sign * distance), 0.0, far, 1e-3) for sign in (-1, 1))
+        return sign * _root(rise, 0.0, float(np.ptp(grid)), 1e-3)
+
+    low, high = end(-1), end(1)
     return Term(*np.exp([middle, middle + low, middle + high]).tolist())
+
+
+def _around_least(grid: FloatArray, losses: Sequence[float]) -> tuple[float, float]:
+    """Return the points of a grid on either side of the least loss."""
+    best = int(np.argmin(losses))
+    return grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
 
 
 def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
@@ -755,9 +767,7 @@ def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
     losses = [loss(np.log(time)) for time in grid]
     if 2 * (without.loss - min(losses)) < _OVERWHELMING:
         return None
-    place = int(np.argmin(losses))
-    bounds = (np.log(grid[max(place - 1, 0)]), np.log(grid[min(place + 1, len(grid) - 1)]))
-    time = float(np.exp(lowest(loss, bounds, 1e-4)))
+    time = float(np.exp(lowest(loss, _around_least(np.log(grid), losses), 1e-4)))
     fit = _fit(replace(without.model, extra=spectrum.decay(time)))
     misfit, freedom = fit.misfit()
     if misfit > chi2_isf(_UNLIKELY, freedom):
