@@ -119,8 +119,9 @@ def read_limits(path: str | os.PathLike[str], rule: str | None = None, risk: flo
     kind, level = rule or document.get("rule", "guarded"), document.get("risk", 0.05) if risk is None else risk
     if isinstance(level, bool) or not isinstance(level, int | float):
         raise InputError(f"{name}: the risk is a number such as 0.05, not {level!r}.")
-    return Limits(limits, Rule(kind, float(level)), _nominal(document.get("nominal", {}), name), name,
-                  file_digest(path))  # fmt: skip
+    return Limits(
+        limits, Rule(kind, float(level)), _nominal(document.get("nominal", {}), name), name, file_digest(path)
+    )
 
 
 def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
@@ -130,18 +131,18 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
     bounds = [name for name in ("within", "low", "high", "typical") if name in entry]
     if not bounds or (len(bounds) > 1 and bounds != ["low", "high"]):
         raise InputError(f"{where}: state one of `within`, `typical`, or `low` and `high`; found {bounds or 'none'}.")
-    found = {name: _value(entry[name], base, f"{where}.{name}") for name in bounds}
+    sizes = {name: _value(entry[name], base, f"{where}.{name}") for name in bounds}
     source = str(entry.get("source", source))
-    if "typical" in found:
-        found["within"] = TYPICAL * found["typical"]
+    if "typical" in sizes:
+        sizes["within"] = TYPICAL * sizes["typical"]
         source = f"{source or 'data sheet'}: {TYPICAL:g} times the typical value {entry['typical']}"
-    if "within" in found:
-        if not found["within"] > 0:
-            raise InputError(f"{where}: the limit must be greater than zero, found {found['within']:g} {base}.")
-        found["high"] = found["within"]
+    if "within" in sizes:
+        if not sizes["within"] > 0:
+            raise InputError(f"{where}: the limit must be greater than zero, found {sizes['within']:g} {base}.")
+        sizes["high"] = sizes["within"]
         if part not in FROM_ALLAN:  # what is positive by nature has no lower limit
-            found["low"] = -found["within"]
-    low, high = found.get("low", -math.inf), found.get("high", math.inf)
+            sizes["low"] = -sizes["within"]
+    low, high = sizes.get("low", -math.inf), sizes.get("high", math.inf)
     if low >= high:
         raise InputError(
             f"{where}: the limits contradict each other: the lower, {low:g}, is not below {high:g} {base}."
@@ -171,15 +172,19 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
     """Return the triad, the quantity, the axes and the unit that a key means."""
     match = _KEY.fullmatch(key)
     name = match[1] if match else ""
-    axes = tuple(int(each) for each in match.groups()[1:] if each) if match else ()
+    axes = tuple(int(digit) for digit in match.groups()[1:] if digit) if match else ()
     owner, _, part = name.partition(".")
     if name in CATALOGUE:
         effect = CATALOGUE[name]
         if effect.scope != "device" or len(axes) > 1 or (axes and axes[0] >= effect.size):
             raise InputError(f"{where}: an effect of the device, such as {name}[{effect.size - 1}], may be limited.")
         return effect.owner, name, axes, effect.coefficient_unit(SENSOR_UNITS[effect.owner])
-    if owner == "navigation" and part in _NAVIGATION and all(axis <= 2 for axis in axes) and (
-        len(axes) <= (part == "position")):  # fmt: skip
+    if (
+        owner == "navigation"
+        and part in _NAVIGATION
+        and all(axis <= 2 for axis in axes)
+        and (len(axes) <= (part == "position"))
+    ):
         return owner, part, axes, _NAVIGATION[part]
     if owner not in SENSOR_QUANTITIES or part not in (*_PARTS, *"QNBKR"):
         raise InputError(
@@ -187,8 +192,11 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
             "accelerometer, gyroscope and magnetometer (accelerometer.bias), effects (accel.quadratic), and "
             "navigation.position and navigation.heading."
         )
-    if any(axis > 2 for axis in axes) or (axes and len(axes) != 1 + (part == "misalignment")) or (
-        part == "misalignment" and len(set(axes)) == 1):  # fmt: skip
+    if (
+        any(axis > 2 for axis in axes)
+        or (axes and len(axes) != 1 + (part == "misalignment"))
+        or (part == "misalignment" and len(set(axes)) == 1)
+    ):
         raise InputError(f"{where}: axes are [0], [1], [2]; of a misalignment two that differ, [1,0].")
     base = (
         SI_UNITS[SENSOR_QUANTITIES[owner]][part] if part in "QNBKR" else {"scale": "1", "misalignment": "rad"}.get(part)
@@ -215,41 +223,41 @@ def _value(stated: Any, base: str, where: str) -> float:
 
 def _range(stated: Any, where: str) -> tuple[float, float]:
     """Return two temperatures in °C."""
-    found = []
-    for each in stated if isinstance(stated, list) else [stated]:
-        match = _NUMBER.fullmatch(each) if isinstance(each, str) else None
+    temperatures = []
+    for end in stated if isinstance(stated, list) else [stated]:
+        match = _NUMBER.fullmatch(end) if isinstance(end, str) else None
         if match is None or not match[2]:
-            raise InputError(f'{where}: {each!r} needs a number with its unit: ["-10 degC", "60 degC"].')
+            raise InputError(f'{where}: {end!r} needs a number with its unit: ["-10 degC", "60 degC"].')
         kind = unit(match[2], "temperature", file=where)
-        found.append(kind.factor * float(match[1]) + kind.offset)
-    if len(found) != 2 or found[0] >= found[1]:
+        temperatures.append(kind.factor * float(match[1]) + kind.offset)
+    if len(temperatures) != 2 or temperatures[0] >= temperatures[1]:
         raise InputError(f'{where}: give the lowest and the highest temperature: ["-10 degC", "60 degC"].')
-    return found[0], found[1]
+    return temperatures[0], temperatures[1]
 
 
 def _nominal(stated: Any, name: str) -> dict[str, tuple[FloatArray, FloatArray]]:
     if not isinstance(stated, dict):
         raise InputError(f'{name}: below [nominal] stand scales such as accelerometer = "2048 count/g".')
     only(stated, (*_NAMES, *(f"{owner}_offset" for owner in _NAMES)), f"{name}, [nominal]")
-    found = {}
+    nominal = {}
     for owner, quantity in _NAMES.items():
         if owner in stated:
             where = f"{name}, nominal.{owner}"
             scale = parse_scale(stated[owner], quantity, where)
             offset = parse_offset(stated.get(f"{owner}_offset", 0.0), f"{where}_offset")
-            found[owner] = np.broadcast_to(scale, 3), np.broadcast_to(offset, 3)
+            nominal[owner] = np.broadcast_to(scale, 3), np.broadcast_to(offset, 3)
         elif f"{owner}_offset" in stated:
             raise InputError(f"{name}: nominal.{owner}_offset needs the scale beside it, nominal.{owner}.")
-    return found
+    return nominal
 
 
 def _refuse_contradictions(limits: tuple[Limit, ...], name: str) -> None:
     """Refuse the limit of an axis that nothing can keep together with the one of all axes."""
-    whole = {(each.owner, each.part): each for each in limits if not each.axes}
-    for each in limits:
-        other = whole.get((each.owner, each.part), each)
-        if each.low > other.high or each.high < other.low:
+    whole = {(limit.owner, limit.part): limit for limit in limits if not limit.axes}
+    for limit in limits:
+        other = whole.get((limit.owner, limit.part), limit)
+        if limit.low > other.high or limit.high < other.low:
             raise InputError(
-                f"{name}: {each.key} ({each.low:g} to {each.high:g} {each.unit}) and {other.key} ({other.low:g} to "
+                f"{name}: {limit.key} ({limit.low:g} to {limit.high:g} {limit.unit}) and {other.key} ({other.low:g} to "
                 f"{other.high:g}) contradict each other: nothing keeps both."
             )

@@ -31,8 +31,16 @@ from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes.titles import effect_title
 
-__all__ = ["Difference", "Fleet", "Population", "Stranger", "days_of", "estimate_population", "read_fleet",
-           "write_shrunk"]  # fmt: skip
+__all__ = [
+    "Difference",
+    "Fleet",
+    "Population",
+    "Stranger",
+    "days_of",
+    "estimate_population",
+    "read_fleet",
+    "write_shrunk",
+]
 
 FEWEST = 8
 """Units from which a population is spoken of."""
@@ -43,8 +51,24 @@ _LEVEL = 0.01
 """Probability of one false alarm in the whole fleet, for each kind of question."""
 _ROUNDS = 200
 _YEAR = 365.25  # days
-_COLUMNS = ("device", "file", "status", "verdict", "effects", "date", "lot", "accel_gain", "accel_bias", "gyro_gain",
-            "gyro_bias", "accel_nominal", "gyro_nominal", "covariance", "accel_rms", "gyro_rms")  # fmt: skip
+_COLUMNS = (
+    "device",
+    "file",
+    "status",
+    "verdict",
+    "effects",
+    "date",
+    "lot",
+    "accel_gain",
+    "accel_bias",
+    "gyro_gain",
+    "gyro_bias",
+    "accel_nominal",
+    "gyro_nominal",
+    "covariance",
+    "accel_rms",
+    "gyro_rms",
+)
 
 
 @dataclass(frozen=True)
@@ -164,7 +188,9 @@ class Fleet(Document):
             "verdicts": dict(sorted(self.verdicts.items())),
             "effects": dict(self.effects.most_common()),
             "failed": [{"reason": reason, "files": files} for reason, files in self.failed.items()],
-            "population": None if population is None else {
+            "population": None
+            if population is None
+            else {
                 "units": population.count,
                 "parameters": list(population.names),
                 "mean": population.mean.tolist(),
@@ -172,18 +198,27 @@ class Fleet(Document):
                 "covariance": population.covariance.tolist(),
             },
             "strangers": [
-                {"device": each.device, "file": each.file, "p_value": each.p_value,
-                 "parameters": [{"name": n, "value": v, "deviations": z} for n, v, z in each.parameters]}
-                for each in self.strangers
+                {
+                    "device": stranger.device,
+                    "file": stranger.file,
+                    "p_value": stranger.p_value,
+                    "parameters": [{"name": n, "value": v, "deviations": z} for n, v, z in stranger.parameters],
+                }
+                for stranger in self.strangers
             ],
             "differences": [
-                {"kind": each.kind, "group": each.group, "count": each.count, "p_value": each.p_value,
-                 "text": each.text,
-                 "parameters": [{"name": n, "amount": a, "sigma": s} for n, a, s in each.parameters]}
-                for each in self.differences
+                {
+                    "kind": difference.kind,
+                    "group": difference.group,
+                    "count": difference.count,
+                    "p_value": difference.p_value,
+                    "text": difference.text,
+                    "parameters": [{"name": n, "amount": a, "sigma": s} for n, a, s in difference.parameters],
+                }
+                for difference in self.differences
             ],
             "notes": list(self.notes),
-        }  # fmt: skip
+        }
 
 
 # --- the population ---------------------------------------------------------------------------------------------------
@@ -199,17 +234,17 @@ def estimate_population(names: Sequence[Name], values: FloatArray, covariances: 
     if count < FEWEST:
         raise NotPossibleError(f"{count} calibrated units are too few for a population: it takes {FEWEST} or more.")
     mean = np.median(values, axis=0)
-    own = np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0)
+    noise = np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0)
     scatter = np.square(1.4826 * np.median(np.abs(values - mean), axis=0))
-    covariance = np.diag(np.maximum(scatter - own, 0.01 * scatter + 1e-18))
+    covariance = np.diag(np.maximum(scatter - noise, 0.01 * scatter + 1e-18))
     limit = float(scipy.stats.chi2.isf(_LEVEL / count, size))
     kept = np.zeros(count, bool)
     for _ in range(10):
-        distance = Population(tuple(names), mean, covariance, own, count).distances(values, covariances)
-        again = distance <= max(limit, float(np.median(distance)))
-        if (again == kept).all():
+        distance = Population(tuple(names), mean, covariance, noise, count).distances(values, covariances)
+        belongs = distance <= max(limit, float(np.median(distance)))
+        if (belongs == kept).all():
             break
-        kept = again
+        kept = belongs
         mean, covariance = _maximise(values[kept], covariances[kept], mean, covariance)
     return Population(tuple(names), mean, covariance, np.std(values[kept], axis=0, ddof=1), int(kept.sum()))
 
@@ -220,9 +255,9 @@ def _maximise(values, covariances, mean, covariance):
     for _ in range(_ROUNDS):
         # posteriors as in `Population.shrink`, of which only sums are needed
         weights = np.linalg.inv(covariance + covariances)
-        found = mean + np.einsum("nij,nj->ni", weights, values - mean) @ covariance
-        better = found.mean(axis=0)
-        rest = found - better
+        means = mean + np.einsum("nij,nj->ni", weights, values - mean) @ covariance
+        better = means.mean(axis=0)
+        rest = means - better
         summed = rest.T @ rest + count * covariance - covariance @ weights.sum(axis=0) @ covariance
         # p units without correlations: what keeps the matrix regular when there are hardly more units than parameters
         fresh = (summed + size * np.diag(np.diagonal(summed) / count)) / (count + size)
@@ -248,12 +283,14 @@ class _Units:
 
 def _units(rows: Sequence[dict[str, Any]], gyroscope: bool) -> _Units:
     """Bring calibrated rows to one scale: gains in nominal scales, biases as inputs in SI."""
-    places = free_places(gyroscope)
+    indices = free_places(gyroscope)
     count, size = len(rows), len(PARAMETERS)
     raw, factor, offset = np.zeros((count, size)), np.ones((count, size)), np.zeros((count, size))
     for start, name in ((0, "accel"), (12, "gyro"))[: 1 + gyroscope]:
-        gain, bias, nominal = (np.array([row[f"{name}_{part}"] for row in rows], float).reshape(count, -1)
-                               for part in ("gain", "bias", "nominal"))  # fmt: skip
+        gain, bias, nominal = (
+            np.array([row[f"{name}_{part}"] for row in rows], float).reshape(count, -1)
+            for part in ("gain", "bias", "nominal")
+        )
         raw[:, start : start + 9], raw[:, start + 9 : start + 12] = gain, bias
         factor[:, start : start + 9] = np.repeat(nominal[:, :3], 3, axis=1)
         factor[:, start + 9 : start + 12] = nominal[:, :3]
@@ -261,8 +298,8 @@ def _units(rows: Sequence[dict[str, Any]], gyroscope: bool) -> _Units:
     whole = covariances(np.array([row["covariance"] for row in rows], float).reshape(count, -1))
     whole = whole / factor[:, :, None] / factor[:, None, :]
     relative = (raw - offset) / factor
-    grid = np.ix_(range(count), places, places)
-    return _Units(tuple(PARAMETERS[place] for place in places), relative[:, places], whole[grid], list(rows))
+    grid = np.ix_(range(count), indices, indices)
+    return _Units(tuple(PARAMETERS[index] for index in indices), relative[:, indices], whole[grid], list(rows))
 
 
 def _groups(path: Path, gyroscope: bool, columns: Sequence[str] | None = None) -> Iterator[list[dict[str, Any]]]:
@@ -305,19 +342,32 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
         )
     step = max(1, -(-total // _MOST))
     kept: list[dict[str, Any]] = []
-    seen = 0
+    passed = 0
     for rows in _groups(path, gyroscope, _COLUMNS):
-        kept += [row for number, row in enumerate(rows, seen) if number % step == 0]
-        seen += len(rows)
+        kept += [row for number, row in enumerate(rows, passed) if number % step == 0]
+        passed += len(rows)
     if step > 1:
         notes.append(f"the population was estimated from {len(kept)} of {total} units, evenly taken.")
     empty = np.empty((0, 0))
-    failed = dict(sorted(failed.items(), key=lambda each: -len(each[1])))
+    failed = dict(sorted(failed.items(), key=lambda pair: -len(pair[1])))
     base: dict[str, Any] = {
-        "table": os.fspath(table), "recordings": sum(statuses.values()), "statuses": statuses, "verdicts": verdicts,
-        "effects": effects, "failed": failed, "population": None, "strangers": (), "differences": (), "values": empty,
-        "shrunk": empty, "sigma": empty, "shrunk_sigma": empty, "lots": (), "shifts": None, "rms": empty,
-    }  # fmt: skip
+        "table": os.fspath(table),
+        "recordings": sum(statuses.values()),
+        "statuses": statuses,
+        "verdicts": verdicts,
+        "effects": effects,
+        "failed": failed,
+        "population": None,
+        "strangers": (),
+        "differences": (),
+        "values": empty,
+        "shrunk": empty,
+        "sigma": empty,
+        "shrunk_sigma": empty,
+        "lots": (),
+        "shifts": None,
+        "rms": empty,
+    }
     if len(kept) < FEWEST:
         return Fleet(**base, notes=(*notes, f"fewer than {FEWEST} calibrated units: no population."))
     units = _units(kept, gyroscope)
@@ -327,13 +377,13 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     population = estimate_population(units.names, centred, units.covariances)
     differences += _repeated(units) + _shared_effects(units)
     shrunk, spread = population.shrink(centred, units.covariances)
-    rms = [[each["accel_rms"], np.nan if each["gyro_rms"] is None else each["gyro_rms"]] for each in kept]
+    rms = [[row["accel_rms"], np.nan if row["gyro_rms"] is None else row["gyro_rms"]] for row in kept]
     return Fleet(
         **base
         | {
             "population": population,
             "strangers": _strangers(path, gyroscope, population, shifts, total),
-            "differences": tuple(sorted(differences, key=lambda each: each.p_value)),
+            "differences": tuple(sorted(differences, key=lambda difference: difference.p_value)),
             "values": units.values,
             "shrunk": shrunk + shift,
             "sigma": np.sqrt(np.diagonal(units.covariances, axis1=1, axis2=2)),
@@ -355,7 +405,7 @@ def _names(units: _Units) -> list[str]:
 
 def _strangers(path: Path, gyroscope: bool, population: Population, shifts: Shifts, total: int):
     """Units farther from the population, or from their lot and date, than one in a hundred fleets would have."""
-    found = []
+    strangers = []
     for rows in _groups(path, gyroscope, _COLUMNS):
         if not rows:
             continue
@@ -363,22 +413,22 @@ def _strangers(path: Path, gyroscope: bool, population: Population, shifts: Shif
         centred = units.values - shifts.of(rows)
         distances = population.distances(centred, units.covariances)
         p_values = scipy.stats.chi2.sf(distances, len(population.names)) * total
-        for place in np.flatnonzero(p_values < _LEVEL):
-            own = np.diagonal(units.covariances[place])
-            z = (centred[place] - population.mean) / np.sqrt(np.diagonal(population.covariance) + own)
+        for index in np.flatnonzero(p_values < _LEVEL):
+            variance = np.diagonal(units.covariances[index])
+            z = (centred[index] - population.mean) / np.sqrt(np.diagonal(population.covariance) + variance)
             worst = np.argsort(-np.abs(z))[:3]
-            named = tuple((population.names[k], float(units.values[place, k]), float(z[k])) for k in worst)
-            row = units.rows[place]
-            found.append(Stranger(row["device"], row["file"], float(min(1.0, p_values[place])), named))
-    return tuple(sorted(found, key=lambda each: each.p_value))
+            named = tuple((population.names[k], float(units.values[index, k]), float(z[k])) for k in worst)
+            row = units.rows[index]
+            strangers.append(Stranger(row["device"], row["file"], float(min(1.0, p_values[index])), named))
+    return tuple(sorted(strangers, key=lambda stranger: stranger.p_value))
 
 
 def days_of(dates: Sequence[str | None]) -> FloatArray:
     """Return dates (n,) in days since 1970; NaN where there is none."""
     days = np.full(len(dates), np.nan)
-    for place, date in enumerate(dates):
+    for index, date in enumerate(dates):
         with suppress(ValueError):
-            days[place] = np.datetime64(date or "NaT").astype("datetime64[s]").astype(float) / 86400
+            days[index] = np.datetime64(date or "NaT").astype("datetime64[s]").astype(float) / 86400
     return np.where(days > -1e8, days, np.nan)  # no date is a very large negative number
 
 
@@ -403,8 +453,8 @@ class _Groups:
         names, counts = np.unique(lots[lots != ""], return_counts=True)
         names = tuple(names[counts >= 3].tolist())
         names = names if len(names) > 1 else ()
-        places = {name: place for place, name in enumerate(names)}
-        lot = np.array([places.get(each, len(names)) for each in lots.tolist()])
+        indices = {name: index for index, name in enumerate(names)}
+        lot = np.array([indices.get(name, len(names)) for name in lots.tolist()])
         return cls(names, lot, (days - middle) / _YEAR if dated else np.full(len(days), np.nan), middle)
 
     @property
@@ -428,21 +478,21 @@ class _Groups:
         By medians, so that a stranger moves nothing.
         """
         values, years = values - np.median(values, axis=0), np.array(self.years)
-        for place in range(len(self.names) + 1):
-            own = self.lot == place
-            if own.sum() >= 3:
+        for index in range(len(self.names) + 1):
+            members = self.lot == index
+            if members.sum() >= 3:
                 # a centre of its own takes one unit away
-                stretch = np.sqrt(own.sum() / (own.sum() - 1))
-                values[own] = (values[own] - np.median(values[own], axis=0)) * stretch
-            if np.isfinite(years[own]).any():
-                years[own] -= np.nanmedian(years[own])
+                stretch = np.sqrt(members.sum() / (members.sum() - 1))
+                values[members] = (values[members] - np.median(values[members], axis=0)) * stretch
+            if np.isfinite(years[members]).any():
+                years[members] -= np.nanmedian(years[members])
         order = np.argsort(years)[: int(np.isfinite(years).sum())]
-        early, late = order[: len(order) // 2], order[(len(order) + 1) // 2 :]
-        apart = years[late] - years[early]
+        earlier, later = order[: len(order) // 2], order[(len(order) + 1) // 2 :]
+        apart = years[later] - years[earlier]
         if not (apart > 0).any():
             return values
         far = apart >= np.median(apart[apart > 0])
-        slope = np.median((values[late[far]] - values[early[far]]) / apart[far, None], axis=0)
+        slope = np.median((values[later[far]] - values[earlier[far]]) / apart[far, None], axis=0)
         return values - np.nan_to_num(years)[:, None] * slope
 
 
@@ -461,29 +511,31 @@ def _lots_and_dates(units: _Units) -> tuple[list[Difference], Shifts]:
     inside = estimate_population(units.names, within, units.covariances)
     limit = scipy.stats.chi2.isf(_LEVEL / len(within), size)
     usual = inside.distances(within, units.covariances) <= limit
-    told: dict[int, list[tuple[float, tuple[Name, float, float]]]] = {}
+    findings: dict[int, list[tuple[float, tuple[Name, float, float]]]] = {}
     for k, name in enumerate(units.names):
         weight = usual / (inside.covariance[k, k] + units.covariances[:, k, k])
         for cause, amount, sigma, p_value in _causes(groups, units.values[:, k], weight, size):
-            told.setdefault(cause, []).append((p_value, (name, amount, sigma)))
+            findings.setdefault(cause, []).append((p_value, (name, amount, sigma)))
             if cause == len(groups.names):
                 shifts.drift[k] = amount
             else:
                 shifts.lots.setdefault(groups.names[cause], np.zeros(size))[k] = amount
-    found = []
-    for cause, each in told.items():
-        each.sort(key=lambda one: one[0])
+    differences = []
+    for cause, entries in findings.items():
+        entries.sort(key=lambda one: one[0])
         if cause == len(groups.names):
             known = groups.years[np.isfinite(groups.years)]
-            first, last = (str(np.datetime64(round((year * _YEAR + groups.middle) * 86400), "s"))[:10]
-                           for year in (known.min(), known.max()))  # fmt: skip
+            first, last = (
+                str(np.datetime64(round((year * _YEAR + groups.middle) * 86400), "s"))[:10]
+                for year in (known.min(), known.max())
+            )
             kind, group, count = "date", f"{first} to {last}", len(known)
             text = f"parameters drift with the date of the recording, {first} to {last}"
         else:
             kind, group, count = "lot", groups.names[cause], int(np.sum(groups.lot == cause))
             text = f"lot {group} ({count} units) differs from the other lots"
-        found.append(Difference(kind, group, count, each[0][0], tuple(one for _, one in each), text))
-    return found, shifts
+        differences.append(Difference(kind, group, count, entries[0][0], tuple(one for _, one in entries), text))
+    return differences, shifts
 
 
 def _causes(
@@ -511,7 +563,7 @@ def _causes(
         if (p_values >= _LEVEL).any():  # what was taken after it explains it
             given_up.append(taken.pop(int(np.argmax(p_values))))
             continue
-        crossed = np.stack([groups.products(weight * each) for each in design])
+        crossed = np.stack([groups.products(weight * row) for row in design])
         squares = groups.products(weight, 2)
         left = squares - np.einsum("ij,ik,kj->j", crossed, spread, crossed)  # of each cause's column, off what is taken
         open_ = left > 1e-9 * squares
@@ -530,37 +582,45 @@ def _causes(
 
 def _repeated(units: _Units) -> list[Difference]:
     """Devices that were recorded again and are no longer what they were."""
-    places: dict[str, list[int]] = {}
-    for place, row in enumerate(units.rows):
-        places.setdefault(row["device"], []).append(place)
-    again = {device: each for device, each in places.items() if len(each) > 1}
-    found = []
-    for device, each in again.items():
-        first, last = each[0], each[-1]
+    indices_of: dict[str, list[int]] = {}
+    for index, row in enumerate(units.rows):
+        indices_of.setdefault(row["device"], []).append(index)
+    repeated = {device: indices for device, indices in indices_of.items() if len(indices) > 1}
+    differences = []
+    for device, indices in repeated.items():
+        first, last = indices[0], indices[-1]
         change = units.values[last] - units.values[first]
         sigma = np.sqrt(np.diagonal(units.covariances[first] + units.covariances[last]))
-        p_values = 2 * scipy.stats.norm.sf(np.abs(change / sigma)) * len(units.names) * len(again)
-        told = [k for k in np.argsort(p_values) if p_values[k] < _LEVEL]
-        if told:
-            named = tuple((units.names[k], float(change[k]), float(sigma[k])) for k in told)
-            found.append(Difference("device", device, len(each), float(p_values[told[0]]), named,
-                                    f"device {device} changed between its recordings"))  # fmt: skip
-    return found
+        p_values = 2 * scipy.stats.norm.sf(np.abs(change / sigma)) * len(units.names) * len(repeated)
+        changed = [k for k in np.argsort(p_values) if p_values[k] < _LEVEL]
+        if changed:
+            named = tuple((units.names[k], float(change[k]), float(sigma[k])) for k in changed)
+            differences.append(
+                Difference(
+                    "device",
+                    device,
+                    len(indices),
+                    float(p_values[changed[0]]),
+                    named,
+                    f"device {device} changed between its recordings",
+                )
+            )
+    return differences
 
 
 def _shared_effects(units: _Units) -> list[Difference]:
     """Effects that the diagnoses name in one lot more often than in the others (Fisher's exact test)."""
     lots = np.array(_names(units))
-    asked = np.array([row["verdict"] is not None for row in units.rows])
+    diagnosed = np.array([row["verdict"] is not None for row in units.rows])
     names = sorted({name for row in units.rows for name in row["effects"] or ()})
-    groups = sorted(set(lots[asked & (lots != "")]))
+    groups = sorted(set(lots[diagnosed & (lots != "")]))
     if len(groups) < 2:
         return []
-    found = []
+    differences = []
     for effect in names:
         shown = np.array([effect in (row["effects"] or ()) for row in units.rows])
         for group in groups:
-            inside, outside = asked & (lots == group), asked & (lots != group)
+            inside, outside = diagnosed & (lots == group), diagnosed & (lots != group)
             table = [[int(np.sum(shown & side)), int(np.sum(~shown & side))] for side in (inside, outside)]
             p_value = float(scipy.stats.fisher_exact(table, "greater")[1]) * len(names) * len(groups)  # pyright: ignore
             if p_value < _LEVEL:
@@ -568,8 +628,8 @@ def _shared_effects(units: _Units) -> list[Difference]:
                     f"lot {group} shares {effect_title(effect)}: found in {table[0][0]} of its {int(inside.sum())} "
                     f"units, in {table[1][0]} of {int(outside.sum())} others"
                 )
-                found.append(Difference("effect", group, table[0][0], p_value, (), text))
-    return found
+                differences.append(Difference("effect", group, table[0][0], p_value, (), text))
+    return differences
 
 
 # --- shrunk estimates -------------------------------------------------------------------------------------------------
@@ -604,8 +664,10 @@ def write_shrunk(fleet: Fleet, path: str | os.PathLike[str]) -> None:
                 for part, first, size in (("gain", start, 9), ("bias", start + 9, 3)):
                     there = name == "accel" or gyroscope
                     for column, which in ((f"{name}_{part}", 0), (f"{name}_{part}_sigma", 1)):
-                        out[column] = [_output(row, name, part, whole[k, first : first + size, which], which)
-                                       if there else None for k, row in enumerate(rows)]  # fmt: skip
+                        out[column] = [
+                            _output(row, name, part, whole[k, first : first + size, which], which) if there else None
+                            for k, row in enumerate(rows)
+                        ]
             writer.write_table(pa.table([pa.array(out[f.name], f.type) for f in schema], schema=schema))
 
 

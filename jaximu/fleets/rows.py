@@ -33,8 +33,18 @@ from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observed_poses, segment
 
-__all__ = ["PARAMETERS", "SCHEMA", "ReadJob", "covariances", "finish", "free_places", "read_job", "require_table",
-           "row_begun", "rows_of"]  # fmt: skip
+__all__ = [
+    "PARAMETERS",
+    "SCHEMA",
+    "ReadJob",
+    "covariances",
+    "finish",
+    "free_places",
+    "read_job",
+    "require_table",
+    "row_begun",
+    "rows_of",
+]
 
 PARAMETERS = names_of(Imu.nominal())
 """Names of the 24 numbers of a row, in the order of its column `covariance`."""
@@ -49,8 +59,12 @@ def _numbers(size: int) -> pa.DataType:
 
 
 def _of_triads(*triads: str) -> list[pa.Field]:
-    return [pa.field(f"{triad}_{part}{end}", _numbers(size)) for triad in triads
-            for part, size in (("gain", 9), ("bias", 3)) for end in ("", "_sigma")]  # fmt: skip
+    return [
+        pa.field(f"{triad}_{part}{end}", _numbers(size))
+        for triad in triads
+        for part, size in (("gain", 9), ("bias", 3))
+        for end in ("", "_sigma")
+    ]
 
 
 _UNITS = {"accel_rms": "m/s^2", "gyro_rms": "deg"}
@@ -79,7 +93,7 @@ SCHEMA = pa.schema(
         "a magnetometer's gain (output units per µT, lower triangle) is in its own axes, which `jaximu magnetometer` "
         "finds against the accelerometer's",
     },
-)  # fmt: skip
+)
 """Columns of the table. The first ones are the fixed surface; what does not apply is null."""
 
 
@@ -96,8 +110,11 @@ def require_table(path: str | os.PathLike[str], needed: Sequence[str]) -> None:
 
 def free_places(gyroscope: bool) -> list[int]:
     """Return which of `PARAMETERS` are free by hand, with a gyroscope or without."""
-    return [place for place, name in enumerate(PARAMETERS)
-            if without_equipment(name) and (gyroscope or name.owner == "accelerometer")]  # fmt: skip
+    return [
+        index
+        for index, name in enumerate(PARAMETERS)
+        if without_equipment(name) and (gyroscope or name.owner == "accelerometer")
+    ]
 
 
 def covariances(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -135,11 +152,11 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
         recording = read_recording(job.file, gyro_log, options)
         noise = _noise(job.static, options) if job.static else None
         with prepared([recording]) as (ready,):
-            found = segment(ready.recording, settings.segmentation)
-            unit, notes = _unit(ready.recording, found, settings, noise)
+            segmentation = segment(ready.recording, settings.segmentation)
+            unit, notes = _unit(ready.recording, segmentation, settings, noise)
     except Exception as error:
         return ReadJob(row | _failure(error), None)
-    row |= _facts(ready.recording, unit, (*recording.notes, *ready.notes, *notes, *found.notes))
+    row |= _facts(ready.recording, unit, (*recording.notes, *ready.notes, *notes, *segmentation.notes))
     if job.date:
         row["date"] = job.date
     if settings.diagnose:
@@ -147,7 +164,7 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
     field = None
     if recording.magnetometer is not None:
         try:
-            field = field_unit(recording.magnetometer, found, settings.field, job.file)
+            field = field_unit(recording.magnetometer, segmentation, settings.field, job.file)
         except Exception as error:
             row["mag_message"] = _sentence(error)
     return ReadJob(row, unit, field)
@@ -160,9 +177,9 @@ def _noise(path: str, options: ReadOptions) -> NoiseModel:
 
 
 def _unit(
-    recording: Recording, found: Segmentation, settings: Settings, noise: NoiseModel | None
+    recording: Recording, segmentation: Segmentation, settings: Settings, noise: NoiseModel | None
 ) -> tuple[FleetUnit, tuple[str, ...]]:
-    observations = observed_poses(found, settings.gravity.value, noise=noise)
+    observations = observed_poses(segmentation, settings.gravity.value, noise=noise)
     nominal, notes = nominal_imu(recording)
     notes += () if noise is None else noise.notes
     return FleetUnit(observations, nominal, recording.gyroscope is not None), notes
@@ -190,10 +207,10 @@ def _diagnosed(recording: Recording, settings: Settings, noise: NoiseModel | Non
     from jaximu.diagnosis import diagnose  # it is not cheap to import, and most runs ask for no diagnosis
 
     try:
-        found = diagnose(recording, settings.gravity, static=noise, segmentation=settings.segmentation)
+        diagnosis = diagnose(recording, settings.gravity, static=noise, segmentation=settings.segmentation)
     except Exception as error:
         return {"message": f"not diagnosed: {_sentence(error)}"}
-    return {"verdict": found.verdict, "effects": [each.name for each in found.effects]}
+    return {"verdict": diagnosis.verdict, "effects": [effect.name for effect in diagnosis.effects]}
 
 
 def _failure(error: Exception) -> dict[str, Any]:
@@ -212,11 +229,13 @@ def _sentence(error: Exception) -> str:
 
 def finish(prepared: Sequence[ReadJob], settings: Settings) -> list[dict[str, Any]]:
     """Fit what was prepared, in one batch, and return its rows in the same order."""
-    units = [each.unit for each in prepared if each.unit is not None]
-    fits = iter(fit_units([*units, *(each.field.unit for each in prepared if each.field is not None)]))
-    rows = [each.row if each.unit is None else _row(each, *next(fits), settings) for each in prepared]
-    return [row if each.field is None else row | _field(each.field, *next(fits), row["file"])
-            for row, each in zip(rows, prepared, strict=True)]  # fmt: skip
+    units = [job.unit for job in prepared if job.unit is not None]
+    fits = iter(fit_units([*units, *(job.field.unit for job in prepared if job.field is not None)]))
+    rows = [job.row if job.unit is None else _row(job, *next(fits), settings) for job in prepared]
+    return [
+        row if job.field is None else row | _field(job.field, *next(fits), row["file"])
+        for row, job in zip(rows, prepared, strict=True)
+    ]
 
 
 def rows_of(jobs: Sequence[Job], settings: Settings) -> list[dict[str, Any]]:
@@ -251,7 +270,7 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
         "covariance": whole[_TRIANGLE],
         "excess": [*np.asarray(fit.excess[:kinds]).tolist(), *[None] * (3 - kinds)],
         "rank": rank,
-        "weak": [each.text for each in weak],
+        "weak": [direction.text for direction in weak],
         "notes": list(dict.fromkeys([*(row["notes"] or ()), *(finding.text for finding in unusual)])),
     }
     if unit.gyroscope and row["turns"]:
@@ -272,9 +291,9 @@ def _require(fit: Fit, poses: int, where: str, sensor: str) -> None:
         raise NotPossibleError(f"{where}: {Failure.MAX_STEPS.value}.")
 
 
-def _field(own: FieldUnit, fit: Fit, rms: FloatArray, where: str) -> dict[str, Any]:
+def _field(magnetometer: FieldUnit, fit: Fit, rms: FloatArray, where: str) -> dict[str, Any]:
     try:
-        _require(fit, own.poses, where, "magnetometer")
+        _require(fit, magnetometer.poses, where, "magnetometer")
     except NotPossibleError as error:
         return {"mag_message": _sentence(error)}
-    return field_row(own, fit, float(rms[0]))
+    return field_row(magnetometer, fit, float(rms[0]))

@@ -54,11 +54,11 @@ def goal_of(what: str, text: str, names: Sequence[Name], unit: Imu, where: str =
 
     Raises `InputError`, beginning with `where`, where there is no such parameter or the size is none.
     """
-    places = [place for place, name in enumerate(names) if what in (name, group_of(name))]
-    if not places:
+    indices = [index for index, name in enumerate(names) if what in (name, group_of(name))]
+    if not indices:
         hint = nearest(what, [*dict.fromkeys(map(group_of, names)), *names])
         raise InputError(f"{where}there is no parameter {what!r} to set a goal for; {hint}")
-    size = quantity(text, unit_of(names[places[0]], unit), f"{where}goal {what}")
+    size = quantity(text, unit_of(names[indices[0]], unit), f"{where}goal {what}")
     if size == 0:
         raise InputError(f"{where}goal {what} must be greater than zero.")
-    return places, size
+    return indices, size

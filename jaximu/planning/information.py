@@ -30,8 +30,18 @@ from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Poses, Turns
 from jaximu.simulation.protocols.motion import smooth_course
 
-__all__ = ["COARSE", "RAMP", "STIMULI", "Accuracy", "Design", "hand_held_information", "robot_information",
-           "table_information", "turn_vectors", "up_vectors"]  # fmt: skip
+__all__ = [
+    "COARSE",
+    "RAMP",
+    "STIMULI",
+    "Accuracy",
+    "Design",
+    "hand_held_information",
+    "robot_information",
+    "table_information",
+    "turn_vectors",
+    "up_vectors",
+]
 
 STIMULI = ("specific_force", "angular_rate", "attitude")
 """What a design tells of the stimulus: effects that need no more can be among the parameters."""
@@ -125,10 +135,15 @@ def _observed(imu: Imu, attitude, accuracy: Accuracy, gravity) -> Observations:
 
     constant = jnp.zeros(count)
     poses = Poses(
-        accelerometer, same(accuracy.accelerometer),
-        jnp.zeros((count, 3)) if gyroscope is None else gyroscope, same(accuracy.gyroscope),
-        constant, constant, constant, jnp.ones(count, bool),
-    )  # fmt: skip
+        accelerometer,
+        same(accuracy.accelerometer),
+        jnp.zeros((count, 3)) if gyroscope is None else gyroscope,
+        same(accuracy.gyroscope),
+        constant,
+        constant,
+        constant,
+        jnp.ones(count, bool),
+    )
     turns = Turns(
         jnp.zeros((*steps, 3)) if turning is None else turning,
         jnp.full(steps, 1.0) * accuracy.turn / SAMPLES,
@@ -186,8 +201,8 @@ def table_information(
 
     def outputs(z):
         unit = parameters.model(imu, z)
-        found = unit.respond(at_rest)
-        return found if unit.gyroscope is None else (*found, jnp.mean(unit.respond(moving)[1], axis=1))  # pyright: ignore[reportArgumentType]
+        means = unit.respond(at_rest)
+        return means if unit.gyroscope is None else (*means, jnp.mean(unit.respond(moving)[1], axis=1))  # pyright: ignore[reportArgumentType]
 
     covariances = (
         (1 + accuracy.excess[0]) * accuracy.accelerometer,
@@ -210,9 +225,9 @@ def _course(design: Design, accuracy: Accuracy) -> tuple[Callable[[Array], Array
     still = jnp.concatenate([vectors, jnp.zeros((1, 3))])
 
     def at(time):
-        place = jnp.clip(jnp.floor(time / (rest + turn)).astype(int), 0, count - 1)
-        done = smooth_course(jnp.clip((time - place * (rest + turn) - rest) / turn, 0.0, 1.0), RAMP)
-        return multiply(design.attitude[place], exponential(done[..., None] * still[place]))
+        leg = jnp.clip(jnp.floor(time / (rest + turn)).astype(int), 0, count - 1)
+        done = smooth_course(jnp.clip((time - leg * (rest + turn) - rest) / turn, 0.0, 1.0), RAMP)
+        return multiply(design.attitude[leg], exponential(done[..., None] * still[leg]))
 
     return at, count * rest + (count - 1) * turn
 
@@ -230,9 +245,18 @@ def _reported(imu: Imu, design: Design, accuracy: Accuracy, gravity, count: int)
     slope = jnp.gradient(turning, axis=0) / step
     stamp = edges[:-1:_SPLIT] + step / 2
     return Intervals(
-        turning, slope, jnp.gradient(slope, axis=0) / step, force, edges[:-1], edges[1:], stamp, at(stamp),
-        jnp.zeros((count, 3)), jnp.ones(count, bool), jnp.asarray(gravity),
-    )  # fmt: skip
+        turning,
+        slope,
+        jnp.gradient(slope, axis=0) / step,
+        force,
+        edges[:-1],
+        edges[1:],
+        stamp,
+        at(stamp),
+        jnp.zeros((count, 3)),
+        jnp.ones(count, bool),
+        jnp.asarray(gravity),
+    )
 
 
 def _grouped(count: int, group: int) -> int:
@@ -241,9 +265,14 @@ def _grouped(count: int, group: int) -> int:
 
 
 def robot_information(
-    imu: Imu, parameters: Parameters, design: Design, accuracy: Accuracy, gravity: Float[Array, ""],
-    count: int = INTERVALS, duration: float = 60.0,
-) -> Float[Array, "p p"]:  # fmt: skip
+    imu: Imu,
+    parameters: Parameters,
+    design: Design,
+    accuracy: Accuracy,
+    gravity: Float[Array, ""],
+    count: int = INTERVALS,
+    duration: float = 60.0,
+) -> Float[Array, "p p"]:
     """Return the information about parameters in typical sizes, from a robot's rests and the turns between them.
 
     The attitude is reported throughout, with white errors from stamp to stamp; how the unit is mounted on the robot,
@@ -258,8 +287,9 @@ def robot_information(
     unit = _plain(imu)
     group = max(1, round(WINDOW * count / duration))
     count = _grouped(count, group)
-    place = jnp.clip(_SPLIT * jnp.arange(count)[:, None] + jnp.arange(-_BESIDE, _SPLIT + 1 + _BESIDE), 0,
-                     _SPLIT * count)  # fmt: skip
+    samples = jnp.clip(
+        _SPLIT * jnp.arange(count)[:, None] + jnp.arange(-_BESIDE, _SPLIT + 1 + _BESIDE), 0, _SPLIT * count
+    )
     mounting = Mounting.effects(rotation=0.0, delay=0.0, tilt=0.0, filter_variance=0.0)
     sizes, effects_of = ravel_pytree([effect.typical_sizes(1.0) for effect in mounting])
     known = len(parameters.names)
@@ -267,7 +297,7 @@ def robot_information(
     def found(z):
         reported = _reported(parameters.model(imu, z[:known]), design, accuracy, gravity, count)
         conditions, spread, length, leaning, _ = evaluated(
-            unit.with_effects(*effects_of(sizes * z[known:])), reported, None, place, accuracy.density, group
+            unit.with_effects(*effects_of(sizes * z[known:])), reported, None, samples, accuracy.density, group
         )
         return conditions(unit), (spread, length, leaning, conditions.target)
 

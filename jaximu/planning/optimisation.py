@@ -55,7 +55,7 @@ class DesignQuestion(eqx.Module):
     """What a design is asked for, all but the design.
 
     imu, parameters: what may be unknown, effects included. prior: information about the parameters (in typical sizes)
-    that is there already. reach: what one sigma of gravity does to them, which no pose can tell. weights: the
+    that is there already. by_gravity: what one sigma of gravity does to them, which no pose can tell. weights: the
     combination of parameters that the criterion "parameter" looks at. turn_limit: rad, the largest turn by hand or of a
     robot. duration: s, of a robot's motion; None: it is none. coarse: whether its motion is cut into few intervals.
     """
@@ -63,7 +63,7 @@ class DesignQuestion(eqx.Module):
     imu: Imu
     parameters: Parameters
     prior: Float[Array, "p p"]
-    reach: Float[Array, " p"]
+    by_gravity: Float[Array, " p"]
     weights: Float[Array, " p"]
     accuracy: Accuracy
     gravity: Float[Array, ""]
@@ -106,18 +106,18 @@ def _covariance(question: DesignQuestion, design: Design) -> DesignCovariance:
         information = robot_information(*known, COARSE if question.coarse else INTERVALS, question.duration)
     else:
         information = (hand_held_information if question.by_hand else table_information)(*known)
-    total = jnp.linalg.inv(question.prior + information) + jnp.outer(question.reach, question.reach)
+    total = jnp.linalg.inv(question.prior + information) + jnp.outer(question.by_gravity, question.by_gravity)
     return DesignCovariance(total, information)
 
 
 def _limits(question: DesignQuestion, design: Design) -> Float[Array, " c"]:
     """What the equipment cannot do, as numbers that must not be negative."""
-    found = []
+    limits = []
     if question.chained:
-        found.append(1 - jnp.sum(turn_vectors(design.attitude) ** 2, axis=-1) / question.turn_limit**2)
+        limits.append(1 - jnp.sum(turn_vectors(design.attitude) ** 2, axis=-1) / question.turn_limit**2)
     if question.z_up:
-        found += [up_vectors(attitude)[:, 2] for attitude in (design.attitude, design.axis)]
-    return jnp.concatenate(found) if found else jnp.zeros(0)
+        limits += [up_vectors(attitude)[:, 2] for attitude in (design.attitude, design.axis)]
+    return jnp.concatenate(limits) if limits else jnp.zeros(0)
 
 
 def _moved(design: Design, step: Step) -> Design:
@@ -155,12 +155,12 @@ def _limited(question: DesignQuestion, design: Design, step: Step) -> tuple[Floa
     """The limits (c,) after a step, and their derivatives (c, n) by all its numbers."""
 
     def of(question, design, step):
-        found = _limits(question, _moved(design, step))
-        return found, found
+        limits = _limits(question, _moved(design, step))
+        return limits, limits
 
     slopes = jax.jacrev(of, argnums=2, has_aux=True)
     by_step, left = stored.call(slopes, f"{question.key} limits", question, design, step)
-    return left, np.concatenate([each.reshape(len(left), -1) for each in by_step], axis=1)
+    return left, np.concatenate([slope.reshape(len(left), -1) for slope in by_step], axis=1)
 
 
 def _descend(question: DesignQuestion, design: Design, fastest: float, iterations: int) -> tuple[float, Design]:
@@ -174,7 +174,7 @@ def _descend(question: DesignQuestion, design: Design, fastest: float, iteration
 
     def evaluate(vector):
         value, gradient = objective(question, design, step(vector))
-        return value, np.concatenate([np.ravel(each) for each in gradient])
+        return value, np.concatenate([np.ravel(part) for part in gradient])
 
     start = np.concatenate([np.zeros(ends[1]), design.rate])
     bounds = [(None, None)] * ends[1] + [(-fastest, fastest)] * turns
@@ -182,15 +182,25 @@ def _descend(question: DesignQuestion, design: Design, fastest: float, iteration
     if question.chained or question.z_up:
         known = lru_cache(maxsize=1)(lambda key: _limited(question, design, step(np.frombuffer(key))))
         limits = [{"type": "ineq", "fun": lambda x: known(x.tobytes())[0], "jac": lambda x: known(x.tobytes())[1]}]
-    found = minimize(evaluate, start, jac=True, method="SLSQP", bounds=bounds, constraints=limits,
-                     options={"maxiter": iterations, "ftol": _CLOSE})  # fmt: skip
-    return float(found.fun), stored.call(_moved, "plan moved", design, step(found.x))
+    solution = minimize(
+        evaluate,
+        start,
+        jac=True,
+        method="SLSQP",
+        bounds=bounds,
+        constraints=limits,
+        options={"maxiter": iterations, "ftol": _CLOSE},
+    )
+    return float(solution.fun), stored.call(_moved, "plan moved", design, step(solution.x))
 
 
 def optimise(
-    question: DesignQuestion, starts: Sequence[Design], fastest: float, report: Callable[[str], None] = lambda _: None,
+    question: DesignQuestion,
+    starts: Sequence[Design],
+    fastest: float,
+    report: Callable[[str], None] = lambda _: None,
     steps: tuple[int, int] = STEPS,
-) -> Design:  # fmt: skip
+) -> Design:
     """Return the best design that is reached from the starts.
 
     **Arguments:** `starts`: designs (NumPy) with the same numbers of poses and turns, none at a saddle such as a rate
