@@ -21,6 +21,7 @@ from jaximu.ground.distributions import normal_isf
 from jaximu.ground.errors import NotPossibleError
 from jaximu.navigation.consequences import consequences, sensor_noise
 from jaximu.navigation.trajectory import Place, level_driving
+from jaximu.planning.information import gravity_sensitivity
 
 __all__ = ["navigation_items"]
 
@@ -64,13 +65,7 @@ def navigation_items(
 
 def _gravity_known(calibration: Calibration) -> Calibration:
     """Return the calibration as it were with gravity known exactly: it acts on the accelerometer's gain, K ∝ 1/g."""
-    gain, gravity = np.asarray(calibration.imu.accelerometer.gain), calibration.gravity
-    by_gravity = np.array(
-        [
-            gain[name.axes] * gravity.sigma / gravity.value if name.startswith("accelerometer.gain") else 0.0
-            for name in calibration.names
-        ]
-    )
+    by_gravity = gravity_sensitivity(calibration.imu, calibration.names, calibration.gravity)
     return replace(calibration, covariance=calibration.covariance - np.outer(by_gravity, by_gravity))
 
 

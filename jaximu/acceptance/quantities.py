@@ -38,6 +38,7 @@ from jaximu.ground.rotation import apply_matrix, inverse_matrix
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSORS
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
+from jaximu.planning.chunks import in_chunks
 
 __all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]
 
@@ -152,15 +153,13 @@ def measure(units: Units, nominal: Mapping[str, tuple[FloatArray, FloatArray]], 
     limited = [(limit.part, limit.owner) for limit, _ in ranges]
     description = f"accept {indices.tolist()} {limited}"
     batched = jax.vmap(all_of, (0, 0, 0, None, None, None))
-    count, size = len(units.numbers), min(_CHUNK, len(units.numbers))
-    chunks = []
-    for start in range(0, count, size):
-        rows = np.minimum(np.arange(start, start + size), count - 1)  # the last chunk is filled up with its last unit
-        some = stored.call(
-            batched, description, units.numbers[rows], units.covariance[rows], units.gravity[rows], *arguments
-        )
-        chunks.append([array[: count - start] for array in some])
-    value, sigma, gravity, slope = (np.concatenate(array) for array in zip(*chunks, strict=True))
+    value, sigma, gravity, slope = in_chunks(
+        lambda *rows: stored.call(batched, description, *rows, *arguments),
+        min(_CHUNK, len(units.numbers)),
+        units.numbers,
+        units.covariance,
+        units.gravity,
+    )
     names = (*_parameter_names(units.like), *(f"{limit.key}[{axis}]" for limit, _ in ranges for axis in range(3)))
     sizes = flatten(typical_sizes(unflatten(units.like, np.median(units.numbers, axis=0))))[indices]
     open_ = np.sqrt(np.diagonal(units.covariance, axis1=1, axis2=2)) > UNDETERMINED * sizes

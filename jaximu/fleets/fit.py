@@ -14,6 +14,7 @@ from jaximu.data.poses import PosesAndTurns, condensed, stack
 from jaximu.estimation.fitting import Fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.sensor import Imu
+from jaximu.planning.chunks import in_chunks
 from jaximu.recordings.observations import Observations
 
 __all__ = ["FleetUnit", "fit_units"]
@@ -70,14 +71,16 @@ def _together(nominals: Sequence[Imu], data: Sequence[PosesAndTurns], gyroscope:
     starts = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, float) for leaf in leaves]), *nominals)
     together = stack(data)
     fits = fit_hand_held(starts, together, "joint" if gyroscope else "accelerometer")
+
+    def scatter(imu: Imu, observed: PosesAndTurns) -> tuple:
+        reduced = condensed(imu, observed)
+        return reduced.force, reduced.angle
+
+    errors = in_chunks(scatter, _SHAPE, fits.imu, together)
     fitted = []
     for lane, unit in enumerate(data):
-        if lane % _SHAPE == 0:
-            part = np.minimum(np.arange(lane, lane + _SHAPE), len(data) - 1)
-            reduced = condensed(*jax.tree.map(lambda leaf, part=part: leaf[part], (fits.imu, together)))
-        fit = jax.tree.map(lambda leaf, lane=lane: leaf[lane], fits)
-        errors = reduced.force[lane % _SHAPE], reduced.angle[lane % _SHAPE]
-        rms = residual_rms(fit.imu, unit, gyroscope, errors)
+        fit, error = jax.tree.map(lambda leaf, lane=lane: leaf[lane], (fits, errors))
+        rms = residual_rms(fit.imu, unit, gyroscope, error)
         fitted.append((fit, np.array([rms[kind][0] if kind in rms else 0.0 for kind in _KINDS])))
     return fitted
 

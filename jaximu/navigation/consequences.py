@@ -40,6 +40,7 @@ from jaximu.model.stimulus import Stimulus
 from jaximu.navigation import Navigation, deviation, linearised, mechanise, noise_covariance
 from jaximu.navigation.trajectory import Trajectory
 from jaximu.noise.analysis import read_analysis
+from jaximu.planning.information import root_of
 from jaximu.recordings.readers.kalibr import read_noise
 
 __all__ = [
@@ -456,8 +457,7 @@ def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
 def _draw(run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise, draws: int, seed: int) -> MonteCarlo:
     """Draw all errors at once and mechanise."""
     rng = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(run.covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = root_of(run.covariance)
     rate = 1 / float(np.mean(path.intervals))
     streams = [
         Noise(

@@ -49,6 +49,7 @@ from jaximu.model.sensor import Imu
 from jaximu.navigation import noise_covariance
 from jaximu.navigation.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
 from jaximu.navigation.trajectory import Trajectory
+from jaximu.planning.information import root_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording
 
@@ -659,7 +660,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
             parts["time stamps"] = pushed
         moment[triad] = np.sum(list(parts.values()), axis=0)[:, rows, rows]
         mine = np.array([owner == triad for owner in owners])
-        roots[triad] = (moved[..., mine] @ _root(covariance[np.ix_(mine, mine)]))[:, rows]
+        roots[triad] = (moved[..., mine] @ root_of(covariance[np.ix_(mine, mine)]))[:, rows]
         for kind in dict.fromkeys(kinds):
             of_kind = mine & np.array([other == kind for other in kinds])
             if of_kind.any() and kind != f"{triad} bias":
@@ -668,12 +669,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
                     "nip,pq,njq->nij", moved[..., of_kind], chosen, moved[..., of_kind], optimize=True
                 )
         terms[triad] = {name: covariances[:, rows, rows] for name, covariances in parts.items()}
-    return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ _root(covariance), terms, block)
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    values, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+    return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ root_of(covariance), terms, block)
 
 
 def _known_at_start(system: Any) -> Any:

@@ -17,6 +17,7 @@ A step is written by component, so that a CPU computes draws and units side by s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -173,9 +174,15 @@ def mechanise(
         state = state._replace(attitude=[component / length for component in state.attitude])
         return state, state
 
+    return _scanned(
+        block, start, lanes, (blocks(rotation), blocks(gained), intervals.reshape(-1, every // together, together))
+    )
+
+
+def _scanned(advance: Callable, start: Navigation, lanes: tuple, parts: tuple) -> Navigation:
+    """Return the states after each of the parts, lanes first."""
     first = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, lanes), _split(start))
-    parts = blocks(rotation), blocks(gained), intervals.reshape(-1, every // together, together)
-    states = jax.lax.scan(block, first, parts)[1]
+    states = jax.lax.scan(advance, first, parts)[1]
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, len(lanes)), _joined(states))
 
 
@@ -201,10 +208,7 @@ def mechanise_increments(
         moved = jnp.moveaxis(array, -2, 0)
         return _parts(jnp.broadcast_to(moved, (len(moved), *lanes, array.shape[-1])))
 
-    first = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, lanes), _split(start))
-    stretches = parts(rotation), parts(velocity), parts(displacement), durations
-    states = jax.lax.scan(advance, first, stretches)[1]
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, len(lanes)), _joined(states))
+    return _scanned(advance, start, lanes, (parts(rotation), parts(velocity), parts(displacement), durations))
 
 
 def deviation(state: Navigation, reference: Navigation) -> Float[Array, "... 9"]:

@@ -46,7 +46,7 @@ residuals makes the fit count up the data's variance (its excess); W is that of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -69,6 +69,7 @@ from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
+from jaximu.planning.chunks import in_chunks
 from jaximu.planning.goals import goal_of, per_si, unit_of
 from jaximu.planning.setup_errors import (
     ErrorScheme,
@@ -263,7 +264,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     errors = [_paired(source) for source in sources]
     means = _recorded(scheme, np.concatenate(errors))
     fixed = stations, start, parameters, excess
-    solved = scale * _chunks(lambda rows: stored.call(_lanes, "budget solutions", *fixed, rows), means)
+    solved = scale * in_chunks(lambda rows: stored.call(_lanes, "budget solutions", *fixed, rows), _CHUNK, means)
     solved -= np.concatenate(errors) @ truth.T
     parts = zip(sigma, errors, np.split(solved, len(errors)), strict=True)
     actual = np.stack(
@@ -339,16 +340,6 @@ def _sessions(scheme: ErrorScheme, both):
     return jax.lax.map(lambda pair: jnp.stack(jax.jvp(scheme.means, (pair[0],), (pair[1],))), both)
 
 
-def _chunks(function: Callable[[FloatArray], Any], values: FloatArray) -> FloatArray:
-    """Call a function of `_CHUNK` rows for all rows of values, the last chunk filled up with its last row."""
-    results = []
-    for first in range(0, len(values), _CHUNK):
-        part = values[first : first + _CHUNK]
-        padded = np.concatenate([part, np.repeat(part[-1:], _CHUNK - len(part), axis=0)])
-        results.append(np.asarray(function(padded))[: len(part)])
-    return np.concatenate(results)
-
-
 def _paired(source: ErrorSource) -> FloatArray:
     """Draws of a source and their negatives: what is odd in them then averages out of what is even."""
     half = source.draw(np.random.default_rng(0), _DRAWS // 2)
@@ -412,7 +403,7 @@ def _check(
         return np.column_stack([off, np.asarray(fit.converged & fit.finite, float)])
 
     start = Imu(sheet(unit.accelerometer), None if unit.gyroscope is None else sheet(unit.gyroscope), unit.setup)
-    *off, good = _chunks(fitted, _recorded(scheme, errors)).T
+    *off, good = in_chunks(fitted, _CHUNK, _recorded(scheme, errors)).T
     fine = good > 0
     return Trials(draws, np.sqrt(_mean_square((np.stack(off, axis=1) - errors @ truth.T)[fine])), int(np.sum(~fine)))
 
@@ -444,7 +435,7 @@ def _reaction(scheme: ErrorScheme) -> FloatArray:
 
 
 def _simulated(scheme: ErrorScheme, both: FloatArray) -> FloatArray:
-    return _chunks(lambda rows: stored.call(_sessions, "budget sessions", scheme, rows), both)
+    return in_chunks(lambda rows: stored.call(_sessions, "budget sessions", scheme, rows), _CHUNK, both)
 
 
 def _added(errors: FloatArray) -> FloatArray:

@@ -24,6 +24,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.model.sensor import Imu
+from jaximu.planning.chunks import in_chunks
 from jaximu.planning.goals import goal_of, parse_goal, per_si
 from jaximu.planning.information import Design, hand_held_information
 from jaximu.planning.optimisation import DesignQuestion
@@ -198,19 +199,14 @@ class Guide:
 
 def _information(question: DesignQuestion, before: FloatArray, after: FloatArray) -> FloatArray:
     """Return the information (n, p, p) of a rest in each direction `after` (n, 3) and of the turn to it."""
-    pairs = np.array([_turned(before, direction) for direction in _padded(after)])
+    pairs = np.array([_turned(before, direction) for direction in after])
 
     def one(question, attitude):
         design = Design(attitude, attitude[:0], attitude[:0, 0])
         return hand_held_information(question.imu, question.parameters, design, question.accuracy, question.gravity)
 
     every = jax.vmap(one, (None, 0))
-    return stored.call(every, f"{question.key} guide", question, pairs)[: len(after)]
-
-
-def _padded(after: FloatArray) -> FloatArray:
-    """Return directions filled up to as many as a box has: one shape is compiled."""
-    return np.concatenate([after, np.repeat(after[-1:], len(_BOX) - len(after), axis=0)])
+    return in_chunks(lambda pairs: stored.call(every, f"{question.key} guide", question, pairs), len(_BOX), pairs)
 
 
 def _turned(before: FloatArray, after: FloatArray) -> FloatArray:

@@ -8,11 +8,12 @@ and the conditions' covariance (`jaximu.data.poses_covariance`) takes the place 
 those of `jaximu.data.attitude`, against the attitude it reports. Nothing of the physics is written here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
@@ -20,8 +21,9 @@ from jaxtyping import Float
 from jaximu.data.attitude import INTERVALS, WINDOW, Intervals, evaluated, shared_ends
 from jaximu.data.poses import condense
 from jaximu.data.poses_covariance import condition_covariance
-from jaximu.estimation.problem import Parameters
-from jaximu.ground.array_types import Array
+from jaximu.estimation.problem import Name, Parameters
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.ground.stored import compiled
 from jaximu.model.mounting import Mounting
@@ -36,8 +38,10 @@ __all__ = [
     "STIMULI",
     "Accuracy",
     "Design",
+    "gravity_sensitivity",
     "hand_held_information",
     "robot_information",
+    "root_of",
     "table_information",
     "turn_vectors",
     "up_vectors",
@@ -154,8 +158,22 @@ def _observed(imu: Imu, attitude, accuracy: Accuracy, gravity) -> Observations:
     return Observations(poses, turns, jnp.asarray(gravity))
 
 
-def _whiten(covariance, jacobian):
-    return solve_triangular(jnp.linalg.cholesky(covariance), jacobian, lower=True)
+def _information(covariance, jacobian):
+    """JᵀC⁻¹J (p, p), summed over leading axes."""
+    whitened = solve_triangular(jnp.linalg.cholesky(covariance), jacobian, lower=True).reshape(-1, jacobian.shape[-1])
+    return whitened.T @ whitened
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """Return a root R (..., n, n), R Rᵀ = C, of covariances or of information; what rounding makes negative is zero."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
+def gravity_sensitivity(imu: Imu, names: Sequence[Name], gravity: LocalGravity) -> FloatArray:
+    """Return what one sigma of gravity does to parameters (p,): the accelerometer's gain is in proportion to 1/g."""
+    gain = np.asarray(imu.accelerometer.gain) * gravity.sigma / gravity.value
+    return np.array([-gain[name.axes] if name.startswith("accelerometer.gain") else 0.0 for name in names])
 
 
 def hand_held_information(
@@ -179,8 +197,7 @@ def hand_held_information(
     jacobian = jax.jacfwd(found)(jnp.zeros(len(parameters.names)))
     observed = _observed(unit, design.attitude, accuracy, gravity)
     covariance = condition_covariance(unit, observed).dense().total(accuracy.excess)[:conditions, :conditions]
-    whitened = _whiten(covariance, jacobian)
-    return whitened.T @ whitened
+    return _information(covariance, jacobian)
 
 
 def table_information(
@@ -213,8 +230,7 @@ def table_information(
     information = jnp.zeros((len(zero), len(zero)))
     for jacobian, covariance in zip(jax.jacfwd(outputs)(zero), covariances, strict=False):
         if jacobian is not None:
-            whitened = _whiten(jnp.broadcast_to(covariance, (len(jacobian), 3, 3)), jacobian).reshape(-1, len(zero))
-            information += whitened.T @ whitened
+            information += _information(jnp.broadcast_to(covariance, (len(jacobian), 3, 3)), jacobian)
     return information
 
 
@@ -259,11 +275,6 @@ def _reported(imu: Imu, design: Design, accuracy: Accuracy, gravity, count: int)
     )
 
 
-def _grouped(count: int, group: int) -> int:
-    """The next lower number of intervals that makes whole windows."""
-    return count // group * group
-
-
 def robot_information(
     imu: Imu,
     parameters: Parameters,
@@ -286,7 +297,7 @@ def robot_information(
     """
     unit = _plain(imu)
     group = max(1, round(WINDOW * count / duration))
-    count = _grouped(count, group)
+    count = count // group * group  # of whole windows
     samples = jnp.clip(
         _SPLIT * jnp.arange(count)[:, None] + jnp.arange(-_BESIDE, _SPLIT + 1 + _BESIDE), 0, _SPLIT * count
     )
@@ -318,7 +329,6 @@ def robot_information(
     noise = ends @ ends.T
     for rows, white in ((rotation, (1 + accuracy.excess[1]) * spread), (force, felt)):
         noise = noise.at[rows[:, :, None], rows[:, None, :]].add(white)
-    white = _whiten(noise, jacobian)
-    whole = white.T @ white
+    whole = _information(noise, jacobian)
     beside = whole[known:, known:] + jnp.eye(size - known) / _FREE**2
     return whole[:known, :known] - whole[:known, known:] @ jnp.linalg.solve(beside, whole[known:, :known])

@@ -18,9 +18,10 @@ from jaxtyping import Float
 from scipy.optimize import minimize
 
 from jaximu.data.attitude import INTERVALS
-from jaximu.estimation.problem import Parameters
+from jaximu.estimation.problem import Name, Parameters
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.errors import InputError, nearest
 from jaximu.ground.rotation import exponential, multiply
 from jaximu.model.sensor import Imu
 from jaximu.planning.information import (
@@ -44,6 +45,21 @@ CRITERIA: dict[str, Callable[[Array, Array], Array]] = {
 }
 """Logarithms of a standard deviation: the geometric mean along the axes of the uncertainty's ellipsoid, the root mean
 square of all parameters (both in typical sizes), that of one combination of parameters."""
+
+
+def criterion_of(criterion: str, parameter: str | None, names: Sequence[Name]) -> tuple[str, FloatArray]:
+    """Return the key of a criterion in `CRITERIA`, and the weights (p,) that it looks at.
+
+    Raises `InputError` for one that is not known, or for a `parameter` that is none of the names.
+    """
+    if parameter is None:
+        if criterion not in ("D", "A"):
+            raise InputError(f"the criterion {criterion!r} is not known; use D, A, or name one parameter.")
+        return criterion, np.zeros(len(names))
+    if parameter not in names:
+        raise InputError(f"there is no parameter {parameter!r} in this plan; {nearest(parameter, names)}")
+    return "parameter", np.array([float(name == parameter) for name in names])
+
 
 STEPS, FEW_STEPS = (40, 200), (15, 40)
 """Steps of every start and of the best; and where each takes long."""

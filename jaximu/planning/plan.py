@@ -16,13 +16,22 @@ from jaximu.estimation.problem import TOLERANCE, Name, Parameters, names_of, wit
 from jaximu.estimation.uncertainty import WeakDirection, weak_directions
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
-from jaximu.ground.errors import InputError, nearest
+from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
-from jaximu.planning.information import COARSE, RAMP, STIMULI, Accuracy, Design, turn_vectors
-from jaximu.planning.optimisation import CRITERIA, FEW_STEPS, STEPS, DesignQuestion, covariance, optimise, score
+from jaximu.planning.information import (
+    COARSE,
+    RAMP,
+    STIMULI,
+    Accuracy,
+    Design,
+    gravity_sensitivity,
+    root_of,
+    turn_vectors,
+)
+from jaximu.planning.optimisation import FEW_STEPS, STEPS, DesignQuestion, covariance, criterion_of, optimise, score
 from jaximu.planning.poses import (
     attitude_words,
     first_heading,
@@ -354,16 +363,15 @@ def propose(
     names, size = question.parameters.names, np.asarray(question.parameters.size)
     prior = np.linalg.inv(question.prior) + np.outer(question.by_gravity, question.by_gravity)
     # what the data sheet adds is none of the data's: it must not hide a direction that no pose tells
-    values, vectors = np.linalg.eigh(best.information + question.prior - np.eye(len(size)) / TOLERANCE**2)
-    jacobian = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    rank, weak = weak_directions(jacobian, names, size, question.imu)
+    root = root_of(best.information + question.prior - np.eye(len(size)) / TOLERANCE**2)
+    rank, weak = weak_directions(root.T, names, size, question.imu)
     stages = prior, best.covariance, covariance(question, exact).covariance
     before, after, _ = (np.sqrt(np.diagonal(stage)) * size for stage in stages)
-    unit = float(size @ question.weights) if question.criterion == "parameter" else 1.0  # else a typical size
+    unit = float(size @ question.weights) or 1.0  # of a parameter; else a typical size
     criteria = (score(question, stage) * unit for stage in stages)
     return Proposal(
         equipment,
-        criterion if parameter is None else _named(parameter, names),
+        parameter or criterion,
         _poses(design, equipment),
         _turns(design, equipment),
         question.imu,
@@ -401,26 +409,12 @@ def question_of(
     def keep(name: Name) -> bool:
         if name.effect is not None:
             return name.part == "coefficients" and name.owner != "setup"
-        return without_equipment(name) if equipment.chained else True
+        return not equipment.chained or without_equipment(name)
 
     parameters = Parameters.select(imu, keep)
     names, size = parameters.names, np.asarray(parameters.size)
-    weights = np.zeros(len(names))
-    if parameter is not None:
-        criterion = "parameter"
-        weights[names.index(_named(parameter, names))] = 1.0
-    elif criterion not in CRITERIA or criterion == "parameter":
-        raise InputError(f"the criterion {criterion!r} is not known; use D, A, or name one parameter.")
-    gain, gravity = np.asarray(imu.accelerometer.gain), known.gravity
-    by_gravity = (
-        np.array(
-            [
-                -gain[name.axes] * gravity.sigma / gravity.value if name.startswith("accelerometer.gain") else 0.0
-                for name in names
-            ]
-        )
-        / size
-    )
+    criterion, weights = criterion_of(criterion, parameter, names)
+    by_gravity = gravity_sensitivity(imu, names, known.gravity) / size
     if known.covariance is not None and not equipment.chained and _is_by_hand(known.names):
         notes += (
             "a calibration by hand has the accelerometer's axes for its frame; how they lie to the table's is "
@@ -469,12 +463,6 @@ def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
         else:
             notes.append(f"{effect.title} is left as it is: poses and turns at one temperature do not determine it.")
     return jax.tree.map(np.asarray, imu.with_effects(*dormant)), tuple(notes)
-
-
-def _named(parameter: str, names: Sequence[Name]) -> Name:
-    if parameter in names:
-        return names[names.index(parameter)]
-    raise InputError(f"there is no parameter {parameter!r} in this plan; {nearest(parameter, names)}")
 
 
 def _in_output(triad: Triad, density: FloatArray) -> FloatArray:

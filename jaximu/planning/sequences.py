@@ -34,13 +34,14 @@ from jaximu.estimation.problem import Name, Parameters, flatten, without_equipme
 from jaximu.estimation.uncertainty import spoken_amount, weak_directions
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError, nearest
+from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.planning.optimisation import CRITERIA
+from jaximu.planning.information import root_of
+from jaximu.planning.optimisation import CRITERIA, criterion_of
 from jaximu.planning.plan import EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, question_of
 from jaximu.planning.poses import pose_words, up_of
 from jaximu.simulation import simulate
@@ -274,8 +275,6 @@ def propose_sequence(
         raise InputError("the filter needs a gyroscope beside the accelerometer, and this unit has none.")
     if positions < 2:
         raise InputError("a sequence for the filter has at least two positions.")
-    if parameter is None and (criterion not in CRITERIA or criterion == "parameter"):
-        raise InputError(f"the criterion {criterion!r} is not known; use D, A, or name one parameter.")
     fastest = np.radians(equipment.fastest) * equipment.turn / 2 + 1e-9  # the rate peaks at twice its mean
     choices = [word for word in _CHOICES if np.linalg.norm(rotation_vector(word)) <= fastest]
     if not choices:
@@ -284,10 +283,8 @@ def propose_sequence(
             f"is {equipment.fastest:g} °/s: give the turn more time, --turn {180 / equipment.fastest:.3g}."
         )
     estimator, notes = filter_of(known, equipment, positions, effects, noise)
-    weights = np.zeros(len(estimator.names))
-    if parameter is not None:
-        criterion = "parameter"
-        weights[_place(parameter, estimator.names)] = 1.0
+    label = parameter or criterion
+    criterion, weights = criterion_of(criterion, parameter, estimator.names)
     rested = estimator.rested()
     upright = attitude_of(np.array([0.0, 0.0, 1.0]))
     kept: list[tuple[float, tuple[str, ...], Rotation, Knowledge]] = [(0.0, (), upright, rested)]
@@ -317,14 +314,7 @@ def propose_sequence(
             notes += ("the well-known nineteen positions do as well as any here, and are proposed.",)
         else:
             notes += (f"the well-known nineteen positions, as long, leave {ratio:.3g} times as much.",)
-    return _proposal(estimator, words, knowledge, best, criterion, parameter, weights, equipment, known.source, notes)
-
-
-def _place(parameter: str, names: Sequence[Name]) -> int:
-    indices = [index for index, name in enumerate(names) if name == parameter]
-    if not indices:
-        raise InputError(f"there is no parameter {parameter!r} in this plan; {nearest(parameter, names)}")
-    return indices[0]
+    return _proposal(estimator, words, knowledge, best, criterion, label, weights, equipment, known.source, notes)
 
 
 def _proposal(
@@ -333,7 +323,7 @@ def _proposal(
     knowledge: Knowledge,
     value: float,
     criterion: str,
-    parameter: str | None,
+    label: str,
     weights: FloatArray,
     equipment: Equipment,
     source: str,
@@ -346,9 +336,9 @@ def _proposal(
     # gravity's column comes last, so that the rows above it hold without it only where it is known
     information = root.T @ root
     alone = information[:-1, :-1] - np.outer(information[:-1, -1], information[-1, :-1]) / information[-1, -1]
-    values, vectors = np.linalg.eigh(alone * size[:, None] * size)
-    jacobian = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    rank, weak = weak_directions(jacobian, estimator.names, size, estimator.imu, state_advice)
+    rank, weak = weak_directions(
+        root_of(alone * size[:, None] * size).T, estimator.names, size, estimator.imu, state_advice
+    )
     of_earth = {estimator.names[index] for index in earth}
     weak = tuple(direction for direction in weak if not {name for name, _ in direction.parameters} <= of_earth)
     unshown = [index for index in earth if after[index] > _SHOWN * before[index]]
@@ -358,7 +348,7 @@ def _proposal(
             "the gyroscope's noise hides the Earth's rotation from this sequence: it is known to "
             f"± {left} (95 %), and is part of how uncertain the biases are.",
         )
-    unit = float(size @ weights) if criterion == "parameter" else 1.0
+    unit = float(size @ weights) or 1.0
     first = estimator.value(start, criterion, weights)
     attitude, poses, turns = attitude_of(np.array([0.0, 0.0, 1.0])), [], []
 
@@ -375,10 +365,9 @@ def _proposal(
         turn_words = f"{np.degrees(angle):.0f}° about {'+' if vector.sum() > 0 else '−'}{word[0]}"
         turns.append(Turn(vector / angle, angle, angle / equipment.turn, turn_words))
     at_first, at_last = (float(np.exp(logarithm)) * unit for logarithm in (first, value))
-    named = criterion if parameter is None else estimator.names[_place(parameter, estimator.names)]
     return Proposal(
         equipment,
-        named,
+        label,
         tuple(poses),
         tuple(turns),
         estimator.imu,

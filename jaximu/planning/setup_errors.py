@@ -32,6 +32,7 @@ from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
+from jaximu.planning.information import root_of
 from jaximu.recordings.observations import Stations
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.protocols import Environment, Interval, Motion
@@ -431,8 +432,7 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
         scale = np.linalg.norm(np.asarray(case.imu.triads()["gyroscope"].gain), axis=1)
         add("vibration", np.diag((shaken * scale[:, None] * during).ravel()), added + 3 * size)
     for name, covariances in (("noise", fast), ("bias_instability", slow)):
-        values, vectors = np.linalg.eigh(covariances)
-        add(name, np.asarray(block_diag(*vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])), added)
+        add(name, np.asarray(block_diag(*root_of(covariances))), added)
 
     def source(name: str, root: FloatArray) -> ErrorSource:
         value, text = errors.get(name, (None, "by the noise"))
