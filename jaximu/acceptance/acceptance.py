@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity, worst
 from jaximu.acceptance.item import Item, deciding
-from jaximu.acceptance.limits import FROM_ALLAN, OF_ONE_UNIT, Limit, Limits
+from jaximu.acceptance.limits import FROM_ALLAN, OF_ONE_UNIT, OUTPUTS, Limit, Limits
 from jaximu.acceptance.navigation import navigation_items
 from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
 from jaximu.calibration import Calibration
@@ -25,7 +25,6 @@ from jaximu.ground.quantities import Z95
 __all__ = ["SCHEMA", "Acceptance", "Judged", "accept", "judge"]
 
 SCHEMA = "jaximu.acceptance/1"
-_OUTPUTS = ("output", "raw_output")
 _BY_HAND = ("joint", "two-step", "two-step-rk4", "accelerometer")
 
 
@@ -85,7 +84,7 @@ class Judged:
 def judge(units: Units, limits: Limits) -> Judged:
     """Hold units of one structure to limits of parameters and outputs; other limits are left alone."""
     held = {name.owner for name in units.names}
-    outputs = [limit for limit in limits.limits if limit.part in _OUTPUTS and limit.owner in held]
+    outputs = [limit for limit in limits.limits if limit.part in OUTPUTS and limit.owner in held]
     measured = measure(units, limits.nominal, outputs)
     first = len(measured.names) - 3 * len(outputs)
     questions: list[tuple[Limit, str, int]] = []
@@ -258,23 +257,11 @@ def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> l
             continue
         value, low, high = term
         sigma, advice = (high - low) / (2 * Z95), ""
-        probability = probability_of_conformity(value, sigma, limit.low, limit.high)
-        verdict = str(rule.verdicts(probability, limit.low <= value <= limit.high))
-        if verdict == UNDECIDED:
+        judged = limit.judged(rule, value, sigma)
+        if judged["verdict"] == UNDECIDED:
             needed = limit.nearest(value) / float(rule.multiple())
             advice = f"Record about {max(1.1, (sigma / needed) ** 2):.2g} times as long at rest."
-        items.append(
-            Item.of(
-                limit,
-                name,
-                value=value,
-                sigma=sigma,
-                verdict=verdict,
-                recording=sigma,
-                probability=float(probability),
-                advice=advice,
-            )
-        )
+        items.append(Item.of(limit, name, **judged, recording=sigma, advice=advice))
     return items
 
 

@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.acceptance.decision import Rule
+from jaximu.acceptance.decision import Rule, probability_of_conformity
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import file_digest, read_toml
 from jaximu.ground.errors import InputError, only
@@ -46,7 +46,7 @@ from jaximu.model.data_sheet import SI_UNITS, parse_quantity
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.columns.nominal import parse_offset, parse_scale
 
-__all__ = ["FROM_ALLAN", "OF_ONE_UNIT", "TYPICAL", "Limit", "Limits", "read_limits"]
+__all__ = ["FROM_ALLAN", "OF_ONE_UNIT", "OUTPUTS", "TYPICAL", "Limit", "Limits", "read_limits"]
 
 TYPICAL = 3.0
 """Limit of what a data sheet calls typical, in typical values: 99.7 % of a normal population lie within."""
@@ -56,7 +56,8 @@ FROM_ALLAN = ("repeatability", *"QNBKR")
 _NAVIGATION = {"position": "m", "heading": "deg"}
 OF_ONE_UNIT = (*FROM_ALLAN, *_NAVIGATION)
 """Quantities that a fleet's table does not tell."""
-_PARTS = ("bias", "scale", "misalignment", "output", "raw_output", "repeatability")
+OUTPUTS = ("output", "raw_output")
+_PARTS = ("bias", "scale", "misalignment", *OUTPUTS, "repeatability")
 _LONGEST = 3600.0  # s, of navigation
 _KEY = re.compile(r"([a-z_.A-Z]+?)(?:\[(\d)(?:,\s*(\d))?\])?")
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
@@ -89,6 +90,12 @@ class Limit:
     def nearest(self, value: float) -> float:
         """Return how far a value is from the nearer bound."""
         return min(abs(self.high - value), abs(value - self.low))
+
+    def judged(self, rule: Rule, value: float, sigma: float) -> dict[str, Any]:
+        """Return what an item says of a value that is normally distributed with this standard uncertainty."""
+        probability = probability_of_conformity(value, sigma, self.low, self.high)
+        verdict = str(rule.verdicts(probability, self.low <= value <= self.high))
+        return {"value": value, "sigma": sigma, "probability": float(probability), "verdict": verdict}
 
 
 @dataclass(frozen=True)
@@ -148,7 +155,7 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
             f"{where}: the limits contradict each other: the lower, {low:g}, is not below {high:g} {base}."
         )
     over, temperature = 0.0, None
-    if part in ("output", "raw_output"):
+    if part in OUTPUTS:
         if "over" not in entry:
             raise InputError(f'{where}: say up to which input the output is limited: over = "1 g" (or "300 deg/s").')
         over = abs(_value(entry["over"], base, f"{where}.over"))
@@ -206,30 +213,32 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
 
 def _value(stated: Any, base: str, where: str) -> float:
     """Return a number in the unit `base` from one with its unit."""
-    match = _NUMBER.fullmatch(stated) if isinstance(stated, str) else None
-    if match is None or not match[2]:
-        example = {"1": "1 %", "rad": "10 mrad", "rad/s": "0.5 deg/s", "m/s^2": "20 mg", "deg": "0.5 deg"}.get(
-            base, f"1 {base}"
-        )
-        raise InputError(f'{where}: {stated!r} needs a number with its unit, such as "{example}".')
-    if match[2].replace(" ", "") == base.replace(" ", ""):
-        return float(match[1])
+    examples = {"1": "1 %", "rad": "10 mrad", "rad/s": "0.5 deg/s", "m/s^2": "20 mg", "deg": "0.5 deg"}
+    number, text = _split(stated, where, f', such as "{examples.get(base, f"1 {base}")}"')
+    if text.replace(" ", "") == base.replace(" ", ""):
+        return number
     if base.startswith("("):
         raise InputError(f'{where}: write it in {base}, such as "1e-4 {base}".')
-    if base == "1" and match[2] not in ("%", "ppm"):
-        raise InputError(f"{where}: {match[2]!r} is no ratio; write %, ppm or 1.")
+    if base == "1" and text not in ("%", "ppm"):
+        raise InputError(f"{where}: {text!r} is no ratio; write %, ppm or 1.")
     return parse_quantity(stated, base, where)
+
+
+def _split(stated: Any, where: str, hint: str) -> tuple[float, str]:
+    """Return a number and the text of its unit."""
+    match = _NUMBER.fullmatch(stated) if isinstance(stated, str) else None
+    if match is None or not match[2]:
+        raise InputError(f"{where}: {stated!r} needs a number with its unit{hint}.")
+    return float(match[1]), match[2]
 
 
 def _range(stated: Any, where: str) -> tuple[float, float]:
     """Return two temperatures in °C."""
     temperatures = []
     for end in stated if isinstance(stated, list) else [stated]:
-        match = _NUMBER.fullmatch(end) if isinstance(end, str) else None
-        if match is None or not match[2]:
-            raise InputError(f'{where}: {end!r} needs a number with its unit: ["-10 degC", "60 degC"].')
-        kind = unit(match[2], "temperature", file=where)
-        temperatures.append(kind.factor * float(match[1]) + kind.offset)
+        number, text = _split(end, where, ': ["-10 degC", "60 degC"]')
+        kind = unit(text, "temperature", file=where)
+        temperatures.append(kind.factor * number + kind.offset)
     if len(temperatures) != 2 or temperatures[0] >= temperatures[1]:
         raise InputError(f'{where}: give the lowest and the highest temperature: ["-10 degC", "60 degC"].')
     return temperatures[0], temperatures[1]

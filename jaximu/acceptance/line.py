@@ -29,9 +29,10 @@ from jaximu.acceptance.statistics import (
     drift,
     gauge,
     tolerance_factor,
+    with_ends,
 )
 from jaximu.acceptance.words import amount, si_unit, spoken
-from jaximu.fleets.population import days_of, read_fleet
+from jaximu.fleets.population import LEVEL, days_of, read_fleet
 from jaximu.fleets.rows import PARAMETERS, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
@@ -52,8 +53,6 @@ __all__ = [
     "write_verdicts",
 ]
 
-_LEVEL = 0.01
-"""Probability of one false alarm in the whole table, for each kind of question."""
 _FEWEST = 8  # units of a chart
 _GOLDEN = 4  # recordings of a unit from which its drift is asked about
 _SHOWN_ITEMS = 1000  # of a table, that its document holds
@@ -210,12 +209,10 @@ def _entry(quantity: FollowedQuantity) -> dict[str, Any]:
             "units": able.count,
             "mean": able.mean,
             "deviation": able.deviation,
-            "cp": None if np.isnan(able.cp[0]) else dict(zip(("value", "low", "high"), able.cp, strict=True)),
-            "cpk": dict(zip(("value", "low", "high"), able.cpk, strict=True)),
+            "cp": None if np.isnan(able.cp[0]) else with_ends(able.cp),
+            "cpk": with_ends(able.cpk),
         },
-        "cpk_by_lot": {
-            lot: dict(zip(("value", "low", "high"), able.cpk, strict=True)) for lot, able in quantity.lots.items()
-        },
+        "cpk_by_lot": {lot: with_ends(able.cpk) for lot, able in quantity.lots.items()},
         "charts": {
             where: {
                 "centre": chart.centre,
@@ -378,7 +375,7 @@ def follow(table: Batch, limits: Limits | None = None, golden: str = "") -> Line
     nominal = {**table.nominal, **(limits.nominal if limits else {})}
     measured = measure(table.units, _in_counts(table, nominal), ())
     first = _first_recordings(table)
-    first = first[[table.devices[row] != golden for row in first.tolist()]]
+    first = first[np.array(table.devices)[first] != golden]
     stations = sorted(set(table.stations))
     watched = (np.array(table.devices) == golden) & np.isfinite(table.days)
     shown = [column for column in range(len(measured.names)) if not measured.fixed[column]]
@@ -389,18 +386,13 @@ def follow(table: Batch, limits: Limits | None = None, golden: str = "") -> Line
         recording = np.sqrt(np.maximum(measured.sigma[:, column] ** 2 - measured.gravity[:, column] ** 2, 0.0))
         charts = {}
         for station in stations:
-            some = first[[table.stations[index] == station for index in first.tolist()]]
+            some = first[np.array(table.stations)[first] == station]
             if len(some) >= _FEWEST:
-                charts[station] = control_chart(values[some], _LEVEL / len(shown) / len(stations)), some
+                charts[station] = control_chart(values[some], LEVEL / len(shown) / len(stations)), some
         limit = by_name.get(name)
         able = capability(values[first], limit.low, limit.high) if limit is not None and len(first) > 1 else None
-        by_lot = (
-            {}
-            if limit is None
-            else {
-                lot: capability(values[some], limit.low, limit.high) for lot, some in _groups(table.lots, first).items()
-            }
-        )
+        lots = () if limit is None else _groups(table.lots, first).items()
+        by_lot = {lot: capability(values[some], limit.low, limit.high) for lot, some in lots if limit}
         study = gauge(values, recording, table.devices, table.stations)
         course = drift(table.days[watched], values[watched]) if np.sum(watched) >= _GOLDEN else None
         followed.append(FollowedQuantity(name, limit, able, by_lot, charts, study, course))
@@ -458,7 +450,7 @@ def _alarms(
             more = f"; {len(hits) - 1} more units are beyond the limits" if len(hits) > 1 else ""
             text = f"{what}: {_when(table, int(places[most]))} {relation} {amount(away[most], unit)}{more}"
             alarms.append(Alarm(kind, name, station, text))
-    if course is not None and course.p_value * questions < _LEVEL:
+    if course is not None and course.p_value * questions < LEVEL:
         alarms.append(
             Alarm(
                 "golden",
@@ -499,7 +491,7 @@ def _compared(
         }
         label = min(shifts, key=lambda label: shifts[label][1])
         shift, p_value = shifts[label]
-        if p_value * questions * len(groups) >= _LEVEL:
+        if p_value * questions * len(groups) >= LEVEL:
             break
         off = f"{amount(abs(shift), si_unit(name))} {'more' if shift > 0 else 'less'} than the other {kind}s"
         verb = "measures" if kind == "station" else "has"

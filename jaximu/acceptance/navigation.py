@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity
+from jaximu.acceptance.decision import UNDECIDED, Rule
 from jaximu.acceptance.item import Item, deciding
 from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
@@ -74,9 +74,8 @@ def _item(
 ) -> Item:
     """Return the item of an error about zero with these standard deviations; gravity_sigma: m/s²."""
     sigma = float(np.sqrt(recording**2 + gravity**2 + noise**2))
-    probability = float(probability_of_conformity(0.0, sigma, limit.low, limit.high))
-    verdict, advice = str(rule.verdicts(probability, limit.low <= 0 <= limit.high)), ""
-    if verdict == UNDECIDED:
+    judged, advice = limit.judged(rule, 0.0, sigma), ""
+    if judged["verdict"] == UNDECIDED:
         needed = limit.nearest(0.0) / float(normal_isf(rule.risk / 2))  # both sides of zero count, hence half the risk
         left, advice = needed**2 - noise**2, "The sensors' noise alone is too much for this limit."
         if left > 0:
@@ -84,10 +83,7 @@ def _item(
     return Item.of(
         limit,
         name,
-        value=0.0,
-        sigma=sigma,
-        probability=probability,
-        verdict=verdict,
+        **judged,
         gravity=gravity,
         recording=float(np.hypot(recording, noise)),
         advice=advice,

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -124,19 +123,15 @@ def measure(units: Units, nominal: Mapping[str, tuple[FloatArray, FloatArray]], 
     indices = np.array([names_of(units.like).index(name) for name in units.names], int)
     ranges = [(limit, output_stimulus(limit, units.like)) for limit in outputs if limit.owner in known]
 
+    # one standard deviation of gravity changes these in proportion
+    of_gravity = np.array([name.startswith("accelerometer.gain") for name in names_of(units.like)])
+
     def all_of(flat, covariance, gravity, like, scales, stimuli):
         def quantities(flat):
             imu = ravel_pytree(like)[1](flat)
             values = [_parameters(triad, *scales[name]) for name, triad in imu.triads().items()]
             values += [effect.coefficients for triad in imu.triads().values() for effect in triad.effects]
             return jnp.concatenate([jnp.ravel(value) for value in values])
-
-        def reach(slope):  # what one standard deviation of gravity does to the quantities
-            imu = ravel_pytree(like)[1](flat)
-            gain = eqx.tree_at(
-                lambda one: one.accelerometer.gain, jax.tree.map(jnp.zeros_like, imu), -imu.accelerometer.gain
-            )
-            return jnp.abs(slope @ ravel_pytree(gain)[0]) * gravity
 
         parts = [(quantities(flat), jax.jacfwd(quantities)(flat))]
         for (limit, _), stimulus in zip(ranges, stimuli, strict=True):
@@ -147,7 +142,8 @@ def measure(units: Units, nominal: Mapping[str, tuple[FloatArray, FloatArray]], 
             parts.append((value[worst, jnp.arange(3)], slope[worst, jnp.arange(3)]))
         value, slope = (jnp.concatenate(column) for column in zip(*parts, strict=True))
         free = slope[:, indices]
-        return value, _sigma(free, covariance), reach(slope), free
+        by_gravity = jnp.abs(slope @ jnp.where(of_gravity, flat, 0.0)) * gravity
+        return value, _sigma(free, covariance), by_gravity, free
 
     arguments = (units.like, scales, [stimulus for _, stimulus in ranges])
     limited = [(limit.part, limit.owner) for limit, _ in ranges]
@@ -224,7 +220,7 @@ def _error_of_output(limit: Limit, like, flat, scales, stimulus):
 
     def output(flat, value):
         triad = ravel_pytree(like)[1](flat).triads()[limit.owner]
-        context = eqx.tree_at(lambda one: getattr(one, quantity), stimulus, value)
+        context = replace(stimulus, **{quantity: value})
         return replace(triad, effects=_effects(triad)).respond(context)
 
     if limit.part == "raw_output":

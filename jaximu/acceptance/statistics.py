@@ -13,12 +13,28 @@ from scipy import special
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, f_tails, normal_isf, student_cdf
 
-__all__ = ["Capability", "Chart", "Drift", "Gauge", "capability", "control_chart", "drift", "gauge", "tolerance_factor"]
+__all__ = [
+    "Capability",
+    "Chart",
+    "Drift",
+    "Gauge",
+    "capability",
+    "control_chart",
+    "drift",
+    "gauge",
+    "tolerance_factor",
+    "with_ends",
+]
 
 _WEIGHT = 0.2  # of the newest value in the moving average
 _MEAN_RANGE = 2 / np.sqrt(np.pi)  # mean range of two normal numbers, d2 = 1.128
 _CATEGORIES = 1.41  # AIAG's √2: a category is a 97 % interval of the gauge wide
 _POOLED = 0.25  # p-value from which AIAG takes an interaction for repeatability
+
+
+def with_ends(numbers: tuple[float, float, float]) -> dict[str, float]:
+    """Return a value and its interval as JSON has them."""
+    return dict(zip(("value", "low", "high"), numbers, strict=True))
 
 
 @dataclass(frozen=True)
@@ -133,9 +149,8 @@ class Gauge:
 
     def document(self) -> dict[str, Any]:
         """Return it as JSON has it."""
-        value, low, high = self.repeatability
         return {
-            "repeatability": {"value": value, "low": low, "high": high},
+            "repeatability": with_ends(self.repeatability),
             "reproducibility": self.reproducibility,
             "gauge": self.total,
             "parts": self.parts,

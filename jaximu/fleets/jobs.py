@@ -163,12 +163,14 @@ def find_jobs(
     table = None if output is None else Path(output).resolve()
     at_rest = _recordings_at_rest(static)
     others = {path.resolve() for path in at_rest.values()}
+
+    def wanted(paths: Iterable[Path]) -> list[Path]:
+        return [path for path in paths if not _is_own(path, table) and path.resolve() not in others]
+
     for argument in arguments:
         path = Path(argument)
         if path.is_dir():
-            inside = [
-                inner for inner in _logs_below(path) if not _is_own(inner, table) and inner.resolve() not in others
-            ]
+            inside = wanted(_logs_below(path))
             if not inside:
                 raise InputError(f"{argument}: the folder holds no logs (files ending in {', '.join(SUFFIXES)}).")
             loose += inside
@@ -179,15 +181,7 @@ def find_jobs(
             else:
                 named += manifest
         elif any(sign in argument for sign in "*?["):
-            matches = [Path(match) for match in sorted(glob.glob(argument, recursive=True))]
-            matches = [
-                match
-                for match in matches
-                if match.is_file()
-                and not match.name.endswith(_NO_LOGS)
-                and not _is_own(match, table)
-                and match.resolve() not in others
-            ]
+            matches = wanted(filter(_is_log, map(Path, sorted(glob.glob(argument, recursive=True)))))
             if not matches:
                 raise InputError(f"{argument}: no file fits this pattern.")
             loose += matches
@@ -233,9 +227,12 @@ def _logs_below(folder: Path) -> list[Path]:
         for inner in below
         if inner.suffix.lower() in SUFFIXES
         and not any(part.startswith(".") for part in inner.relative_to(folder).parts)
-        and not inner.name.endswith(_NO_LOGS)
-        and inner.is_file()
+        and _is_log(inner)
     )
+
+
+def _is_log(path: Path) -> bool:
+    return path.is_file() and not path.name.endswith(_NO_LOGS)
 
 
 def _is_own(path: Path, output: Path | None) -> bool:

@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.estimation.problem import Name
-from jaximu.fleets.rows import PARAMETERS, SCHEMA, covariances, free_places, require_table
+from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, SCHEMA, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.document import Document
@@ -47,7 +47,7 @@ FEWEST = 8
 _SUMMED = ["file", "status", "message", "verdict", "effects", "gyro_unit"]
 _MOST = 10_000
 """Units that the population is estimated from, evenly taken from a larger fleet: what keeps the memory bounded."""
-_LEVEL = 0.01
+LEVEL = 0.01
 """Probability of one false alarm in the whole fleet, for each kind of question."""
 _ROUNDS = 200
 _YEAR = 365.25  # days
@@ -69,6 +69,9 @@ _COLUMNS = (
     "accel_rms",
     "gyro_rms",
 )
+
+
+_SHRUNK = ("device", "file", *COLUMN_PLACES, *(f"{name}_sigma" for name in COLUMN_PLACES))
 
 
 @dataclass(frozen=True)
@@ -237,7 +240,7 @@ def estimate_population(names: Sequence[Name], values: FloatArray, covariances: 
     noise = np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0)
     scatter = np.square(1.4826 * np.median(np.abs(values - mean), axis=0))
     covariance = np.diag(np.maximum(scatter - noise, 0.01 * scatter + 1e-18))
-    limit = float(scipy.stats.chi2.isf(_LEVEL / count, size))
+    limit = float(scipy.stats.chi2.isf(LEVEL / count, size))
     kept = np.zeros(count, bool)
     for _ in range(10):
         distance = Population(tuple(names), mean, covariance, noise, count).distances(values, covariances)
@@ -273,12 +276,17 @@ def _maximise(values, covariances, mean, covariance):
 
 @dataclass(frozen=True)
 class _Units:
-    """Calibrated units of a table: parameters relative to the data sheet, and what they are grouped by."""
+    """Calibrated units of a table: parameters relative to the data sheet, and what they are grouped by.
+
+    factor, offset: (n, 24), outputs of the table are parameters times the one plus the other.
+    """
 
     names: tuple[Name, ...]
     values: FloatArray
     covariances: FloatArray
     rows: list[dict[str, Any]]
+    factor: FloatArray
+    offset: FloatArray
 
 
 def _units(rows: Sequence[dict[str, Any]], gyroscope: bool) -> _Units:
@@ -286,20 +294,18 @@ def _units(rows: Sequence[dict[str, Any]], gyroscope: bool) -> _Units:
     indices = free_places(gyroscope)
     count, size = len(rows), len(PARAMETERS)
     raw, factor, offset = np.zeros((count, size)), np.ones((count, size)), np.zeros((count, size))
-    for start, name in ((0, "accel"), (12, "gyro"))[: 1 + gyroscope]:
-        gain, bias, nominal = (
-            np.array([row[f"{name}_{part}"] for row in rows], float).reshape(count, -1)
-            for part in ("gain", "bias", "nominal")
-        )
-        raw[:, start : start + 9], raw[:, start + 9 : start + 12] = gain, bias
-        factor[:, start : start + 9] = np.repeat(nominal[:, :3], 3, axis=1)
-        factor[:, start + 9 : start + 12] = nominal[:, :3]
-        offset[:, start + 9 : start + 12] = nominal[:, 3:]
+    for name, part in list(COLUMN_PLACES.items())[: 2 + 2 * gyroscope]:
+        scale, zero = np.split(np.array([row[f"{name.partition('_')[0]}_nominal"] for row in rows], float), 2, axis=1)
+        raw[:, part] = np.array([row[name] for row in rows], float)
+        factor[:, part] = np.repeat(scale, 3, axis=1) if name.endswith("gain") else scale
+        offset[:, part] = 0.0 if name.endswith("gain") else zero
     whole = covariances(np.array([row["covariance"] for row in rows], float).reshape(count, -1))
     whole = whole / factor[:, :, None] / factor[:, None, :]
     relative = (raw - offset) / factor
     grid = np.ix_(range(count), indices, indices)
-    return _Units(tuple(PARAMETERS[index] for index in indices), relative[:, indices], whole[grid], list(rows))
+    return _Units(
+        tuple(PARAMETERS[index] for index in indices), relative[:, indices], whole[grid], list(rows), factor, offset
+    )
 
 
 def _groups(path: Path, gyroscope: bool, columns: Sequence[str] | None = None) -> Iterator[list[dict[str, Any]]]:
@@ -307,7 +313,9 @@ def _groups(path: Path, gyroscope: bool, columns: Sequence[str] | None = None) -
     with pq.ParquetFile(path) as file:
         for batch in file.iter_batches(batch_size=1024, columns=None if columns is None else list(columns)):
             rows = batch.to_pylist()
-            yield [row for row in rows if row["status"] == "ok" and (row["gyro_gain"] is not None) == gyroscope]
+            rows = [row for row in rows if row["status"] == "ok" and (row["gyro_gain"] is not None) == gyroscope]
+            if rows:
+                yield rows
 
 
 def read_fleet(table: str | os.PathLike[str]) -> Fleet:
@@ -348,28 +356,29 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
         passed += len(rows)
     if step > 1:
         notes.append(f"the population was estimated from {len(kept)} of {total} units, evenly taken.")
-    empty = np.empty((0, 0))
     failed = dict(sorted(failed.items(), key=lambda pair: -len(pair[1])))
-    base: dict[str, Any] = {
-        "table": os.fspath(table),
-        "recordings": sum(statuses.values()),
-        "statuses": statuses,
-        "verdicts": verdicts,
-        "effects": effects,
-        "failed": failed,
-        "population": None,
-        "strangers": (),
-        "differences": (),
-        "values": empty,
-        "shrunk": empty,
-        "sigma": empty,
-        "shrunk_sigma": empty,
-        "lots": (),
-        "shifts": None,
-        "rms": empty,
-    }
+    empty = np.empty((0, 0))
+    fleet = Fleet(
+        os.fspath(table),
+        statuses.total(),
+        statuses,
+        verdicts,
+        effects,
+        failed,
+        None,
+        (),
+        (),
+        empty,
+        empty,
+        empty,
+        empty,
+        (),
+        None,
+        empty,
+        tuple(notes),
+    )
     if len(kept) < FEWEST:
-        return Fleet(**base, notes=(*notes, f"fewer than {FEWEST} calibrated units: no population."))
+        return replace(fleet, notes=(*notes, f"fewer than {FEWEST} calibrated units: no population."))
     units = _units(kept, gyroscope)
     differences, shifts = _lots_and_dates(units)
     shift = shifts.of(units.rows)
@@ -378,21 +387,18 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     differences += _repeated(units) + _shared_effects(units)
     shrunk, spread = population.shrink(centred, units.covariances)
     rms = [[row["accel_rms"], np.nan if row["gyro_rms"] is None else row["gyro_rms"]] for row in kept]
-    return Fleet(
-        **base
-        | {
-            "population": population,
-            "strangers": _strangers(path, gyroscope, population, shifts, total),
-            "differences": tuple(sorted(differences, key=lambda difference: difference.p_value)),
-            "values": units.values,
-            "shrunk": shrunk + shift,
-            "sigma": np.sqrt(np.diagonal(units.covariances, axis1=1, axis2=2)),
-            "shrunk_sigma": np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0)),
-            "lots": tuple(_names(units)),
-            "shifts": shifts,
-            "rms": np.array(rms, float),
-        },
-        notes=tuple(notes),
+    return replace(
+        fleet,
+        population=population,
+        strangers=_strangers(path, gyroscope, population, shifts, total),
+        differences=tuple(sorted(differences, key=lambda difference: difference.p_value)),
+        values=units.values,
+        shrunk=shrunk + shift,
+        sigma=np.sqrt(np.diagonal(units.covariances, axis1=1, axis2=2)),
+        shrunk_sigma=np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0)),
+        lots=tuple(_names(units)),
+        shifts=shifts,
+        rms=np.array(rms, float),
     )
 
 
@@ -407,13 +413,11 @@ def _strangers(path: Path, gyroscope: bool, population: Population, shifts: Shif
     """Units farther from the population, or from their lot and date, than one in a hundred fleets would have."""
     strangers = []
     for rows in _groups(path, gyroscope, _COLUMNS):
-        if not rows:
-            continue
         units = _units(rows, gyroscope)
         centred = units.values - shifts.of(rows)
         distances = population.distances(centred, units.covariances)
         p_values = scipy.stats.chi2.sf(distances, len(population.names)) * total
-        for index in np.flatnonzero(p_values < _LEVEL):
+        for index in np.flatnonzero(p_values < LEVEL):
             variance = np.diagonal(units.covariances[index])
             z = (centred[index] - population.mean) / np.sqrt(np.diagonal(population.covariance) + variance)
             worst = np.argsort(-np.abs(z))[:3]
@@ -509,7 +513,7 @@ def _lots_and_dates(units: _Units) -> tuple[list[Difference], Shifts]:
         return [], shifts
     within = groups.within(units.values)
     inside = estimate_population(units.names, within, units.covariances)
-    limit = scipy.stats.chi2.isf(_LEVEL / len(within), size)
+    limit = scipy.stats.chi2.isf(LEVEL / len(within), size)
     usual = inside.distances(within, units.covariances) <= limit
     findings: dict[int, list[tuple[float, tuple[Name, float, float]]]] = {}
     for k, name in enumerate(units.names):
@@ -560,7 +564,7 @@ def _causes(
         amounts = spread @ (design @ (weight * values))
         sigmas = np.sqrt(np.diagonal(spread))
         p_values = p_value((amounts / sigmas)[1:], taken)
-        if (p_values >= _LEVEL).any():  # what was taken after it explains it
+        if (p_values >= LEVEL).any():  # what was taken after it explains it
             given_up.append(taken.pop(int(np.argmax(p_values))))
             continue
         crossed = np.stack([groups.products(weight * row) for row in design])
@@ -574,7 +578,7 @@ def _causes(
         z[open_] = (groups.products(weight * (values - amounts @ design)) / np.sqrt(np.where(open_, left, 1.0)))[open_]
         # the time last where it does as well as a lot: of two lots, each of one date
         best = int(np.flatnonzero(np.abs(z) >= (1 - 1e-9) * np.abs(z).max())[0])
-        if p_value(z[best], best) >= _LEVEL:
+        if p_value(z[best], best) >= LEVEL:
             break
         taken.append(best)
     return [(cause, float(amounts[k + 1]), float(sigmas[k + 1]), float(p_values[k])) for k, cause in enumerate(taken)]
@@ -592,7 +596,7 @@ def _repeated(units: _Units) -> list[Difference]:
         change = units.values[last] - units.values[first]
         sigma = np.sqrt(np.diagonal(units.covariances[first] + units.covariances[last]))
         p_values = 2 * scipy.stats.norm.sf(np.abs(change / sigma)) * len(units.names) * len(repeated)
-        changed = [k for k in np.argsort(p_values) if p_values[k] < _LEVEL]
+        changed = [k for k in np.argsort(p_values) if p_values[k] < LEVEL]
         if changed:
             named = tuple((units.names[k], float(change[k]), float(sigma[k])) for k in changed)
             differences.append(
@@ -623,7 +627,7 @@ def _shared_effects(units: _Units) -> list[Difference]:
             inside, outside = diagnosed & (lots == group), diagnosed & (lots != group)
             table = [[int(np.sum(shown & side)), int(np.sum(~shown & side))] for side in (inside, outside)]
             p_value = float(scipy.stats.fisher_exact(table, "greater")[1]) * len(names) * len(groups)  # pyright: ignore
-            if p_value < _LEVEL:
+            if p_value < LEVEL:
                 text = (
                     f"lot {group} shares {effect_title(effect)}: found in {table[0][0]} of its {int(inside.sum())} "
                     f"units, in {table[1][0]} of {int(outside.sum())} others"
@@ -645,34 +649,20 @@ def write_shrunk(fleet: Fleet, path: str | os.PathLike[str]) -> None:
         raise NotPossibleError(f"{fleet.table}: there is no population to learn from: {' '.join(fleet.notes)}")
     population = fleet.population
     gyroscope = any(name.owner == "gyroscope" for name in population.names)
-    numbers = ("accel_gain", "accel_bias", "gyro_gain", "gyro_bias")
-    columns = [name for name in SCHEMA.names if name in ("device", "file") or name.startswith(numbers)]
-    schema = pa.schema([SCHEMA.field(name) for name in columns])
+    schema = pa.schema([field for field in SCHEMA if field.name in _SHRUNK])
     places = free_places(gyroscope)
     with atomic_write(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
         for rows in _groups(Path(fleet.table), gyroscope, _COLUMNS):
-            if not rows:
-                continue
             units = _units(rows, gyroscope)
             moved = fleet.shifts.of(rows)
             mean, spread = population.shrink(units.values - moved, units.covariances)
-            whole = np.zeros((len(rows), len(PARAMETERS), 2))
-            whole[:, places, 0] = mean + moved
-            whole[:, places, 1] = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0))
+            values, sigma = np.zeros((2, len(rows), len(PARAMETERS)))
+            values[:, places] = mean + moved
+            sigma[:, places] = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0))
+            values, sigma = values * units.factor + units.offset, sigma * units.factor
             out: dict[str, list] = {name: [row[name] for row in rows] for name in ("device", "file")}
-            for start, name in ((0, "accel"), (12, "gyro")):
-                for part, first, size in (("gain", start, 9), ("bias", start + 9, 3)):
-                    there = name == "accel" or gyroscope
-                    for column, which in ((f"{name}_{part}", 0), (f"{name}_{part}_sigma", 1)):
-                        out[column] = [
-                            _output(row, name, part, whole[k, first : first + size, which], which) if there else None
-                            for k, row in enumerate(rows)
-                        ]
+            for name, part in COLUMN_PLACES.items():
+                there = gyroscope or name.startswith("accel")
+                for column, numbers in ((name, values), (f"{name}_sigma", sigma)):
+                    out[column] = list(numbers[:, part]) if there else [None] * len(rows)
             writer.write_table(pa.table([pa.array(out[f.name], f.type) for f in schema], schema=schema))
-
-
-def _output(row: dict[str, Any], name: str, part: str, relative: FloatArray, which: int) -> FloatArray:
-    scale, offset = np.array(row[f"{name}_nominal"][:3]), np.array(row[f"{name}_nominal"][3:])
-    if part == "gain":
-        return relative * np.repeat(scale, 3)
-    return relative * scale + (offset if which == 0 else 0.0)

@@ -17,7 +17,7 @@ from jaximu.calibration import nominal_imu, require_spanning
 from jaximu.calibration.arrangement import unusual_gains
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.fitting import Fit
-from jaximu.estimation.problem import names_of, without_equipment
+from jaximu.estimation.problem import flatten, names_of, without_equipment
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import weak_directions
 from jaximu.fleets.field import FieldUnit, field_row, field_unit
@@ -25,6 +25,7 @@ from jaximu.fleets.fit import FleetUnit, fit_units
 from jaximu.fleets.jobs import Job, Settings
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
+from jaximu.ground.units import SENSORS
 from jaximu.mistakes import prepared
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
@@ -34,6 +35,7 @@ from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observed_poses, segment
 
 __all__ = [
+    "COLUMN_PLACES",
     "PARAMETERS",
     "SCHEMA",
     "ReadJob",
@@ -48,9 +50,14 @@ __all__ = [
 
 PARAMETERS = names_of(Imu.nominal())
 """Names of the 24 numbers of a row, in the order of its column `covariance`."""
+COLUMN_PLACES = {
+    "accel_gain": slice(0, 9),
+    "accel_bias": slice(9, 12),
+    "gyro_gain": slice(12, 21),
+    "gyro_bias": slice(21, 24),
+}
+"""Which of `PARAMETERS` a column of the table holds."""
 _TRIANGLE = np.tril_indices(len(PARAMETERS))
-_TRIADS = {"accel": "accelerometer", "gyro": "gyroscope"}
-"""By what the table's columns call them."""
 _EPOCH = 946684800.0  # s; the year 2000: a logger's start before it is no date
 
 
@@ -251,7 +258,9 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
     except NotPossibleError as error:
         return row | _failure(error)
     rank, weak = weak_directions(fit.jacobian, fit.names, fit.sizes, unit.nominal)
-    scales = {triad: np.array(row[f"{name}_nominal"][:3]) for name, triad in _TRIADS.items() if row[f"{name}_nominal"]}
+    scales = {
+        triad: np.array(row[f"{name}_nominal"][:3]) for name, triad in SENSORS.items() if row.get(f"{name}_nominal")
+    }
     unusual = unusual_gains(fit.imu, weak, scales) if scales else []
     for finding in unusual:
         if finding.apply is not None:  # in wrong axes the unit is none of the population
@@ -275,10 +284,9 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
     }
     if unit.gyroscope and row["turns"]:
         row["gyro_rms"] = float(rms[1])
-    for (name, triad), start in zip(list(_TRIADS.items())[: 1 + unit.gyroscope], (0, 12), strict=False):
-        gain, bias, known = slice(start, start + 9), slice(start + 9, start + 12), fit.imu.triads()[triad]
-        row[f"{name}_gain"], row[f"{name}_bias"] = np.ravel(known.gain), known.bias
-        row[f"{name}_gain_sigma"], row[f"{name}_bias_sigma"] = sigma[gain], sigma[bias]
+    values = flatten(fit.imu)
+    for name, part in list(COLUMN_PLACES.items())[: 2 + 2 * unit.gyroscope]:
+        row[name], row[f"{name}_sigma"] = values[part], sigma[part]
     return row
 
 

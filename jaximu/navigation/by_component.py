@@ -28,10 +28,8 @@ def matvec(matrix: Matrix, vector: Vector) -> Vector:
 
 
 def _dot(first: Vector, second: Vector) -> Array:
-    total = first[0] * second[0]
-    for a, b in zip(first[1:], second[1:], strict=True):
-        total = total + a * b
-    return total
+    products = [a * b for a, b in zip(first, second, strict=True)]
+    return sum(products[1:], products[0])
 
 
 def cross(first: Vector, second: Vector) -> Vector:

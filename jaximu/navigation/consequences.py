@@ -40,6 +40,7 @@ from jaximu.model.stimulus import Stimulus
 from jaximu.navigation import Navigation, deviation, linearised, mechanise, noise_covariance
 from jaximu.navigation.trajectory import Trajectory
 from jaximu.noise.analysis import read_analysis
+from jaximu.planning.goals import group_of
 from jaximu.planning.information import root_of
 from jaximu.recordings.readers.kalibr import read_noise
 
@@ -128,8 +129,7 @@ def kind_of(name: Name, model: Imu) -> str:
     """Return what a term of the budget calls a number of the unit: "accelerometer scale", or an effect's name."""
     if name.effect is not None:
         return model.all_effects()[name.owner, name.effect].english
-    part = name.part if name.part == "bias" else "scale" if name.axes[0] == name.axes[1] else "misalignment"
-    return f"{name.owner} {part}"
+    return group_of(name).replace(".", " ")
 
 
 def _simplified(imu: Imu) -> dict[str, Imu]:
@@ -444,7 +444,7 @@ def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
     stimulus = path.stimulus
     vectors = increments(*map(jnp.asarray, (stimulus.angular_rate, stimulus.specific_force, path.intervals)))
     transition, reaction = compiled(linearised)(path.start, *vectors, jnp.asarray(path.intervals))
-    terms, interval = {}, float(np.mean(path.intervals))
+    terms, interval = {}, path.interval
     propagate = compiled(noise_covariance)
     for triad, term in wanted:
         columns = reaction[..., :3] if triad == "gyroscope" else reaction[..., 3:]
@@ -458,7 +458,6 @@ def _draw(run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise,
     """Draw all errors at once and mechanise."""
     rng = np.random.default_rng(seed)
     root = root_of(run.covariance)
-    rate = 1 / float(np.mean(path.intervals))
     streams = [
         Noise(
             tuple(_PROCESSES[term](figure) for term, figure in noise.get(triad, {}).items()), INERTIAL_QUANTITIES[triad]
@@ -468,6 +467,9 @@ def _draw(run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise,
     errors = []
     for first in range(0, draws, _TOGETHER):
         changes = rng.standard_normal((_TOGETHER, len(root))) @ root.T
-        parts = [stream.sample(len(path.intervals), rate, (seed, first), shape=(_TOGETHER,)) for stream in streams]
+        parts = [
+            stream.sample(len(path.intervals), 1 / path.interval, (seed, first), shape=(_TOGETHER,))
+            for stream in streams
+        ]
         errors.append(np.asarray(_errors(run, reference, changes, np.concatenate(parts, axis=-1))))
     return MonteCarlo(np.concatenate(errors)[:draws], seed)

@@ -118,7 +118,7 @@ class ModelledErrors:
     @property
     def rate(self) -> float:
         """Samples a second."""
-        return 1 / float(np.mean(self.trajectory.intervals))
+        return 1 / self.trajectory.interval
 
     @property
     def duration(self) -> float:

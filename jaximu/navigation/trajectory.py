@@ -105,6 +105,11 @@ class Trajectory:
         """The reported times (T,), s from the start."""
         return np.round(np.cumsum(self.intervals)[self.every - 1 :: self.every], 9)  # not 0.99…
 
+    @property
+    def interval(self) -> float:
+        """Mean interval of the samples, s."""
+        return float(np.mean(self.intervals))
+
     def excess_power(self, density: Mapping[str, FloatArray]) -> dict[str, float]:
         """Return by triad how much more power the samples have at half their rate than white noise of a density N has.
 
@@ -120,7 +125,7 @@ class Trajectory:
         for triad, values in known:
             whole = np.asarray(values)[: len(self.intervals) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
             measured = np.mean(np.einsum("k,nki->ni", weight, whole) ** 2) / np.sum(weight**2)
-            white = np.mean(np.square(density[triad])) / np.mean(self.intervals)
+            white = np.mean(np.square(density[triad])) / self.interval
             excess[triad] = max(float(measured / white) - 1.0, 0.0)
         return excess
 
@@ -232,8 +237,7 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
     ready = compensate(calibration, recording)
     gyroscope, accelerometer = ready.gyroscope, ready.accelerometer
     assert gyroscope is not None
-    time = gyroscope.time
-    rate = gyroscope.values
+    time, rate = gyroscope.time, gyroscope.values
     force = np.stack([np.interp(time, accelerometer.time, column) for column in accelerometer.values.T], axis=1)
     notes: list[str] = []
     if recording.attitude is not None:

@@ -50,7 +50,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -386,18 +385,15 @@ def _check(
 
     def sheet(triad: Triad) -> Triad:
         gain = np.diag(np.linalg.norm(np.asarray(triad.gain), axis=1))
-        return eqx.tree_at(lambda t: (t.gain, t.bias), triad, (gain, np.zeros(3)))
+        return replace(triad, gain=gain, bias=np.zeros(3))
 
     def many(leaf):
         return np.broadcast_to(np.asarray(leaf), (_CHUNK, *np.shape(leaf)))
 
     def fitted(means: FloatArray) -> FloatArray:
         """Errors of the parameters, and whether the fit went well, (n, p + 1)."""
-        sessions = eqx.tree_at(
-            lambda observed: (observed.accelerometer_mean, observed.gyroscope_mean),
-            jax.tree.map(many, scheme.stations),
-            (means[:, 0], means[:, 1]),
-        )
+        stations = jax.tree.map(many, scheme.stations)
+        sessions = replace(stations, accelerometer_mean=means[:, 0], gyroscope_mean=means[:, 1])
         fit = fit_turntable(jax.tree.map(many, start), sessions, task.fitted)
         off = (np.asarray(fit.values) - flatten(unit)[indices]) / per
         return np.column_stack([off, np.asarray(fit.converged & fit.finite, float)])

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaximu.estimation.problem import Name
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, nearest
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.sensor import Imu
 from jaximu.planning.setup_errors import quantity
 
-__all__ = ["goal_of", "group_of", "parse_goal", "per_si", "unit_of"]
+__all__ = ["goal_of", "goal_sigmas", "group_of", "parse_goal", "per_si", "unit_of"]
 
 
 def parse_goal(text: str) -> tuple[str, str]:
@@ -47,6 +48,15 @@ def unit_of(name: Name, unit: Imu) -> str:
     if name.part == "bias":
         return SENSOR_UNITS[name.owner]
     return "1" if name.axes[0] == name.axes[1] else "rad"
+
+
+def goal_sigmas(what: str, text: str, names: Sequence[Name], unit: Imu, sigma: FloatArray) -> tuple[float, FloatArray]:
+    """Return the size of a goal, and the standard deviations of what it is for, both in its unit.
+
+    **Arguments:** `sigma` (p,): of the parameters, in output units; else, and errors, as of [`goal_of`].
+    """
+    indices, size = goal_of(what, text, names, unit)
+    return size, np.array([sigma[index] / per_si(names[index], unit) for index in indices])
 
 
 def goal_of(what: str, text: str, names: Sequence[Name], unit: Imu, where: str = "") -> tuple[list[int], float]:

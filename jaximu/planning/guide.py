@@ -25,7 +25,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.model.sensor import Imu
 from jaximu.planning.chunks import in_chunks
-from jaximu.planning.goals import goal_of, parse_goal, per_si
+from jaximu.planning.goals import goal_of, goal_sigmas, parse_goal
 from jaximu.planning.information import Design, hand_held_information
 from jaximu.planning.optimisation import DesignQuestion
 from jaximu.planning.plan import EQUIPMENT, Known, question_of
@@ -174,15 +174,11 @@ class Guide:
             return -float(np.linalg.slogdet(information)[1])
         covariance = np.linalg.inv(information) + np.outer(question.by_gravity, question.by_gravity)
         sigma = np.sqrt(np.diagonal(covariance)) * np.asarray(question.parameters.size)
-        over = []
+        total = 0.0
         for _, what, text in self.goals:
-            indices, size = goal_of(what, text, question.parameters.names, question.imu)
-            names = [question.parameters.names[index] for index in indices]
-            over += [
-                sigma[index] / per_si(name, question.imu) / size for index, name in zip(indices, names, strict=True)
-            ]
-        # the largest counts most, and where it cannot be helped at once, the others do
-        return float(np.log(np.sum(np.array(over) ** 4)))
+            size, now = goal_sigmas(what, text, question.parameters.names, question.imu, sigma)
+            total += np.sum((now / size) ** 4)  # the largest counts most; where it cannot be helped at once, the others
+        return float(np.log(total))
 
     def _goals(self, recording: Recording) -> list[GoalProgress]:
         progress, calibration = [], self._calibration
@@ -190,10 +186,9 @@ class Guide:
             if calibration is None:
                 progress.append(GoalProgress(text, 0.0, np.inf))
                 continue
-            names, imu = calibration.names, calibration.imu
-            indices, wanted = goal_of(what, size, names, imu)
             sigma = np.sqrt(np.diagonal(calibration.covariance))
-            progress.append(GoalProgress(text, wanted, max(float(sigma[k]) / per_si(names[k], imu) for k in indices)))
+            wanted, now = goal_sigmas(what, size, calibration.names, calibration.imu, sigma)
+            progress.append(GoalProgress(text, wanted, float(now.max())))
         return progress
 
 

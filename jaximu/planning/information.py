@@ -9,6 +9,7 @@ those of `jaximu.data.attitude`, against the attitude it reports. Nothing of the
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -27,7 +28,7 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.ground.stored import compiled
 from jaximu.model.mounting import Mounting
-from jaximu.model.sensor import Imu, Triad
+from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Poses, Turns
 from jaximu.simulation.protocols.motion import smooth_course
@@ -112,11 +113,7 @@ def _plain(imu: Imu) -> Imu:
     """The unit without effects; with a perfect gyroscope where there is none, which no condition then looks at."""
     gyroscope = Imu.nominal().gyroscope if imu.gyroscope is None else imu.gyroscope
     assert gyroscope is not None
-
-    def plain(triad: Triad) -> Triad:
-        return eqx.tree_at(lambda t: t.effects, triad, ())
-
-    return Imu(plain(imu.accelerometer), plain(gyroscope))
+    return Imu(replace(imu.accelerometer, effects=()), replace(gyroscope, effects=()))
 
 
 def _observed(imu: Imu, attitude, accuracy: Accuracy, gravity) -> Observations:

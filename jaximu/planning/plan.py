@@ -47,11 +47,12 @@ from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specific
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.positions import directions, spiral
 
-__all__ = ["EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose", "question_of"]
+__all__ = ["AS_GOOD", "EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose", "question_of"]
 
 SCHEMA = "jaximu.plan/1"
 _STARTS, _FEW_STARTS = 10, 4
-_AS_GOOD = 1.001  # a simpler scheme is taken where the best is better by no more than this
+AS_GOOD = 1.001
+"""A well-known scheme is proposed where the best is better by no more than this."""
 _MOUNTING = TOLERANCE * 0.1
 """How far (rad) a table's frame may lie from that of a calibration by hand: as far as a misalignment may."""
 
@@ -357,7 +358,7 @@ def propose(
     if not equipment.chained and _classical(poses, equipment):
         simple = _ordered(starts[0], equipment)
         plain = covariance(question, simple)
-        if score(question, plain.covariance) <= _AS_GOOD * score(question, best.covariance):
+        if score(question, plain.covariance) <= AS_GOOD * score(question, best.covariance):
             design, best = simple, plain
             notes += ("well known positions do as well as any here, and are proposed.",)
     names, size = question.parameters.names, np.asarray(question.parameters.size)

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import orth
 
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.observe_stations import observe_stations
@@ -205,8 +206,7 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
 
 
 def _basis(columns: NDArray[np.floating]) -> FloatArray:
-    u, s, _ = np.linalg.svd(np.asarray(columns, np.float64), full_matrices=False)
-    return u[:, s > 1e-6 * max(s[0], 1e-300)]
+    return orth(np.asarray(columns, np.float64), rcond=1e-6)
 
 
 def _detected(noncentrality: float, freedom: int, level: float) -> float:

@@ -42,7 +42,7 @@ from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.planning.information import root_of
 from jaximu.planning.optimisation import CRITERIA, criterion_of
-from jaximu.planning.plan import EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, question_of
+from jaximu.planning.plan import AS_GOOD, EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, question_of
 from jaximu.planning.poses import pose_words, up_of
 from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Rotations
@@ -60,7 +60,6 @@ _RATE = 50.0
 """Hz of the simulated motion: nothing but means and increments over half a second are made of it."""
 _BEFORE = 2.0
 """Seconds of rest before a simulated rotation."""
-_AS_GOOD = 1.001  # the well-known sequence is taken where the best is better by no more than this
 _SHOWN = 0.5
 """Share of its uncertainty beforehand down to which a number must come to count as shown."""
 
@@ -309,7 +308,7 @@ def propose_sequence(
         other = estimator.whole(classical)
         value = estimator.value(other, criterion, weights)
         ratio = float(np.exp(value - best))
-        if ratio <= _AS_GOOD:
+        if ratio <= AS_GOOD:
             words, knowledge, best = classical, other, value
             notes += ("the well-known nineteen positions do as well as any here, and are proposed.",)
         else:

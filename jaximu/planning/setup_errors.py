@@ -51,7 +51,6 @@ __all__ = [
 ]
 
 _TURN_ONLY = ("rate-table", "single-axis-table")  # their angle about the vertical is all that is set
-_ONE_MOUNTING = ("dividing-head",)
 _FLICKER_INTERVAL = 0.01  # s; flicker noise faster than this averages out like white noise
 
 
@@ -158,6 +157,11 @@ def task(document: Mapping[str, Any], name: str = "specification") -> Task:
     return Task(specification.case(0), environment, errors, tuple(fitted), stated, name)
 
 
+def _stated(errors: Mapping[str, tuple[Any, str]], name: str) -> dict[str, float]:
+    """The sizes of a table of errors, SI; empty where it is not stated."""
+    return errors.get(name, ({}, ""))[0]
+
+
 def quantity(value: Any, unit: str, where: str) -> float:
     """Return a size in SI.
 
@@ -171,10 +175,10 @@ def quantity(value: Any, unit: str, where: str) -> float:
     return parsed
 
 
-def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
+def _errors(table: Any, name: str, environment: Mapping[str, Any]) -> dict[str, Any]:
     """Check the table; sizes in SI, with the text they were stated in."""
     sizes_of: dict[str, Any] = {}
-    latitude = isinstance(environment, dict) and "latitude" in environment
+    latitude = "latitude" in environment
     for key, value in only(table, _ERRORS, name, "[errors]").items():
         where = f"{name}: errors.{key}"
         if key in _SINGLE:
@@ -199,10 +203,10 @@ def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
                 sizes_of[effect] = np.array([quantity(one, unit, entry) for one in sizes]), f"{stated} {unit}"
     if latitude and table.get("earth_rotation", "ignored") == "ignored":
         sizes_of["earth_rotation"] = float(environment["latitude"]), f"latitude {environment['latitude']}°"
-    vibration = sizes_of.get("vibration", ({}, ""))[0]
+    vibration = _stated(sizes_of, "vibration")
     if ("rectification" in vibration) != ("rms" in vibration):
         raise InputError(f"{name}: errors.vibration: rms and rectification go together.")
-    knots = isinstance(environment, dict) and isinstance(environment.get("temperature"), list)
+    knots = isinstance(environment.get("temperature"), list)
     if "temperature" in sizes_of and knots == ("span" in sizes_of["temperature"][0]):
         text = "both are there; leave one out" if knots else "neither is there"
         raise InputError(f"{name}: errors.temperature needs a span, or a path [environment] temperature: {text}.")
@@ -325,7 +329,7 @@ def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
     across = np.eye(3) - stops.up[:, :, None] * stops.up[:, None, :]
     about = np.eye(count)[:, None, :] * stops.up[:, :, None]  # (A, 3, A)
     others = np.einsum("aij,as->aisj", across, member).reshape(count, 3, -1)
-    mounted = np.ones((count, 1)) if kind in _ONE_MOUNTING else member
+    mounted = np.ones((count, 1)) if kind == "dividing-head" else member  # one mounting
     mounting = np.einsum("as,ij->aisj", mounted, np.eye(3)).reshape(count, 3, -1)
     polar = np.arccos(np.clip(stops.up[:, 2], -1, 1))
     level = np.hypot(stops.up[:, 0], stops.up[:, 1]) < 1e-9
@@ -385,7 +389,7 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
             f"{task.name}: a budget needs poses and turns that a table knows, and the protocol {protocol.kind} has "
             "none: take positions, dividing-head, single-axis-table or rate-table."
         )
-    temperature = errors.get("temperature", ({}, ""))[0]
+    temperature = _stated(errors, "temperature")
     if "span" in temperature:
         knots = ((0.0, 25.0), (case.plan.motion.length, 25.0 + temperature["span"]))
         environment = replace(environment, temperature=knots)
@@ -427,7 +431,7 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
         sizes = np.concatenate([size for _, size in group])
         add(name, np.diag(sizes), coefficient)
         coefficient += len(sizes)
-    if shaken := errors.get("vibration", ({}, ""))[0].get("noise", 0.0):
+    if shaken := _stated(errors, "vibration").get("noise", 0.0):
         during = np.asarray(stations.turn & stations.gyroscope_used) / np.sqrt(_durations(stations))
         scale = np.linalg.norm(np.asarray(case.imu.triads()["gyroscope"].gain), axis=1)
         add("vibration", np.diag((shaken * scale[:, None] * during).ravel()), added + 3 * size)
@@ -508,11 +512,11 @@ def _effects_by_source(errors: Mapping[str, tuple[Any, str]], unit: Imu, ramps: 
         sources["earth_rotation"] = [
             effect("gyro.earth_rotation", EARTH_RATE * np.abs([level, level, np.sin(latitude)]))
         ]
-    drifts, temperature = (errors.get(name, ({}, ""))[0] for name in ("drift", "temperature"))
+    drifts, temperature = (_stated(errors, name) for name in ("drift", "temperature"))
     drifts = {name: np.hypot(drifts.get(name, 0.0), ramp) for name, ramp in ramps.items()}
     for source, stem, sizes in (("drift", "bias_ramp", drifts), ("temperature", "temperature", temperature)):
         sources[source] = [effect(f"{PREFIXES[name]}.{stem}", sizes.get(name, 0.0)) for name in INERTIAL_QUANTITIES]
-    vibration = errors.get("vibration", ({}, ""))[0]
+    vibration = _stated(errors, "vibration")
     sources["vibration"] = [effect("gyro.vibration_rectification", vibration.get("rectification", 0.0))]
     sources |= {name: [effect(name, size)] for name, (size, _) in errors.items() if name in CATALOGUE}
     return {
@@ -535,6 +539,6 @@ def _scheme(
     angle[:count] = [interval.angle if interval.kind == "turn" else np.inf for interval in intervals]
     pace = np.einsum("sqi,si->sq", np.asarray(stations.stimulus.angular_rate), axis) / angle[:, None]
     done = (np.cumsum(pace, axis=1) - pace / 2) * (_durations(stations) / pace.shape[1])[:, None]
-    rms = errors.get("vibration", ({}, ""))[0].get("rms", 0.0)
+    rms = _stated(errors, "vibration").get("rms", 0.0)
     power = np.where(np.asarray(stations.turn)[:, None], rms**2, np.zeros_like(pace))
     return ErrorScheme(unit, effects, stations, motion, ends, done, pace, power, len(stops.up))
