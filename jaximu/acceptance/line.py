@@ -18,7 +18,7 @@ from jaximu.acceptance.acceptance import SCHEMA, Judged, judge
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
 from jaximu.acceptance.item import Item
 from jaximu.acceptance.limits import OF_ONE_UNIT, Limit, Limits
-from jaximu.acceptance.quantities import Measured, Units, measure
+from jaximu.acceptance.quantities import Measured, Units, measure, share_of
 from jaximu.acceptance.statistics import (
     Capability,
     Chart,
@@ -33,7 +33,7 @@ from jaximu.acceptance.statistics import (
 )
 from jaximu.acceptance.words import amount, si_unit, spoken
 from jaximu.fleets.population import LEVEL, days_of, read_fleet
-from jaximu.fleets.rows import PARAMETERS, covariances, free_places, require_table
+from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.distributions import student_cdf
@@ -266,7 +266,7 @@ def read_table(path: str | os.PathLike[str]) -> Batch:
         outputs[f"{owner}_unit"] = output_units[0]
     like = Imu.nominal(**outputs)
     like = like if gyroscope else Imu(like.accelerometer, None)
-    parts = [numbers(f"{short}_{part}") for short in triads for part in ("gain", "bias")]
+    parts = [numbers(column) for column in list(COLUMN_PLACES)[: 2 * len(triads)]]
     free = free_places(gyroscope)
     covariance = covariances(numbers("covariance"))[np.ix_(range(len(rows)), free, free)]
     # gravity's part is in the sigmas and not in the covariance; it acts on the accelerometer's gain as a whole
@@ -275,9 +275,8 @@ def read_table(path: str | os.PathLike[str]) -> Batch:
     added = numbers("accel_gain_sigma")[:, scales] ** 2 - variances
     gravity = np.sqrt(np.maximum(np.mean(added / parts[0][:, scales] ** 2, axis=1), 0.0))
     by_gravity = np.where(np.array(free) < 9, np.concatenate(parts, axis=1)[:, free], 0.0) * gravity[:, None]
-    excess = numbers("excess")
     poses, turns = (np.nan_to_num(numbers(column)[:, 0]) for column in ("poses", "turns"))
-    share = np.nan_to_num(excess / (1 + excess))
+    share = np.nan_to_num(share_of(numbers("excess")))
     accelerometer = np.maximum(1.0, poses - 9), share[:, 0]
     conditions = {("accelerometer", part): accelerometer for part in ("gain", "bias")}
     if gyroscope:

@@ -39,7 +39,7 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.planning.chunks import in_chunks
 
-__all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]
+__all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus", "share_of"]
 
 _CHUNK = 512  # units that are computed at once
 _GRID = np.array([point for point in product(range(-2, 3), repeat=3) if max(map(abs, point)) == 2], float)
@@ -99,12 +99,12 @@ def of_calibration(calibration: Calibration) -> Units:
     for (owner, part), (kind, count) in counts.items():
         if count is not None and kind in excess:
             free = numbers[owner] if owner == "accelerometer" else 9 if part == "gain" else 3
-            conditions[owner, part] = np.array([max(1.0, count - free)]), _share(np.array([excess[kind]]))
+            conditions[owner, part] = np.array([max(1.0, count - free)]), share_of(np.array([excess[kind]]))
     gravity = calibration.gravity.sigma / calibration.gravity.value
     return Units(imu, flatten(imu)[None], names, calibration.covariance[None], np.array([gravity]), conditions)
 
 
-def _share(excess: FloatArray) -> FloatArray:
+def share_of(excess: FloatArray) -> FloatArray:
     """Return the share of the variance that scatter beyond the noise has."""
     return excess / (1 + excess)
 

@@ -325,7 +325,7 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     statuses, verdicts, effects = Counter(), Counter(), Counter()
     failed: dict[str, list[str]] = {}
     reasons: dict[str, str] = {}
-    with_gyroscope = without = 0
+    kinds = Counter()  # with a gyroscope, or without
     with pq.ParquetFile(path) as file:
         for batch in file.iter_batches(batch_size=4096, columns=_SUMMED):
             for row in batch.to_pylist():
@@ -334,20 +334,16 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
                     verdicts[row["verdict"]] += 1
                 effects.update(row["effects"] or ())
                 if row["status"] == "ok":
-                    with_gyroscope += row["gyro_unit"] is not None
-                    without += row["gyro_unit"] is None
+                    kinds[row["gyro_unit"] is not None] += 1
                 else:
                     reason = (row["message"] or "").removeprefix(f"{row['file']}: ")
                     alike = reasons.setdefault(re.sub(r"\d+", "0", reason), reason)
                     failed.setdefault(alike, []).append(row["file"])
-    gyroscope = with_gyroscope >= without
-    total = max(with_gyroscope, without)
+    gyroscope = kinds[True] >= kinds[False]
+    total, others = kinds[gyroscope], kinds[not gyroscope]
     notes = []
-    if min(with_gyroscope, without):
-        notes.append(
-            f"{min(with_gyroscope, without)} units {'without' if gyroscope else 'with'} a gyroscope are not part of "
-            "the population."
-        )
+    if others:
+        notes.append(f"{others} units {'without' if gyroscope else 'with'} a gyroscope are not part of the population.")
     step = max(1, -(-total // _MOST))
     kept: list[dict[str, Any]] = []
     passed = 0

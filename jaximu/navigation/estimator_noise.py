@@ -26,7 +26,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -594,6 +593,11 @@ class _Length(NamedTuple):
     block: NDArray[np.int64]
 
 
+def _squared(root: FloatArray) -> FloatArray:
+    """R Rᵀ (n, m, m) of roots R (n, m, p)."""
+    return root @ np.swapaxes(root, 1, 2)
+
+
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
@@ -632,15 +636,13 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
         errors, velocity_errors = stretches.errors, stretches.velocity_errors
         assert errors is not None
         moments = {"gyroscope": errors[:, :3], "accelerometer": velocity_errors}
-        squares = {
-            name: None if error is None else error[:, :, None] * error[:, None] for name, error in moments.items()
-        }
+        squares = {name: None if error is None else _squared(error[..., None]) for name, error in moments.items()}
         return _Length(
             stretches,
             spread,
             squares,
             dict.fromkeys(squares),
-            errors[:, :, None] * errors[:, None],
+            _squared(errors[..., None]),
             None,
             {triad: {} for triad in _OWN},
             block,
@@ -664,17 +666,14 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
         for kind in dict.fromkeys(kinds):
             of_kind = mine & np.array([other == kind for other in kinds])
             if of_kind.any() and kind != f"{triad} bias":
-                chosen = covariance[np.ix_(of_kind, of_kind)]
-                parts[kind] = np.einsum(
-                    "nip,pq,njq->nij", moved[..., of_kind], chosen, moved[..., of_kind], optimize=True
-                )
+                parts[kind] = _squared(moved[..., of_kind] @ root_of(covariance[np.ix_(of_kind, of_kind)]))
         terms[triad] = {name: covariances[:, rows, rows] for name, covariances in parts.items()}
     return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ root_of(covariance), terms, block)
 
 
 def _known_at_start(system: Any) -> Any:
     """Return the process that starts from zero: the estimator's bias state holds what it was."""
-    return eqx.tree_at(lambda process: process.root, system, np.zeros_like(system.root))
+    return replace(system, root=np.zeros_like(system.root))
 
 
 def _stamp_errors(stretches: Stretches) -> FloatArray:
@@ -774,7 +773,7 @@ def _nees(part: _Length, multipliers: Mapping[str, float], walks: Mapping[str, f
         ],
         axis=0,
     )
-    whole = part.whole if part.root is None else part.whole + part.root @ np.swapaxes(part.root, 1, 2)
+    whole = part.whole if part.root is None else part.whole + _squared(part.root)
     return {
         name: _multiples(assumed[:, rows, rows], whole[:, rows, rows])
         for name, rows in _ROWS.items()

@@ -75,6 +75,7 @@ from jaximu.planning.setup_errors import (
     ErrorSource,
     Task,
     read_task,
+    scale_of,
     scheme_and_sources,
     task,
     with_effects,
@@ -384,7 +385,7 @@ def _check(
     indices = [names_of(unit).index(name) for name in result.names]
 
     def sheet(triad: Triad) -> Triad:
-        gain = np.diag(np.linalg.norm(np.asarray(triad.gain), axis=1))
+        gain = np.diag(scale_of(triad))
         return replace(triad, gain=gain, bias=np.zeros(3))
 
     def many(leaf):

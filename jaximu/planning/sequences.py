@@ -54,6 +54,7 @@ __all__ = ["FILTERED", "Filter", "filter_of", "propose_sequence"]
 FILTERED = replace(EQUIPMENT["table"], rest=20.0, turn=8.0, setting=0.0, in_sequence=True)
 """A table that turns a unit from one position to the next while it is recorded."""
 _CHOICES = [f"{axis}{angle}" for angle in (90, -90, 180) for axis in "xyz"]
+_UPRIGHT = attitude_of(np.array([0.0, 0.0, 1.0]))
 _WIDTH = 12
 """Sequences that are kept at every length."""
 _RATE = 50.0
@@ -202,13 +203,11 @@ def filter_of(
     plain = replace(known, imu=known.imu.with_effects())
     question, notes = question_of(plain, equipment, "D", None)
     if noise is None:
-        gyroscope = question.imu.gyroscope
-        assert gyroscope is not None
-        gains = [np.linalg.inv(np.asarray(triad.gain)) for triad in (question.imu.accelerometer, gyroscope)]
+        gains = [np.linalg.inv(np.asarray(triad.gain)) for triad in question.imu.triads().values()]
         densities = np.asarray(question.accuracy.accelerometer) * equipment.rest, np.asarray(question.accuracy.density)
         white = [
             AxisNoise.of_white(np.diagonal(gain @ density @ gain.T))
-            for gain, density in zip(gains, densities, strict=True)
+            for gain, density in zip(gains, densities, strict=False)
         ]
         duration = positions * equipment.rest + (positions - 1) * equipment.turn
         noise = with_usual_drift(NoiseModel(white[0], white[1]), equipment.rest, duration)
@@ -285,8 +284,7 @@ def propose_sequence(
     label = parameter or criterion
     criterion, weights = criterion_of(criterion, parameter, estimator.names)
     rested = estimator.rested()
-    upright = attitude_of(np.array([0.0, 0.0, 1.0]))
-    kept: list[tuple[float, tuple[str, ...], Rotation, Knowledge]] = [(0.0, (), upright, rested)]
+    kept: list[tuple[float, tuple[str, ...], Rotation, Knowledge]] = [(0.0, (), _UPRIGHT, rested)]
     for number in range(1, positions):
         report(f"position {number + 1} of {positions}")
         longer = []
@@ -349,13 +347,13 @@ def _proposal(
         )
     unit = float(size @ weights) or 1.0
     first = estimator.value(start, criterion, weights)
-    attitude, poses, turns = attitude_of(np.array([0.0, 0.0, 1.0])), [], []
+    attitude, turns = _UPRIGHT, []
 
     def stand(attitude: Rotation) -> Pose:
         quaternion = attitude.as_quat(scalar_first=True)
         return Pose(up_of(quaternion), quaternion, pose_words(np.round(up_of(quaternion))))
 
-    poses.append(stand(attitude))
+    poses = [stand(attitude)]
     for word in words:
         vector = rotation_vector(word)
         angle = float(np.linalg.norm(vector))
