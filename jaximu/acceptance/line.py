@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -275,20 +275,13 @@ def read_table(path: str | os.PathLike[str]) -> Batch:
     added = numbers("accel_gain_sigma")[:, scales] ** 2 - variances
     gravity = np.sqrt(np.maximum(np.mean(added / parts[0][:, scales] ** 2, axis=1), 0.0))
     by_gravity = np.where(np.array(free) < 9, np.concatenate(parts, axis=1)[:, free], 0.0) * gravity[:, None]
-    poses, turns = (np.nan_to_num(numbers(column)[:, 0]) for column in ("poses", "turns"))
-    share = np.nan_to_num(share_of(numbers("excess")))
-    accelerometer = np.maximum(1.0, poses - 9), share[:, 0]
-    conditions = {("accelerometer", part): accelerometer for part in ("gain", "bias")}
-    if gyroscope:
-        conditions["gyroscope", "gain"] = np.maximum(1.0, 2 * turns - 9), share[:, 1]
-        conditions["gyroscope", "bias"] = np.maximum(1.0, 3 * poses - 3), share[:, 2]
     units = Units(
         like,
         np.concatenate(parts, axis=1),
         tuple(PARAMETERS[index] for index in free),
         covariance + by_gravity[:, :, None] * by_gravity[:, None, :],
         gravity,
-        conditions,
+        _conditions(numbers, gyroscope),
     )
     nominal = {owner: (numbers(f"{short}_nominal")[0, :3], np.zeros(3)) for short, owner in triads.items()}
     return Batch(
@@ -303,6 +296,20 @@ def read_table(path: str | os.PathLike[str]) -> Batch:
         words("station"),
         nominal,
     )
+
+
+def _conditions(
+    numbers: Callable[[str], FloatArray], gyroscope: bool
+) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
+    """Degrees of freedom and shares of the scatter beyond the noise, as `Units` has them, by a table's columns."""
+    poses, turns = (np.nan_to_num(numbers(column)[:, 0]) for column in ("poses", "turns"))
+    share = np.nan_to_num(share_of(numbers("excess")))
+    accelerometer = np.maximum(1.0, poses - 9), share[:, 0]
+    conditions = {("accelerometer", part): accelerometer for part in ("gain", "bias")}
+    if gyroscope:
+        conditions["gyroscope", "gain"] = np.maximum(1.0, 2 * turns - 9), share[:, 1]
+        conditions["gyroscope", "bias"] = np.maximum(1.0, 3 * poses - 3), share[:, 2]
+    return conditions
 
 
 def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:

@@ -145,12 +145,11 @@ def measure(units: Units, nominal: Mapping[str, tuple[FloatArray, FloatArray]], 
         by_gravity = jnp.abs(slope @ jnp.where(of_gravity, flat, 0.0)) * gravity
         return value, _sigma(free, covariance), by_gravity, free
 
-    arguments = (units.like, scales, [stimulus for _, stimulus in ranges])
-    limited = [(limit.part, limit.owner) for limit, _ in ranges]
-    description = f"accept {indices.tolist()} {limited}"
+    stimuli = [stimulus for _, stimulus in ranges]
+    description = f"accept {indices.tolist()} {[(limit.part, limit.owner) for limit, _ in ranges]}"
     batched = jax.vmap(all_of, (0, 0, 0, None, None, None))
     value, sigma, gravity, slope = in_chunks(
-        lambda *rows: stored.call(batched, description, *rows, *arguments),
+        lambda *rows: stored.call(batched, description, *rows, units.like, scales, stimuli),
         min(_CHUNK, len(units.numbers)),
         units.numbers,
         units.covariance,

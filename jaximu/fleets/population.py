@@ -375,16 +375,19 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     )
     if len(kept) < FEWEST:
         return replace(fleet, notes=(*notes, f"fewer than {FEWEST} calibrated units: no population."))
-    units = _units(kept, gyroscope)
+    return replace(fleet, notes=tuple(notes), **_of_population(path, _units(kept, gyroscope), gyroscope, total))
+
+
+def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> dict[str, Any]:
+    """What units of a table say as a population, by the fields of `Fleet`; total: units of the table."""
     differences, shifts = _lots_and_dates(units)
     shift = shifts.of(units.rows)
     centred = units.values - shift
     population = estimate_population(units.names, centred, units.covariances)
     differences += _repeated(units) + _shared_effects(units)
     shrunk, spread = population.shrink(centred, units.covariances)
-    rms = [[row["accel_rms"], np.nan if row["gyro_rms"] is None else row["gyro_rms"]] for row in kept]
-    return replace(
-        fleet,
+    rms = [[row["accel_rms"], np.nan if row["gyro_rms"] is None else row["gyro_rms"]] for row in units.rows]
+    return dict(
         population=population,
         strangers=_strangers(path, gyroscope, population, shifts, total),
         differences=tuple(sorted(differences, key=lambda difference: difference.p_value)),

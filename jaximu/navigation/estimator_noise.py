@@ -633,20 +633,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
     longest = max(length, source.duration / _BLOCKS)
     block = (stretches.start / longest).astype(int)
     if not modelled:
-        errors, velocity_errors = stretches.errors, stretches.velocity_errors
-        assert errors is not None
-        moments = {"gyroscope": errors[:, :3], "accelerometer": velocity_errors}
-        squares = {name: None if error is None else _squared(error[..., None]) for name, error in moments.items()}
-        return _Length(
-            stretches,
-            spread,
-            squares,
-            dict.fromkeys(squares),
-            _squared(errors[..., None]),
-            None,
-            {triad: {} for triad in _OWN},
-            block,
-        )
+        return _measured_part(stretches, spread, block)
     moved, pushed = np.asarray(moved), None if pushed is None else np.asarray(pushed)
     power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in INERTIAL_QUANTITIES})
     whole = 0.0 if pushed is None else pushed
@@ -669,6 +656,25 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
                 parts[kind] = _squared(moved[..., of_kind] @ root_of(covariance[np.ix_(of_kind, of_kind)]))
         terms[triad] = {name: covariances[:, rows, rows] for name, covariances in parts.items()}
     return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ root_of(covariance), terms, block)
+
+
+def _measured_part(
+    stretches: Stretches, spread: dict[tuple[str, str], FloatArray], block: NDArray[np.int64]
+) -> _Length:
+    errors, velocity_errors = stretches.errors, stretches.velocity_errors
+    assert errors is not None
+    moments = {"gyroscope": errors[:, :3], "accelerometer": velocity_errors}
+    squares = {name: None if error is None else _squared(error[..., None]) for name, error in moments.items()}
+    return _Length(
+        stretches,
+        spread,
+        squares,
+        dict.fromkeys(squares),
+        _squared(errors[..., None]),
+        None,
+        {triad: {} for triad in _OWN},
+        block,
+    )
 
 
 def _known_at_start(system: Any) -> Any:

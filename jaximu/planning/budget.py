@@ -274,10 +274,6 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
         ]
     )
 
-    known = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(names)) / TOLERANCE**2)
-    # what the data sheet's tolerance holds is as uncertain as the data sheet, which is no part of the budget
-    held = scale * np.linalg.norm(known, axis=1) / TOLERANCE
-    determined = (np.sqrt(np.diagonal(known)) <= UNDETERMINED) & (held <= _OFF * np.linalg.norm(sigma, axis=0))
     protocol = task.case.protocol
     result = Budget(
         task.name,
@@ -288,7 +284,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
         sources,
         sigma,
         actual,
-        determined,
+        _determined(jacobian, scale, sigma),
         excess,
         tuple(weak.text for weak in weak_directions(jacobian, names, np.asarray(parameters.size), start)[1]),
         (),
@@ -296,6 +292,13 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     )
     result = replace(result, goals=tuple(_goal(result, what, size) for what, size in task.goals))
     return replace(result, check=_check(task, result, scheme, per, truth, draws, seed)) if draws else result
+
+
+def _determined(jacobian: FloatArray, scale: FloatArray, sigma: FloatArray) -> NDArray[np.bool_]:
+    """Which parameters (p,) the scheme determines: what the data sheet's tolerance holds is as uncertain as that."""
+    known = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(scale)) / TOLERANCE**2)
+    held = scale * np.linalg.norm(known, axis=1) / TOLERANCE
+    return (np.sqrt(np.diagonal(known)) <= UNDETERMINED) & (held <= _OFF * np.linalg.norm(sigma, axis=0))
 
 
 def _mean_square(values: FloatArray) -> FloatArray:

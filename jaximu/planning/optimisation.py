@@ -35,7 +35,18 @@ from jaximu.planning.information import (
     up_vectors,
 )
 
-__all__ = ["CRITERIA", "FEW_STEPS", "STEPS", "DesignQuestion", "Step", "covariance", "objective", "optimise", "score"]
+__all__ = [
+    "CRITERIA",
+    "FEW_STEPS",
+    "STEPS",
+    "DesignCovariance",
+    "DesignQuestion",
+    "Step",
+    "covariance",
+    "objective",
+    "optimise",
+    "score",
+]
 
 
 CRITERIA: dict[str, Callable[[Array, Array], Array]] = {

@@ -31,7 +31,16 @@ from jaximu.planning.information import (
     root_of,
     turn_vectors,
 )
-from jaximu.planning.optimisation import FEW_STEPS, STEPS, DesignQuestion, covariance, criterion_of, optimise, score
+from jaximu.planning.optimisation import (
+    FEW_STEPS,
+    STEPS,
+    DesignCovariance,
+    DesignQuestion,
+    covariance,
+    criterion_of,
+    optimise,
+    score,
+)
 from jaximu.planning.poses import (
     attitude_words,
     first_heading,
@@ -348,19 +357,9 @@ def propose(
         raise InputError(f"a plan {equipment.words} needs at least {'two poses' if equipment.chained else 'one'}.")
     if turns < 0:
         raise InputError(f"the number of turns must not be negative, found {turns}.")
-    fastest = np.radians(equipment.fastest)
-    robot = equipment.accuracy is not None
-    starts = _starts(poses, turns, equipment, seed)[: _FEW_STARTS if robot else None]
-    sought = optimise(_coarsened(question), starts, fastest, report, FEW_STEPS if robot else STEPS)
-    exact = _ordered(sought, equipment)
-    design = _rounded(exact, equipment)
-    best = covariance(question, design)
-    if not equipment.chained and _classical(poses, equipment):
-        simple = _ordered(starts[0], equipment)
-        plain = covariance(question, simple)
-        if score(question, plain.covariance) <= AS_GOOD * score(question, best.covariance):
-            design, best = simple, plain
-            notes += ("well known positions do as well as any here, and are proposed.",)
+    exact, design, best, classical = _searched(question, poses, turns, equipment, seed, report)
+    if classical:
+        notes += ("well known positions do as well as any here, and are proposed.",)
     names, size = question.parameters.names, np.asarray(question.parameters.size)
     prior = np.linalg.inv(question.prior) + np.outer(question.by_gravity, question.by_gravity)
     # what the data sheet adds is none of the data's: it must not hide a direction that no pose tells
@@ -385,6 +384,25 @@ def propose(
         source=known.source,
         notes=notes,
     )
+
+
+def _searched(
+    question: DesignQuestion, poses: int, turns: int, equipment: Equipment, seed: int, report: Callable[[str], None]
+) -> tuple[Design, Design, DesignCovariance, bool]:
+    """The best design; it rounded, or a classical one that does as well; what this leaves; whether it is classical."""
+    fastest = np.radians(equipment.fastest)
+    robot = equipment.accuracy is not None
+    starts = _starts(poses, turns, equipment, seed)[: _FEW_STARTS if robot else None]
+    sought = optimise(_coarsened(question), starts, fastest, report, FEW_STEPS if robot else STEPS)
+    exact = _ordered(sought, equipment)
+    design = _rounded(exact, equipment)
+    best = covariance(question, design)
+    if not equipment.chained and _classical(poses, equipment):
+        simple = _ordered(starts[0], equipment)
+        plain = covariance(question, simple)
+        if score(question, plain.covariance) <= AS_GOOD * score(question, best.covariance):
+            return exact, simple, plain, True
+    return exact, design, best, False
 
 
 # --- the question -----------------------------------------------------------------------------------------------------

@@ -283,6 +283,31 @@ def propose_sequence(
     estimator, notes = filter_of(known, equipment, positions, effects, noise)
     label = parameter or criterion
     criterion, weights = criterion_of(criterion, parameter, estimator.names)
+    words = _searched(estimator, choices, positions, criterion, weights, report)
+    knowledge = estimator.whole(words)
+    best = estimator.value(knowledge, criterion, weights)
+    classical = tuple(NINETEEN.split())
+    if positions == len(classical) + 1 and set(classical) <= set(choices):
+        other = estimator.whole(classical)
+        value = estimator.value(other, criterion, weights)
+        ratio = float(np.exp(value - best))
+        if ratio <= AS_GOOD:
+            words, knowledge, best = classical, other, value
+            notes += ("the well-known nineteen positions do as well as any here, and are proposed.",)
+        else:
+            notes += (f"the well-known nineteen positions, as long, leave {ratio:.3g} times as much.",)
+    return _proposal(estimator, words, knowledge, best, criterion, label, weights, equipment, known.source, notes)
+
+
+def _searched(
+    estimator: Filter,
+    choices: Sequence[str],
+    positions: int,
+    criterion: str,
+    weights: FloatArray,
+    report: Callable[[str], None],
+) -> tuple[str, ...]:
+    """The rotations that make the criterion smallest, of those that are tried."""
     rested = estimator.rested()
     kept: list[tuple[float, tuple[str, ...], Rotation, Knowledge]] = [(0.0, (), _UPRIGHT, rested)]
     for number in range(1, positions):
@@ -298,20 +323,7 @@ def propose_sequence(
         for option in longer:  # of sequences that are alike but for the names of axes one is enough
             if len(kept) < _WIDTH and (not kept or option[0] - kept[-1][0] > 1e-7):
                 kept.append(option)
-    words = kept[0][1]
-    knowledge = estimator.whole(words)
-    best = estimator.value(knowledge, criterion, weights)
-    classical = tuple(NINETEEN.split())
-    if positions == len(classical) + 1 and set(classical) <= set(choices):
-        other = estimator.whole(classical)
-        value = estimator.value(other, criterion, weights)
-        ratio = float(np.exp(value - best))
-        if ratio <= AS_GOOD:
-            words, knowledge, best = classical, other, value
-            notes += ("the well-known nineteen positions do as well as any here, and are proposed.",)
-        else:
-            notes += (f"the well-known nineteen positions, as long, leave {ratio:.3g} times as much.",)
-    return _proposal(estimator, words, knowledge, best, criterion, label, weights, equipment, known.source, notes)
+    return kept[0][1]
 
 
 def _proposal(
@@ -347,6 +359,29 @@ def _proposal(
         )
     unit = float(size @ weights) or 1.0
     first = estimator.value(start, criterion, weights)
+    poses, turns = _poses_and_turns(words, equipment)
+    at_first, at_last = (float(np.exp(logarithm)) * unit for logarithm in (first, value))
+    return Proposal(
+        equipment,
+        label,
+        poses,
+        turns,
+        estimator.imu,
+        estimator.names,
+        before,
+        after,
+        at_first,
+        at_last,
+        at_last,
+        rank,
+        weak,
+        source,
+        notes,
+    )
+
+
+def _poses_and_turns(words: Sequence[str], equipment: Equipment) -> tuple[tuple[Pose, ...], tuple[Turn, ...]]:
+    """The positions that rotations lead through, z up first, and the turns between them."""
     attitude, turns = _UPRIGHT, []
 
     def stand(attitude: Rotation) -> Pose:
@@ -361,21 +396,4 @@ def _proposal(
         poses.append(stand(attitude))
         turn_words = f"{np.degrees(angle):.0f}° about {'+' if vector.sum() > 0 else '−'}{word[0]}"
         turns.append(Turn(vector / angle, angle, angle / equipment.turn, turn_words))
-    at_first, at_last = (float(np.exp(logarithm)) * unit for logarithm in (first, value))
-    return Proposal(
-        equipment,
-        label,
-        tuple(poses),
-        tuple(turns),
-        estimator.imu,
-        estimator.names,
-        before,
-        after,
-        at_first,
-        at_last,
-        at_last,
-        rank,
-        weak,
-        source,
-        notes,
-    )
+    return tuple(poses), tuple(turns)

@@ -303,7 +303,9 @@ class _Stops:
     ends: NDArray[np.int64]
 
 
-def _stops(intervals: tuple[Interval, ...], begin: list[Rotation]) -> _Stops:
+def _stops(intervals: tuple[Interval, ...], motion: Motion) -> _Stops:
+    segment = np.searchsorted(motion.start, [interval.start + 1e-9 for interval in intervals], side="right") - 1
+    begin = [Rotation.from_quat(motion.attitude[row], scalar_first=True) for row in segment]
     up: list[FloatArray] = []
     setting, ends = [], []
     last: Rotation | None = None
@@ -395,16 +397,12 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
         knots = ((0.0, 25.0), (case.plan.motion.length, 25.0 + temperature["span"]))
         environment = replace(environment, temperature=knots)
     plan = protocol.plan(np.random.default_rng(0), environment)
-    segment = (
-        np.searchsorted(plan.motion.start, [interval.start + 1e-9 for interval in plan.intervals], side="right") - 1
-    )
-    begin = [Rotation.from_quat(plan.motion.attitude[row], scalar_first=True) for row in segment]
     stations = scheme_stations(protocol, case.imu, TYPICAL_NOISE, environment)
     size = stations.turn.shape[0]
     stations, fast, slow, ramps, notes = _with_noise(case, stations, plan.intervals)
 
     effects = _effects_by_source(errors, case.imu, ramps)
-    stops = _stops(plan.intervals, begin)
+    stops = _stops(plan.intervals, plan.motion)
     scheme = _scheme(
         case.imu,
         plan.motion,
@@ -439,12 +437,13 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
     for name, covariances in (("noise", fast), ("bias_instability", slow)):
         add(name, np.asarray(block_diag(*root_of(covariances))), added)
 
-    def source(name: str, root: FloatArray) -> ErrorSource:
-        value, text = errors.get(name, (None, "by the noise"))
-        single = value if name in _SINGLE else None
-        return ErrorSource(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), root)
+    return scheme, tuple(_source(errors, name, root) for name, root in roots.items() if root.size), notes
 
-    return scheme, tuple(source(name, root) for name, root in roots.items() if root.size), notes
+
+def _source(errors: Mapping[str, tuple[Any, str]], name: str, root: FloatArray) -> ErrorSource:
+    value, text = errors.get(name, (None, "by the noise"))
+    single = value if name in _SINGLE else None
+    return ErrorSource(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), root)
 
 
 def scale_of(triad: Triad) -> FloatArray:
