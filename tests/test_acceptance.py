@@ -391,7 +391,7 @@ def test_charts_find_a_shift_and_are_quiet_without():
     quiet = [control_chart(rng.standard_normal(200), 0.05) for _ in range(200)]
     alarms = sum(bool(len(each.beyond) or len(each.drifting)) for each in quiet)
     assert alarms < 30  # 5 % for each of two, and some luck
-    assert control_chart(rng.standard_normal(20), 0.05).reach == pytest.approx(3.0, abs=0.05)
+    assert control_chart(rng.standard_normal(20), 0.05).bound == pytest.approx(3.0, abs=0.05)
     moved = rng.standard_normal(200)
     moved[100:] += 1.5
     assert len(control_chart(moved, 0.001).drifting)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity, worst
 from jaximu.acceptance.item import Item, deciding
-from jaximu.acceptance.limits import FROM_ALLAN, OF_ONE_UNIT, Limit, Limits
+from jaximu.acceptance.limits import FROM_ALLAN, OF_ONE_UNIT, OUTPUTS, Limit, Limits
 from jaximu.acceptance.navigation import navigation_items
 from jaximu.acceptance.quantities import Measured, Units, measure, of_calibration
 from jaximu.calibration import Calibration
@@ -25,7 +25,6 @@ from jaximu.ground.quantities import Z95
 __all__ = ["SCHEMA", "Acceptance", "Judged", "accept", "judge"]
 
 SCHEMA = "jaximu.acceptance/1"
-_OUTPUTS = ("output", "raw_output")
 _BY_HAND = ("joint", "two-step", "two-step-rk4", "accelerometer")
 
 
@@ -44,7 +43,7 @@ class Acceptance(Document):
     @property
     def verdict(self) -> str:
         """Fail if any item fails, else undecided if any is, else pass."""
-        return worst([each.verdict for each in self.items])
+        return worst([item.verdict for item in self.items])
 
     @property
     def serial(self) -> str:
@@ -60,7 +59,7 @@ class Acceptance(Document):
             "calibration": {"file": self.file, "digest": self.digest},
             "limits": dict(self.limits),
             "decision": self.rule.document(),
-            "items": [each.document() for each in self.items],
+            "items": [item.document() for item in self.items],
             "trace": self.trace,
             "notes": list(self.notes),
             "software": SOFTWARE,
@@ -85,38 +84,47 @@ class Judged:
 def judge(units: Units, limits: Limits) -> Judged:
     """Hold units of one structure to limits of parameters and outputs; other limits are left alone."""
     held = {name.owner for name in units.names}
-    outputs = [each for each in limits.limits if each.part in _OUTPUTS and each.owner in held]
+    outputs = [limit for limit in limits.limits if limit.part in OUTPUTS and limit.owner in held]
     measured = measure(units, limits.nominal, outputs)
     first = len(measured.names) - 3 * len(outputs)
-    asked: list[tuple[Limit, str, int]] = []
-    named = {(each.owner, each.part, each.axes) for each in limits.limits}
+    questions: list[tuple[Limit, str, int]] = []
+    named = {(limit.owner, limit.part, limit.axes) for limit in limits.limits}
     for limit in limits.limits:
         if limit.part in OF_ONE_UNIT:
             continue
         stem = limit.part if "." in limit.part else f"{limit.owner}.{limit.part}"
         if limit in outputs:
             start = first + 3 * outputs.index(limit)
-            found = {(axis,): start + axis for axis in range(3)}
+            columns = {(axis,): start + axis for axis in range(3)}
         else:
-            found = {_axes(name): place for place, name in enumerate(measured.names[:first])
-                     if name.partition("[")[0] == stem and limit.owner in held}  # fmt: skip
-        for axes, place in found.items():
-            own = limit.axes == axes or (not limit.axes and (limit.owner, limit.part, axes) not in named)
+            columns = {
+                _axes(name): column
+                for column, name in enumerate(measured.names[:first])
+                if name.partition("[")[0] == stem and limit.owner in held
+            }
+        for axes, column in columns.items():
+            applies = limit.axes == axes or (not limit.axes and (limit.owner, limit.part, axes) not in named)
             # the convention's zeros are no result; who names one is told so
-            if own and (limit.axes or limit in outputs or not measured.fixed[place]):
-                asked.append((limit, f"{stem}[{','.join(map(str, axes))}]", place))
-        if not found or (limit.axes and limit.axes not in found):
-            asked.append((limit, limit.key, -1))
-    places = [place for _, _, place in asked]
-    value, sigma, freedom = (each[:, places] for each in (measured.value, measured.sigma, measured.freedom))
-    low, high = (np.array([getattr(limit, end) for limit, _, _ in asked]) for end in ("low", "high"))
+            if applies and (limit.axes or limit in outputs or not measured.fixed[column]):
+                questions.append((limit, f"{stem}[{','.join(map(str, axes))}]", column))
+        if not columns or (limit.axes and limit.axes not in columns):
+            questions.append((limit, limit.key, -1))
+    indices = [column for _, _, column in questions]
+    value, sigma, freedom = (array[:, indices] for array in (measured.value, measured.sigma, measured.freedom))
+    low, high = (np.array([getattr(limit, end) for limit, _, _ in questions]) for end in ("low", "high"))
     probability = probability_of_conformity(value, sigma, low, high, freedom)
     verdict = limits.rule.verdicts(probability, (low <= value) & (value <= high))
-    open_ = ~measured.determined[:, places] | measured.fixed[places]
-    unknown = np.array([bool(_not_stated(limit, units, limits)) or place < 0 for limit, _, place in asked], bool)
+    open_ = ~measured.determined[:, indices] | measured.fixed[indices]
+    unknown = np.array([bool(_not_stated(limit, units, limits)) or column < 0 for limit, _, column in questions], bool)
     verdict = np.where(open_ | unknown, UNDECIDED, verdict)
-    return Judged(measured, tuple(limit for limit, _, _ in asked), tuple(name for _, name, _ in asked), tuple(places),
-                  probability, verdict)  # fmt: skip
+    return Judged(
+        measured,
+        tuple(limit for limit, _, _ in questions),
+        tuple(name for _, name, _ in questions),
+        tuple(indices),
+        probability,
+        verdict,
+    )
 
 
 def _axes(name: str) -> tuple[int, ...]:
@@ -134,7 +142,7 @@ def _not_stated(limit: Limit, units: Units, limits: Limits) -> str:
             f"the {limit.owner} was logged in counts: state its nominal scale below [nominal], "
             f'{limit.owner} = "{example}"'
         )
-    if "." in limit.part and limit.part not in {each.name for each in triad.effects}:
+    if "." in limit.part and limit.part not in {effect.name for effect in triad.effects}:
         return f"{limit.part} is not part of this calibration; jaximu calibrate --effect {limit.part} fits it"
     if "." in limit.part and triad.output_unit == "count":
         return f"{limit.part} was calibrated in counts; limit the output instead"
@@ -157,9 +165,10 @@ def accept(
     """
     units = of_calibration(calibration)
     judged = judge(units, limits)
-    items = [_item(calibration, units, limits, judged, place) for place in range(len(judged.names))]
-    items += [item for limit in limits.limits if limit.part in FROM_ALLAN
-              for item in _noise_items(limit, limits.rule, noise)]  # fmt: skip
+    items = [_item(calibration, units, limits, judged, index) for index in range(len(judged.names))]
+    items += [
+        item for limit in limits.limits if limit.part in FROM_ALLAN for item in _noise_items(limit, limits.rule, noise)
+    ]
     along = [limit for limit in limits.limits if limit.owner == "navigation"]
     navigated, on_the_path = navigation_items(along, limits.rule, calibration, noise, os.fspath(file))
     items += navigated
@@ -168,16 +177,26 @@ def accept(
     if "temperature_range" not in calibration.data:
         warm = calibration.data.get("temperature")
         at = "at one temperature" if warm is None else f"at {warm:.1f} °C"
-        notes += [f"{each.key}: the unit was calibrated {at}, and its uncertainty at others is not known."
-                  for each in limits.limits if each.temperature]  # fmt: skip
+        notes += [
+            f"{limit.key}: the unit was calibrated {at}, and its uncertainty at others is not known."
+            for limit in limits.limits
+            if limit.temperature
+        ]
     notes += on_the_path
-    return Acceptance(tuple(items), limits.rule, os.fspath(file), {"file": limits.file, "sha256": limits.sha256},
-                      trace, calibration.digest, tuple(notes))  # fmt: skip
+    return Acceptance(
+        tuple(items),
+        limits.rule,
+        os.fspath(file),
+        {"file": limits.file, "sha256": limits.sha256},
+        trace,
+        calibration.digest,
+        tuple(notes),
+    )
 
 
-def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged, place: int) -> Item:
-    limit, at, measured, name = judged.limits[place], judged.places[place], judged.measured, judged.names[place]
-    seen, warm = calibration.data.get("temperature_range"), limit.temperature
+def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged, index: int) -> Item:
+    limit, at, measured, name = judged.limits[index], judged.places[index], judged.measured, judged.names[index]
+    calibrated, warm = calibration.data.get("temperature_range"), limit.temperature
     reason = _not_stated(limit, units, limits)
     if reason:
         return Item.of(limit, name, reason=reason)
@@ -188,19 +207,29 @@ def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged
     record = _record(calibration, units, measured.slope[0, at])
     if not measured.determined[0, at]:
         return Item.of(limit, name, reason="the recording does not determine it", advice=record)
-    if warm and seen and not seen[0] <= warm[0] <= warm[1] <= seen[1]:
-        beyond = f"{seen[0]:.1f} to {seen[1]:.1f} °C that were calibrated"
+    if warm and calibrated and not calibrated[0] <= warm[0] <= warm[1] <= calibrated[1]:
+        beyond = f"{calibrated[0]:.1f} to {calibrated[1]:.1f} °C that were calibrated"
         return Item.of(limit, name, reason=f"the limit's temperatures go beyond the {beyond}")
     value, sigma, gravity, freedom = (
-        float(each[0, at]) for each in (measured.value, measured.sigma, measured.gravity, measured.freedom)
+        float(array[0, at]) for array in (measured.value, measured.sigma, measured.gravity, measured.freedom)
     )
-    verdict, recording = str(judged.verdict[0, place]), float(np.sqrt(max(sigma**2 - gravity**2, 0.0)))
+    verdict, recording = str(judged.verdict[0, index]), float(np.sqrt(max(sigma**2 - gravity**2, 0.0)))
     advice = ""
     if verdict == UNDECIDED:
         needed = limit.nearest(value) / float(limits.rule.multiple(freedom))
         advice = deciding(needed, recording, gravity, calibration.gravity.sigma, record)
-    return Item.of(limit, name, value=value, sigma=sigma, freedom=freedom, verdict=verdict, gravity=gravity,
-                   probability=float(judged.probability[0, place]), recording=recording, advice=advice)  # fmt: skip
+    return Item.of(
+        limit,
+        name,
+        value=value,
+        sigma=sigma,
+        freedom=freedom,
+        verdict=verdict,
+        gravity=gravity,
+        probability=float(judged.probability[0, index]),
+        recording=recording,
+        advice=advice,
+    )
 
 
 def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
@@ -222,19 +251,17 @@ def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
 def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> list[Item]:
     items = []
     for axis in limit.axes or range(3):
-        name, found = f"{limit.owner}.{limit.part}[{axis}]", _noise_term(limit, axis, noise)
-        if isinstance(found[0], str):
-            items.append(Item.of(limit, name, reason=found[0], advice=found[1]))
+        name, term = f"{limit.owner}.{limit.part}[{axis}]", _noise_term(limit, axis, noise)
+        if isinstance(term[0], str):
+            items.append(Item.of(limit, name, reason=term[0], advice=term[1]))
             continue
-        value, low, high = found
+        value, low, high = term
         sigma, advice = (high - low) / (2 * Z95), ""
-        probability = probability_of_conformity(value, sigma, limit.low, limit.high)
-        verdict = str(rule.verdicts(probability, limit.low <= value <= limit.high))
-        if verdict == UNDECIDED:
+        judged = limit.judged(rule, value, sigma)
+        if judged["verdict"] == UNDECIDED:
             needed = limit.nearest(value) / float(rule.multiple())
             advice = f"Record about {max(1.1, (sigma / needed) ** 2):.2g} times as long at rest."
-        items.append(Item.of(limit, name, value=value, sigma=sigma, verdict=verdict, recording=sigma,
-                             probability=float(probability), advice=advice))  # fmt: skip
+        items.append(Item.of(limit, name, **judged, recording=sigma, advice=advice))
     return items
 
 

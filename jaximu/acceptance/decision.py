@@ -81,7 +81,7 @@ def probability_of_conformity(
     **Arguments:** value, low, high (...) in one unit; sigma (...): standard uncertainties, zero where a value is exact;
     freedom (...): effective degrees of freedom.
     """
-    value, sigma, low, high = (np.asarray(each, float) for each in (value, sigma, low, high))
+    value, sigma, low, high = (np.asarray(array, float) for array in (value, sigma, low, high))
     with np.errstate(divide="ignore", invalid="ignore"):
         above, below = (high - value) / sigma, (low - value) / sigma
     exact = np.broadcast_to(sigma == 0, above.shape)

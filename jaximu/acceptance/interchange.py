@@ -30,8 +30,20 @@ from jaximu.ground.errors import InputError
 
 __all__ = ["check_measurements", "write_measurements"]
 
-_COLUMNS = ("device", "file", "name", "value", "uncertainty", "unit", "low", "high", "verdict", "probability", "source",
-            "reason")  # fmt: skip
+_COLUMNS = (
+    "device",
+    "file",
+    "name",
+    "value",
+    "uncertainty",
+    "unit",
+    "low",
+    "high",
+    "verdict",
+    "probability",
+    "source",
+    "reason",
+)
 _NOT_CALIBRATED = Item("calibration", -np.inf, np.inf, "", "", reason="the unit was not calibrated")
 
 
@@ -43,22 +55,27 @@ def check_measurements(path: str | os.PathLike[str]) -> str:
     return suffix
 
 
-def write_measurements(found: Sequence[Acceptance] | Line, path: str | os.PathLike[str]) -> None:
+def write_measurements(verdicts: Sequence[Acceptance] | Line, path: str | os.PathLike[str]) -> None:
     """Write verdicts by the suffix of `path`, whole or not at all: `.csv`, `.xml` (JUnit) or `.json` (OpenHTF).
 
     Raises `InputError` for another suffix, or where it cannot be written.
     """
     writer = _WRITERS[check_measurements(path)]
-    rows = list(_of_line(found) if isinstance(found, Line) else _of_units(found))
+    rows = list(_of_line(verdicts) if isinstance(verdicts, Line) else _of_units(verdicts))
     with atomic_write(path) as temporary:
         temporary.write_bytes(writer(rows))
 
 
-def _of_units(found: Sequence[Acceptance]) -> Iterator[dict[str, Any]]:
-    for each in found:
-        day = str((each.trace or {}).get("date", ""))
-        for item in each.items:
-            yield item.document() | {"device": each.serial or each.file, "file": each.file, "date": day, "item": item}
+def _of_units(verdicts: Sequence[Acceptance]) -> Iterator[dict[str, Any]]:
+    for acceptance in verdicts:
+        day = str((acceptance.trace or {}).get("date", ""))
+        for item in acceptance.items:
+            yield item.document() | {
+                "device": acceptance.serial or acceptance.file,
+                "file": acceptance.file,
+                "date": day,
+                "item": item,
+            }
 
 
 def _of_line(line: Line) -> Iterator[dict[str, Any]]:
@@ -67,19 +84,23 @@ def _of_line(line: Line) -> Iterator[dict[str, Any]]:
         date = "" if np.isnan(day) else str(np.datetime64(int(day), "D"))
         for item in line.judgement(row):
             yield item.document() | {"device": device, "file": file, "date": date, "item": item}
-    for place in sorted(set(range(table.total)) - set(table.rows.tolist())):
-        yield _NOT_CALIBRATED.document() | {"device": f"row {place + 1} of {table.file}", "file": table.file,
-                                            "date": "", "item": _NOT_CALIBRATED}  # fmt: skip
+    for missing in sorted(set(range(table.total)) - set(table.rows.tolist())):
+        yield _NOT_CALIBRATED.document() | {
+            "device": f"row {missing + 1} of {table.file}",
+            "file": table.file,
+            "date": "",
+            "item": _NOT_CALIBRATED,
+        }
 
 
 def _by_unit(rows: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    for (device, _), some in groupby(rows, lambda each: (each["device"], each["file"])):
+    for (device, _), some in groupby(rows, lambda row: (row["device"], row["file"])):
         yield device, list(some)
 
 
 def _csv(rows: list[dict[str, Any]]) -> bytes:
     sink = pa.BufferOutputStream()
-    pc.write_csv(pa.table({name: [each[name] for each in rows] for name in _COLUMNS}), sink)
+    pc.write_csv(pa.table({name: [row[name] for row in rows] for name in _COLUMNS}), sink)
     return sink.getvalue().to_pybytes()
 
 
@@ -87,24 +108,30 @@ def _said(row: dict[str, Any]) -> str:
     item: Item = row["item"]
     if item.value is None:
         return item.said() or "no value"
-    found = f"{item.value:.6g} ± {2 * (item.sigma or 0.0):.2g} {item.unit} (k = 2)"
-    return f"{found}; the limits are {between(item.low, item.high, item.unit)}. {item.said()}".strip()
+    text = f"{item.value:.6g} ± {2 * (item.sigma or 0.0):.2g} {item.unit} (k = 2)"
+    return f"{text}; the limits are {between(item.low, item.high, item.unit)}. {item.said()}".strip()
 
 
 def _junit(rows: list[dict[str, Any]]) -> bytes:
     suites = ElementTree.Element("testsuites", name="jaximu accept")
     for device, some in _by_unit(rows):
-        count = {verdict: str(sum(each["verdict"] == verdict for each in some)) for verdict in (FAIL, UNDECIDED)}
-        suite = ElementTree.SubElement(suites, "testsuite", name=device, tests=str(len(some)), failures=count[FAIL],
-                                       errors=count[UNDECIDED], **({"timestamp": some[0]["date"]} if some[0]["date"]
-                                                                   else {}))  # fmt: skip
-        for each in some:
-            case = ElementTree.SubElement(suite, "testcase", classname=device, name=each["name"])
-            if each["verdict"] == PASS:
-                ElementTree.SubElement(case, "system-out").text = _said(each)
+        count = {verdict: str(sum(row["verdict"] == verdict for row in some)) for verdict in (FAIL, UNDECIDED)}
+        suite = ElementTree.SubElement(
+            suites,
+            "testsuite",
+            name=device,
+            tests=str(len(some)),
+            failures=count[FAIL],
+            errors=count[UNDECIDED],
+            **({"timestamp": some[0]["date"]} if some[0]["date"] else {}),
+        )
+        for row in some:
+            case = ElementTree.SubElement(suite, "testcase", classname=device, name=row["name"])
+            if row["verdict"] == PASS:
+                ElementTree.SubElement(case, "system-out").text = _said(row)
             else:
-                kind = "failure" if each["verdict"] == FAIL else "error"
-                ElementTree.SubElement(case, kind, type=each["verdict"], message=_said(each))
+                kind = "failure" if row["verdict"] == FAIL else "error"
+                ElementTree.SubElement(case, kind, type=row["verdict"], message=_said(row))
     ElementTree.indent(suites)
     return ElementTree.tostring(suites, encoding="utf-8", xml_declaration=True)
 
@@ -112,18 +139,38 @@ def _junit(rows: list[dict[str, Any]]) -> bytes:
 def _openhtf(rows: list[dict[str, Any]]) -> bytes:
     records = []
     for device, some in _by_unit(rows):
-        verdict = worst([each["verdict"] for each in some])
+        verdict = worst([row["verdict"] for row in some])
         day = some[0]["date"]
         stamp = round(1000 * datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp()) if day else None
         outcome, marginal = "PASS" if verdict == PASS else "FAIL", verdict == UNDECIDED
-        details = [] if verdict == PASS else [{"code": verdict, "description": f"{each['name']}: {_said(each)}"}
-                                              for each in some if each["verdict"] != PASS]  # fmt: skip
+        details = (
+            []
+            if verdict == PASS
+            else [
+                {"code": verdict, "description": f"{row['name']}: {_said(row)}"}
+                for row in some
+                if row["verdict"] != PASS
+            ]
+        )
         times = {"start_time_millis": stamp, "end_time_millis": stamp}
-        phase = {"name": "calibration", "outcome": outcome, "marginal": marginal, **times,
-                 "measurements": {each["name"]: _measurement(each) for each in some}}  # fmt: skip
-        records.append({"dut_id": device, "outcome": outcome, "marginal": marginal, "outcome_details": details, **times,
-                        "metadata": {"test_name": "jaximu accept", "file": some[0]["file"]},
-                        "phases": [phase]})  # fmt: skip
+        phase = {
+            "name": "calibration",
+            "outcome": outcome,
+            "marginal": marginal,
+            **times,
+            "measurements": {row["name"]: _measurement(row) for row in some},
+        }
+        records.append(
+            {
+                "dut_id": device,
+                "outcome": outcome,
+                "marginal": marginal,
+                "outcome_details": details,
+                **times,
+                "metadata": {"test_name": "jaximu accept", "file": some[0]["file"]},
+                "phases": [phase],
+            }
+        )
     return json.dumps(records[0] if len(records) == 1 else records, indent=1, allow_nan=False).encode()
 
 
@@ -132,13 +179,21 @@ def _measurement(row: dict[str, Any]) -> dict[str, Any]:
     bound = (
         f"{low:g} <= x <= {high:g}" if None not in (low, high) else f"x <= {high:g}" if low is None else f"x >= {low:g}"
     )
-    found = {"name": row["name"], "validators": [bound], "units": {"suffix": row["unit"]},
-             "docstring": f"{row['verdict']}: {_said(row)}"}  # fmt: skip
+    record = {
+        "name": row["name"],
+        "validators": [bound],
+        "units": {"suffix": row["unit"]},
+        "docstring": f"{row['verdict']}: {_said(row)}",
+    }
     if row["value"] is None:
-        return found | {"outcome": "UNSET"}
+        return record | {"outcome": "UNSET"}
     passed = row["verdict"] == PASS
-    return found | {"outcome": "PASS" if passed else "FAIL", "marginal": row["verdict"] == UNDECIDED,
-                    "measured_value": row["value"], "uncertainty": row["uncertainty"]}  # fmt: skip
+    return record | {
+        "outcome": "PASS" if passed else "FAIL",
+        "marginal": row["verdict"] == UNDECIDED,
+        "measured_value": row["value"],
+        "uncertainty": row["uncertainty"],
+    }
 
 
 _WRITERS = {".csv": _csv, ".xml": _junit, ".json": _openhtf}

@@ -39,9 +39,9 @@ class Item:
     recording: float = 0.0
 
     @classmethod
-    def of(cls, limit: Limit, name: str, **found: Any) -> Item:
+    def of(cls, limit: Limit, name: str, **result: Any) -> Item:
         """Return the item of a limit with what was found: undecided where that is nothing."""
-        return cls(name, limit.low, limit.high, limit.unit, limit.source, **found)
+        return cls(name, limit.low, limit.high, limit.unit, limit.source, **result)
 
     def said(self) -> str:
         """Return why it is undecided and what would decide it, in sentences; "" where nothing is to be said."""
@@ -50,12 +50,20 @@ class Item:
     def document(self) -> dict[str, Any]:
         """Return the item as JSON has it; uncertainty is expanded, k = 2."""
         return {
-            "name": self.name, "value": self.value, "uncertainty": None if self.sigma is None else 2 * self.sigma,
-            "low": _finite(self.low), "high": _finite(self.high), "unit": self.unit, "verdict": self.verdict,
-            "probability": self.probability, "degrees_of_freedom": _finite(self.freedom), "source": self.source,
-            "reason": self.reason, "advice": self.advice,
+            "name": self.name,
+            "value": self.value,
+            "uncertainty": None if self.sigma is None else 2 * self.sigma,
+            "low": _finite(self.low),
+            "high": _finite(self.high),
+            "unit": self.unit,
+            "verdict": self.verdict,
+            "probability": self.probability,
+            "degrees_of_freedom": _finite(self.freedom),
+            "source": self.source,
+            "reason": self.reason,
+            "advice": self.advice,
             "budget": {"recording": self.recording, "gravity": self.gravity},
-        }  # fmt: skip
+        }
 
 
 def _finite(value: float) -> float | None:

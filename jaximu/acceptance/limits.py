@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.acceptance.decision import Rule
+from jaximu.acceptance.decision import Rule, probability_of_conformity
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import file_digest, read_toml
 from jaximu.ground.errors import InputError, only
@@ -46,7 +46,7 @@ from jaximu.model.data_sheet import SI_UNITS, parse_quantity
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.columns.nominal import parse_offset, parse_scale
 
-__all__ = ["FROM_ALLAN", "OF_ONE_UNIT", "TYPICAL", "Limit", "Limits", "read_limits"]
+__all__ = ["FROM_ALLAN", "OF_ONE_UNIT", "OUTPUTS", "TYPICAL", "Limit", "Limits", "read_limits"]
 
 TYPICAL = 3.0
 """Limit of what a data sheet calls typical, in typical values: 99.7 % of a normal population lie within."""
@@ -56,7 +56,8 @@ FROM_ALLAN = ("repeatability", *"QNBKR")
 _NAVIGATION = {"position": "m", "heading": "deg"}
 OF_ONE_UNIT = (*FROM_ALLAN, *_NAVIGATION)
 """Quantities that a fleet's table does not tell."""
-_PARTS = ("bias", "scale", "misalignment", "output", "raw_output", "repeatability")
+OUTPUTS = ("output", "raw_output")
+_PARTS = ("bias", "scale", "misalignment", *OUTPUTS, "repeatability")
 _LONGEST = 3600.0  # s, of navigation
 _KEY = re.compile(r"([a-z_.A-Z]+?)(?:\[(\d)(?:,\s*(\d))?\])?")
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
@@ -90,6 +91,12 @@ class Limit:
         """Return how far a value is from the nearer bound."""
         return min(abs(self.high - value), abs(value - self.low))
 
+    def judged(self, rule: Rule, value: float, sigma: float) -> dict[str, Any]:
+        """Return what an item says of a value that is normally distributed with this standard uncertainty."""
+        probability = probability_of_conformity(value, sigma, self.low, self.high)
+        verdict = str(rule.verdicts(probability, self.low <= value <= self.high))
+        return {"value": value, "sigma": sigma, "probability": float(probability), "verdict": verdict}
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -119,8 +126,9 @@ def read_limits(path: str | os.PathLike[str], rule: str | None = None, risk: flo
     kind, level = rule or document.get("rule", "guarded"), document.get("risk", 0.05) if risk is None else risk
     if isinstance(level, bool) or not isinstance(level, int | float):
         raise InputError(f"{name}: the risk is a number such as 0.05, not {level!r}.")
-    return Limits(limits, Rule(kind, float(level)), _nominal(document.get("nominal", {}), name), name,
-                  file_digest(path))  # fmt: skip
+    return Limits(
+        limits, Rule(kind, float(level)), _nominal(document.get("nominal", {}), name), name, file_digest(path)
+    )
 
 
 def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
@@ -130,24 +138,24 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
     bounds = [name for name in ("within", "low", "high", "typical") if name in entry]
     if not bounds or (len(bounds) > 1 and bounds != ["low", "high"]):
         raise InputError(f"{where}: state one of `within`, `typical`, or `low` and `high`; found {bounds or 'none'}.")
-    found = {name: _value(entry[name], base, f"{where}.{name}") for name in bounds}
+    sizes = {name: _value(entry[name], base, f"{where}.{name}") for name in bounds}
     source = str(entry.get("source", source))
-    if "typical" in found:
-        found["within"] = TYPICAL * found["typical"]
+    if "typical" in sizes:
+        sizes["within"] = TYPICAL * sizes["typical"]
         source = f"{source or 'data sheet'}: {TYPICAL:g} times the typical value {entry['typical']}"
-    if "within" in found:
-        if not found["within"] > 0:
-            raise InputError(f"{where}: the limit must be greater than zero, found {found['within']:g} {base}.")
-        found["high"] = found["within"]
+    if "within" in sizes:
+        if not sizes["within"] > 0:
+            raise InputError(f"{where}: the limit must be greater than zero, found {sizes['within']:g} {base}.")
+        sizes["high"] = sizes["within"]
         if part not in FROM_ALLAN:  # what is positive by nature has no lower limit
-            found["low"] = -found["within"]
-    low, high = found.get("low", -math.inf), found.get("high", math.inf)
+            sizes["low"] = -sizes["within"]
+    low, high = sizes.get("low", -math.inf), sizes.get("high", math.inf)
     if low >= high:
         raise InputError(
             f"{where}: the limits contradict each other: the lower, {low:g}, is not below {high:g} {base}."
         )
     over, temperature = 0.0, None
-    if part in ("output", "raw_output"):
+    if part in OUTPUTS:
         if "over" not in entry:
             raise InputError(f'{where}: say up to which input the output is limited: over = "1 g" (or "300 deg/s").')
         over = abs(_value(entry["over"], base, f"{where}.over"))
@@ -171,15 +179,19 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
     """Return the triad, the quantity, the axes and the unit that a key means."""
     match = _KEY.fullmatch(key)
     name = match[1] if match else ""
-    axes = tuple(int(each) for each in match.groups()[1:] if each) if match else ()
+    axes = tuple(int(digit) for digit in match.groups()[1:] if digit) if match else ()
     owner, _, part = name.partition(".")
     if name in CATALOGUE:
         effect = CATALOGUE[name]
         if effect.scope != "device" or len(axes) > 1 or (axes and axes[0] >= effect.size):
             raise InputError(f"{where}: an effect of the device, such as {name}[{effect.size - 1}], may be limited.")
         return effect.owner, name, axes, effect.coefficient_unit(SENSOR_UNITS[effect.owner])
-    if owner == "navigation" and part in _NAVIGATION and all(axis <= 2 for axis in axes) and (
-        len(axes) <= (part == "position")):  # fmt: skip
+    if (
+        owner == "navigation"
+        and part in _NAVIGATION
+        and all(axis <= 2 for axis in axes)
+        and (len(axes) <= (part == "position"))
+    ):
         return owner, part, axes, _NAVIGATION[part]
     if owner not in SENSOR_QUANTITIES or part not in (*_PARTS, *"QNBKR"):
         raise InputError(
@@ -187,8 +199,11 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
             "accelerometer, gyroscope and magnetometer (accelerometer.bias), effects (accel.quadratic), and "
             "navigation.position and navigation.heading."
         )
-    if any(axis > 2 for axis in axes) or (axes and len(axes) != 1 + (part == "misalignment")) or (
-        part == "misalignment" and len(set(axes)) == 1):  # fmt: skip
+    if (
+        any(axis > 2 for axis in axes)
+        or (axes and len(axes) != 1 + (part == "misalignment"))
+        or (part == "misalignment" and len(set(axes)) == 1)
+    ):
         raise InputError(f"{where}: axes are [0], [1], [2]; of a misalignment two that differ, [1,0].")
     base = (
         SI_UNITS[SENSOR_QUANTITIES[owner]][part] if part in "QNBKR" else {"scale": "1", "misalignment": "rad"}.get(part)
@@ -198,58 +213,60 @@ def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:
 
 def _value(stated: Any, base: str, where: str) -> float:
     """Return a number in the unit `base` from one with its unit."""
-    match = _NUMBER.fullmatch(stated) if isinstance(stated, str) else None
-    if match is None or not match[2]:
-        example = {"1": "1 %", "rad": "10 mrad", "rad/s": "0.5 deg/s", "m/s^2": "20 mg", "deg": "0.5 deg"}.get(
-            base, f"1 {base}"
-        )
-        raise InputError(f'{where}: {stated!r} needs a number with its unit, such as "{example}".')
-    if match[2].replace(" ", "") == base.replace(" ", ""):
-        return float(match[1])
+    examples = {"1": "1 %", "rad": "10 mrad", "rad/s": "0.5 deg/s", "m/s^2": "20 mg", "deg": "0.5 deg"}
+    number, text = _split(stated, where, f', such as "{examples.get(base, f"1 {base}")}"')
+    if text.replace(" ", "") == base.replace(" ", ""):
+        return number
     if base.startswith("("):
         raise InputError(f'{where}: write it in {base}, such as "1e-4 {base}".')
-    if base == "1" and match[2] not in ("%", "ppm"):
-        raise InputError(f"{where}: {match[2]!r} is no ratio; write %, ppm or 1.")
+    if base == "1" and text not in ("%", "ppm"):
+        raise InputError(f"{where}: {text!r} is no ratio; write %, ppm or 1.")
     return parse_quantity(stated, base, where)
+
+
+def _split(stated: Any, where: str, hint: str) -> tuple[float, str]:
+    """Return a number and the text of its unit."""
+    match = _NUMBER.fullmatch(stated) if isinstance(stated, str) else None
+    if match is None or not match[2]:
+        raise InputError(f"{where}: {stated!r} needs a number with its unit{hint}.")
+    return float(match[1]), match[2]
 
 
 def _range(stated: Any, where: str) -> tuple[float, float]:
     """Return two temperatures in °C."""
-    found = []
-    for each in stated if isinstance(stated, list) else [stated]:
-        match = _NUMBER.fullmatch(each) if isinstance(each, str) else None
-        if match is None or not match[2]:
-            raise InputError(f'{where}: {each!r} needs a number with its unit: ["-10 degC", "60 degC"].')
-        kind = unit(match[2], "temperature", file=where)
-        found.append(kind.factor * float(match[1]) + kind.offset)
-    if len(found) != 2 or found[0] >= found[1]:
+    temperatures = []
+    for end in stated if isinstance(stated, list) else [stated]:
+        number, text = _split(end, where, ': ["-10 degC", "60 degC"]')
+        kind = unit(text, "temperature", file=where)
+        temperatures.append(kind.factor * number + kind.offset)
+    if len(temperatures) != 2 or temperatures[0] >= temperatures[1]:
         raise InputError(f'{where}: give the lowest and the highest temperature: ["-10 degC", "60 degC"].')
-    return found[0], found[1]
+    return temperatures[0], temperatures[1]
 
 
 def _nominal(stated: Any, name: str) -> dict[str, tuple[FloatArray, FloatArray]]:
     if not isinstance(stated, dict):
         raise InputError(f'{name}: below [nominal] stand scales such as accelerometer = "2048 count/g".')
     only(stated, (*_NAMES, *(f"{owner}_offset" for owner in _NAMES)), f"{name}, [nominal]")
-    found = {}
+    nominal = {}
     for owner, quantity in _NAMES.items():
         if owner in stated:
             where = f"{name}, nominal.{owner}"
             scale = parse_scale(stated[owner], quantity, where)
             offset = parse_offset(stated.get(f"{owner}_offset", 0.0), f"{where}_offset")
-            found[owner] = np.broadcast_to(scale, 3), np.broadcast_to(offset, 3)
+            nominal[owner] = np.broadcast_to(scale, 3), np.broadcast_to(offset, 3)
         elif f"{owner}_offset" in stated:
             raise InputError(f"{name}: nominal.{owner}_offset needs the scale beside it, nominal.{owner}.")
-    return found
+    return nominal
 
 
 def _refuse_contradictions(limits: tuple[Limit, ...], name: str) -> None:
     """Refuse the limit of an axis that nothing can keep together with the one of all axes."""
-    whole = {(each.owner, each.part): each for each in limits if not each.axes}
-    for each in limits:
-        other = whole.get((each.owner, each.part), each)
-        if each.low > other.high or each.high < other.low:
+    whole = {(limit.owner, limit.part): limit for limit in limits if not limit.axes}
+    for limit in limits:
+        other = whole.get((limit.owner, limit.part), limit)
+        if limit.low > other.high or limit.high < other.low:
             raise InputError(
-                f"{name}: {each.key} ({each.low:g} to {each.high:g} {each.unit}) and {other.key} ({other.low:g} to "
+                f"{name}: {limit.key} ({limit.low:g} to {limit.high:g} {limit.unit}) and {other.key} ({other.low:g} to "
                 f"{other.high:g}) contradict each other: nothing keeps both."
             )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from jaximu.acceptance.acceptance import SCHEMA, Judged, judge
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
 from jaximu.acceptance.item import Item
 from jaximu.acceptance.limits import OF_ONE_UNIT, Limit, Limits
-from jaximu.acceptance.quantities import Measured, Units, measure
+from jaximu.acceptance.quantities import Measured, Units, measure, share_of
 from jaximu.acceptance.statistics import (
     Capability,
     Chart,
@@ -29,10 +29,11 @@ from jaximu.acceptance.statistics import (
     drift,
     gauge,
     tolerance_factor,
+    with_ends,
 )
 from jaximu.acceptance.words import amount, si_unit, spoken
-from jaximu.fleets.population import days_of, read_fleet
-from jaximu.fleets.rows import PARAMETERS, covariances, free_places, require_table
+from jaximu.fleets.population import LEVEL, days_of, read_fleet
+from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.distributions import student_cdf
@@ -52,14 +53,29 @@ __all__ = [
     "write_verdicts",
 ]
 
-_LEVEL = 0.01
-"""Probability of one false alarm in the whole table, for each kind of question."""
 _FEWEST = 8  # units of a chart
 _GOLDEN = 4  # recordings of a unit from which its drift is asked about
 _SHOWN_ITEMS = 1000  # of a table, that its document holds
-_ROW = ("device", "file", "status", "date", "lot", "accel_gain", "accel_bias", "accel_nominal", "gyro_gain",
-        "gyro_bias", "gyro_nominal", "gyro_unit", "accel_unit", "covariance", "accel_gain_sigma", "excess", "poses",
-        "turns")  # fmt: skip
+_ROW = (
+    "device",
+    "file",
+    "status",
+    "date",
+    "lot",
+    "accel_gain",
+    "accel_bias",
+    "accel_nominal",
+    "gyro_gain",
+    "gyro_bias",
+    "gyro_nominal",
+    "gyro_unit",
+    "accel_unit",
+    "covariance",
+    "accel_gain_sigma",
+    "excess",
+    "poses",
+    "turns",
+)
 
 
 @dataclass(frozen=True)
@@ -147,22 +163,22 @@ class Line(Document):
             return []
         worst_first = np.lexsort([judged.probability.ravel(), (judged.verdict != FAIL).ravel()])
         kept = worst_first[(judged.verdict != PASS).ravel()[worst_first]][:most]
-        places = zip(*np.unravel_index(kept, judged.verdict.shape), strict=True)
-        return [(self.table.devices[row], self._item(judged, int(row), int(place))) for row, place in places]
+        indices = zip(*np.unravel_index(kept, judged.verdict.shape), strict=True)
+        return [(self.table.devices[row], self._item(judged, int(row), int(index))) for row, index in indices]
 
     def judgement(self, row: int) -> list[Item]:
         """Return every item of a calibrated unit (by its place among these)."""
         judged = self.judged
-        return [] if judged is None else [self._item(judged, row, place) for place in range(len(judged.names))]
+        return [] if judged is None else [self._item(judged, row, index) for index in range(len(judged.names))]
 
-    def _item(self, judged: Judged, row: int, place: int) -> Item:
-        at, measured = judged.places[place], judged.measured
+    def _item(self, judged: Judged, row: int, index: int) -> Item:
+        at, measured = judged.places[index], judged.measured
         numbers: dict[str, Any] = {"reason": "not determined"}
         if at >= 0 and measured.determined[row, at]:
             numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
-            numbers["probability"] = float(judged.probability[row, place])
-        verdict = str(judged.verdict[row, place])
-        return Item.of(judged.limits[place], judged.names[place], verdict=verdict, **numbers)
+            numbers["probability"] = float(judged.probability[row, index])
+        verdict = str(judged.verdict[row, index])
+        return Item.of(judged.limits[index], judged.names[index], verdict=verdict, **numbers)
 
     def document(self) -> dict[str, Any]:
         """Return verdicts and statistics as JSON has them; single units' verdicts stand in the table."""
@@ -176,30 +192,41 @@ class Line(Document):
             "limits": None if limits is None else {"file": limits.file, "sha256": limits.sha256},
             "decision": None if limits is None else limits.rule.document(),
             "items": items,
-            "line": [_entry(each) for each in self.followed],
-            "alarms": [vars(each) for each in self.alarms],
+            "line": [_entry(quantity) for quantity in self.followed],
+            "alarms": [vars(alarm) for alarm in self.alarms],
             "golden": self.golden or None,
             "notes": list(self.notes),
         }
 
 
-def _entry(each: FollowedQuantity) -> dict[str, Any]:
-    found = each.capability
+def _entry(quantity: FollowedQuantity) -> dict[str, Any]:
+    able = quantity.capability
     return {
-        "name": each.name,
-        "capability": None if found is None else {
-            "units": found.count, "mean": found.mean, "deviation": found.deviation,
-            "cp": None if np.isnan(found.cp[0]) else dict(zip(("value", "low", "high"), found.cp, strict=True)),
-            "cpk": dict(zip(("value", "low", "high"), found.cpk, strict=True)),
+        "name": quantity.name,
+        "capability": None
+        if able is None
+        else {
+            "units": able.count,
+            "mean": able.mean,
+            "deviation": able.deviation,
+            "cp": None if np.isnan(able.cp[0]) else with_ends(able.cp),
+            "cpk": with_ends(able.cpk),
         },
-        "cpk_by_lot": {lot: dict(zip(("value", "low", "high"), able.cpk, strict=True))
-                       for lot, able in each.lots.items()},
-        "charts": {where: {"centre": chart.centre, "deviation": chart.deviation, "reach": chart.reach,
-                           "beyond": len(chart.beyond), "jumps": len(chart.jumps), "drifting": len(chart.drifting)}
-                   for where, (chart, _) in each.charts.items()},
-        "gauge": None if each.gauge is None else each.gauge.document(),
-        "drift": None if each.drift is None else vars(each.drift),
-    }  # fmt: skip
+        "cpk_by_lot": {lot: with_ends(able.cpk) for lot, able in quantity.lots.items()},
+        "charts": {
+            where: {
+                "centre": chart.centre,
+                "deviation": chart.deviation,
+                "reach": chart.bound,
+                "beyond": len(chart.beyond),
+                "jumps": len(chart.jumps),
+                "drifting": len(chart.drifting),
+            }
+            for where, (chart, _) in quantity.charts.items()
+        },
+        "gauge": None if quantity.gauge is None else quantity.gauge.document(),
+        "drift": None if quantity.drift is None else vars(quantity.drift),
+    }
 
 
 # --- the table --------------------------------------------------------------------------------------------------------
@@ -228,39 +255,61 @@ def read_table(path: str | os.PathLike[str]) -> Batch:
 
     def words(column: str) -> tuple[str, ...]:
         known = column in kept.column_names
-        return tuple(each or "" for each in kept[column].to_pylist()) if known else ("",) * len(rows)
+        return tuple(text or "" for text in kept[column].to_pylist()) if known else ("",) * len(rows)
 
     triads = {short: SENSORS[short] for short in ("accel", "gyro")[: 1 + gyroscope]}
     outputs: dict[str, Any] = {}
     for short, owner in triads.items():
-        found = sorted(set(words(f"{short}_unit")))
-        if len(found) > 1:
-            raise InputError(f"{name}: the {owner}s are in {' and '.join(found)}: one table, one unit.")
-        outputs[f"{owner}_unit"] = found[0]
+        output_units = sorted(set(words(f"{short}_unit")))
+        if len(output_units) > 1:
+            raise InputError(f"{name}: the {owner}s are in {' and '.join(output_units)}: one table, one unit.")
+        outputs[f"{owner}_unit"] = output_units[0]
     like = Imu.nominal(**outputs)
     like = like if gyroscope else Imu(like.accelerometer, None)
-    parts = [numbers(f"{short}_{part}") for short in triads for part in ("gain", "bias")]
+    parts = [numbers(column) for column in list(COLUMN_PLACES)[: 2 * len(triads)]]
     free = free_places(gyroscope)
     covariance = covariances(numbers("covariance"))[np.ix_(range(len(rows)), free, free)]
     # gravity's part is in the sigmas and not in the covariance; it acts on the accelerometer's gain as a whole
     scales = [0, 4, 8]
-    variances = np.diagonal(covariance, axis1=1, axis2=2)[:, [free.index(place) for place in scales]]
+    variances = np.diagonal(covariance, axis1=1, axis2=2)[:, [free.index(index) for index in scales]]
     added = numbers("accel_gain_sigma")[:, scales] ** 2 - variances
     gravity = np.sqrt(np.maximum(np.mean(added / parts[0][:, scales] ** 2, axis=1), 0.0))
-    reach = np.where(np.array(free) < 9, np.concatenate(parts, axis=1)[:, free], 0.0) * gravity[:, None]
-    excess = numbers("excess")
-    poses, turns = (np.nan_to_num(numbers(each)[:, 0]) for each in ("poses", "turns"))
-    share = np.nan_to_num(excess / (1 + excess))
+    by_gravity = np.where(np.array(free) < 9, np.concatenate(parts, axis=1)[:, free], 0.0) * gravity[:, None]
+    units = Units(
+        like,
+        np.concatenate(parts, axis=1),
+        tuple(PARAMETERS[index] for index in free),
+        covariance + by_gravity[:, :, None] * by_gravity[:, None, :],
+        gravity,
+        _conditions(numbers, gyroscope),
+    )
+    nominal = {owner: (numbers(f"{short}_nominal")[0, :3], np.zeros(3)) for short, owner in triads.items()}
+    return Batch(
+        name,
+        len(table),
+        rows,
+        units,
+        words("device"),
+        words("file"),
+        days_of(words("date")),
+        words("lot"),
+        words("station"),
+        nominal,
+    )
+
+
+def _conditions(
+    numbers: Callable[[str], FloatArray], gyroscope: bool
+) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
+    """Degrees of freedom and shares of the scatter beyond the noise, as `Units` has them, by a table's columns."""
+    poses, turns = (np.nan_to_num(numbers(column)[:, 0]) for column in ("poses", "turns"))
+    share = np.nan_to_num(share_of(numbers("excess")))
     accelerometer = np.maximum(1.0, poses - 9), share[:, 0]
     conditions = {("accelerometer", part): accelerometer for part in ("gain", "bias")}
     if gyroscope:
         conditions["gyroscope", "gain"] = np.maximum(1.0, 2 * turns - 9), share[:, 1]
         conditions["gyroscope", "bias"] = np.maximum(1.0, 3 * poses - 3), share[:, 2]
-    units = Units(like, np.concatenate(parts, axis=1), tuple(PARAMETERS[place] for place in free),
-                  covariance + reach[:, :, None] * reach[:, None, :], gravity, conditions)  # fmt: skip
-    nominal = {owner: (numbers(f"{short}_nominal")[0, :3], np.zeros(3)) for short, owner in triads.items()}
-    return Batch(name, len(table), rows, units, words("device"), words("file"), days_of(words("date")), words("lot"),
-                 words("station"), nominal)  # fmt: skip
+    return conditions
 
 
 def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
@@ -270,8 +319,8 @@ def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
     recording counts. Raises `NotPossibleError` for fewer than ten units.
     """
     table = read_table(path)
-    strange = {each.device for each in read_fleet(path).strangers}
-    kept = np.array([place for place in _first_recordings(table) if table.devices[place] not in strange], int)
+    strange = {stranger.device for stranger in read_fleet(path).strangers}
+    kept = np.array([index for index in _first_recordings(table) if table.devices[index] not in strange], int)
     if len(kept) < 10:
         raise NotPossibleError(f"{table.file}: {len(kept)} units are too few for limits of a population: it takes ten.")
     nominal = _in_counts(table, table.nominal)
@@ -279,10 +328,10 @@ def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
     factor = tolerance_factor(len(kept))
     source = f"population of {len(kept)} units in {Path(table.file).name}: 99 % of it with 95 % confidence"
     limits = []
-    for place, name in enumerate(measured.names):
-        if measured.fixed[place]:
+    for index, name in enumerate(measured.names):
+        if measured.fixed[index]:
             continue
-        values = measured.value[kept, place]
+        values = measured.value[kept, index]
         stem, _, axes = name.rstrip("]").partition("[")
         owner, _, part = stem.partition(".")
         middle, half = float(np.mean(values)), factor * float(np.std(values, ddof=1))
@@ -294,7 +343,7 @@ def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
 def _in_counts(table: Batch, nominal: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict:
     """Return the nominal scales of the triads that were logged in counts."""
     triads = table.units.like.triads()
-    return {owner: each for owner, each in nominal.items() if triads[owner].output_unit == "count"}
+    return {owner: scales for owner, scales in nominal.items() if triads[owner].output_unit == "count"}
 
 
 def _first_recordings(table: Batch) -> NDArray[np.int64]:
@@ -324,7 +373,7 @@ def follow(table: Batch, limits: Limits | None = None, golden: str = "") -> Line
     if limits is not None:
         judged = judge(table.units, limits)
         verdicts[table.rows] = [worst(row) for row in judged.verdict] if len(judged.names) else UNDECIDED
-        left = [each.key for each in limits.limits if each.part in OF_ONE_UNIT]
+        left = [limit.key for limit in limits.limits if limit.part in OF_ONE_UNIT]
         if left:
             notes.append(f"limits of noise and navigation are of single units and were left out: {', '.join(left)}.")
         if table.total > len(table.rows):
@@ -332,114 +381,137 @@ def follow(table: Batch, limits: Limits | None = None, golden: str = "") -> Line
     nominal = {**table.nominal, **(limits.nominal if limits else {})}
     measured = measure(table.units, _in_counts(table, nominal), ())
     first = _first_recordings(table)
-    first = first[[table.devices[place] != golden for place in first.tolist()]]
+    first = first[np.array(table.devices)[first] != golden]
     stations = sorted(set(table.stations))
     watched = (np.array(table.devices) == golden) & np.isfinite(table.days)
-    shown = [place for place in range(len(measured.names)) if not measured.fixed[place]]
+    shown = [column for column in range(len(measured.names)) if not measured.fixed[column]]
     by_name = {} if judged is None else dict(zip(judged.names, judged.limits, strict=True))
     followed, alarms = [], []
-    for place in shown:
-        name, values = measured.names[place], measured.value[:, place]
-        own = np.sqrt(np.maximum(measured.sigma[:, place] ** 2 - measured.gravity[:, place] ** 2, 0.0))
+    for column in shown:
+        name, values = measured.names[column], measured.value[:, column]
+        recording = np.sqrt(np.maximum(measured.sigma[:, column] ** 2 - measured.gravity[:, column] ** 2, 0.0))
         charts = {}
         for station in stations:
-            some = first[[table.stations[each] == station for each in first.tolist()]]
+            some = first[np.array(table.stations)[first] == station]
             if len(some) >= _FEWEST:
-                charts[station] = control_chart(values[some], _LEVEL / len(shown) / len(stations)), some
+                charts[station] = control_chart(values[some], LEVEL / len(shown) / len(stations)), some
         limit = by_name.get(name)
         able = capability(values[first], limit.low, limit.high) if limit is not None and len(first) > 1 else None
-        by_lot = (
-            {}
-            if limit is None
-            else {
-                lot: capability(values[some], limit.low, limit.high) for lot, some in _groups(table.lots, first).items()
-            }
-        )
-        study = gauge(values, own, table.devices, table.stations)
+        lots = () if limit is None else _groups(table.lots, first).items()
+        by_lot = {lot: capability(values[some], limit.low, limit.high) for lot, some in lots if limit}
+        study = gauge(values, recording, table.devices, table.stations)
         course = drift(table.days[watched], values[watched]) if np.sum(watched) >= _GOLDEN else None
         followed.append(FollowedQuantity(name, limit, able, by_lot, charts, study, course))
         alarms += _alarms(table, name, si_unit(name), charts, course, golden, len(shown))
         for kind, labels in (("station", table.stations), ("lot", table.lots)):
             alarms += _compared(kind, _groups(labels, first), name, values[first], first, len(shown))
-    if not any(each.charts for each in followed):
+    if not any(quantity.charts for quantity in followed):
         notes.append(f"fewer than {_FEWEST} units: no control chart.")
     elif np.isnan(table.days[first]).all():
         notes.append("no dates are known: the charts follow the order of the table.")
     return Line(table, limits, judged, measured, verdicts, tuple(followed), tuple(alarms), golden, tuple(notes))
 
 
-def _when(table: Batch, place: int) -> str:
-    if np.isnan(table.days[place]):
-        return table.devices[place]
-    return f"{np.datetime64(round(table.days[place] * 86400), 's').astype('datetime64[D]')} ({table.devices[place]})"
+def _when(table: Batch, row: int) -> str:
+    if np.isnan(table.days[row]):
+        return table.devices[row]
+    return f"{np.datetime64(round(table.days[row] * 86400), 's').astype('datetime64[D]')} ({table.devices[row]})"
 
 
 def _alarms(
-    table: Batch, name: str, unit: str, charts: dict[str, tuple[Chart, NDArray[np.int64]]], course: Drift | None,
-    golden: str, questions: int,
-) -> list[Alarm]:  # fmt: skip
-    found = []
+    table: Batch,
+    name: str,
+    unit: str,
+    charts: dict[str, tuple[Chart, NDArray[np.int64]]],
+    course: Drift | None,
+    golden: str,
+    questions: int,
+) -> list[Alarm]:
+    alarms = []
     for station, (chart, places) in charts.items():
         what = spoken(name) + (f" at station {station}" if station else "")
         off = np.abs(chart.average - chart.centre)
         if len(chart.drifting):
             start, most = int(chart.drifting[0]), int(chart.drifting[np.argmax(off[chart.drifting])])
             side = "above" if chart.average[most] > chart.centre else "below"
-            found.append(Alarm("average", name, station, (
-                f"{what}: the moving average left its limits at {_when(table, int(places[start]))} and is farthest, "
-                f"{amount(off[most], unit)} {side} the mean of all, at {_when(table, int(places[most]))}"
-            )))  # fmt: skip
+            alarms.append(
+                Alarm(
+                    "average",
+                    name,
+                    station,
+                    (
+                        f"{what}: the moving average left its limits at {_when(table, int(places[start]))} and is "
+                        f"farthest, {amount(off[most], unit)} {side} the mean of all, at "
+                        f"{_when(table, int(places[most]))}"
+                    ),
+                )
+            )
         # a value far off is a jump, too: it is said once
         kind, hits = ("value", chart.beyond) if len(chart.beyond) else ("jump", chart.jumps)
         if len(hits):
             before = np.concatenate([[np.nan], chart.values[:-1]])
             away = chart.values - (chart.centre if kind == "value" else before)
             most = int(hits[np.argmax(np.abs(away[hits]))])
-            said = "is off the mean by" if kind == "value" else "differs from the unit before by"
+            relation = "is off the mean by" if kind == "value" else "differs from the unit before by"
             more = f"; {len(hits) - 1} more units are beyond the limits" if len(hits) > 1 else ""
-            text = f"{what}: {_when(table, int(places[most]))} {said} {amount(away[most], unit)}{more}"
-            found.append(Alarm(kind, name, station, text))
-    if course is not None and course.p_value * questions < _LEVEL:
-        found.append(Alarm("golden", name, "", (
-            f"{spoken(name)} of the golden unit {golden} drifts by {amount(30 * course.slope, unit)} in 30 days "
-            f"(± {amount(30 * 1.96 * course.sigma, unit, 2)}, 95 %)"
-        )))  # fmt: skip
-    return found
+            text = f"{what}: {_when(table, int(places[most]))} {relation} {amount(away[most], unit)}{more}"
+            alarms.append(Alarm(kind, name, station, text))
+    if course is not None and course.p_value * questions < LEVEL:
+        alarms.append(
+            Alarm(
+                "golden",
+                name,
+                "",
+                (
+                    f"{spoken(name)} of the golden unit {golden} drifts by {amount(30 * course.slope, unit)} in "
+                    f"30 days (± {amount(30 * 1.96 * course.sigma, unit, 2)}, 95 %)"
+                ),
+            )
+        )
+    return alarms
 
 
 def _groups(labels: Sequence[str], first: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
     """Return the places of units with the same label, of labels with enough of them; empty where there is but one."""
-    own = np.array(labels)[first]
-    names = [each for each in sorted(set(own.tolist())) if each]
-    return {each: first[own == each] for each in names if len(names) > 1 and np.sum(own == each) >= _FEWEST}
+    of_first = np.array(labels)[first]
+    names = [label for label in sorted(set(of_first.tolist())) if label]
+    return {
+        label: first[of_first == label] for label in names if len(names) > 1 and np.sum(of_first == label) >= _FEWEST
+    }
 
 
 def _compared(
-    kind: str, groups: dict[str, NDArray[np.int64]], name: str, values: FloatArray, first: NDArray[np.int64],
+    kind: str,
+    groups: dict[str, NDArray[np.int64]],
+    name: str,
+    values: FloatArray,
+    first: NDArray[np.int64],
     questions: int,
-) -> list[Alarm]:  # fmt: skip
+) -> list[Alarm]:
     """Name the stations or lots whose units (first,) differ from the others', the surest first."""
-    found, left = [], dict(groups)
+    alarms, left = [], dict(groups)
     while len(left) > 1:
-        shifts = {label: _shift(values, np.isin(first, places), np.isin(first, np.concatenate([*left.values()])))
-                  for label, places in left.items()}  # fmt: skip
-        label = min(shifts, key=lambda each: shifts[each][1])
+        shifts = {
+            label: _shift(values, np.isin(first, places), np.isin(first, np.concatenate([*left.values()])))
+            for label, places in left.items()
+        }
+        label = min(shifts, key=lambda label: shifts[label][1])
         shift, p_value = shifts[label]
-        if p_value * questions * len(groups) >= _LEVEL:
+        if p_value * questions * len(groups) >= LEVEL:
             break
         off = f"{amount(abs(shift), si_unit(name))} {'more' if shift > 0 else 'less'} than the other {kind}s"
         verb = "measures" if kind == "station" else "has"
-        found.append(Alarm(kind, name, label, f"{kind} {label} {verb} {spoken(name)} {off}"))
+        alarms.append(Alarm(kind, name, label, f"{kind} {label} {verb} {spoken(name)} {off}"))
         del left[label]  # those that remain are compared without it
-    return found
+    return alarms
 
 
 def _shift(values: FloatArray, inside: NDArray[np.bool_], all_of: NDArray[np.bool_]) -> tuple[float, float]:
     """Return by how much the values inside differ from the others in the mean, and the p-value of Welch's test."""
     sides = values[inside], values[all_of & ~inside]
-    parts = np.array([np.var(each, ddof=1) / len(each) for each in sides])
+    parts = np.array([np.var(side, ddof=1) / len(side) for side in sides])
     shift, variance = float(sides[0].mean() - sides[1].mean()), float(parts.sum())
-    freedom = variance**2 / float(np.sum(parts**2 / np.array([len(each) - 1 for each in sides])))
+    freedom = variance**2 / float(np.sum(parts**2 / np.array([len(side) - 1 for side in sides])))
     return shift, 2 * float(student_cdf(-abs(shift) / np.sqrt(variance), freedom))
 
 
@@ -451,8 +523,8 @@ def write_verdicts(line: Line, path: str | os.PathLike[str]) -> None:
     table = pq.read_table(line.table.file)
     table = table.drop_columns([name for name in ("acceptance", "not_passed") if name in table.column_names])
     missed: list[list[str]] = [[] for _ in range(line.table.total)]
-    for place, row in enumerate(line.table.rows.tolist()):
-        missed[row] = line.missed(place)
+    for index, row in enumerate(line.table.rows.tolist()):
+        missed[row] = line.missed(index)
     table = table.append_column("acceptance", pa.array(line.verdicts.tolist(), pa.string()))
     table = table.append_column("not_passed", pa.array(missed, pa.list_(pa.string())))
     with atomic_write(path) as temporary:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.acceptance.decision import UNDECIDED, Rule, probability_of_conformity
+from jaximu.acceptance.decision import UNDECIDED, Rule
 from jaximu.acceptance.item import Item, deciding
 from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
@@ -21,6 +21,7 @@ from jaximu.ground.distributions import normal_isf
 from jaximu.ground.errors import NotPossibleError
 from jaximu.navigation.consequences import consequences, sensor_noise
 from jaximu.navigation.trajectory import Place, level_driving
+from jaximu.planning.information import gravity_sensitivity
 
 __all__ = ["navigation_items"]
 
@@ -37,35 +38,35 @@ def navigation_items(
     """
     items, notes = [], []
     known = None if noise is None else sensor_noise(noise, "the allan.json")
-    place = Place(_LATITUDE, 0.0, calibration.gravity)
+    site = Place(_LATITUDE, 0.0, calibration.gravity)
     for after in dict.fromkeys(limit.after for limit in limits):
         here = [limit for limit in limits if limit.after == after]
         try:
-            found = consequences(calibration, level_driving(place, after), known, draws=0, files=(file, ""))
+            outcome = consequences(calibration, level_driving(site, after), known, draws=0, files=(file, ""))
         except NotPossibleError as error:
             items += [Item.of(limit, limit.key, reason=str(error).rstrip(".")) for limit in here]
             continue
-        exact = consequences(_gravity_known(calibration), level_driving(place, after), draws=0, files=(file, ""))
-        errors = [(np.sqrt(each[-1, :3]), np.degrees(np.sqrt(each[-1, _UP:])))
-                  for each in (found.calibration, exact.calibration, found.noise)]  # fmt: skip
+        exact = consequences(_gravity_known(calibration), level_driving(site, after), draws=0, files=(file, ""))
+        errors = [
+            (np.sqrt(variances[-1, :3]), np.degrees(np.sqrt(variances[-1, _UP:])))
+            for variances in (outcome.calibration, exact.calibration, outcome.noise)
+        ]
         for limit in here:
-            parts = [each[limit.part == "heading"] for each in errors]
+            parts = [pair[limit.part == "heading"] for pair in errors]
             for axis in limit.axes or range(len(parts[0])):
                 name = f"navigation.{limit.part}" + (f"[{axis}]" if limit.part == "position" else "")
-                own, recording, rest = (float(each[axis]) for each in parts)
-                of_gravity = float(np.sqrt(max(own**2 - recording**2, 0.0)))
+                total, recording, rest = (float(sigma[axis]) for sigma in parts)
+                of_gravity = float(np.sqrt(max(total**2 - recording**2, 0.0)))
                 items.append(_item(limit, name, rule, recording, of_gravity, rest, calibration.gravity.sigma))
-        notes.append(f"{', '.join(limit.key for limit in here)}: after {found.trajectory.words}.")
+        notes.append(f"{', '.join(limit.key for limit in here)}: after {outcome.trajectory.words}.")
         notes += [] if known else [f"{here[0].key}: without --noise the sensors' noise is left out."]
     return items, notes
 
 
 def _gravity_known(calibration: Calibration) -> Calibration:
     """Return the calibration as it were with gravity known exactly: it acts on the accelerometer's gain, K ∝ 1/g."""
-    gain, gravity = np.asarray(calibration.imu.accelerometer.gain), calibration.gravity
-    reach = np.array([gain[name.axes] * gravity.sigma / gravity.value if name.startswith("accelerometer.gain") else 0.0
-                      for name in calibration.names])  # fmt: skip
-    return replace(calibration, covariance=calibration.covariance - np.outer(reach, reach))
+    by_gravity = gravity_sensitivity(calibration.imu, calibration.names, calibration.gravity)
+    return replace(calibration, covariance=calibration.covariance - np.outer(by_gravity, by_gravity))
 
 
 def _item(
@@ -73,12 +74,17 @@ def _item(
 ) -> Item:
     """Return the item of an error about zero with these standard deviations; gravity_sigma: m/s²."""
     sigma = float(np.sqrt(recording**2 + gravity**2 + noise**2))
-    probability = float(probability_of_conformity(0.0, sigma, limit.low, limit.high))
-    verdict, advice = str(rule.verdicts(probability, limit.low <= 0 <= limit.high)), ""
-    if verdict == UNDECIDED:
+    judged, advice = limit.judged(rule, 0.0, sigma), ""
+    if judged["verdict"] == UNDECIDED:
         needed = limit.nearest(0.0) / float(normal_isf(rule.risk / 2))  # both sides of zero count, hence half the risk
         left, advice = needed**2 - noise**2, "The sensors' noise alone is too much for this limit."
         if left > 0:
             advice = deciding(float(np.sqrt(left)), recording, gravity, gravity_sigma, "longer rests.")
-    return Item.of(limit, name, value=0.0, sigma=sigma, probability=probability, verdict=verdict, gravity=gravity,
-                   recording=float(np.hypot(recording, noise)), advice=advice)  # fmt: skip
+    return Item.of(
+        limit,
+        name,
+        **judged,
+        gravity=gravity,
+        recording=float(np.hypot(recording, noise)),
+        advice=advice,
+    )

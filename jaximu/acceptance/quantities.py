@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,11 +37,12 @@ from jaximu.ground.rotation import apply_matrix, inverse_matrix
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSORS
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
+from jaximu.planning.chunks import in_chunks
 
-__all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus"]
+__all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus", "share_of"]
 
 _CHUNK = 512  # units that are computed at once
-_GRID = np.array([each for each in product(range(-2, 3), repeat=3) if max(map(abs, each)) == 2], float)
+_GRID = np.array([point for point in product(range(-2, 3), repeat=3) if max(map(abs, point)) == 2], float)
 _GRID /= np.linalg.norm(_GRID, axis=1, keepdims=True)
 """98 directions: the largest standard deviation among them is within 3 % of the largest of all."""
 
@@ -99,12 +99,12 @@ def of_calibration(calibration: Calibration) -> Units:
     for (owner, part), (kind, count) in counts.items():
         if count is not None and kind in excess:
             free = numbers[owner] if owner == "accelerometer" else 9 if part == "gain" else 3
-            conditions[owner, part] = np.array([max(1.0, count - free)]), _share(np.array([excess[kind]]))
+            conditions[owner, part] = np.array([max(1.0, count - free)]), share_of(np.array([excess[kind]]))
     gravity = calibration.gravity.sigma / calibration.gravity.value
     return Units(imu, flatten(imu)[None], names, calibration.covariance[None], np.array([gravity]), conditions)
 
 
-def _share(excess: FloatArray) -> FloatArray:
+def share_of(excess: FloatArray) -> FloatArray:
     """Return the share of the variance that scatter beyond the noise has."""
     return excess / (1 + excess)
 
@@ -120,52 +120,55 @@ def measure(units: Units, nominal: Mapping[str, tuple[FloatArray, FloatArray]], 
     known = units.like.triads()
     si = np.ones(3), np.zeros(3)
     scales = {name: nominal.get(name, si) if triad.output_unit == "count" else si for name, triad in known.items()}
-    places = np.array([names_of(units.like).index(name) for name in units.names], int)
-    asked = [(each, output_stimulus(each, units.like)) for each in outputs if each.owner in known]
+    indices = np.array([names_of(units.like).index(name) for name in units.names], int)
+    ranges = [(limit, output_stimulus(limit, units.like)) for limit in outputs if limit.owner in known]
+
+    # one standard deviation of gravity changes these in proportion
+    of_gravity = np.array([name.startswith("accelerometer.gain") for name in names_of(units.like)])
 
     def all_of(flat, covariance, gravity, like, scales, stimuli):
         def quantities(flat):
             imu = ravel_pytree(like)[1](flat)
-            found = [_parameters(triad, *scales[name]) for name, triad in imu.triads().items()]
-            found += [effect.coefficients for triad in imu.triads().values() for effect in triad.effects]
-            return jnp.concatenate([jnp.ravel(each) for each in found])
-
-        def reach(slope):  # what one standard deviation of gravity does to the quantities
-            imu = ravel_pytree(like)[1](flat)
-            gain = eqx.tree_at(lambda one: one.accelerometer.gain, jax.tree.map(jnp.zeros_like, imu),
-                               -imu.accelerometer.gain)  # fmt: skip
-            return jnp.abs(slope @ ravel_pytree(gain)[0]) * gravity
+            values = [_parameters(triad, *scales[name]) for name, triad in imu.triads().items()]
+            values += [effect.coefficients for triad in imu.triads().values() for effect in triad.effects]
+            return jnp.concatenate([jnp.ravel(value) for value in values])
 
         parts = [(quantities(flat), jax.jacfwd(quantities)(flat))]
-        for (limit, _), stimulus in zip(asked, stimuli, strict=True):
+        for (limit, _), stimulus in zip(ranges, stimuli, strict=True):
             error = _error_of_output(limit, like, flat, scales, stimulus)
             value, slope = error(flat), jax.jacfwd(error)(flat)  # (points, 3), (points, 3, m)
-            sigma = _sigma(slope[..., places], covariance)
+            sigma = _sigma(slope[..., indices], covariance)
             worst = jnp.argmax(jnp.abs(value) + 2 * sigma, axis=0)
             parts.append((value[worst, jnp.arange(3)], slope[worst, jnp.arange(3)]))
-        value, slope = (jnp.concatenate(each) for each in zip(*parts, strict=True))
-        free = slope[:, places]
-        return value, _sigma(free, covariance), reach(slope), free
+        value, slope = (jnp.concatenate(column) for column in zip(*parts, strict=True))
+        free = slope[:, indices]
+        by_gravity = jnp.abs(slope @ jnp.where(of_gravity, flat, 0.0)) * gravity
+        return value, _sigma(free, covariance), by_gravity, free
 
-    arguments = (units.like, scales, [stimulus for _, stimulus in asked])
-    limited = [(each.part, each.owner) for each, _ in asked]
-    description = f"accept {places.tolist()} {limited}"
+    stimuli = [stimulus for _, stimulus in ranges]
+    description = f"accept {indices.tolist()} {[(limit.part, limit.owner) for limit, _ in ranges]}"
     batched = jax.vmap(all_of, (0, 0, 0, None, None, None))
-    count, size = len(units.numbers), min(_CHUNK, len(units.numbers))
-    found = []
-    for start in range(0, count, size):
-        rows = np.minimum(np.arange(start, start + size), count - 1)  # the last chunk is filled up with its last unit
-        some = stored.call(
-            batched, description, units.numbers[rows], units.covariance[rows], units.gravity[rows], *arguments
-        )
-        found.append([each[: count - start] for each in some])
-    value, sigma, gravity, slope = (np.concatenate(each) for each in zip(*found, strict=True))
-    names = (*_parameter_names(units.like), *(f"{each.key}[{axis}]" for each, _ in asked for axis in range(3)))
-    sizes = flatten(typical_sizes(unflatten(units.like, np.median(units.numbers, axis=0))))[places]
+    value, sigma, gravity, slope = in_chunks(
+        lambda *rows: stored.call(batched, description, *rows, units.like, scales, stimuli),
+        min(_CHUNK, len(units.numbers)),
+        units.numbers,
+        units.covariance,
+        units.gravity,
+    )
+    names = (*_parameter_names(units.like), *(f"{limit.key}[{axis}]" for limit, _ in ranges for axis in range(3)))
+    sizes = flatten(typical_sizes(unflatten(units.like, np.median(units.numbers, axis=0))))[indices]
     open_ = np.sqrt(np.diagonal(units.covariance, axis1=1, axis2=2)) > UNDETERMINED * sizes
     determined = ~np.any((np.abs(slope) > 0) & open_[:, None], axis=2)
-    return Measured(names, value, sigma, gravity, _freedom(units, names, sigma, gravity), determined,
-                    np.all(slope == 0, axis=(0, 2)), slope)  # fmt: skip
+    return Measured(
+        names,
+        value,
+        sigma,
+        gravity,
+        _freedom(units, names, sigma, gravity),
+        determined,
+        np.all(slope == 0, axis=(0, 2)),
+        slope,
+    )
 
 
 def _sigma(slope, covariance):
@@ -174,9 +177,9 @@ def _sigma(slope, covariance):
 
 def _parameters(triad, scale, offset):
     """Return bias (3,), scale (3,) and misalignment (6,) of a triad, one after the other."""
-    own = jnp.diagonal(triad.gain)
-    crossed = (triad.gain / own[:, None])[~np.eye(3, dtype=bool)]
-    return jnp.concatenate([(triad.bias - offset) / own, own / scale - 1, crossed])
+    diagonal = jnp.diagonal(triad.gain)
+    crossed = (triad.gain / diagonal[:, None])[~np.eye(3, dtype=bool)]
+    return jnp.concatenate([(triad.bias - offset) / diagonal, diagonal / scale - 1, crossed])
 
 
 def _parameter_names(imu: Imu) -> list[str]:
@@ -190,12 +193,12 @@ def _parameter_names(imu: Imu) -> list[str]:
 
 def output_stimulus(limit: Limit, imu: Imu) -> Stimulus:
     """Return the inputs (points, 3) of a range: 98 directions at its end, at the ends and the middle of temperature."""
-    given: dict[str, Any] = {SENSOR_QUANTITIES[limit.owner]: limit.over * _GRID}
+    inputs: dict[str, Any] = {SENSOR_QUANTITIES[limit.owner]: limit.over * _GRID}
     if limit.temperature is not None:
         low, high = limit.temperature
         warmth = np.repeat([low, (low + high) / 2, high], len(_GRID))
-        given = {name: np.tile(each, (3, 1)) for name, each in given.items()} | {"temperature": warmth}
-    stimulus = Stimulus(**given)
+        inputs = {name: np.tile(values, (3, 1)) for name, values in inputs.items()} | {"temperature": warmth}
+    stimulus = Stimulus(**inputs)
     triad = imu.triads()[limit.owner]
     try:
         jax.eval_shape(lambda one: replace(triad, effects=_effects(triad)).respond(one), stimulus)
@@ -205,7 +208,7 @@ def output_stimulus(limit: Limit, imu: Imu) -> Stimulus:
 
 
 def _effects(triad):
-    return tuple(each for each in triad.effects if each.scope == "device")
+    return tuple(effect for effect in triad.effects if effect.scope == "device")
 
 
 def _error_of_output(limit: Limit, like, flat, scales, stimulus):
@@ -216,14 +219,16 @@ def _error_of_output(limit: Limit, like, flat, scales, stimulus):
 
     def output(flat, value):
         triad = ravel_pytree(like)[1](flat).triads()[limit.owner]
-        context = eqx.tree_at(lambda one: getattr(one, quantity), stimulus, value)
+        context = replace(stimulus, **{quantity: value})
         return replace(triad, effects=_effects(triad)).respond(context)
 
     if limit.part == "raw_output":
         return lambda numbers: (output(numbers, true) - offset) / scale - true
     # each point's output reacts to its own input alone: three directional derivatives give all points' slopes
-    columns = [jax.jvp(lambda value: output(flat, value), (true,), (jnp.broadcast_to(unit, true.shape),))[1]
-               for unit in jnp.eye(3)]  # fmt: skip
+    columns = [
+        jax.jvp(lambda value: output(flat, value), (true,), (jnp.broadcast_to(unit, true.shape),))[1]
+        for unit in jnp.eye(3)
+    ]
     slope, estimate = jnp.stack(columns, axis=-1), output(flat, true)
     # by hand, not by LAPACK: its batched calls from within a compiled loop wait for each other on two cores
     inverse = inverse_matrix(slope)
@@ -232,15 +237,15 @@ def _error_of_output(limit: Limit, like, flat, scales, stimulus):
 
 def _freedom(units: Units, names: Sequence[str], sigma: FloatArray, gravity: FloatArray) -> FloatArray:
     """Return the effective degrees of freedom (n, q)."""
-    found = np.full(sigma.shape, np.inf)
-    for place, name in enumerate(names):
+    effective = np.full(sigma.shape, np.inf)
+    for column, name in enumerate(names):
         owner, _, part = name.partition("[")[0].partition(".")
         known = units.conditions.get((SENSORS.get(owner, owner), "bias" if part == "bias" else "gain"))
         if known is None:
             continue
         freedom, share = known
-        total = sigma[:, place] ** 2
-        scattered = share * np.maximum(total - gravity[:, place] ** 2, 0.0)
+        total = sigma[:, column] ** 2
+        scattered = share * np.maximum(total - gravity[:, column] ** 2, 0.0)
         has = scattered > 1e-9 * total
-        found[has, place] = (freedom * total**2)[has] / scattered[has] ** 2
-    return np.maximum(found, 1.0)
+        effective[has, column] = (freedom * total**2)[has] / scattered[has] ** 2
+    return np.maximum(effective, 1.0)

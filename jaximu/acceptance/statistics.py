@@ -13,12 +13,28 @@ from scipy import special
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, f_tails, normal_isf, student_cdf
 
-__all__ = ["Capability", "Chart", "Drift", "Gauge", "capability", "control_chart", "drift", "gauge", "tolerance_factor"]
+__all__ = [
+    "Capability",
+    "Chart",
+    "Drift",
+    "Gauge",
+    "capability",
+    "control_chart",
+    "drift",
+    "gauge",
+    "tolerance_factor",
+    "with_ends",
+]
 
 _WEIGHT = 0.2  # of the newest value in the moving average
 _MEAN_RANGE = 2 / np.sqrt(np.pi)  # mean range of two normal numbers, d2 = 1.128
 _CATEGORIES = 1.41  # AIAG's √2: a category is a 97 % interval of the gauge wide
 _POOLED = 0.25  # p-value from which AIAG takes an interaction for repeatability
+
+
+def with_ends(numbers: tuple[float, float, float]) -> dict[str, float]:
+    """Return a value and its interval as JSON has them."""
+    return dict(zip(("value", "low", "high"), numbers, strict=True))
 
 
 @dataclass(frozen=True)
@@ -44,15 +60,20 @@ def capability(values: FloatArray, low: float, high: float) -> Capability:
         cpk = np.float64(min(high - mean, mean - low)) / (3 * deviation)
     ends = [np.sqrt(chi2_isf(p, count - 1) / (count - 1)) for p in (0.975, 0.025)]
     half = normal_isf(0.025) * np.sqrt(1 / (9 * count) + cpk**2 / (2 * (count - 1)))
-    return Capability(count, mean, deviation, (float(cp), float(cp * ends[0]), float(cp * ends[1])),
-                      (float(cpk), float(cpk - half), float(cpk + half)))  # fmt: skip
+    return Capability(
+        count,
+        mean,
+        deviation,
+        (float(cp), float(cp * ends[0]), float(cp * ends[1])),
+        (float(cpk), float(cpk - half), float(cpk + half)),
+    )
 
 
 @dataclass(frozen=True)
 class Chart:
     """A control chart of values (n,) in their order, with their moving average (n,).
 
-    centre, deviation: of the process; reach: limits of the values, in deviations; average_reach (n,): of the average.
+    centre, deviation: of the process; bound: limits of the values, in deviations; average_bound (n,): of the average.
     beyond, jumps, drifting: places beyond the limits of values, of ranges (the later of two), and of the average.
     """
 
@@ -60,8 +81,8 @@ class Chart:
     average: FloatArray
     centre: float
     deviation: float
-    reach: float
-    average_reach: FloatArray
+    bound: float
+    average_bound: FloatArray
     beyond: NDArray[np.int64]
     jumps: NDArray[np.int64]
     drifting: NDArray[np.int64]
@@ -77,20 +98,25 @@ def control_chart(values: FloatArray, level: float) -> Chart:
     count = len(values)
     ranges = np.abs(np.diff(values))
     centre, deviation = float(np.mean(values)), float(np.mean(ranges) / _MEAN_RANGE)
-    reach = float(normal_isf(level / 2 / count))
+    bound = float(normal_isf(level / 2 / count))
     average = np.empty(count)
     running = centre
-    for place, value in enumerate(values.tolist()):
+    for index, value in enumerate(values.tolist()):
         running += _WEIGHT * (value - running)
-        average[place] = running
+        average[index] = running
     steps = np.arange(1, count + 1)
-    average_reach = reach * np.sqrt(_WEIGHT / (2 - _WEIGHT) * -np.expm1(2 * steps * np.log1p(-_WEIGHT)))
+    average_bound = bound * np.sqrt(_WEIGHT / (2 - _WEIGHT) * -np.expm1(2 * steps * np.log1p(-_WEIGHT)))
     return Chart(
-        values, average, centre, deviation, reach, average_reach,
-        np.flatnonzero(np.abs(values - centre) > reach * deviation),
-        1 + np.flatnonzero(ranges > np.sqrt(2) * reach * deviation),
-        np.flatnonzero(np.abs(average - centre) > average_reach * deviation),
-    )  # fmt: skip
+        values,
+        average,
+        centre,
+        deviation,
+        bound,
+        average_bound,
+        np.flatnonzero(np.abs(values - centre) > bound * deviation),
+        1 + np.flatnonzero(ranges > np.sqrt(2) * bound * deviation),
+        np.flatnonzero(np.abs(average - centre) > average_bound * deviation),
+    )
 
 
 @dataclass(frozen=True)
@@ -123,13 +149,18 @@ class Gauge:
 
     def document(self) -> dict[str, Any]:
         """Return it as JSON has it."""
-        value, low, high = self.repeatability
         return {
-            "repeatability": {"value": value, "low": low, "high": high}, "reproducibility": self.reproducibility,
-            "gauge": self.total, "parts": self.parts, "ndc": self.categories, "units": self.count,
-            "recordings": self.repetitions, "crossed": self.crossed, "observed_over_stated": self.explained,
+            "repeatability": with_ends(self.repeatability),
+            "reproducibility": self.reproducibility,
+            "gauge": self.total,
+            "parts": self.parts,
+            "ndc": self.categories,
+            "units": self.count,
+            "recordings": self.repetitions,
+            "crossed": self.crossed,
+            "observed_over_stated": self.explained,
             "p_value": self.p_value,
-        }  # fmt: skip
+        }
 
 
 def gauge(values: FloatArray, sigma: FloatArray, parts: Sequence[str], places: Sequence[str]) -> Gauge | None:
@@ -147,34 +178,42 @@ def gauge(values: FloatArray, sigma: FloatArray, parts: Sequence[str], places: S
     if len(set(part[kept])) < 2:
         return None
     values, sigma, part = values[kept], sigma[kept], np.unique(part[kept], return_inverse=True)[1]
-    place = np.unique(np.asarray(places)[kept], return_inverse=True)[1]
-    size, sites = int(part.max()) + 1, int(place.max()) + 1
+    site = np.unique(np.asarray(places)[kept], return_inverse=True)[1]
+    size, sites = int(part.max()) + 1, int(site.max()) + 1
     number = np.bincount(part).astype(float)
     means = np.bincount(part, values) / number
     freedom = len(values) - size
     within = float(np.sum((values - means[part]) ** 2))
     between = float(number @ (means - values.mean()) ** 2) / (size - 1)
     cells = np.zeros((size, sites))
-    np.add.at(cells, (part, place), 1)
+    np.add.at(cells, (part, site), 1)
     crossed = bool(sites > 1 and (cells == cells[0, 0]).all())
     reproducibility = 0.0
     if crossed:
-        each = cells[0, 0]
-        of_place = np.bincount(place, values) / np.bincount(place)
-        squares = size * each * float(np.sum((of_place - values.mean()) ** 2))
+        per_cell = cells[0, 0]
+        of_place = np.bincount(site, values) / np.bincount(site)
+        squares = size * per_cell * float(np.sum((of_place - values.mean()) ** 2))
         cell = np.zeros((size, sites))
-        np.add.at(cell, (part, place), values / each)
+        np.add.at(cell, (part, site), values / per_cell)
         additive = means[:, None] + of_place - values.mean()
-        interaction, own = each * float(np.sum((cell - additive) ** 2)), (size - 1) * (sites - 1)
+        interaction, crossed_freedom = per_cell * float(np.sum((cell - additive) ** 2)), (size - 1) * (sites - 1)
         error, rest = within - squares - interaction, len(values) - size * sites
-        pooled = rest == 0 or f_tails(interaction / own / max(error / max(rest, 1), 1e-300), own, rest)[1] > _POOLED
+        pooled = (
+            rest == 0
+            or f_tails(interaction / crossed_freedom / max(error / max(rest, 1), 1e-300), crossed_freedom, rest)[1]
+            > _POOLED
+        )
         if pooled:
-            error, rest = error + interaction, rest + own
+            error, rest = error + interaction, rest + crossed_freedom
         variance, freedom = max(error, 0.0) / rest, rest
-        against = variance if pooled else interaction / own
-        reproducibility = float(np.sqrt(max(squares / (sites - 1) - against, 0.0) / (size * each)
-                                        + (0.0 if pooled else max(against - variance, 0.0) / each)))  # fmt: skip
-        of_parts = max(between - against, 0.0) / (sites * each)
+        against = variance if pooled else interaction / crossed_freedom
+        reproducibility = float(
+            np.sqrt(
+                max(squares / (sites - 1) - against, 0.0) / (size * per_cell)
+                + (0.0 if pooled else max(against - variance, 0.0) / per_cell)
+            )
+        )
+        of_parts = max(between - against, 0.0) / (sites * per_cell)
     else:
         variance = within / freedom
         typical = (len(values) - float(number @ number) / len(values)) / (size - 1)  # repetitions, if they differ
@@ -184,9 +223,16 @@ def gauge(values: FloatArray, sigma: FloatArray, parts: Sequence[str], places: S
     centre = np.bincount(part, weight * values) / np.bincount(part, weight)
     square, all_freedom = float(weight @ (values - centre[part]) ** 2), len(values) - size
     root = float(np.sqrt(variance))
-    return Gauge((root, float(low * root), float(high * root)), reproducibility, float(np.sqrt(of_parts)), size,
-                 len(values), crossed, float(np.sqrt(square / all_freedom)),
-                 float(chi2_sf(square, all_freedom)))  # fmt: skip
+    return Gauge(
+        (root, float(low * root), float(high * root)),
+        reproducibility,
+        float(np.sqrt(of_parts)),
+        size,
+        len(values),
+        crossed,
+        float(np.sqrt(square / all_freedom)),
+        float(chi2_sf(square, all_freedom)),
+    )
 
 
 def tolerance_factor(count: int, share: float = 0.99, confidence: float = 0.95) -> float:

@@ -55,25 +55,25 @@ def _links(path: Path, folders: list[Path], what: str, expected: str | None = No
     yield Link(what, str(path), state)
     calibration = document.get("calibration")
     if isinstance(calibration, dict) and calibration.get("digest"):
-        found = _find(str(calibration["file"]), folders)
-        if found is None:
+        file = _find(str(calibration["file"]), folders)
+        if file is None:
             yield Link("calibration", str(calibration["file"]), MISSING)
         else:
-            yield from _links(found, [*folders, found.parent], "calibration", str(calibration["digest"]))
+            yield from _links(file, [*folders, file.parent], "calibration", str(calibration["digest"]))
     named = [("limits", document.get("limits"))]
     data = document.get("data")
-    named += [("recording", each) for each in (data.get("files") or () if isinstance(data, dict) else ())]
+    named += [("recording", recording) for recording in (data.get("files") or () if isinstance(data, dict) else ())]
     trace = document.get("trace")
     if calibration is None and isinstance(trace, dict):
-        named += [(f"certificate of {each['name']}", each) for each in trace.get("reference", ())]
+        named += [(f"certificate of {reference['name']}", reference) for reference in trace.get("reference", ())]
     for part, entry in named:
         if isinstance(entry, dict) and entry.get("sha256") and entry.get("file"):
-            found = _find(str(entry["file"]), folders)
-            same = found is not None and file_digest(found) == entry["sha256"]
-            yield Link(part, str(entry["file"]), MISSING if found is None else INTACT if same else CHANGED)
+            file = _find(str(entry["file"]), folders)
+            same = file is not None and file_digest(file) == entry["sha256"]
+            yield Link(part, str(entry["file"]), MISSING if file is None else INTACT if same else CHANGED)
 
 
 def _find(name: str, folders: list[Path]) -> Path | None:
     """Return a file where it was, or of the same name in one of the folders."""
-    places = [Path(name), *(folder / name for folder in folders), *(folder / Path(name).name for folder in folders)]
-    return next((place for place in places if place.is_file()), None)
+    paths = [Path(name), *(folder / name for folder in folders), *(folder / Path(name).name for folder in folders)]
+    return next((path for path in paths if path.is_file()), None)

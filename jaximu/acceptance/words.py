@@ -12,16 +12,29 @@ from jaximu.ground.units import SENSOR_UNITS, STANDARD_GRAVITY
 __all__ = ["amount", "between", "in_shown_unit", "si_unit", "spoken"]
 
 _SHOWN = {
-    "m/s^2": ("mm/s²", 1e3), "rad/s": ("°/s", 180 / math.pi), "rad": ("mrad", 1e3), "1": ("%", 100.0),
+    "m/s^2": ("mm/s²", 1e3),
+    "rad/s": ("°/s", 180 / math.pi),
+    "rad": ("mrad", 1e3),
+    "1": ("%", 100.0),
     "uT": ("µT", 1.0),
-    "rad/s/sqrt(Hz)": ("°/s/√Hz", 180 / math.pi), "m/s^2/sqrt(Hz)": ("µg/√Hz", 1e6 / STANDARD_GRAVITY),
-}  # fmt: skip
+    "rad/s/sqrt(Hz)": ("°/s/√Hz", 180 / math.pi),
+    "m/s^2/sqrt(Hz)": ("µg/√Hz", 1e6 / STANDARD_GRAVITY),
+}
 _PARTS = {
-    "bias": "bias", "scale": "scale", "misalignment": "misalignment", "output": "corrected output",
-    "raw_output": "uncorrected output", "repeatability": "bias repeatability", "N": "white noise (N)",
-    "B": "bias instability (B)", "K": "rate random walk (K)", "Q": "quantisation (Q)", "R": "rate ramp (R)",
-    "position": "position", "heading": "heading",
-}  # fmt: skip
+    "bias": "bias",
+    "scale": "scale",
+    "misalignment": "misalignment",
+    "output": "corrected output",
+    "raw_output": "uncorrected output",
+    "repeatability": "bias repeatability",
+    "N": "white noise (N)",
+    "B": "bias instability (B)",
+    "K": "rate random walk (K)",
+    "Q": "quantisation (Q)",
+    "R": "rate ramp (R)",
+    "position": "position",
+    "heading": "heading",
+}
 
 
 def spoken(name: str) -> str:

@@ -19,7 +19,7 @@ from jaximu.ground import stored
 __all__ = ["compute"]
 
 
-def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, workers: int) -> Iterator[Rows]:
+def compute(jobs: Sequence[Job], indices: Sequence[int], settings: Settings, workers: int) -> Iterator[Rows]:
     """Give rows from the cluster that RAY_ADDRESS names, else from `workers` processes of a cluster of one's own.
 
     A worker that dies is replaced and its work is done again; the caller keeps each row once. Without a graphics
@@ -27,10 +27,11 @@ def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, work
     """
     away = "RAY_ADDRESS" in os.environ
     folder = None if away else stored.folder()  # on other machines there is no such folder
-    own, effects = not ray.is_initialized(), own_effects()
-    if own:
-        where: dict[str, Any] = {} if away else {
-            "num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}  # fmt: skip
+    started, effects = not ray.is_initialized(), own_effects()
+    if started:
+        where: dict[str, Any] = (
+            {} if away else {"num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+        )
         ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": ONE_THREAD}, **where)
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     ray.data.DataContext.get_current().enable_progress_bars = False
@@ -48,19 +49,26 @@ def compute(jobs: Sequence[Job], places: Sequence[int], settings: Settings, work
             register_all(effects)
 
         def __call__(self, batch: dict[str, np.ndarray]) -> dict[str, Any]:
-            rows = finish([pickle.loads(each) for each in batch["prepared"]], settings)
+            rows = finish([pickle.loads(item) for item in batch["prepared"]], settings)
             return {"place": batch["place"], "row": [pickle.dumps(row) for row in rows]}
 
     graphics = int(ray.cluster_resources().get("GPU", 0))
-    cut = batches(places, settings, workers)
-    items = [{"place": place, "job": pickle.dumps(jobs[place])} for place in places]
+    cut = batches(indices, settings, workers)
+    items = [{"place": index, "job": pickle.dumps(jobs[index])} for index in indices]
     try:
-        rows = ray.data.from_items(items, override_num_blocks=len(cut)).map(read, num_cpus=1).map_batches(
-            FittingActor, batch_size=len(cut[0]), num_cpus=1, num_gpus=1 if graphics else 0,
-            compute=ray.data.ActorPoolStrategy(size=graphics or workers),
-        )  # fmt: skip
+        rows = (
+            ray.data.from_items(items, override_num_blocks=len(cut))
+            .map(read, num_cpus=1)
+            .map_batches(
+                FittingActor,
+                batch_size=len(cut[0]),
+                num_cpus=1,
+                num_gpus=1 if graphics else 0,
+                compute=ray.data.ActorPoolStrategy(size=graphics or workers),
+            )
+        )
         for batch in rows.iter_batches(batch_size=None, batch_format="numpy"):
-            yield [int(place) for place in batch["place"]], [pickle.loads(row) for row in batch["row"]]
+            yield [int(index) for index in batch["place"]], [pickle.loads(row) for row in batch["row"]]
     finally:
-        if own:
+        if started:
             ray.shutdown()

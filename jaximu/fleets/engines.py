@@ -32,7 +32,7 @@ def local(jobs: Sequence[Job], places: Sequence[int], settings: Settings, worker
     cut = batches(places, settings, workers)
     if workers == 1 or len(cut) == 1:
         for part in cut:
-            yield part, rows_of([jobs[place] for place in part], settings)
+            yield part, rows_of([jobs[index] for index in part], settings)
         return
     waiting = deque((part, 0) for part in cut)  # with how often each has seen its pool break
     while waiting:
@@ -50,7 +50,7 @@ def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: 
             while waiting and len(running) < room and not broken and (waiting[0][1] >= _TRIES) == alone:
                 part, strikes = waiting[0]
                 try:
-                    future = pool.submit(rows_of, [jobs[place] for place in part], settings)
+                    future = pool.submit(rows_of, [jobs[index] for index in part], settings)
                 except BrokenProcessPool:  # a process died before it had a batch: this one is not to blame
                     broken = True
                     break
@@ -73,7 +73,7 @@ def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: 
                     if len(part) == 1 and alone:
                         yield part, [row_begun(jobs[part[0]]) | {"status": "failed", "message": _DIED}]
                     elif strikes + 1 >= _TRIES:
-                        waiting.extend(([place], _TRIES) for place in part)
+                        waiting.extend(([index], _TRIES) for index in part)
                     else:
                         waiting.appendleft((part, strikes + 1))
 

@@ -40,37 +40,41 @@ class FieldUnit:
     poses: int
 
 
-def field_unit(signal: Signal, found: Segmentation, strength: FieldStrength | None, where: str) -> FieldUnit:
+def field_unit(signal: Signal, segmentation: Segmentation, strength: FieldStrength | None, where: str) -> FieldUnit:
     """Reduce a magnetometer's samples to the means of a recording's rests.
 
     `strength`: of the field; None where it is what the data sheet's scale says. Raises `NotPossibleError` where there
     are no samples at rest, or outputs are on no sphere of the Earth's field.
     """
-    first, stop = np.searchsorted(signal.time, found.intervals).T
-    rests = found.intervals[stop - first >= _FEWEST]
+    first, stop = np.searchsorted(signal.time, segmentation.intervals).T
+    rests = segmentation.intervals[stop - first >= _FEWEST]
     if not len(rests):
         raise NotPossibleError(f"{where}: the magnetometer has no samples while the unit is at rest.")
     _, means, _ = rest_statistics(signal, rests)
     scale, centre, field, _ = field_start(means, signal.unit, strength, where)
     per_gravity = np.full(3, scale * field.value / STANDARD_GRAVITY)
-    observations = observed_poses(replace(found, recording=Recording(signal), intervals=rests), STANDARD_GRAVITY)
+    observations = observed_poses(replace(segmentation, recording=Recording(signal), intervals=rests), STANDARD_GRAVITY)
     nominal = Imu.nominal(tuple(per_gravity), tuple(centre), signal.unit)
     return FieldUnit(FleetUnit(observations, nominal, False), field, signal.unit, len(rests))
 
 
-def field_row(own: FieldUnit, fit: Fit, rms: float) -> dict[str, Any]:
+def field_row(magnetometer: FieldUnit, fit: Fit, rms: float) -> dict[str, Any]:
     """Return what a table says of a fitted magnetometer, per µT; `rms`: of its norm, m/s²."""
-    factor = STANDARD_GRAVITY / own.field.value
+    factor = STANDARD_GRAVITY / magnetometer.field.value
     sigma = np.zeros(12)
     triad = fit.imu.accelerometer
     places = [3 * name.axes[0] + name.axes[1] if name.part == "gain" else 9 + name.axes[0] for name in fit.names]
-    sigma[places] = np.sqrt(np.diagonal(fit.total_covariance(factor * own.field.sigma)))
+    sigma[places] = np.sqrt(np.diagonal(fit.total_covariance(factor * magnetometer.field.sigma)))
     return {
-        "mag_gain": factor * np.ravel(triad.gain), "mag_gain_sigma": factor * sigma[:9],
-        "mag_bias": triad.bias, "mag_bias_sigma": sigma[9:],
-        "mag_rms": rms / factor, "mag_field": own.field.value, "mag_field_sigma": own.field.sigma,
-        "mag_unit": own.output_unit,
-    }  # fmt: skip
+        "mag_gain": factor * np.ravel(triad.gain),
+        "mag_gain_sigma": factor * sigma[:9],
+        "mag_bias": triad.bias,
+        "mag_bias_sigma": sigma[9:],
+        "mag_rms": rms / factor,
+        "mag_field": magnetometer.field.value,
+        "mag_field_sigma": magnetometer.field.sigma,
+        "mag_unit": magnetometer.output_unit,
+    }
 
 
 def field_words(table: str | os.PathLike[str]) -> list[str]:
@@ -80,5 +84,7 @@ def field_words(table: str | os.PathLike[str]) -> list[str]:
     reasons = Counter(row["mag_message"].removeprefix(f"{row['file']}: ") for row in rows if row["mag_message"])
     if not done and not reasons:
         return []
-    return [f"magnetometers: {done} of {done + reasons.total()} calibrated.",
-            *(f"  {count} not calibrated: {reason}" for reason, count in reasons.most_common(3))]  # fmt: skip
+    return [
+        f"magnetometers: {done} of {done + reasons.total()} calibrated.",
+        *(f"  {count} not calibrated: {reason}" for reason, count in reasons.most_common(3)),
+    ]

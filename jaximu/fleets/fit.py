@@ -14,6 +14,7 @@ from jaximu.data.poses import PosesAndTurns, condensed, stack
 from jaximu.estimation.fitting import Fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.sensor import Imu
+from jaximu.planning.chunks import in_chunks
 from jaximu.recordings.observations import Observations
 
 __all__ = ["FleetUnit", "fit_units"]
@@ -51,18 +52,18 @@ def fit_units(units: Sequence[FleetUnit]) -> list[tuple[Fit, FloatArray]]:
     **Returns:** of each unit its fit, and the rms (3,) of the norm of gravity (m/s²), of carried gravity (degrees) and
     of the rate at rest (rad/s), 0 where there is none. Failures do not raise: look at `converged` and `finite`.
     """
-    found: dict[int, tuple[Fit, FloatArray]] = {}
+    fits: dict[int, tuple[Fit, FloatArray]] = {}
     groups: dict[tuple, list[tuple[int, PosesAndTurns]]] = {}
-    for place, unit in enumerate(units):
+    for index, unit in enumerate(units):
         data = unit.alike()
         shapes = jax.tree.structure((unit.nominal, data)), *(np.shape(leaf) for leaf in jax.tree.leaves(data))
-        groups.setdefault((unit.gyroscope, shapes), []).append((place, data))
+        groups.setdefault((unit.gyroscope, shapes), []).append((index, data))
     for (gyroscope, _), group in groups.items():
         for first in range(0, len(group), _BATCH):
-            places, data = zip(*group[first : first + _BATCH], strict=True)
-            fitted = _together([units[place].nominal for place in places], data, gyroscope)
-            found |= zip(places, fitted, strict=True)
-    return [found[place] for place in range(len(units))]
+            indices, data = zip(*group[first : first + _BATCH], strict=True)
+            fitted = _together([units[index].nominal for index in indices], data, gyroscope)
+            fits |= zip(indices, fitted, strict=True)
+    return [fits[index] for index in range(len(units))]
 
 
 def _together(nominals: Sequence[Imu], data: Sequence[PosesAndTurns], gyroscope: bool) -> list[tuple[Fit, FloatArray]]:
@@ -70,14 +71,16 @@ def _together(nominals: Sequence[Imu], data: Sequence[PosesAndTurns], gyroscope:
     starts = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, float) for leaf in leaves]), *nominals)
     together = stack(data)
     fits = fit_hand_held(starts, together, "joint" if gyroscope else "accelerometer")
+
+    def scatter(imu: Imu, observed: PosesAndTurns) -> tuple:
+        reduced = condensed(imu, observed)
+        return reduced.force, reduced.angle
+
+    errors = in_chunks(scatter, _SHAPE, fits.imu, together)
     fitted = []
     for lane, unit in enumerate(data):
-        if lane % _SHAPE == 0:
-            part = np.minimum(np.arange(lane, lane + _SHAPE), len(data) - 1)
-            seen = condensed(*jax.tree.map(lambda leaf, part=part: leaf[part], (fits.imu, together)))
-        fit = jax.tree.map(lambda leaf, lane=lane: leaf[lane], fits)
-        errors = seen.force[lane % _SHAPE], seen.angle[lane % _SHAPE]
-        rms = residual_rms(fit.imu, unit, gyroscope, errors)
+        fit, error = jax.tree.map(lambda leaf, lane=lane: leaf[lane], (fits, errors))
+        rms = residual_rms(fit.imu, unit, gyroscope, error)
         fitted.append((fit, np.array([rms[kind][0] if kind in rms else 0.0 for kind in _KINDS])))
     return fitted
 

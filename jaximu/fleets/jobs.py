@@ -32,14 +32,29 @@ ONE_THREAD: dict[str, str] = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"), "1"
 )
 
-SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".log", ".parquet", ".npz", ".mat", ".h5", ".hdf5", ".bag", ".mcap", ".db3",
-            ".ulg", ".bin")  # fmt: skip
+SUFFIXES = (
+    ".csv",
+    ".tsv",
+    ".txt",
+    ".dat",
+    ".log",
+    ".parquet",
+    ".npz",
+    ".mat",
+    ".h5",
+    ".hdf5",
+    ".bag",
+    ".mcap",
+    ".db3",
+    ".ulg",
+    ".bin",
+)
 """What a folder is searched for; a file that is named on its own may have any."""
 _NO_LOGS = (".truth.json", ".schedule.csv")
 _COLUMNS = ("device", "file", "date", "lot", "station", "static", "options")
 _ALL = ""  # no device is called so
 _NUMBERS = {"rate": float, "instance": int}
-_OPTIONS = tuple(each.name for each in fields(ReadOptions) if each.name not in ("gravity", "check"))
+_OPTIONS = tuple(option.name for option in fields(ReadOptions) if option.name not in ("gravity", "check"))
 
 
 @dataclass(frozen=True)
@@ -142,40 +157,36 @@ def find_jobs(
     """
     named: list[Job] = []
     loose: list[Path] = []
-    given = [os.fspath(each) for each in logs]
-    if not given:
+    arguments = [os.fspath(argument) for argument in logs]
+    if not arguments:
         raise InputError("no log was given: name logs, folders of logs, patterns in quotes, or a manifest.")
-    own = None if output is None else Path(output).resolve()
+    table = None if output is None else Path(output).resolve()
     at_rest = _recordings_at_rest(static)
     others = {path.resolve() for path in at_rest.values()}
-    for each in given:
-        path = Path(each)
+
+    def wanted(paths: Iterable[Path]) -> list[Path]:
+        return [path for path in paths if not _is_own(path, table) and path.resolve() not in others]
+
+    for argument in arguments:
+        path = Path(argument)
         if path.is_dir():
-            found = [inner for inner in _logs_below(path) if not _is_own(inner, own) and inner.resolve() not in others]
-            if not found:
-                raise InputError(f"{each}: the folder holds no logs (files ending in {', '.join(SUFFIXES)}).")
-            loose += found
+            inside = wanted(_logs_below(path))
+            if not inside:
+                raise InputError(f"{argument}: the folder holds no logs (files ending in {', '.join(SUFFIXES)}).")
+            loose += inside
         elif path.exists():
             manifest = _read_manifest(path)
             if manifest is None:
                 loose.append(path)
             else:
                 named += manifest
-        elif any(sign in each for sign in "*?["):
-            matches = [Path(match) for match in sorted(glob.glob(each, recursive=True))]
-            matches = [
-                match
-                for match in matches
-                if match.is_file()
-                and not match.name.endswith(_NO_LOGS)
-                and not _is_own(match, own)
-                and match.resolve() not in others
-            ]
+        elif any(sign in argument for sign in "*?["):
+            matches = wanted(filter(_is_log, map(Path, sorted(glob.glob(argument, recursive=True)))))
             if not matches:
-                raise InputError(f"{each}: no file fits this pattern.")
+                raise InputError(f"{argument}: no file fits this pattern.")
             loose += matches
         else:
-            raise InputError(f"{each}: no such file or folder.")
+            raise InputError(f"{argument}: no such file or folder.")
     jobs = named + [Job(device, str(path)) for device, path in zip(_devices(loose), loose, strict=True)]
     _refuse_repeated(jobs)
     jobs = _with_copies(jobs)
@@ -195,15 +206,17 @@ def _recordings_at_rest(static: str | os.PathLike[str] | None) -> dict[str, Path
         return {_ALL: path}
     if not path.is_dir():
         raise InputError(f"--static {path}: no such file or folder.")
-    found: dict[str, Path] = {}
-    for each in _logs_below(path):
-        device = each.relative_to(path).with_suffix("").as_posix()
-        if device in found:
-            raise InputError(f"--static {path}: {found[device].name} and {each.name} are both called after {device}.")
-        found[device] = each
-    if not found:
+    recordings: dict[str, Path] = {}
+    for log in _logs_below(path):
+        device = log.relative_to(path).with_suffix("").as_posix()
+        if device in recordings:
+            raise InputError(
+                f"--static {path}: {recordings[device].name} and {log.name} are both called after {device}."
+            )
+        recordings[device] = log
+    if not recordings:
         raise InputError(f"--static {path}: the folder holds no logs (files ending in {', '.join(SUFFIXES)}).")
-    return found
+    return recordings
 
 
 def _logs_below(folder: Path) -> list[Path]:
@@ -214,9 +227,12 @@ def _logs_below(folder: Path) -> list[Path]:
         for inner in below
         if inner.suffix.lower() in SUFFIXES
         and not any(part.startswith(".") for part in inner.relative_to(folder).parts)
-        and not inner.name.endswith(_NO_LOGS)
-        and inner.is_file()
+        and _is_log(inner)
     )
+
+
+def _is_log(path: Path) -> bool:
+    return path.is_file() and not path.name.endswith(_NO_LOGS)
 
 
 def _is_own(path: Path, output: Path | None) -> bool:
@@ -241,14 +257,14 @@ def _devices(paths: Sequence[Path]) -> list[str]:
 
 
 def _refuse_repeated(jobs: Sequence[Job]) -> None:
-    seen: dict[str, Job] = {}
+    by_path: dict[str, Job] = {}
     for job in jobs:
         real = os.path.realpath(job.file)
-        if real in seen:
-            other = seen[real]
+        if real in by_path:
+            other = by_path[real]
             owners = job.device if job.device == other.device else f"{other.device} and {job.device}"
             raise InputError(f"{job.file} is named twice ({owners}): every recording must be named once.")
-        seen[real] = job
+        by_path[real] = job
 
 
 def _with_copies(jobs: Sequence[Job]) -> list[Job]:
@@ -294,8 +310,17 @@ def _read_manifest(path: Path) -> list[Job] | None:
         files[file] = number
         options = _parse_options(cells.get("options", ""), f"{path}, row {number}", path.parent)
         static = str(path.parent / cells["static"]) if cells.get("static") else ""
-        jobs.append(Job(cells["device"], file, cells.get("date", ""), cells.get("lot", ""), options, static,
-                        cells.get("station", "")))  # fmt: skip
+        jobs.append(
+            Job(
+                cells["device"],
+                file,
+                cells.get("date", ""),
+                cells.get("lot", ""),
+                options,
+                static,
+                cells.get("station", ""),
+            )
+        )
     return jobs
 
 
@@ -305,7 +330,7 @@ def _parse_options(text: str, where: str, folder: Path) -> tuple[tuple[str, str]
         words = shlex.split(text)
     except ValueError as error:
         raise InputError(f"{where}: the options {text!r} have a quote that is not closed.") from error
-    found = {}
+    options = {}
     while words:
         name, _, value = words.pop(0).partition("=")
         key = name.removeprefix("--").replace("-", "_")
@@ -322,8 +347,8 @@ def _parse_options(text: str, where: str, folder: Path) -> tuple[tuple[str, str]
                 _NUMBERS[key](value)
             except ValueError:
                 raise InputError(f"{where}: {name} needs a number, found {value!r}.") from None
-        found[key] = value
-    return tuple(sorted(found.items()))
+        options[key] = value
+    return tuple(sorted(options.items()))
 
 
 def batches(places: Sequence[int], settings: Settings, workers: int) -> list[list[int]]:

@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,27 +24,54 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.estimation.problem import Name
-from jaximu.fleets.rows import PARAMETERS, SCHEMA, covariances, free_places, require_table
+from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, SCHEMA, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes.titles import effect_title
 
-__all__ = ["Difference", "Fleet", "Population", "Stranger", "days_of", "estimate_population", "read_fleet",
-           "write_shrunk"]  # fmt: skip
+__all__ = [
+    "Difference",
+    "Fleet",
+    "Population",
+    "Stranger",
+    "days_of",
+    "estimate_population",
+    "read_fleet",
+    "write_shrunk",
+]
 
 FEWEST = 8
 """Units from which a population is spoken of."""
 _SUMMED = ["file", "status", "message", "verdict", "effects", "gyro_unit"]
 _MOST = 10_000
 """Units that the population is estimated from, evenly taken from a larger fleet: what keeps the memory bounded."""
-_LEVEL = 0.01
+LEVEL = 0.01
 """Probability of one false alarm in the whole fleet, for each kind of question."""
 _ROUNDS = 200
 _YEAR = 365.25  # days
-_COLUMNS = ("device", "file", "status", "verdict", "effects", "date", "lot", "accel_gain", "accel_bias", "gyro_gain",
-            "gyro_bias", "accel_nominal", "gyro_nominal", "covariance", "accel_rms", "gyro_rms")  # fmt: skip
+_COLUMNS = (
+    "device",
+    "file",
+    "status",
+    "verdict",
+    "effects",
+    "date",
+    "lot",
+    "accel_gain",
+    "accel_bias",
+    "gyro_gain",
+    "gyro_bias",
+    "accel_nominal",
+    "gyro_nominal",
+    "covariance",
+    "accel_rms",
+    "gyro_rms",
+)
+
+
+_SHRUNK = ("device", "file", *COLUMN_PLACES, *(f"{name}_sigma" for name in COLUMN_PLACES))
 
 
 @dataclass(frozen=True)
@@ -164,7 +191,9 @@ class Fleet(Document):
             "verdicts": dict(sorted(self.verdicts.items())),
             "effects": dict(self.effects.most_common()),
             "failed": [{"reason": reason, "files": files} for reason, files in self.failed.items()],
-            "population": None if population is None else {
+            "population": None
+            if population is None
+            else {
                 "units": population.count,
                 "parameters": list(population.names),
                 "mean": population.mean.tolist(),
@@ -172,18 +201,27 @@ class Fleet(Document):
                 "covariance": population.covariance.tolist(),
             },
             "strangers": [
-                {"device": each.device, "file": each.file, "p_value": each.p_value,
-                 "parameters": [{"name": n, "value": v, "deviations": z} for n, v, z in each.parameters]}
-                for each in self.strangers
+                {
+                    "device": stranger.device,
+                    "file": stranger.file,
+                    "p_value": stranger.p_value,
+                    "parameters": [{"name": n, "value": v, "deviations": z} for n, v, z in stranger.parameters],
+                }
+                for stranger in self.strangers
             ],
             "differences": [
-                {"kind": each.kind, "group": each.group, "count": each.count, "p_value": each.p_value,
-                 "text": each.text,
-                 "parameters": [{"name": n, "amount": a, "sigma": s} for n, a, s in each.parameters]}
-                for each in self.differences
+                {
+                    "kind": difference.kind,
+                    "group": difference.group,
+                    "count": difference.count,
+                    "p_value": difference.p_value,
+                    "text": difference.text,
+                    "parameters": [{"name": n, "amount": a, "sigma": s} for n, a, s in difference.parameters],
+                }
+                for difference in self.differences
             ],
             "notes": list(self.notes),
-        }  # fmt: skip
+        }
 
 
 # --- the population ---------------------------------------------------------------------------------------------------
@@ -199,17 +237,17 @@ def estimate_population(names: Sequence[Name], values: FloatArray, covariances: 
     if count < FEWEST:
         raise NotPossibleError(f"{count} calibrated units are too few for a population: it takes {FEWEST} or more.")
     mean = np.median(values, axis=0)
-    own = np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0)
+    noise = np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0)
     scatter = np.square(1.4826 * np.median(np.abs(values - mean), axis=0))
-    covariance = np.diag(np.maximum(scatter - own, 0.01 * scatter + 1e-18))
-    limit = float(scipy.stats.chi2.isf(_LEVEL / count, size))
+    covariance = np.diag(np.maximum(scatter - noise, 0.01 * scatter + 1e-18))
+    limit = float(scipy.stats.chi2.isf(LEVEL / count, size))
     kept = np.zeros(count, bool)
     for _ in range(10):
-        distance = Population(tuple(names), mean, covariance, own, count).distances(values, covariances)
-        again = distance <= max(limit, float(np.median(distance)))
-        if (again == kept).all():
+        distance = Population(tuple(names), mean, covariance, noise, count).distances(values, covariances)
+        belongs = distance <= max(limit, float(np.median(distance)))
+        if (belongs == kept).all():
             break
-        kept = again
+        kept = belongs
         mean, covariance = _maximise(values[kept], covariances[kept], mean, covariance)
     return Population(tuple(names), mean, covariance, np.std(values[kept], axis=0, ddof=1), int(kept.sum()))
 
@@ -220,9 +258,9 @@ def _maximise(values, covariances, mean, covariance):
     for _ in range(_ROUNDS):
         # posteriors as in `Population.shrink`, of which only sums are needed
         weights = np.linalg.inv(covariance + covariances)
-        found = mean + np.einsum("nij,nj->ni", weights, values - mean) @ covariance
-        better = found.mean(axis=0)
-        rest = found - better
+        means = mean + np.einsum("nij,nj->ni", weights, values - mean) @ covariance
+        better = means.mean(axis=0)
+        rest = means - better
         summed = rest.T @ rest + count * covariance - covariance @ weights.sum(axis=0) @ covariance
         # p units without correlations: what keeps the matrix regular when there are hardly more units than parameters
         fresh = (summed + size * np.diag(np.diagonal(summed) / count)) / (count + size)
@@ -238,31 +276,36 @@ def _maximise(values, covariances, mean, covariance):
 
 @dataclass(frozen=True)
 class _Units:
-    """Calibrated units of a table: parameters relative to the data sheet, and what they are grouped by."""
+    """Calibrated units of a table: parameters relative to the data sheet, and what they are grouped by.
+
+    factor, offset: (n, 24), outputs of the table are parameters times the one plus the other.
+    """
 
     names: tuple[Name, ...]
     values: FloatArray
     covariances: FloatArray
     rows: list[dict[str, Any]]
+    factor: FloatArray
+    offset: FloatArray
 
 
 def _units(rows: Sequence[dict[str, Any]], gyroscope: bool) -> _Units:
     """Bring calibrated rows to one scale: gains in nominal scales, biases as inputs in SI."""
-    places = free_places(gyroscope)
+    indices = free_places(gyroscope)
     count, size = len(rows), len(PARAMETERS)
     raw, factor, offset = np.zeros((count, size)), np.ones((count, size)), np.zeros((count, size))
-    for start, name in ((0, "accel"), (12, "gyro"))[: 1 + gyroscope]:
-        gain, bias, nominal = (np.array([row[f"{name}_{part}"] for row in rows], float).reshape(count, -1)
-                               for part in ("gain", "bias", "nominal"))  # fmt: skip
-        raw[:, start : start + 9], raw[:, start + 9 : start + 12] = gain, bias
-        factor[:, start : start + 9] = np.repeat(nominal[:, :3], 3, axis=1)
-        factor[:, start + 9 : start + 12] = nominal[:, :3]
-        offset[:, start + 9 : start + 12] = nominal[:, 3:]
+    for name, part in list(COLUMN_PLACES.items())[: 2 + 2 * gyroscope]:
+        scale, zero = np.split(np.array([row[f"{name.partition('_')[0]}_nominal"] for row in rows], float), 2, axis=1)
+        raw[:, part] = np.array([row[name] for row in rows], float)
+        factor[:, part] = np.repeat(scale, 3, axis=1) if name.endswith("gain") else scale
+        offset[:, part] = 0.0 if name.endswith("gain") else zero
     whole = covariances(np.array([row["covariance"] for row in rows], float).reshape(count, -1))
     whole = whole / factor[:, :, None] / factor[:, None, :]
     relative = (raw - offset) / factor
-    grid = np.ix_(range(count), places, places)
-    return _Units(tuple(PARAMETERS[place] for place in places), relative[:, places], whole[grid], list(rows))
+    grid = np.ix_(range(count), indices, indices)
+    return _Units(
+        tuple(PARAMETERS[index] for index in indices), relative[:, indices], whole[grid], list(rows), factor, offset
+    )
 
 
 def _groups(path: Path, gyroscope: bool, columns: Sequence[str] | None = None) -> Iterator[list[dict[str, Any]]]:
@@ -270,7 +313,9 @@ def _groups(path: Path, gyroscope: bool, columns: Sequence[str] | None = None) -
     with pq.ParquetFile(path) as file:
         for batch in file.iter_batches(batch_size=1024, columns=None if columns is None else list(columns)):
             rows = batch.to_pylist()
-            yield [row for row in rows if row["status"] == "ok" and (row["gyro_gain"] is not None) == gyroscope]
+            rows = [row for row in rows if row["status"] == "ok" and (row["gyro_gain"] is not None) == gyroscope]
+            if rows:
+                yield rows
 
 
 def read_fleet(table: str | os.PathLike[str]) -> Fleet:
@@ -280,7 +325,7 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     statuses, verdicts, effects = Counter(), Counter(), Counter()
     failed: dict[str, list[str]] = {}
     reasons: dict[str, str] = {}
-    with_gyroscope = without = 0
+    kinds = Counter()  # with a gyroscope, or without
     with pq.ParquetFile(path) as file:
         for batch in file.iter_batches(batch_size=4096, columns=_SUMMED):
             for row in batch.to_pylist():
@@ -289,60 +334,70 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
                     verdicts[row["verdict"]] += 1
                 effects.update(row["effects"] or ())
                 if row["status"] == "ok":
-                    with_gyroscope += row["gyro_unit"] is not None
-                    without += row["gyro_unit"] is None
+                    kinds[row["gyro_unit"] is not None] += 1
                 else:
                     reason = (row["message"] or "").removeprefix(f"{row['file']}: ")
                     alike = reasons.setdefault(re.sub(r"\d+", "0", reason), reason)
                     failed.setdefault(alike, []).append(row["file"])
-    gyroscope = with_gyroscope >= without
-    total = max(with_gyroscope, without)
+    gyroscope = kinds[True] >= kinds[False]
+    total, others = kinds[gyroscope], kinds[not gyroscope]
     notes = []
-    if min(with_gyroscope, without):
-        notes.append(
-            f"{min(with_gyroscope, without)} units {'without' if gyroscope else 'with'} a gyroscope are not part of "
-            "the population."
-        )
+    if others:
+        notes.append(f"{others} units {'without' if gyroscope else 'with'} a gyroscope are not part of the population.")
     step = max(1, -(-total // _MOST))
     kept: list[dict[str, Any]] = []
-    seen = 0
+    passed = 0
     for rows in _groups(path, gyroscope, _COLUMNS):
-        kept += [row for number, row in enumerate(rows, seen) if number % step == 0]
-        seen += len(rows)
+        kept += [row for number, row in enumerate(rows, passed) if number % step == 0]
+        passed += len(rows)
     if step > 1:
         notes.append(f"the population was estimated from {len(kept)} of {total} units, evenly taken.")
+    failed = dict(sorted(failed.items(), key=lambda pair: -len(pair[1])))
     empty = np.empty((0, 0))
-    failed = dict(sorted(failed.items(), key=lambda each: -len(each[1])))
-    base: dict[str, Any] = {
-        "table": os.fspath(table), "recordings": sum(statuses.values()), "statuses": statuses, "verdicts": verdicts,
-        "effects": effects, "failed": failed, "population": None, "strangers": (), "differences": (), "values": empty,
-        "shrunk": empty, "sigma": empty, "shrunk_sigma": empty, "lots": (), "shifts": None, "rms": empty,
-    }  # fmt: skip
+    fleet = Fleet(
+        os.fspath(table),
+        statuses.total(),
+        statuses,
+        verdicts,
+        effects,
+        failed,
+        None,
+        (),
+        (),
+        empty,
+        empty,
+        empty,
+        empty,
+        (),
+        None,
+        empty,
+        tuple(notes),
+    )
     if len(kept) < FEWEST:
-        return Fleet(**base, notes=(*notes, f"fewer than {FEWEST} calibrated units: no population."))
-    units = _units(kept, gyroscope)
+        return replace(fleet, notes=(*notes, f"fewer than {FEWEST} calibrated units: no population."))
+    return replace(fleet, notes=tuple(notes), **_of_population(path, _units(kept, gyroscope), gyroscope, total))
+
+
+def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> dict[str, Any]:
+    """What units of a table say as a population, by the fields of `Fleet`; total: units of the table."""
     differences, shifts = _lots_and_dates(units)
     shift = shifts.of(units.rows)
     centred = units.values - shift
     population = estimate_population(units.names, centred, units.covariances)
     differences += _repeated(units) + _shared_effects(units)
     shrunk, spread = population.shrink(centred, units.covariances)
-    rms = [[each["accel_rms"], np.nan if each["gyro_rms"] is None else each["gyro_rms"]] for each in kept]
-    return Fleet(
-        **base
-        | {
-            "population": population,
-            "strangers": _strangers(path, gyroscope, population, shifts, total),
-            "differences": tuple(sorted(differences, key=lambda each: each.p_value)),
-            "values": units.values,
-            "shrunk": shrunk + shift,
-            "sigma": np.sqrt(np.diagonal(units.covariances, axis1=1, axis2=2)),
-            "shrunk_sigma": np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0)),
-            "lots": tuple(_names(units)),
-            "shifts": shifts,
-            "rms": np.array(rms, float),
-        },
-        notes=tuple(notes),
+    rms = [[row["accel_rms"], np.nan if row["gyro_rms"] is None else row["gyro_rms"]] for row in units.rows]
+    return dict(
+        population=population,
+        strangers=_strangers(path, gyroscope, population, shifts, total),
+        differences=tuple(sorted(differences, key=lambda difference: difference.p_value)),
+        values=units.values,
+        shrunk=shrunk + shift,
+        sigma=np.sqrt(np.diagonal(units.covariances, axis1=1, axis2=2)),
+        shrunk_sigma=np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0)),
+        lots=tuple(_names(units)),
+        shifts=shifts,
+        rms=np.array(rms, float),
     )
 
 
@@ -355,30 +410,28 @@ def _names(units: _Units) -> list[str]:
 
 def _strangers(path: Path, gyroscope: bool, population: Population, shifts: Shifts, total: int):
     """Units farther from the population, or from their lot and date, than one in a hundred fleets would have."""
-    found = []
+    strangers = []
     for rows in _groups(path, gyroscope, _COLUMNS):
-        if not rows:
-            continue
         units = _units(rows, gyroscope)
         centred = units.values - shifts.of(rows)
         distances = population.distances(centred, units.covariances)
         p_values = scipy.stats.chi2.sf(distances, len(population.names)) * total
-        for place in np.flatnonzero(p_values < _LEVEL):
-            own = np.diagonal(units.covariances[place])
-            z = (centred[place] - population.mean) / np.sqrt(np.diagonal(population.covariance) + own)
+        for index in np.flatnonzero(p_values < LEVEL):
+            variance = np.diagonal(units.covariances[index])
+            z = (centred[index] - population.mean) / np.sqrt(np.diagonal(population.covariance) + variance)
             worst = np.argsort(-np.abs(z))[:3]
-            named = tuple((population.names[k], float(units.values[place, k]), float(z[k])) for k in worst)
-            row = units.rows[place]
-            found.append(Stranger(row["device"], row["file"], float(min(1.0, p_values[place])), named))
-    return tuple(sorted(found, key=lambda each: each.p_value))
+            named = tuple((population.names[k], float(units.values[index, k]), float(z[k])) for k in worst)
+            row = units.rows[index]
+            strangers.append(Stranger(row["device"], row["file"], float(min(1.0, p_values[index])), named))
+    return tuple(sorted(strangers, key=lambda stranger: stranger.p_value))
 
 
 def days_of(dates: Sequence[str | None]) -> FloatArray:
     """Return dates (n,) in days since 1970; NaN where there is none."""
     days = np.full(len(dates), np.nan)
-    for place, date in enumerate(dates):
+    for index, date in enumerate(dates):
         with suppress(ValueError):
-            days[place] = np.datetime64(date or "NaT").astype("datetime64[s]").astype(float) / 86400
+            days[index] = np.datetime64(date or "NaT").astype("datetime64[s]").astype(float) / 86400
     return np.where(days > -1e8, days, np.nan)  # no date is a very large negative number
 
 
@@ -403,8 +456,8 @@ class _Groups:
         names, counts = np.unique(lots[lots != ""], return_counts=True)
         names = tuple(names[counts >= 3].tolist())
         names = names if len(names) > 1 else ()
-        places = {name: place for place, name in enumerate(names)}
-        lot = np.array([places.get(each, len(names)) for each in lots.tolist()])
+        indices = {name: index for index, name in enumerate(names)}
+        lot = np.array([indices.get(name, len(names)) for name in lots.tolist()])
         return cls(names, lot, (days - middle) / _YEAR if dated else np.full(len(days), np.nan), middle)
 
     @property
@@ -428,21 +481,21 @@ class _Groups:
         By medians, so that a stranger moves nothing.
         """
         values, years = values - np.median(values, axis=0), np.array(self.years)
-        for place in range(len(self.names) + 1):
-            own = self.lot == place
-            if own.sum() >= 3:
+        for index in range(len(self.names) + 1):
+            members = self.lot == index
+            if members.sum() >= 3:
                 # a centre of its own takes one unit away
-                stretch = np.sqrt(own.sum() / (own.sum() - 1))
-                values[own] = (values[own] - np.median(values[own], axis=0)) * stretch
-            if np.isfinite(years[own]).any():
-                years[own] -= np.nanmedian(years[own])
+                stretch = np.sqrt(members.sum() / (members.sum() - 1))
+                values[members] = (values[members] - np.median(values[members], axis=0)) * stretch
+            if np.isfinite(years[members]).any():
+                years[members] -= np.nanmedian(years[members])
         order = np.argsort(years)[: int(np.isfinite(years).sum())]
-        early, late = order[: len(order) // 2], order[(len(order) + 1) // 2 :]
-        apart = years[late] - years[early]
+        earlier, later = order[: len(order) // 2], order[(len(order) + 1) // 2 :]
+        apart = years[later] - years[earlier]
         if not (apart > 0).any():
             return values
         far = apart >= np.median(apart[apart > 0])
-        slope = np.median((values[late[far]] - values[early[far]]) / apart[far, None], axis=0)
+        slope = np.median((values[later[far]] - values[earlier[far]]) / apart[far, None], axis=0)
         return values - np.nan_to_num(years)[:, None] * slope
 
 
@@ -459,31 +512,33 @@ def _lots_and_dates(units: _Units) -> tuple[list[Difference], Shifts]:
         return [], shifts
     within = groups.within(units.values)
     inside = estimate_population(units.names, within, units.covariances)
-    limit = scipy.stats.chi2.isf(_LEVEL / len(within), size)
+    limit = scipy.stats.chi2.isf(LEVEL / len(within), size)
     usual = inside.distances(within, units.covariances) <= limit
-    told: dict[int, list[tuple[float, tuple[Name, float, float]]]] = {}
+    findings: dict[int, list[tuple[float, tuple[Name, float, float]]]] = {}
     for k, name in enumerate(units.names):
         weight = usual / (inside.covariance[k, k] + units.covariances[:, k, k])
         for cause, amount, sigma, p_value in _causes(groups, units.values[:, k], weight, size):
-            told.setdefault(cause, []).append((p_value, (name, amount, sigma)))
+            findings.setdefault(cause, []).append((p_value, (name, amount, sigma)))
             if cause == len(groups.names):
                 shifts.drift[k] = amount
             else:
                 shifts.lots.setdefault(groups.names[cause], np.zeros(size))[k] = amount
-    found = []
-    for cause, each in told.items():
-        each.sort(key=lambda one: one[0])
+    differences = []
+    for cause, entries in findings.items():
+        entries.sort(key=lambda one: one[0])
         if cause == len(groups.names):
             known = groups.years[np.isfinite(groups.years)]
-            first, last = (str(np.datetime64(round((year * _YEAR + groups.middle) * 86400), "s"))[:10]
-                           for year in (known.min(), known.max()))  # fmt: skip
+            first, last = (
+                str(np.datetime64(round((year * _YEAR + groups.middle) * 86400), "s"))[:10]
+                for year in (known.min(), known.max())
+            )
             kind, group, count = "date", f"{first} to {last}", len(known)
             text = f"parameters drift with the date of the recording, {first} to {last}"
         else:
             kind, group, count = "lot", groups.names[cause], int(np.sum(groups.lot == cause))
             text = f"lot {group} ({count} units) differs from the other lots"
-        found.append(Difference(kind, group, count, each[0][0], tuple(one for _, one in each), text))
-    return found, shifts
+        differences.append(Difference(kind, group, count, entries[0][0], tuple(one for _, one in entries), text))
+    return differences, shifts
 
 
 def _causes(
@@ -508,10 +563,10 @@ def _causes(
         amounts = spread @ (design @ (weight * values))
         sigmas = np.sqrt(np.diagonal(spread))
         p_values = p_value((amounts / sigmas)[1:], taken)
-        if (p_values >= _LEVEL).any():  # what was taken after it explains it
+        if (p_values >= LEVEL).any():  # what was taken after it explains it
             given_up.append(taken.pop(int(np.argmax(p_values))))
             continue
-        crossed = np.stack([groups.products(weight * each) for each in design])
+        crossed = np.stack([groups.products(weight * row) for row in design])
         squares = groups.products(weight, 2)
         left = squares - np.einsum("ij,ik,kj->j", crossed, spread, crossed)  # of each cause's column, off what is taken
         open_ = left > 1e-9 * squares
@@ -522,7 +577,7 @@ def _causes(
         z[open_] = (groups.products(weight * (values - amounts @ design)) / np.sqrt(np.where(open_, left, 1.0)))[open_]
         # the time last where it does as well as a lot: of two lots, each of one date
         best = int(np.flatnonzero(np.abs(z) >= (1 - 1e-9) * np.abs(z).max())[0])
-        if p_value(z[best], best) >= _LEVEL:
+        if p_value(z[best], best) >= LEVEL:
             break
         taken.append(best)
     return [(cause, float(amounts[k + 1]), float(sigmas[k + 1]), float(p_values[k])) for k, cause in enumerate(taken)]
@@ -530,46 +585,54 @@ def _causes(
 
 def _repeated(units: _Units) -> list[Difference]:
     """Devices that were recorded again and are no longer what they were."""
-    places: dict[str, list[int]] = {}
-    for place, row in enumerate(units.rows):
-        places.setdefault(row["device"], []).append(place)
-    again = {device: each for device, each in places.items() if len(each) > 1}
-    found = []
-    for device, each in again.items():
-        first, last = each[0], each[-1]
+    indices_of: dict[str, list[int]] = {}
+    for index, row in enumerate(units.rows):
+        indices_of.setdefault(row["device"], []).append(index)
+    repeated = {device: indices for device, indices in indices_of.items() if len(indices) > 1}
+    differences = []
+    for device, indices in repeated.items():
+        first, last = indices[0], indices[-1]
         change = units.values[last] - units.values[first]
         sigma = np.sqrt(np.diagonal(units.covariances[first] + units.covariances[last]))
-        p_values = 2 * scipy.stats.norm.sf(np.abs(change / sigma)) * len(units.names) * len(again)
-        told = [k for k in np.argsort(p_values) if p_values[k] < _LEVEL]
-        if told:
-            named = tuple((units.names[k], float(change[k]), float(sigma[k])) for k in told)
-            found.append(Difference("device", device, len(each), float(p_values[told[0]]), named,
-                                    f"device {device} changed between its recordings"))  # fmt: skip
-    return found
+        p_values = 2 * scipy.stats.norm.sf(np.abs(change / sigma)) * len(units.names) * len(repeated)
+        changed = [k for k in np.argsort(p_values) if p_values[k] < LEVEL]
+        if changed:
+            named = tuple((units.names[k], float(change[k]), float(sigma[k])) for k in changed)
+            differences.append(
+                Difference(
+                    "device",
+                    device,
+                    len(indices),
+                    float(p_values[changed[0]]),
+                    named,
+                    f"device {device} changed between its recordings",
+                )
+            )
+    return differences
 
 
 def _shared_effects(units: _Units) -> list[Difference]:
     """Effects that the diagnoses name in one lot more often than in the others (Fisher's exact test)."""
     lots = np.array(_names(units))
-    asked = np.array([row["verdict"] is not None for row in units.rows])
+    diagnosed = np.array([row["verdict"] is not None for row in units.rows])
     names = sorted({name for row in units.rows for name in row["effects"] or ()})
-    groups = sorted(set(lots[asked & (lots != "")]))
+    groups = sorted(set(lots[diagnosed & (lots != "")]))
     if len(groups) < 2:
         return []
-    found = []
+    differences = []
     for effect in names:
         shown = np.array([effect in (row["effects"] or ()) for row in units.rows])
         for group in groups:
-            inside, outside = asked & (lots == group), asked & (lots != group)
+            inside, outside = diagnosed & (lots == group), diagnosed & (lots != group)
             table = [[int(np.sum(shown & side)), int(np.sum(~shown & side))] for side in (inside, outside)]
             p_value = float(scipy.stats.fisher_exact(table, "greater")[1]) * len(names) * len(groups)  # pyright: ignore
-            if p_value < _LEVEL:
+            if p_value < LEVEL:
                 text = (
                     f"lot {group} shares {effect_title(effect)}: found in {table[0][0]} of its {int(inside.sum())} "
                     f"units, in {table[1][0]} of {int(outside.sum())} others"
                 )
-                found.append(Difference("effect", group, table[0][0], p_value, (), text))
-    return found
+                differences.append(Difference("effect", group, table[0][0], p_value, (), text))
+    return differences
 
 
 # --- shrunk estimates -------------------------------------------------------------------------------------------------
@@ -585,32 +648,20 @@ def write_shrunk(fleet: Fleet, path: str | os.PathLike[str]) -> None:
         raise NotPossibleError(f"{fleet.table}: there is no population to learn from: {' '.join(fleet.notes)}")
     population = fleet.population
     gyroscope = any(name.owner == "gyroscope" for name in population.names)
-    numbers = ("accel_gain", "accel_bias", "gyro_gain", "gyro_bias")
-    columns = [name for name in SCHEMA.names if name in ("device", "file") or name.startswith(numbers)]
-    schema = pa.schema([SCHEMA.field(name) for name in columns])
+    schema = pa.schema([field for field in SCHEMA if field.name in _SHRUNK])
     places = free_places(gyroscope)
     with atomic_write(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
         for rows in _groups(Path(fleet.table), gyroscope, _COLUMNS):
-            if not rows:
-                continue
             units = _units(rows, gyroscope)
             moved = fleet.shifts.of(rows)
             mean, spread = population.shrink(units.values - moved, units.covariances)
-            whole = np.zeros((len(rows), len(PARAMETERS), 2))
-            whole[:, places, 0] = mean + moved
-            whole[:, places, 1] = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0))
+            values, sigma = np.zeros((2, len(rows), len(PARAMETERS)))
+            values[:, places] = mean + moved
+            sigma[:, places] = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0))
+            values, sigma = values * units.factor + units.offset, sigma * units.factor
             out: dict[str, list] = {name: [row[name] for row in rows] for name in ("device", "file")}
-            for start, name in ((0, "accel"), (12, "gyro")):
-                for part, first, size in (("gain", start, 9), ("bias", start + 9, 3)):
-                    there = name == "accel" or gyroscope
-                    for column, which in ((f"{name}_{part}", 0), (f"{name}_{part}_sigma", 1)):
-                        out[column] = [_output(row, name, part, whole[k, first : first + size, which], which)
-                                       if there else None for k, row in enumerate(rows)]  # fmt: skip
+            for name, part in COLUMN_PLACES.items():
+                there = gyroscope or name.startswith("accel")
+                for column, numbers in ((name, values), (f"{name}_sigma", sigma)):
+                    out[column] = list(numbers[:, part]) if there else [None] * len(rows)
             writer.write_table(pa.table([pa.array(out[f.name], f.type) for f in schema], schema=schema))
-
-
-def _output(row: dict[str, Any], name: str, part: str, relative: FloatArray, which: int) -> FloatArray:
-    scale, offset = np.array(row[f"{name}_nominal"][:3]), np.array(row[f"{name}_nominal"][3:])
-    if part == "gain":
-        return relative * np.repeat(scale, 3)
-    return relative * scale + (offset if which == 0 else 0.0)

@@ -17,7 +17,7 @@ from jaximu.calibration import nominal_imu, require_spanning
 from jaximu.calibration.arrangement import unusual_gains
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.fitting import Fit
-from jaximu.estimation.problem import names_of, without_equipment
+from jaximu.estimation.problem import flatten, names_of, without_equipment
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import weak_directions
 from jaximu.fleets.field import FieldUnit, field_row, field_unit
@@ -25,6 +25,7 @@ from jaximu.fleets.fit import FleetUnit, fit_units
 from jaximu.fleets.jobs import Job, Settings
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
+from jaximu.ground.units import SENSORS
 from jaximu.mistakes import prepared
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
@@ -33,14 +34,30 @@ from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observed_poses, segment
 
-__all__ = ["PARAMETERS", "SCHEMA", "ReadJob", "covariances", "finish", "free_places", "read_job", "require_table",
-           "row_begun", "rows_of"]  # fmt: skip
+__all__ = [
+    "COLUMN_PLACES",
+    "PARAMETERS",
+    "SCHEMA",
+    "ReadJob",
+    "covariances",
+    "finish",
+    "free_places",
+    "read_job",
+    "require_table",
+    "row_begun",
+    "rows_of",
+]
 
 PARAMETERS = names_of(Imu.nominal())
 """Names of the 24 numbers of a row, in the order of its column `covariance`."""
+COLUMN_PLACES = {
+    "accel_gain": slice(0, 9),
+    "accel_bias": slice(9, 12),
+    "gyro_gain": slice(12, 21),
+    "gyro_bias": slice(21, 24),
+}
+"""Which of `PARAMETERS` a column of the table holds."""
 _TRIANGLE = np.tril_indices(len(PARAMETERS))
-_TRIADS = {"accel": "accelerometer", "gyro": "gyroscope"}
-"""By what the table's columns call them."""
 _EPOCH = 946684800.0  # s; the year 2000: a logger's start before it is no date
 
 
@@ -49,8 +66,12 @@ def _numbers(size: int) -> pa.DataType:
 
 
 def _of_triads(*triads: str) -> list[pa.Field]:
-    return [pa.field(f"{triad}_{part}{end}", _numbers(size)) for triad in triads
-            for part, size in (("gain", 9), ("bias", 3)) for end in ("", "_sigma")]  # fmt: skip
+    return [
+        pa.field(f"{triad}_{part}{end}", _numbers(size))
+        for triad in triads
+        for part, size in (("gain", 9), ("bias", 3))
+        for end in ("", "_sigma")
+    ]
 
 
 _UNITS = {"accel_rms": "m/s^2", "gyro_rms": "deg"}
@@ -79,7 +100,7 @@ SCHEMA = pa.schema(
         "a magnetometer's gain (output units per µT, lower triangle) is in its own axes, which `jaximu magnetometer` "
         "finds against the accelerometer's",
     },
-)  # fmt: skip
+)
 """Columns of the table. The first ones are the fixed surface; what does not apply is null."""
 
 
@@ -96,8 +117,11 @@ def require_table(path: str | os.PathLike[str], needed: Sequence[str]) -> None:
 
 def free_places(gyroscope: bool) -> list[int]:
     """Return which of `PARAMETERS` are free by hand, with a gyroscope or without."""
-    return [place for place, name in enumerate(PARAMETERS)
-            if without_equipment(name) and (gyroscope or name.owner == "accelerometer")]  # fmt: skip
+    return [
+        index
+        for index, name in enumerate(PARAMETERS)
+        if without_equipment(name) and (gyroscope or name.owner == "accelerometer")
+    ]
 
 
 def covariances(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -135,11 +159,11 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
         recording = read_recording(job.file, gyro_log, options)
         noise = _noise(job.static, options) if job.static else None
         with prepared([recording]) as (ready,):
-            found = segment(ready.recording, settings.segmentation)
-            unit, notes = _unit(ready.recording, found, settings, noise)
+            segmentation = segment(ready.recording, settings.segmentation)
+            unit, notes = _unit(ready.recording, segmentation, settings, noise)
     except Exception as error:
         return ReadJob(row | _failure(error), None)
-    row |= _facts(ready.recording, unit, (*recording.notes, *ready.notes, *notes, *found.notes))
+    row |= _facts(ready.recording, unit, (*recording.notes, *ready.notes, *notes, *segmentation.notes))
     if job.date:
         row["date"] = job.date
     if settings.diagnose:
@@ -147,7 +171,7 @@ def read_job(job: Job, settings: Settings) -> ReadJob:
     field = None
     if recording.magnetometer is not None:
         try:
-            field = field_unit(recording.magnetometer, found, settings.field, job.file)
+            field = field_unit(recording.magnetometer, segmentation, settings.field, job.file)
         except Exception as error:
             row["mag_message"] = _sentence(error)
     return ReadJob(row, unit, field)
@@ -160,9 +184,9 @@ def _noise(path: str, options: ReadOptions) -> NoiseModel:
 
 
 def _unit(
-    recording: Recording, found: Segmentation, settings: Settings, noise: NoiseModel | None
+    recording: Recording, segmentation: Segmentation, settings: Settings, noise: NoiseModel | None
 ) -> tuple[FleetUnit, tuple[str, ...]]:
-    observations = observed_poses(found, settings.gravity.value, noise=noise)
+    observations = observed_poses(segmentation, settings.gravity.value, noise=noise)
     nominal, notes = nominal_imu(recording)
     notes += () if noise is None else noise.notes
     return FleetUnit(observations, nominal, recording.gyroscope is not None), notes
@@ -190,10 +214,10 @@ def _diagnosed(recording: Recording, settings: Settings, noise: NoiseModel | Non
     from jaximu.diagnosis import diagnose  # it is not cheap to import, and most runs ask for no diagnosis
 
     try:
-        found = diagnose(recording, settings.gravity, static=noise, segmentation=settings.segmentation)
+        diagnosis = diagnose(recording, settings.gravity, static=noise, segmentation=settings.segmentation)
     except Exception as error:
         return {"message": f"not diagnosed: {_sentence(error)}"}
-    return {"verdict": found.verdict, "effects": [each.name for each in found.effects]}
+    return {"verdict": diagnosis.verdict, "effects": [effect.name for effect in diagnosis.effects]}
 
 
 def _failure(error: Exception) -> dict[str, Any]:
@@ -212,11 +236,13 @@ def _sentence(error: Exception) -> str:
 
 def finish(prepared: Sequence[ReadJob], settings: Settings) -> list[dict[str, Any]]:
     """Fit what was prepared, in one batch, and return its rows in the same order."""
-    units = [each.unit for each in prepared if each.unit is not None]
-    fits = iter(fit_units([*units, *(each.field.unit for each in prepared if each.field is not None)]))
-    rows = [each.row if each.unit is None else _row(each, *next(fits), settings) for each in prepared]
-    return [row if each.field is None else row | _field(each.field, *next(fits), row["file"])
-            for row, each in zip(rows, prepared, strict=True)]  # fmt: skip
+    units = [job.unit for job in prepared if job.unit is not None]
+    fits = iter(fit_units([*units, *(job.field.unit for job in prepared if job.field is not None)]))
+    rows = [job.row if job.unit is None else _row(job, *next(fits), settings) for job in prepared]
+    return [
+        row if job.field is None else row | _field(job.field, *next(fits), row["file"])
+        for row, job in zip(rows, prepared, strict=True)
+    ]
 
 
 def rows_of(jobs: Sequence[Job], settings: Settings) -> list[dict[str, Any]]:
@@ -232,7 +258,9 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
     except NotPossibleError as error:
         return row | _failure(error)
     rank, weak = weak_directions(fit.jacobian, fit.names, fit.sizes, unit.nominal)
-    scales = {triad: np.array(row[f"{name}_nominal"][:3]) for name, triad in _TRIADS.items() if row[f"{name}_nominal"]}
+    scales = {
+        triad: np.array(row[f"{name}_nominal"][:3]) for name, triad in SENSORS.items() if row.get(f"{name}_nominal")
+    }
     unusual = unusual_gains(fit.imu, weak, scales) if scales else []
     for finding in unusual:
         if finding.apply is not None:  # in wrong axes the unit is none of the population
@@ -251,15 +279,14 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
         "covariance": whole[_TRIANGLE],
         "excess": [*np.asarray(fit.excess[:kinds]).tolist(), *[None] * (3 - kinds)],
         "rank": rank,
-        "weak": [each.text for each in weak],
+        "weak": [direction.text for direction in weak],
         "notes": list(dict.fromkeys([*(row["notes"] or ()), *(finding.text for finding in unusual)])),
     }
     if unit.gyroscope and row["turns"]:
         row["gyro_rms"] = float(rms[1])
-    for (name, triad), start in zip(list(_TRIADS.items())[: 1 + unit.gyroscope], (0, 12), strict=False):
-        gain, bias, known = slice(start, start + 9), slice(start + 9, start + 12), fit.imu.triads()[triad]
-        row[f"{name}_gain"], row[f"{name}_bias"] = np.ravel(known.gain), known.bias
-        row[f"{name}_gain_sigma"], row[f"{name}_bias_sigma"] = sigma[gain], sigma[bias]
+    values = flatten(fit.imu)
+    for name, part in list(COLUMN_PLACES.items())[: 2 + 2 * unit.gyroscope]:
+        row[name], row[f"{name}_sigma"] = values[part], sigma[part]
     return row
 
 
@@ -272,9 +299,9 @@ def _require(fit: Fit, poses: int, where: str, sensor: str) -> None:
         raise NotPossibleError(f"{where}: {Failure.MAX_STEPS.value}.")
 
 
-def _field(own: FieldUnit, fit: Fit, rms: FloatArray, where: str) -> dict[str, Any]:
+def _field(magnetometer: FieldUnit, fit: Fit, rms: FloatArray, where: str) -> dict[str, Any]:
     try:
-        _require(fit, own.poses, where, "magnetometer")
+        _require(fit, magnetometer.poses, where, "magnetometer")
     except NotPossibleError as error:
         return {"mag_message": _sentence(error)}
-    return field_row(own, fit, float(rms[0]))
+    return field_row(magnetometer, fit, float(rms[0]))

@@ -57,8 +57,8 @@ def run_fleet(
         kept = done = len(jobs) - len(pending)
         progress(done, kept, statuses)
         if pending:
-            with closing(ENGINES[engine](jobs, pending, settings, workers or available_cores())) as found:  # pyright: ignore[reportArgumentType]
-                for places, rows in found:
+            with closing(ENGINES[engine](jobs, pending, settings, workers or available_cores())) as results:  # pyright: ignore[reportArgumentType]
+                for places, rows in results:
                     store.add(places, rows)
                     statuses.update(row["status"] for row in rows)
                     done += len(places)

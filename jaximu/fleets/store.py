@@ -37,7 +37,7 @@ class Store:
     def __init__(self, output: Path, keys: Sequence[str]):
         self.output, self.keys = Path(output), list(keys)
         self.folder = self.output.with_name(f"{self.output.name}.parts")
-        self._place = {key: place for place, key in enumerate(self.keys)}
+        self._place = {key: index for index, key in enumerate(self.keys)}
         self._owner = np.full(len(self.keys), -1)  # which part holds a row
         self._parts: list[Path] = []
         self._lock: BinaryIO | None = None
@@ -76,24 +76,24 @@ class Store:
             keys = pq.read_table(path, columns=["key"]).column("key").to_pylist()
         except (OSError, pa.ArrowException):
             keys = []  # a disk that filled up, or another program's file: these rows are computed again
-        places = [self._place[key] for key in keys if key in self._place]
-        places = [place for place in places if self._owner[place] < 0]
-        if not places:
+        indices = [self._place[key] for key in keys if key in self._place]
+        indices = [index for index in indices if self._owner[index] < 0]
+        if not indices:
             return
-        self._owner[places] = len(self._parts)
+        self._owner[indices] = len(self._parts)
         self._parts.append(path)
 
     def add(self, places: Sequence[int], rows: Sequence[dict[str, Any]]) -> None:
         """Keep the rows of some places. Raises `InputError` where they cannot be written."""
-        fresh = [(place, row) for place, row in zip(places, rows, strict=True) if self._owner[place] < 0]
+        fresh = [(index, row) for index, row in zip(places, rows, strict=True) if self._owner[index] < 0]
         if not fresh:
             return
-        table = _table([{"key": self.keys[place]} | row for place, row in fresh], _PART)
-        digest = hashlib.sha256("".join(self.keys[place] for place, _ in fresh).encode()).hexdigest()[:16]
+        table = _table([{"key": self.keys[index]} | row for index, row in fresh], _PART)
+        digest = hashlib.sha256("".join(self.keys[index] for index, _ in fresh).encode()).hexdigest()[:16]
         path = self.folder / f"{fresh[0][0]:09d}-{digest}.parquet"
         with self._told(), atomic_write(path) as temporary:
             pq.write_table(table, temporary)
-        self._owner[[place for place, _ in fresh]] = len(self._parts)
+        self._owner[[index for index, _ in fresh]] = len(self._parts)
         self._parts.append(path)
 
     @contextmanager
@@ -111,10 +111,10 @@ class Store:
         left = np.bincount(self._owner, minlength=len(self._parts))
         opened: dict[int, dict[str, dict[str, Any]]] = {}
         group: list[dict[str, Any]] = []
-        for place, part in enumerate(self._owner.tolist()):
+        for index, part in enumerate(self._owner.tolist()):
             if part not in opened:
                 opened[part] = {row.pop("key"): row for row in pq.read_table(self._parts[part]).to_pylist()}
-            group.append(opened[part][self.keys[place]])
+            group.append(opened[part][self.keys[index]])
             left[part] -= 1
             if not left[part]:
                 del opened[part]

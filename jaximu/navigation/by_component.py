@@ -28,10 +28,8 @@ def matvec(matrix: Matrix, vector: Vector) -> Vector:
 
 
 def _dot(first: Vector, second: Vector) -> Array:
-    total = first[0] * second[0]
-    for a, b in zip(first[1:], second[1:], strict=True):
-        total = total + a * b
-    return total
+    products = [a * b for a, b in zip(first, second, strict=True)]
+    return sum(products[1:], products[0])
 
 
 def cross(first: Vector, second: Vector) -> Vector:
@@ -50,14 +48,14 @@ def _series(start: int, step: float):
     return [(-step) ** k / factorial(2 * k + start) for k in range(_TERMS)]
 
 
-_COSINE_HALF, _SINE_HALF = _series(0, 0.25), [each / 2 for each in _series(1, 0.25)]  # cos(θ/2) and sin(θ/2) / θ
+_COSINE_HALF, _SINE_HALF = _series(0, 0.25), [term / 2 for term in _series(1, 0.25)]  # cos(θ/2) and sin(θ/2) / θ
 _FIRST, _SECOND = _series(2, 1.0), _series(3, 1.0)  # (1 − cos θ) / θ² and (θ − sin θ) / θ³
 
 
 def _sum(coefficients: list[float], squared: Array) -> Array:
     total = jnp.full_like(squared, coefficients[-1])
-    for each in reversed(coefficients[:-1]):
-        total = total * squared + each
+    for coefficient in reversed(coefficients[:-1]):
+        total = total * squared + coefficient
     return total
 
 
@@ -65,7 +63,7 @@ def turn(quaternion: Vector, vector: Vector) -> Vector:
     """Return quaternion ⊗ exp(vector), exact for rotation vectors of up to 1 rad (see `_TERMS`)."""
     squared = _dot(vector, vector)
     sine = _sum(_SINE_HALF, squared)
-    return list(product(quaternion, [_sum(_COSINE_HALF, squared), *(sine * each for each in vector)]))
+    return list(product(quaternion, [_sum(_COSINE_HALF, squared), *(sine * component for component in vector)]))
 
 
 def right_jacobian(vector: Vector) -> Matrix:

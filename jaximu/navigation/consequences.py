@@ -40,17 +40,37 @@ from jaximu.model.stimulus import Stimulus
 from jaximu.navigation import Navigation, deviation, linearised, mechanise, noise_covariance
 from jaximu.navigation.trajectory import Trajectory
 from jaximu.noise.analysis import read_analysis
+from jaximu.planning.goals import group_of
+from jaximu.planning.information import root_of
 from jaximu.recordings.readers.kalibr import read_noise
 
-__all__ = ["NOISE_WORDS", "Consequences", "MonteCarlo", "Run", "SensorNoise", "consequences", "kind_of", "position",
-           "prepared", "read_sensor_noise", "sensor_noise"]  # fmt: skip
+__all__ = [
+    "NOISE_WORDS",
+    "Consequences",
+    "MonteCarlo",
+    "Run",
+    "SensorNoise",
+    "consequences",
+    "kind_of",
+    "position",
+    "prepared",
+    "read_sensor_noise",
+    "sensor_noise",
+]
 
 SCHEMA = "jaximu.consequences/1"
 _PROCESSES: dict[str, Callable[[FloatArray], Process]] = {
-    "N": White, "B": BiasInstability, "K": RandomWalk, "repeatability": BiasRepeatability,
-}  # fmt: skip
-NOISE_WORDS = {"N": "white noise N", "B": "bias instability B", "K": "rate random walk K",
-               "repeatability": "bias repeatability"}  # fmt: skip
+    "N": White,
+    "B": BiasInstability,
+    "K": RandomWalk,
+    "repeatability": BiasRepeatability,
+}
+NOISE_WORDS = {
+    "N": "white noise N",
+    "B": "bias instability B",
+    "K": "rate random walk K",
+    "repeatability": "bias repeatability",
+}
 SensorNoise = Mapping[str, Mapping[str, FloatArray]]
 """By triad and term (N, B, K, repeatability), the figure of each axis (3,), SI, two-sided."""
 _TOGETHER = 25
@@ -65,16 +85,20 @@ def read_sensor_noise(path: str | os.PathLike[str]) -> dict[str, dict[str, Float
     name = os.fspath(path)
     if name.lower().endswith((".yaml", ".yml")):
         known = read_noise(path)
-        figures = {triad: {"N": known.get(f"{triad}_noise_density"), "K": known.get(f"{triad}_random_walk")}
-                   for triad in INERTIAL_QUANTITIES}  # fmt: skip
-        return {triad: {term: np.full(3, value) for term, value in terms.items() if value}
-                for triad, terms in figures.items()}  # fmt: skip
+        figures = {
+            triad: {"N": known.get(f"{triad}_noise_density"), "K": known.get(f"{triad}_random_walk")}
+            for triad in INERTIAL_QUANTITIES
+        }
+        return {
+            triad: {term: np.full(3, value) for term, value in terms.items() if value}
+            for triad, terms in figures.items()
+        }
     return sensor_noise(read_analysis(path), name)
 
 
 def sensor_noise(document: Mapping[str, Any], name: str) -> dict[str, dict[str, FloatArray]]:
     """Return N, B, K and repeatability of an `allan.json` as a dictionary, called `name`; as `read_sensor_noise`."""
-    found: dict[str, dict[str, FloatArray]] = {}
+    figures: dict[str, dict[str, FloatArray]] = {}
     for triad, quantity in INERTIAL_QUANTITIES.items():
         axes = document.get(triad)
         if axes is None:
@@ -83,14 +107,15 @@ def sensor_noise(document: Mapping[str, Any], name: str) -> dict[str, dict[str, 
         with damage(name):
             for term in ("N", "B", "K"):
                 entries = [axis["terms"].get(term) for axis in axes]
-                values = [0.0 if each is None else _in_si(each, units[term], f"{name}: {triad} {term}")
-                          for each in entries]  # fmt: skip
+                values = [
+                    0.0 if entry is None else _in_si(entry, units[term], f"{name}: {triad} {term}") for entry in entries
+                ]
                 terms[term] = np.array(values, float).reshape(3)
             spread = (document.get("repeatability") or {}).get(triad)
             if spread is not None:
                 terms["repeatability"] = np.reshape(_in_si(spread, units["B"], f"{name}: {triad} repeatability"), 3)
-        found[triad] = {term: values for term, values in terms.items() if np.any(values)}
-    return found
+        figures[triad] = {term: values for term, values in terms.items() if np.any(values)}
+    return figures
 
 
 def _in_si(entry: Any, unit: str, what: str) -> Any:
@@ -104,23 +129,22 @@ def kind_of(name: Name, model: Imu) -> str:
     """Return what a term of the budget calls a number of the unit: "accelerometer scale", or an effect's name."""
     if name.effect is not None:
         return model.all_effects()[name.owner, name.effect].english
-    part = name.part if name.part == "bias" else "scale" if name.axes[0] == name.axes[1] else "misalignment"
-    return f"{name.owner} {part}"
+    return group_of(name).replace(".", " ")
 
 
 def _simplified(imu: Imu) -> dict[str, Imu]:
     """Return the unit without its misalignment, and without each of its effects, by what was left out."""
-    found: dict[str, Imu] = {}
+    simplified: dict[str, Imu] = {}
     for owner in INERTIAL_QUANTITIES:
         triad: Triad = getattr(imu, owner)
         straight = replace(triad, gain=np.diag(np.diagonal(triad.gain)))
         if not np.array_equal(straight.gain, triad.gain):
-            found[f"{owner} misalignment"] = replace(imu, **{owner: straight})
-        for place, effect in enumerate(triad.effects):
+            simplified[f"{owner} misalignment"] = replace(imu, **{owner: straight})
+        for index, effect in enumerate(triad.effects):
             absent = replace(effect, coefficients=np.zeros(effect.size))  # of the same structure: compiled already
-            left = (*triad.effects[:place], absent, *triad.effects[place + 1 :])
-            found[effect.english] = replace(imu, **{owner: replace(triad, effects=left)})
-    return found
+            left = (*triad.effects[:index], absent, *triad.effects[index + 1 :])
+            simplified[effect.english] = replace(imu, **{owner: replace(triad, effects=left)})
+    return simplified
 
 
 @dataclass(frozen=True)
@@ -164,7 +188,7 @@ class Consequences(Document):
     @property
     def noise(self) -> FloatArray:
         """Variances (T, 9) of all noise."""
-        parts = [each for name, each in self.terms.items() if name not in self.known]
+        parts = [variances for name, variances in self.terms.items() if name not in self.known]
         return np.sum(parts, axis=0) if parts else np.zeros_like(self.calibration)
 
     @property
@@ -176,11 +200,11 @@ class Consequences(Document):
         """Return which term's position error is the largest, from when to when (s)."""
         names = list(self.terms)
         first = np.argmax([position(self.terms[name]) for name in names], axis=0)
-        found: list[tuple[str, float, float]] = []
-        for time, place in zip(self.times, first, strict=True):
-            start = found.pop()[1] if found and found[-1][0] == names[place] else (found[-1][2] if found else 0.0)
-            found.append((names[place], float(start), float(time)))
-        return found
+        spans: list[tuple[str, float, float]] = []
+        for time, index in zip(self.times, first, strict=True):
+            start = spans.pop()[1] if spans and spans[-1][0] == names[index] else (spans[-1][2] if spans else 0.0)
+            spans.append((names[index], float(start), float(time)))
+        return spans
 
     def document(self) -> dict[str, Any]:
         """Return the budget as the JSON document of schema `jaximu.consequences/1`; all figures are 1σ."""
@@ -193,7 +217,7 @@ class Consequences(Document):
             return {name: track(sigma, part) for part, name in enumerate(names)}
 
         def listed(errors: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
-            return [{"term": name, "position": each.tolist()} for name, each in errors.items()]
+            return [{"term": name, "position": values.tolist()} for name, values in errors.items()]
 
         check, against = self.check, self.against
         known = self.known | {"the whole calibration": np.zeros_like(self.noise)}
@@ -201,20 +225,24 @@ class Consequences(Document):
             "schema": SCHEMA,
             "times": self.times.tolist(),
             **tracks(np.sqrt(self.total)),
-            "budget": listed({name: position(each) for name, each in self.terms.items()}),
+            "budget": listed({name: position(variances) for name, variances in self.terms.items()}),
             "calibration": {"position": position(self.calibration).tolist()},
             "dominant": [{"term": name, "start": start, "stop": stop} for name, start, stop in self.dominant()],
-            "if_known_exactly": listed({name: position(each + self.noise) for name, each in known.items()}),
+            "if_known_exactly": listed({name: position(variances + self.noise) for name, variances in known.items()}),
             "left_out": listed(self.left_out),
             "monte_carlo": check and {"draws": len(check.errors), "seed": check.seed, **tracks(check.sigma)},
-            "against": None if against is None or self.apart is None else {
-                "file": against.calibration_file, "position_sigma": track(np.sqrt(against.total), 0),
-                "position_apart": track(self.apart, 0)},
+            "against": None
+            if against is None or self.apart is None
+            else {
+                "file": against.calibration_file,
+                "position_sigma": track(np.sqrt(against.total), 0),
+                "position_apart": track(self.apart, 0),
+            },
             "calibration_file": self.calibration_file,
             "path": self.trajectory.words,
             "notes": list(self.notes),
             "software": SOFTWARE,
-        }  # fmt: skip
+        }
 
 
 def position(variances: FloatArray) -> FloatArray:
@@ -308,9 +336,9 @@ def consequences(
     terms: dict[str, FloatArray] = {}
     known: dict[str, FloatArray] = {}
     for kind in dict.fromkeys(kinds):
-        own = np.array([each == kind for each in kinds])
-        terms[kind] = _variances(slopes[..., own], run.covariance[np.ix_(own, own)])
-        known[kind] = _variances(slopes[..., ~own], _given(run.covariance, own))
+        chosen = np.array([other == kind for other in kinds])
+        terms[kind] = _variances(slopes[..., chosen], run.covariance[np.ix_(chosen, chosen)])
+        known[kind] = _variances(slopes[..., ~chosen], _given(run.covariance, chosen))
     whole = _variances(slopes, run.covariance)
     notes = [*trajectory.notes, *_notes(calibration, noise)]
     terms |= _noise_terms(trajectory, noise or {})
@@ -324,9 +352,19 @@ def consequences(
         None if against is None else consequences(against, trajectory, noise, draws=0, files=(files[1], files[0]))
     )
     return Consequences(
-        files[0], trajectory, jax.tree.map(np.asarray, reference), trajectory.times, terms, whole, known, left_out,
-        check, compared, apart, tuple(notes),
-    )  # fmt: skip
+        files[0],
+        trajectory,
+        jax.tree.map(np.asarray, reference),
+        trajectory.times,
+        terms,
+        whole,
+        known,
+        left_out,
+        check,
+        compared,
+        apart,
+        tuple(notes),
+    )
 
 
 def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run:
@@ -340,9 +378,9 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
     calibration = calibration.inertial()
     imu = calibration.imu.transferable()
     everything = names_of(imu)
-    known = {_identity(name, imu): place for place, name in enumerate(everything)}
+    known = {_identity(name, imu): index for index, name in enumerate(everything)}
     rows = [row for row, name in enumerate(calibration.names) if _identity(name, calibration.imu) in known]
-    places = np.array([known[_identity(calibration.names[row], calibration.imu)] for row in rows], int)
+    indices = np.array([known[_identity(calibration.names[row], calibration.imu)] for row in rows], int)
     covariance = np.asarray(calibration.covariance)[np.ix_(rows, rows)]
     if not rows or not np.diagonal(covariance).any():
         raise NotPossibleError(
@@ -351,11 +389,16 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
         )
     imu, stimulus = jax.tree.map(np.asarray, imu), trajectory.stimulus
     return Run(
-        imu, trajectory.start,
-        replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None), trajectory.intervals,
-        compiled(Imu.respond)(imu, stimulus), covariance, places, tuple(everything[place] for place in places),
+        imu,
+        trajectory.start,
+        replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None),
+        trajectory.intervals,
+        compiled(Imu.respond)(imu, stimulus),
+        covariance,
+        indices,
+        tuple(everything[index] for index in indices),
         trajectory.every,
-    )  # fmt: skip
+    )
 
 
 def _identity(name: Name, model: Imu) -> tuple:
@@ -375,7 +418,7 @@ def _notes(calibration: Calibration, noise: SensorNoise | None) -> list[str]:
     effects = calibration.imu.transferable().all_effects().values()
     if not any("temperature" in effect.needs for effect in effects):
         notes.append("temperature is not in the budget: the calibration has no effect of it (see `jaximu thermal`).")
-    if any(not each.determined for each in calibration.weak):
+    if any(not direction.determined for direction in calibration.weak):
         notes.append("the calibration leaves directions undetermined, and what they do is far from first order.")
     return notes
 
@@ -385,10 +428,13 @@ def _variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.maximum(np.einsum("tip,pq,tiq->ti", slopes, covariance, slopes, optimize=True), 0.0)
 
 
-def _given(covariance: FloatArray, own: NDArray[np.bool_]) -> FloatArray:
+def _given(covariance: FloatArray, chosen: NDArray[np.bool_]) -> FloatArray:
     """Covariance of the others were these known exactly (normal distribution, conditioned)."""
-    cross, inverse = covariance[np.ix_(~own, own)], np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True)
-    return covariance[np.ix_(~own, ~own)] - cross @ inverse @ cross.T
+    cross, inverse = (
+        covariance[np.ix_(~chosen, chosen)],
+        np.linalg.pinv(covariance[np.ix_(chosen, chosen)], hermitian=True),
+    )
+    return covariance[np.ix_(~chosen, ~chosen)] - cross @ inverse @ cross.T
 
 
 def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
@@ -398,29 +444,32 @@ def _noise_terms(path: Trajectory, noise: SensorNoise) -> dict[str, FloatArray]:
     stimulus = path.stimulus
     vectors = increments(*map(jnp.asarray, (stimulus.angular_rate, stimulus.specific_force, path.intervals)))
     transition, reaction = compiled(linearised)(path.start, *vectors, jnp.asarray(path.intervals))
-    found, interval = {}, float(np.mean(path.intervals))
+    terms, interval = {}, path.interval
     propagate = compiled(noise_covariance)
     for triad, term in wanted:
         columns = reaction[..., :3] if triad == "gyroscope" else reaction[..., 3:]
         system = _PROCESSES[term](noise[triad][term]).system(interval)
         variances, _ = propagate(transition, columns, system)
-        found[f"{triad} {NOISE_WORDS[term]}"] = np.asarray(variances)[path.every - 1 :: path.every]
-    return found
+        terms[f"{triad} {NOISE_WORDS[term]}"] = np.asarray(variances)[path.every - 1 :: path.every]
+    return terms
 
 
-def _draw(
-    run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise, draws: int, seed: int
-) -> MonteCarlo:  # fmt: skip
+def _draw(run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise, draws: int, seed: int) -> MonteCarlo:
     """Draw all errors at once and mechanise."""
     rng = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(run.covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    rate = 1 / float(np.mean(path.intervals))
-    streams = [Noise(tuple(_PROCESSES[term](each) for term, each in noise.get(triad, {}).items()),
-                     INERTIAL_QUANTITIES[triad]) for triad in ("gyroscope", "accelerometer")]  # fmt: skip
-    found = []
+    root = root_of(run.covariance)
+    streams = [
+        Noise(
+            tuple(_PROCESSES[term](figure) for term, figure in noise.get(triad, {}).items()), INERTIAL_QUANTITIES[triad]
+        )
+        for triad in ("gyroscope", "accelerometer")
+    ]
+    errors = []
     for first in range(0, draws, _TOGETHER):
         changes = rng.standard_normal((_TOGETHER, len(root))) @ root.T
-        parts = [each.sample(len(path.intervals), rate, (seed, first), shape=(_TOGETHER,)) for each in streams]
-        found.append(np.asarray(_errors(run, reference, changes, np.concatenate(parts, axis=-1))))
-    return MonteCarlo(np.concatenate(found)[:draws], seed)
+        parts = [
+            stream.sample(len(path.intervals), 1 / path.interval, (seed, first), shape=(_TOGETHER,))
+            for stream in streams
+        ]
+        errors.append(np.asarray(_errors(run, reference, changes, np.concatenate(parts, axis=-1))))
+    return MonteCarlo(np.concatenate(errors)[:draws], seed)

@@ -26,7 +26,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,11 +48,20 @@ from jaximu.model.sensor import Imu
 from jaximu.navigation import noise_covariance
 from jaximu.navigation.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
 from jaximu.navigation.trajectory import Trajectory
+from jaximu.planning.information import root_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording
 
-__all__ = ["LENGTHS", "EstimatorNoise", "MeasuredErrors", "ModelledErrors", "TriadNoise",
-           "estimator_noise", "nees", "steady_stamps"]  # fmt: skip
+__all__ = [
+    "LENGTHS",
+    "EstimatorNoise",
+    "MeasuredErrors",
+    "ModelledErrors",
+    "TriadNoise",
+    "estimator_noise",
+    "nees",
+    "steady_stamps",
+]
 
 SCHEMA = "jaximu.estimator-noise/1"
 LENGTHS = (0.1, 1.0, 10.0)
@@ -81,7 +89,7 @@ class Stretches(NamedTuple):
     """n stretches of S samples: rates, forces (n, S, 3), SI, each sample over `held` (n, S) s; `start` (n,) s.
 
     rows: (n, S), of the samples in the motion. errors: (n, 9) measured, or fewer columns where the reference lacks
-    them; own: (n, 3) of Δv with the rotation known, or None.
+    them; velocity_errors: (n, 3) of Δv with the rotation known, or None.
     """
 
     rates: FloatArray
@@ -90,7 +98,7 @@ class Stretches(NamedTuple):
     start: FloatArray
     rows: NDArray[np.int64]
     errors: FloatArray | None = None
-    own: FloatArray | None = None
+    velocity_errors: FloatArray | None = None
 
 
 def _spread(rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -109,7 +117,7 @@ class ModelledErrors:
     @property
     def rate(self) -> float:
         """Samples a second."""
-        return 1 / float(np.mean(self.trajectory.intervals))
+        return 1 / self.trajectory.interval
 
     @property
     def duration(self) -> float:
@@ -127,9 +135,9 @@ class ModelledErrors:
         size = max(2, round(length * self.rate))
         first = _spread(np.arange(0, len(intervals) - size + 1, size))
         rows = first[:, None] + np.arange(size)
-        begun = np.concatenate([[0.0], np.cumsum(intervals)])[first]
-        rates, forces = (np.asarray(each)[rows] for each in (stimulus.angular_rate, stimulus.specific_force))
-        return Stretches(rates, forces, intervals[rows], begun, rows)
+        start = np.concatenate([[0.0], np.cumsum(intervals)])[first]
+        rates, forces = (np.asarray(samples)[rows] for samples in (stimulus.angular_rate, stimulus.specific_force))
+        return Stretches(rates, forces, intervals[rows], start, rows)
 
     @cached_property
     def slopes(self) -> tuple[FloatArray, FloatArray, list[str], list[str]]:
@@ -145,7 +153,7 @@ class ModelledErrors:
             change,
             run.covariance,
             [kind_of(name, run.imu) for name in run.names],
-            [each.owner for each in run.names],
+            [name.owner for name in run.names],
         )
 
 
@@ -158,15 +166,15 @@ def _reaction(run: Run) -> Any:
 class MeasuredErrors:
     """Errors of a unit's increments against a measured attitude, and its velocity and position where it has them.
 
-    rates, forces: (S, 3) corrected samples, SI; early, late: (S,) s, between which each holds. stamp: (T,) of the
+    rates, forces: (S, 3) corrected samples, SI; since, until: (S,) s, between which each holds. stamp: (T,) of the
     reference on the recording's clock; rotation: (T, 4) quaternions w first from the unit's body to a frame whose z
     points up; velocity, position: (T, 3) or None. steady: (T,), whether the reference does not leap there.
     """
 
     rates: FloatArray
     forces: FloatArray
-    early: FloatArray
-    late: FloatArray
+    since: FloatArray
+    until: FloatArray
     stamp: FloatArray
     rotation: FloatArray
     velocity: FloatArray | None
@@ -185,24 +193,24 @@ class MeasuredErrors:
         does.
         """
         require_float64()
-        found, measurement = calibrate_against_attitude(recording, attitude, gravity, unit=unit)
+        fitted, measurement = calibrate_against_attitude(recording, attitude, gravity, unit=unit)
         data, known = measurement.intervals, measurement.attitude
-        mounting = Mounting.of(found.imu)
+        mounting = Mounting.of(fitted.imu)
         middle = (np.asarray(data.since) + np.asarray(data.until)) / 2
         beside = replace(
-            measurement.around(found.imu), specific_force=None, angular_rate=None, angular_acceleration=None
+            measurement.around(fitted.imu), specific_force=None, angular_rate=None, angular_acceleration=None
         )
-        force, rate = compiled(Imu.recover)(replace(found.imu, setup=()), data.force, data.rate, beside)
+        force, rate = compiled(Imu.recover)(replace(fitted.imu, setup=()), data.force, data.rate, beside)
         tilt = scipy.spatial.transform.Rotation.from_rotvec(np.append(mounting.tilt, 0.0))
         whole = replace(known, quaternion=np.asarray(mounting.unit_attitude(known.quaternion))).rotation()
         velocity = known.velocities()
         stamp = np.asarray(mounting.on_log(known.time))
-        felt = np.stack([np.interp(stamp, middle, each) for each in np.asarray(force).T], axis=1)
+        felt = np.stack([np.interp(stamp, middle, component) for component in np.asarray(force).T], axis=1)
         steady = np.ones(len(stamp), bool)
         notes: list[str] = []
         if velocity is not None:
             velocity = tilt.apply(velocity)
-            steady = steady_stamps(stamp, velocity, whole.apply(felt) - [0.0, 0.0, found.gravity.value])
+            steady = steady_stamps(stamp, velocity, whole.apply(felt) - [0.0, 0.0, fitted.gravity.value])
         if not steady.all():
             notes.append(
                 f"{attitude.name} leaps: at {int(np.sum(~steady))} of {len(stamp)} stamps its velocity changes as the "
@@ -214,68 +222,79 @@ class MeasuredErrors:
                 "accelerometer's multiplier contains."
             )
         return cls(
-            np.asarray(rate), np.asarray(force), np.asarray(data.since), np.asarray(data.until), stamp,
-            whole.as_quat(scalar_first=True), velocity, None if known.position is None else tilt.apply(known.position),
-            found.gravity.value, steady, f"measured against {attitude.name} along {recording.name}", tuple(notes),
-        )  # fmt: skip
+            np.asarray(rate),
+            np.asarray(force),
+            np.asarray(data.since),
+            np.asarray(data.until),
+            stamp,
+            whole.as_quat(scalar_first=True),
+            velocity,
+            None if known.position is None else tilt.apply(known.position),
+            fitted.gravity.value,
+            steady,
+            f"measured against {attitude.name} along {recording.name}",
+            tuple(notes),
+        )
 
     @property
     def rate(self) -> float:
         """Samples a second."""
-        return 1 / float(np.median(self.late - self.early))
+        return 1 / float(np.median(self.until - self.since))
 
     @property
     def duration(self) -> float:
         """Length of the motion, s."""
-        return float(min(self.late[-1], self.stamp[-1]) - max(self.early[0], self.stamp[0]))
+        return float(min(self.until[-1], self.stamp[-1]) - max(self.since[0], self.stamp[0]))
 
     def over(self, length: float) -> Stretches:
         """Return stretches from stamp to stamp of the reference, about `length` (s) each, without its gaps."""
-        inside = np.flatnonzero((self.stamp > self.early[0]) & (self.stamp < self.late[-1]))
+        inside = np.flatnonzero((self.stamp > self.since[0]) & (self.stamp < self.until[-1]))
         period = float(np.median(np.diff(self.stamp)))
         step = max(1, round(length / period))
         first = inside[: max(0, len(inside) - step) : step]
         last = first + step
         whole = (self.stamp[last] - self.stamp[first] < (step + 1.5) * period) & _without_gaps(
-            self.early, self.late, self.stamp[first], self.stamp[last]
+            self.since, self.until, self.stamp[first], self.stamp[last]
         )
         kept = _spread(np.flatnonzero(whole & self.steady[first] & self.steady[last]))
         first, last = first[kept], last[kept]
         start, stop = self.stamp[first], self.stamp[last]
-        begin = np.searchsorted(self.late, start, "right")
-        size = max(1, int((np.searchsorted(self.early, stop) - begin).max(initial=1)))
-        rows = np.minimum(begin[:, None] + np.arange(size), len(self.late) - 1)
-        inner = begin[:, None] + np.arange(size) < len(self.late)
-        held = np.minimum(self.late[rows], stop[:, None]) - np.maximum(self.early[rows], start[:, None])
+        begin = np.searchsorted(self.until, start, "right")
+        size = max(1, int((np.searchsorted(self.since, stop) - begin).max(initial=1)))
+        rows = np.minimum(begin[:, None] + np.arange(size), len(self.until) - 1)
+        inner = begin[:, None] + np.arange(size) < len(self.until)
+        held = np.minimum(self.until[rows], stop[:, None]) - np.maximum(self.since[rows], start[:, None])
         held = np.maximum(held, 0.0) * inner
         rates, forces = self.rates[rows], self.forces[rows]
-        errors, own = self._errors(rates, forces, held, first, last)
-        return Stretches(rates, forces, held, start - self.early[0], rows, errors, own)
+        errors, velocity_errors = self._errors(rates, forces, held, first, last)
+        return Stretches(rates, forces, held, start - self.since[0], rows, errors, velocity_errors)
 
     def _errors(self, rates: FloatArray, forces: FloatArray, held: FloatArray, first: Any, last: Any) -> Any:
         """Return errors (n, 3, 6 or 9) of ΔR, Δv, Δp and of Δv with the reference's rotation (n, 3), or None."""
         rotations = scipy.spatial.transform.Rotation
         known = rotations.from_quat(self.rotation, scalar_first=True)
-        begun, time = known[first], self.stamp[last] - self.stamp[first]
-        found = _integrated(rates, forces, held)
-        turned = (begun.inv() * known[last]).inv() * rotations.from_quat(found[0], scalar_first=True)
+        at_start, time = known[first], self.stamp[last] - self.stamp[first]
+        integrated = _integrated(rates, forces, held)
+        turned = (at_start.inv() * known[last]).inv() * rotations.from_quat(integrated[0], scalar_first=True)
         errors = [turned.as_rotvec()]
         if self.velocity is None:
             return errors[0], None
         up = np.array([0.0, 0.0, self.gravity])
-        gained = begun.inv().apply(self.velocity[last] - self.velocity[first] + up * time[:, None])
-        errors.append(np.asarray(found[1]) - gained)
+        gained = at_start.inv().apply(self.velocity[last] - self.velocity[first] + up * time[:, None])
+        errors.append(np.asarray(integrated[1]) - gained)
         if self.position is not None:
             away = self.position[last] - self.position[first] - self.velocity[first] * time[:, None]
-            errors.append(np.asarray(found[2]) - begun.inv().apply(away + up * time[:, None] ** 2 / 2))
+            errors.append(np.asarray(integrated[2]) - at_start.inv().apply(away + up * time[:, None] ** 2 / 2))
         edges = self.stamp[first][:, None] + np.concatenate([np.zeros((len(held), 1)), np.cumsum(held, axis=1)], axis=1)
         edges = np.clip(edges, self.stamp[0], self.stamp[-1])
         path = scipy.spatial.transform.Slerp(self.stamp, known)(edges.ravel()).as_quat()
-        before, after = (rotations.from_quat(path.reshape(*edges.shape, 4)[:, part].reshape(-1, 4))
-                         for part in (slice(None, -1), slice(1, None)))  # fmt: skip
+        before, after = (
+            rotations.from_quat(path.reshape(*edges.shape, 4)[:, part].reshape(-1, 4))
+            for part in (slice(None, -1), slice(1, None))
+        )
         turning = (before.inv() * after).as_rotvec().reshape(rates.shape) / np.where(held > 0, held, 1.0)[..., None]
-        own = np.asarray(_integrated(turning, forces, held)[1]) - gained
-        return np.concatenate(errors, axis=1), own
+        velocity_errors = np.asarray(_integrated(turning, forces, held)[1]) - gained
+        return np.concatenate(errors, axis=1), velocity_errors
 
 
 def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> NDArray[np.bool_]:
@@ -287,11 +306,11 @@ def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatAr
     return ~np.concatenate([near, [False]])[1 : len(stamp) + 1]
 
 
-def _without_gaps(early: FloatArray, late: FloatArray, start: FloatArray, stop: FloatArray) -> NDArray[np.bool_]:
+def _without_gaps(since: FloatArray, until: FloatArray, start: FloatArray, stop: FloatArray) -> NDArray[np.bool_]:
     """Whether no sample between two times holds far longer than others do."""
-    lengths = late - early
+    lengths = until - since
     long = np.concatenate([[0], np.cumsum(lengths > 2.5 * np.median(lengths))])
-    return long[np.searchsorted(early, stop)] == long[np.searchsorted(late, start)]
+    return long[np.searchsorted(since, stop)] == long[np.searchsorted(until, start)]
 
 
 @compiled
@@ -313,8 +332,10 @@ def _covariances(samples: tuple, interval: Any, flicker: Mapping[str, Any], slop
         white = jnp.einsum("sij,skj->jik", reaction, reaction) / interval
         later = jnp.cumsum(reaction[::-1], axis=0)[::-1] - reaction  # a walk's step moves all samples after it
         walk = jnp.einsum("sij,skj->jik", later, later) * interval
-        drift = {triad: noise_covariance(None, reaction[..., _COLUMNS[triad]], system)[1]
-                 for triad, system in flicker.items()}  # fmt: skip
+        drift = {
+            triad: noise_covariance(None, reaction[..., _COLUMNS[triad]], system)[1]
+            for triad, system in flicker.items()
+        }
         moved = None if slope is None else jnp.einsum("sij,sjp->ip", reaction, slope)
         pushed = None if change is None else jnp.einsum("sij,sj->si", reaction, change)
         return white, walk, drift, moved, None if pushed is None else pushed.T @ pushed
@@ -365,28 +386,32 @@ class EstimatorNoise(Document):
 
     def densities(self) -> dict[str, float]:
         """Return the continuous densities with the multipliers applied, by Kalibr's keys, and what GTSAM asks for."""
-        found = {"update_rate": self.rate, "integration_covariance": self.integration}
+        densities = {"update_rate": self.rate, "integration_covariance": self.integration}
         for name, triad in self.triads.items():
-            found[f"{name}_noise_density"] = triad.white * float(triad.applied[self.chosen])
-            found[f"{name}_random_walk"] = float(triad.walk[self.chosen])
-        return found
+            densities[f"{name}_noise_density"] = triad.white * float(triad.applied[self.chosen])
+            densities[f"{name}_random_walk"] = float(triad.walk[self.chosen])
+        return densities
 
     def headline(self) -> str:
         """Say by how much N is to be multiplied."""
         at = f"{self.lengths[self.chosen]:g} s"
-        parts = [f"the {name}'s white noise by {number(each.applied[self.chosen])} "
-                 f"({number(each.low[self.chosen], 2)} to {number(each.high[self.chosen], 2)})"
-                 for name, each in self.triads.items()]  # fmt: skip
+        parts = [
+            f"the {name}'s white noise by {number(triad.applied[self.chosen])} "
+            f"({number(triad.low[self.chosen], 2)} to {number(triad.high[self.chosen], 2)})"
+            for name, triad in self.triads.items()
+        ]
         return f"For an estimator whose states are {at} apart, multiply {' and '.join(parts)}; {self.words}."
 
     def rows(self) -> list[tuple[str, ...]]:
         """Return the multipliers, what they are made of, and the NEES that follow, by length."""
         shown: list[tuple[str, ...]] = []
-        for name, each in self.triads.items():
-            cells = [f"{number(m)} ({number(low, 2)} to {number(high, 2)})"
-                     for m, low, high in zip(each.multiplier, each.low, each.high, strict=True)]  # fmt: skip
+        for name, triad in self.triads.items():
+            cells = [
+                f"{number(m)} ({number(low, 2)} to {number(high, 2)})"
+                for m, low, high in zip(triad.multiplier, triad.low, triad.high, strict=True)
+            ]
             shown.append((f"{name}, N times", *cells))
-            for term, values in each.terms.items():
+            for term, values in triad.terms.items():
                 if np.max(values) >= _LEAST:
                     shown.append((f"  {term}", *(f"{value:.2f}" for value in values)))
         for name, values in self.nees.items():
@@ -397,19 +422,24 @@ class EstimatorNoise(Document):
     def statements(self) -> list[str]:
         """Say for which lengths the numbers hold, and where they do not."""
         at = f"{self.lengths[self.chosen]:g} s"
-        said = [f"The {name}'s errors ask for {number(each.multiplier[self.chosen])} times its white noise over {at}. "
-                "It is left as it is, because in motion a sensor is no quieter than at rest."
-                for name, each in self.triads.items() if each.high[self.chosen] < _QUIETER]  # fmt: skip
+        sentences = [
+            f"The {name}'s errors ask for {number(triad.multiplier[self.chosen])} times its white noise over {at}. "
+            "It is left as it is, because in motion a sensor is no quieter than at rest."
+            for name, triad in self.triads.items()
+            if triad.high[self.chosen] < _QUIETER
+        ]
         for name, values in self.nees.items():
-            off = [f"{number(value, 2)} at {length:g} s"
-                   for length, value in zip(self.lengths, values[:, 1], strict=True)
-                   if not _HOLDS[0] <= value <= _HOLDS[1]]  # fmt: skip
+            off = [
+                f"{number(value, 2)} at {length:g} s"
+                for length, value in zip(self.lengths, values[:, 1], strict=True)
+                if not _HOLDS[0] <= value <= _HOLDS[1]
+            ]
             if off:
-                said.append(
+                sentences.append(
                     f"No white noise makes the NEES of {name} one at every length: with the numbers for {at} it is "
                     f"{', '.join(off)}. Above one the estimator trusts the unit too much, below one too little."
                 )
-        return said
+        return sentences
 
     def document(self) -> dict[str, Any]:
         """Return it as the JSON document of schema `jaximu.estimator-noise/1`; densities are SI and continuous."""
@@ -420,19 +450,26 @@ class EstimatorNoise(Document):
             "stretches": list(self.count),
             **{
                 name: {
-                    "noise_density": triad.white, "random_walk": triad.walk.tolist(),
-                    "multiplier": triad.multiplier.tolist(), "low": triad.low.tolist(), "high": triad.high.tolist(),
-                    "terms": [{"term": term, "multiple": each.tolist()} for term, each in triad.terms.items()],
+                    "noise_density": triad.white,
+                    "random_walk": triad.walk.tolist(),
+                    "multiplier": triad.multiplier.tolist(),
+                    "low": triad.low.tolist(),
+                    "high": triad.high.tolist(),
+                    "terms": [
+                        {"term": term, "multiple": multiples.tolist()} for term, multiples in triad.terms.items()
+                    ],
                 }
                 for name, triad in self.triads.items()
             },
-            "nees": {name: {"stated": each[:, 0].tolist(), "multiplied": each[:, 1].tolist()}
-                     for name, each in self.nees.items()},
+            "nees": {
+                name: {"stated": values[:, 0].tolist(), "multiplied": values[:, 1].tolist()}
+                for name, values in self.nees.items()
+            },
             "densities": self.densities(),
             "errors": self.words,
             "notes": list(self.notes),
             "software": SOFTWARE,
-        }  # fmt: skip
+        }
 
 
 def estimator_noise(
@@ -462,16 +499,16 @@ def estimator_noise(
         if not np.any(noise.get(triad, {}).get("N", 0.0)):
             raise InputError(f"the noise file states no white noise N of the {triad}, which is what is multiplied.")
     wanted = sorted({*lengths, interval})
-    kept = [each for each in wanted if source.duration >= _FEWEST * each]
+    kept = [length for length in wanted if source.duration >= _FEWEST * length]
     if interval not in kept:
         raise NotPossibleError(
             f"the motion lasts {source.duration:.3g} s, and {_FEWEST * interval:g} s are needed for an estimator whose "
             f"states are {interval:g} s apart: give a longer one."
         )
-    notes = [f"the motion is too short for stretches of {each:g} s." for each in wanted if each not in kept]
+    notes = [f"the motion is too short for stretches of {length:g} s." for length in wanted if length not in kept]
     notes += [f"{interval * source.rate:.2g} samples lie between two states."] if interval * source.rate < 2 else []
-    parts = {each: _part(source, noise, each) for each in kept}
-    walks = {each: {triad: _walk(part, triad) for triad in INERTIAL_QUANTITIES} for each, part in parts.items()}
+    parts = {length: _part(source, noise, length) for length in kept}
+    walks = {length: {triad: _walk(part, triad) for triad in INERTIAL_QUANTITIES} for length, part in parts.items()}
     if isinstance(source, MeasuredErrors):
         notes += source.notes
     elif not source.trajectory.recorded:
@@ -480,35 +517,53 @@ def estimator_noise(
     triads: dict[str, TriadNoise] = {}
     turned = np.ones(len(kept))
     for triad in _OWN:  # the gyroscope first
-        rows = [_multiplier(parts[each], triad, walks[each], one, draws, rng)
-                for each, one in zip(kept, turned, strict=True)]  # fmt: skip
+        rows = [
+            _multiplier(parts[length], triad, walks[length], one, draws, rng)
+            for length, one in zip(kept, turned, strict=True)
+        ]
         if rows[kept.index(interval)] is None:
             notes.append(f"the reference has neither velocity nor position: the {triad}'s noise is left as it is.")
             rows = [(1.0, 1.0, 1.0)] * len(kept)
         table = np.array(rows, float)
-        terms = [_terms(parts[each], triad) for each in kept]
+        terms = [_terms(parts[length], triad) for length in kept]
         triads[triad] = TriadNoise(
-            _rms(noise[triad]["N"]), np.array([walks[each][triad] for each in kept]),
-            table[:, 0], table[:, 1], table[:, 2],
-            {name: np.array([each[name] for each in terms]) for name in terms[0]},
-        )  # fmt: skip
+            _rms(noise[triad]["N"]),
+            np.array([walks[length][triad] for length in kept]),
+            table[:, 0],
+            table[:, 1],
+            table[:, 2],
+            {name: np.array([term_values[name] for term_values in terms]) for name in terms[0]},
+        )
         turned = triads[triad].applied
     chosen = kept.index(interval)
-    final = {triad: float(each.applied[chosen]) for triad, each in triads.items()}
+    final = {triad: float(triad_noise.applied[chosen]) for triad, triad_noise in triads.items()}
     stated = dict.fromkeys(final, 1.0)
-    rows = [[_nees(parts[each], multipliers, walks[interval]) for multipliers in (stated, final)] for each in kept]
-    nees = {name: np.array([[each[name] for each in pair] for pair in rows])
-            for name in _ROWS if all(name in each for pair in rows for each in pair)}  # fmt: skip
+    rows = [[_nees(parts[length], multipliers, walks[interval]) for multipliers in (stated, final)] for length in kept]
+    nees = {
+        name: np.array([[increments[name] for increments in pair] for pair in rows])
+        for name in _ROWS
+        if all(name in increments for pair in rows for increments in pair)
+    }
     return EstimatorNoise(
-        np.array(kept), chosen, triads, nees, tuple(len(parts[each].stretches.start) for each in kept), source.rate,
-        _integration(parts[kept[0]].stretches), source.words, tuple(notes),
-    )  # fmt: skip
+        np.array(kept),
+        chosen,
+        triads,
+        nees,
+        tuple(len(parts[length].stretches.start) for length in kept),
+        source.rate,
+        _integration(parts[kept[0]].stretches),
+        source.words,
+        tuple(notes),
+    )
 
 
 def nees(
-    source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: float, multipliers: Mapping[str, float],
+    source: ModelledErrors | MeasuredErrors,
+    noise: SensorNoise,
+    length: float,
+    multipliers: Mapping[str, float],
     interval: float | None = None,
-) -> dict[str, float]:  # fmt: skip
+) -> dict[str, float]:
     """Return the mean NEES of ΔR, Δv and Δp over stretches of one length, each over its three degrees of freedom.
 
     **Arguments:** as of [`estimator_noise`]; `multipliers`: of N by triad, such as those that another motion gave;
@@ -538,6 +593,11 @@ class _Length(NamedTuple):
     block: NDArray[np.int64]
 
 
+def _squared(root: FloatArray) -> FloatArray:
+    """R Rᵀ (n, m, m) of roots R (n, m, p)."""
+    return root @ np.swapaxes(root, 1, 2)
+
+
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
@@ -547,8 +607,11 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
     if len(stretches.start) < _FEWEST:
         raise NotPossibleError(f"only {len(stretches.start)} stretches of {length:g} s without gaps are there.")
     interval = 1 / source.rate
-    flicker = {triad: _known_at_start(BiasInstability(noise[triad]["B"]).system(interval))
-               for triad in INERTIAL_QUANTITIES if np.any(noise[triad].get("B", 0.0))}  # fmt: skip
+    flicker = {
+        triad: _known_at_start(BiasInstability(noise[triad]["B"]).system(interval))
+        for triad in INERTIAL_QUANTITIES
+        if np.any(noise[triad].get("B", 0.0))
+    }
     modelled = isinstance(source, ModelledErrors)
     slopes = stamps = None
     if modelled:
@@ -559,7 +622,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
     samples = (stretches.rates, stretches.forces, stretches.held)
     white, walk, drift, moved, pushed = _covariances(samples, interval, flicker, slopes, stamps)
     white, walk = np.asarray(white), np.asarray(walk)
-    spread = {(triad, "B"): np.asarray(each) for triad, each in drift.items()}
+    spread = {(triad, "B"): np.asarray(covariance_of_drift) for triad, covariance_of_drift in drift.items()}
     for triad, columns in _COLUMNS.items():
         sizes = noise[triad]
         spread[triad, "N"] = np.einsum("njik,j->nik", white[:, columns], np.square(sizes["N"]))
@@ -570,12 +633,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
     longest = max(length, source.duration / _BLOCKS)
     block = (stretches.start / longest).astype(int)
     if not modelled:
-        errors, own = stretches.errors, stretches.own
-        assert errors is not None
-        moments = {"gyroscope": errors[:, :3], "accelerometer": own}
-        squares = {name: None if each is None else each[:, :, None] * each[:, None] for name, each in moments.items()}
-        return _Length(stretches, spread, squares, dict.fromkeys(squares), errors[:, :, None] * errors[:, None], None,
-                     {triad: {} for triad in _OWN}, block)  # fmt: skip
+        return _measured_part(stretches, spread, block)
     moved, pushed = np.asarray(moved), None if pushed is None else np.asarray(pushed)
     power = source.trajectory.excess_power({triad: noise[triad]["N"] for triad in INERTIAL_QUANTITIES})
     whole = 0.0 if pushed is None else pushed
@@ -591,24 +649,37 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
             parts["time stamps"] = pushed
         moment[triad] = np.sum(list(parts.values()), axis=0)[:, rows, rows]
         mine = np.array([owner == triad for owner in owners])
-        roots[triad] = (moved[..., mine] @ _root(covariance[np.ix_(mine, mine)]))[:, rows]
+        roots[triad] = (moved[..., mine] @ root_of(covariance[np.ix_(mine, mine)]))[:, rows]
         for kind in dict.fromkeys(kinds):
-            own = mine & np.array([each == kind for each in kinds])
-            if own.any() and kind != f"{triad} bias":
-                chosen = covariance[np.ix_(own, own)]
-                parts[kind] = np.einsum("nip,pq,njq->nij", moved[..., own], chosen, moved[..., own], optimize=True)
-        terms[triad] = {name: each[:, rows, rows] for name, each in parts.items()}
-    return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ _root(covariance), terms, block)
+            of_kind = mine & np.array([other == kind for other in kinds])
+            if of_kind.any() and kind != f"{triad} bias":
+                parts[kind] = _squared(moved[..., of_kind] @ root_of(covariance[np.ix_(of_kind, of_kind)]))
+        terms[triad] = {name: covariances[:, rows, rows] for name, covariances in parts.items()}
+    return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ root_of(covariance), terms, block)
 
 
-def _root(covariance: FloatArray) -> FloatArray:
-    values, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+def _measured_part(
+    stretches: Stretches, spread: dict[tuple[str, str], FloatArray], block: NDArray[np.int64]
+) -> _Length:
+    errors, velocity_errors = stretches.errors, stretches.velocity_errors
+    assert errors is not None
+    moments = {"gyroscope": errors[:, :3], "accelerometer": velocity_errors}
+    squares = {name: None if error is None else _squared(error[..., None]) for name, error in moments.items()}
+    return _Length(
+        stretches,
+        spread,
+        squares,
+        dict.fromkeys(squares),
+        _squared(errors[..., None]),
+        None,
+        {triad: {} for triad in _OWN},
+        block,
+    )
 
 
 def _known_at_start(system: Any) -> Any:
     """Return the process that starts from zero: the estimator's bias state holds what it was."""
-    return eqx.tree_at(lambda each: each.root, system, np.zeros_like(system.root))
+    return replace(system, root=np.zeros_like(system.root))
 
 
 def _stamp_errors(stretches: Stretches) -> FloatArray:
@@ -633,12 +704,12 @@ def _multiples(unit: FloatArray, moment: FloatArray) -> float:
 def _terms(part: _Length, triad: str) -> dict[str, float]:
     """Return what a triad's error is made of, each as a multiple of its white noise."""
     white = part.noise[triad, "white"][:, _OWN[triad], _OWN[triad]]
-    return {name: float(np.sqrt(_multiples(white, each))) for name, each in part.terms[triad].items()}
+    return {name: float(np.sqrt(_multiples(white, moment))) for name, moment in part.terms[triad].items()}
 
 
 def _multiplier(
     part: _Length, triad: str, walks: Mapping[str, float], turned: float, draws: int, rng: np.random.Generator
-) -> tuple[float, float, float] | None:  # fmt: skip
+) -> tuple[float, float, float] | None:
     """Return the multiplier of N and its 95 % interval; None where nothing measures the error.
 
     turned: the gyroscope's multiplier, in what the accelerometer's stands beside.
@@ -647,19 +718,24 @@ def _multiplier(
     if moment is None:
         return None
     white, known = part.noise[triad, "white"][:, rows, rows], walks[triad] ** 2 * part.noise[triad, "1"][:, rows, rows]
-    found = [_with_interval(white, known, moment, part.roots[triad], part.block, draws, rng)]
+    candidates = [_with_interval(white, known, moment, part.roots[triad], part.block, draws, rng)]
     if triad == "accelerometer":
         beside = turned**2 * part.noise["gyroscope", "white"] + walks["gyroscope"] ** 2 * part.noise["gyroscope", "1"]
         root = None if part.root is None else part.root[:, rows]
         known = known + beside[:, rows, rows]
-        found.append(_with_interval(white, known, part.whole[:, rows, rows], root, part.block, draws, rng))
-    return max(found)
+        candidates.append(_with_interval(white, known, part.whole[:, rows, rows], root, part.block, draws, rng))
+    return max(candidates)
 
 
 def _with_interval(
-    white: FloatArray, known: FloatArray, moment: FloatArray, root: FloatArray | None, block: NDArray[np.int64],
-    draws: int, rng: np.random.Generator,
-) -> tuple[float, float, float]:  # fmt: skip
+    white: FloatArray,
+    known: FloatArray,
+    moment: FloatArray,
+    root: FloatArray | None,
+    block: NDArray[np.int64],
+    draws: int,
+    rng: np.random.Generator,
+) -> tuple[float, float, float]:
     """Return m and its interval for which the NEES of an error is one, where m² white + known is assumed of it."""
     inverse = np.linalg.inv(np.linalg.cholesky(white))
     share, turn = np.linalg.eigh(inverse @ known @ np.swapaxes(inverse, 1, 2))
@@ -669,16 +745,16 @@ def _with_interval(
     if root is None:
         value = float(np.sqrt(_solved(square, share)))
         blocks = np.unique(block)
-        left = np.array([np.sqrt(_solved(square[block != each], share[block != each])) for each in blocks])
+        left = np.array([np.sqrt(_solved(square[block != omitted], share[block != omitted])) for omitted in blocks])
         left = np.log(np.maximum(left, 1e-3 * max(value, 1e-3)))
         count = len(blocks)
         sigma = float(np.sqrt((count - 1) / count * np.sum((left - left.mean()) ** 2)))
         wide = float(np.exp(min(scipy.special.stdtrit(count - 1, 0.975) * sigma, 50.0)))
         return value, value / wide, value * wide
-    reach = basis @ root
-    value = float(np.sqrt(_solved(square + np.sum(reach**2, axis=2), share)))
+    projected = basis @ root
+    value = float(np.sqrt(_solved(square + np.sum(projected**2, axis=2), share)))
     numbers = rng.standard_normal((draws, root.shape[2]))
-    drawn = square + np.einsum("nap,dp->dna", reach, numbers, optimize=True) ** 2
+    drawn = square + np.einsum("nap,dp->dna", projected, numbers, optimize=True) ** 2
     low, high = np.quantile(np.sqrt(_solved(drawn, share)), (0.025, 0.975))
     return value, float(low), float(high)
 
@@ -696,11 +772,19 @@ def _solved(square: FloatArray, share: FloatArray) -> FloatArray:
 
 def _nees(part: _Length, multipliers: Mapping[str, float], walks: Mapping[str, float]) -> dict[str, float]:
     """Return the mean NEES of each increment over its three degrees of freedom."""
-    assumed = np.sum([multipliers[triad] ** 2 * part.noise[triad, "white"] + walks[triad] ** 2 * part.noise[triad, "1"]
-                      for triad in INERTIAL_QUANTITIES], axis=0)  # fmt: skip
-    whole = part.whole if part.root is None else part.whole + part.root @ np.swapaxes(part.root, 1, 2)
-    return {name: _multiples(assumed[:, rows, rows], whole[:, rows, rows])
-            for name, rows in _ROWS.items() if whole.shape[1] >= rows.stop}  # fmt: skip
+    assumed = np.sum(
+        [
+            multipliers[triad] ** 2 * part.noise[triad, "white"] + walks[triad] ** 2 * part.noise[triad, "1"]
+            for triad in INERTIAL_QUANTITIES
+        ],
+        axis=0,
+    )
+    whole = part.whole if part.root is None else part.whole + _squared(part.root)
+    return {
+        name: _multiples(assumed[:, rows, rows], whole[:, rows, rows])
+        for name, rows in _ROWS.items()
+        if whole.shape[1] >= rows.stop
+    }
 
 
 def _integration(stretches: Stretches) -> float:

@@ -17,6 +17,7 @@ A step is written by component, so that a CPU computes draws and units side by s
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -54,7 +55,7 @@ class Navigation(NamedTuple):
     def at(cls, attitude, velocity, latitude: float, height: float, gravity: float) -> Navigation:
         """Return a start at a latitude (rad) and height (m) where gravity (m/s²) has been stated; longitude zero."""
         numbers = (latitude, 0.0, height, gravity - normal_gravity(jnp.sin(latitude) ** 2, height))
-        return cls(jnp.asarray(attitude), jnp.asarray(velocity), *(jnp.asarray(each, float) for each in numbers))
+        return cls(jnp.asarray(attitude), jnp.asarray(velocity), *(jnp.asarray(number, float) for number in numbers))
 
 
 def _radii(sine: Array, height: Array) -> tuple[Array, Array]:
@@ -90,7 +91,7 @@ def _add(sums: _Sums, rotation: list[Array], gained: list[Array], interval: Arra
 
 def _lagging(vector: list[Array], rate: list[Array], time: Array | float) -> list[Array]:
     """Return a vector as a frame sees it that has turned at a rate for some time, to first order."""
-    return [each - time * swept for each, swept in zip(vector, cross(rate, vector), strict=True)]
+    return [component - time * swept for component, swept in zip(vector, cross(rate, vector), strict=True)]
 
 
 def _step(state: Navigation, sums: _Sums) -> Navigation:
@@ -118,13 +119,17 @@ def _step(state: Navigation, sums: _Sums) -> Navigation:
     w, x, y, z = product(state.attitude, sums.rotation)
     w, x, y, z = turn([w, -x, -y, -z], turning)  # exp(−ζ) ⊗ q = (q* ⊗ exp(ζ))*
     return Navigation(
-        [w, -x, -y, -z], after, state.latitude + moved[1] / meridian, state.longitude + moved[0] / (across * cosine),
-        state.height + moved[2], state.anomaly,
-    )  # pyright: ignore[reportArgumentType] # fmt: skip
+        [w, -x, -y, -z],
+        after,
+        state.latitude + moved[1] / meridian,
+        state.longitude + moved[0] / (across * cosine),
+        state.height + moved[2],
+        state.anomaly,
+    )  # pyright: ignore[reportArgumentType]
 
 
 def _parts(array: Array) -> list[Array]:
-    return [array[..., place] for place in range(array.shape[-1])]
+    return [array[..., index] for index in range(array.shape[-1])]
 
 
 def _split(state: Navigation) -> Navigation:
@@ -155,7 +160,7 @@ def mechanise(
 
     def blocks(array):  # (..., S, 3) -> (S / every, every / together, together, ...) of each component
         moved = jnp.moveaxis(jnp.broadcast_to(array, (*lanes, samples, 3)), -2, 0)
-        return [each.reshape(-1, every // together, together, *lanes) for each in _parts(moved)]
+        return [component.reshape(-1, every // together, together, *lanes) for component in _parts(moved)]
 
     def add(sums, sample):
         return _add(sums, *sample), None
@@ -165,13 +170,19 @@ def mechanise(
 
     def block(state, part):
         state = jax.lax.scan(advance, state, part)[0]
-        length = jnp.sqrt(sum(each**2 for each in state.attitude))
-        state = state._replace(attitude=[each / length for each in state.attitude])
+        length = jnp.sqrt(sum(component**2 for component in state.attitude))
+        state = state._replace(attitude=[component / length for component in state.attitude])
         return state, state
 
+    return _scanned(
+        block, start, lanes, (blocks(rotation), blocks(gained), intervals.reshape(-1, every // together, together))
+    )
+
+
+def _scanned(advance: Callable, start: Navigation, lanes: tuple, parts: tuple) -> Navigation:
+    """Return the states after each of the parts, lanes first."""
     first = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, lanes), _split(start))
-    parts = blocks(rotation), blocks(gained), intervals.reshape(-1, every // together, together)
-    states = jax.lax.scan(block, first, parts)[1]
+    states = jax.lax.scan(advance, first, parts)[1]
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, len(lanes)), _joined(states))
 
 
@@ -197,10 +208,7 @@ def mechanise_increments(
         moved = jnp.moveaxis(array, -2, 0)
         return _parts(jnp.broadcast_to(moved, (len(moved), *lanes, array.shape[-1])))
 
-    first = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, lanes), _split(start))
-    stretches = parts(rotation), parts(velocity), parts(displacement), durations
-    states = jax.lax.scan(advance, first, stretches)[1]
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, len(lanes)), _joined(states))
+    return _scanned(advance, start, lanes, (parts(rotation), parts(velocity), parts(displacement), durations))
 
 
 def deviation(state: Navigation, reference: Navigation) -> Float[Array, "... 9"]:

@@ -33,11 +33,11 @@ def noise_covariance(
         if matrix is not None:
             error = matrix @ error @ matrix.T
             cross = jnp.einsum("ij,ajs->ais", matrix, cross)
-        seen = jnp.einsum("as,ast->at", system.output, inner)
+        with_output = jnp.einsum("as,ast->at", system.output, inner)
         mixed = jnp.einsum("ais,as,aj->ij", cross, system.output, push)
-        variance = jnp.einsum("at,at->a", seen, system.output) + jnp.sum(system.through**2, axis=-1)
+        variance = jnp.einsum("at,at->a", with_output, system.output) + jnp.sum(system.through**2, axis=-1)
         error = error + mixed + mixed.T + jnp.einsum("ai,a,aj->ij", push, variance, push)
-        onward = jnp.einsum("at,ast->as", seen, system.transition) + jnp.einsum(
+        onward = jnp.einsum("at,ast->as", with_output, system.transition) + jnp.einsum(
             "asm,am->as", system.drive, system.through
         )
         cross = jnp.einsum("ais,ats->ait", cross, system.transition) + push[:, :, None] * onward[:, None, :]

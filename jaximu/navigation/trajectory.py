@@ -72,8 +72,16 @@ class Trajectory:
     jitter: float = 0.0
 
     @classmethod
-    def of(cls, start: Navigation, stimulus: Stimulus, intervals: FloatArray, words: str,
-           notes: tuple[str, ...] = (), recorded: bool = False, jitter: float = 0.0) -> Trajectory:  # fmt: skip
+    def of(
+        cls,
+        start: Navigation,
+        stimulus: Stimulus,
+        intervals: FloatArray,
+        words: str,
+        notes: tuple[str, ...] = (),
+        recorded: bool = False,
+        jitter: float = 0.0,
+    ) -> Trajectory:
         """Cut a path to a whole number of reported times, a second or a twentieth of it apart.
 
         Raises `NotPossibleError` for one that is too short or too long.
@@ -97,6 +105,11 @@ class Trajectory:
         """The reported times (T,), s from the start."""
         return np.round(np.cumsum(self.intervals)[self.every - 1 :: self.every], 9)  # not 0.99…
 
+    @property
+    def interval(self) -> float:
+        """Mean interval of the samples, s."""
+        return float(np.mean(self.intervals))
+
     def excess_power(self, density: Mapping[str, FloatArray]) -> dict[str, float]:
         """Return by triad how much more power the samples have at half their rate than white noise of a density N has.
 
@@ -108,13 +121,13 @@ class Trajectory:
             return {}
         weight = np.hanning(_WINDOW) * np.where(np.arange(_WINDOW) % 2 == 0, 1.0, -1.0)
         known = (("gyroscope", self.stimulus.angular_rate), ("accelerometer", self.stimulus.specific_force))
-        found = {}
+        excess = {}
         for triad, values in known:
             whole = np.asarray(values)[: len(self.intervals) // _WINDOW * _WINDOW].reshape(-1, _WINDOW, 3)
-            seen = np.mean(np.einsum("k,nki->ni", weight, whole) ** 2) / np.sum(weight**2)
-            white = np.mean(np.square(density[triad])) / np.mean(self.intervals)
-            found[triad] = max(float(seen / white) - 1.0, 0.0)
-        return found
+            measured = np.mean(np.einsum("k,nki->ni", weight, whole) ** 2) / np.sum(weight**2)
+            white = np.mean(np.square(density[triad])) / self.interval
+            excess[triad] = max(float(measured / white) - 1.0, 0.0)
+        return excess
 
     def require_range(self, limits: Mapping[str, float]) -> None:
         """Raise `NotPossibleError` where the path leaves a sensor's range, by triad in m/s² and rad/s."""
@@ -123,7 +136,7 @@ class Trajectory:
             felt = np.asarray(self.stimulus.angular_rate if gyroscope else self.stimulus.specific_force)
             beyond = np.abs(felt) > limit
             if beyond.any():
-                row, axis = (int(each[0]) for each in np.nonzero(beyond))
+                row, axis = (int(index[0]) for index in np.nonzero(beyond))
                 factor, unit = (np.degrees(1.0), "°/s") if gyroscope else (1.0, "m/s²")
                 raise NotPossibleError(
                     f"the path leaves the {triad}'s range of ±{factor * limit:.4g} {unit}: {'xyz'[axis]} feels "
@@ -133,7 +146,7 @@ class Trajectory:
 
 
 def level_driving(
-    place: Place, duration: float = 600.0, temperature: float = REFERENCE_TEMPERATURE, rate: float = 100.0
+    site: Place, duration: float = 600.0, temperature: float = REFERENCE_TEMPERATURE, rate: float = 100.0
 ) -> Trajectory:
     """Return level driving: at rest for 5 s, in 10 s up to 15 m/s, and from 30 s on a turn of 90° every minute.
 
@@ -141,13 +154,13 @@ def level_driving(
     """
     time = (np.arange(round(duration * rate)) + 0.5) / rate
     turns = np.arange(_FIRST_TURN, duration, _TURN_EVERY)
-    latitude, gravity = np.radians(place.latitude), place.gravity.value
+    latitude, gravity = np.radians(site.latitude), site.gravity.value
     force, turned, attitude = _felt_on_the_road(time, turns, earth_rate(latitude), latitude, gravity)
     warm = np.full(len(time), float(temperature))
     stimulus = Stimulus(force, turned, time=time, temperature=warm, temperature_rate=0 * warm, attitude=attitude)
-    start = _start(np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]), place, place.gravity.value)
+    start = _start(np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]), site, site.gravity.value)
     words = (
-        f"{duration:g} s of level driving at {place.latitude:g}° latitude: at rest for {_REST:g} s, then up to "
+        f"{duration:g} s of level driving at {site.latitude:g}° latitude: at rest for {_REST:g} s, then up to "
         f"{_SPEED:g} m/s in {_RISE:g} s, a turn of 90° every {_TURN_EVERY:g} s from {_FIRST_TURN:g} s on"
     )
     return Trajectory.of(start, stimulus, np.full(len(time), 1 / rate), words)
@@ -179,39 +192,39 @@ def _felt_on_the_road(time, turns, earth, latitude, gravity):
     return jax.vmap(felt)(time)
 
 
-def _start(attitude: FloatArray, place: Place, gravity: float) -> Navigation:
-    return Navigation.at(attitude, np.zeros(3), np.radians(place.latitude), place.height, gravity)
+def _start(attitude: FloatArray, site: Place, gravity: float) -> Navigation:
+    return Navigation.at(attitude, np.zeros(3), np.radians(site.latitude), site.height, gravity)
 
 
 def of_specification(
-    specification: Specification, place: Place, duration: float | None = None
+    specification: Specification, site: Place, duration: float | None = None
 ) -> tuple[Trajectory, dict[str, float]]:
     """Return the motion of a specification's first unit, and the ranges that its clipping states, by triad in SI.
 
-    Its latitude and gravity hold where it states them, else those of `place`.
+    Its latitude and gravity hold where it states them, else those of `site`.
     """
     document = dict(specification.document)
     stated = dict(document.get("environment", {}))
-    place = replace(place, latitude=float(stated.get("latitude", place.latitude)))
-    environment = {"gravity": place.gravity.value} | stated | {"latitude": place.latitude}
+    site = replace(site, latitude=float(stated.get("latitude", site.latitude)))
+    environment = {"gravity": site.gravity.value} | stated | {"latitude": site.latitude}
     case = Specification(document | {"environment": environment}, specification.name).case(0)
     motion = case.plan.motion
     whole = motion.stimulus(case.rate)
     longest = motion.samples(case.rate)
     count = longest if duration is None else min(longest, round(duration * case.rate))
     stimulus = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], whole)
-    start = _start(np.asarray(motion.attitude[0]), place, float(motion.gravity))
+    start = _start(np.asarray(motion.attitude[0]), site, float(motion.gravity))
     limits = {}
     for artefact in case.artefacts:
         for name in ("accelerometer", "gyroscope"):
             if artefact.name == "clipping" and getattr(artefact, name) is not None:
                 scale = np.linalg.norm(np.asarray(case.imu.triads()[name].gain), axis=1)
                 limits[name] = float(getattr(artefact, name) / scale.max())
-    words = f"the motion of {Path(specification.name).name}, {count / case.rate:g} s at {place.latitude:g}° latitude"
+    words = f"the motion of {Path(specification.name).name}, {count / case.rate:g} s at {site.latitude:g}° latitude"
     return Trajectory.of(start, stimulus, np.full(count, 1 / case.rate), words), limits
 
 
-def of_recording(recording: Recording, calibration: Calibration, place: Place, duration: float = 60.0) -> Trajectory:
+def of_recording(recording: Recording, calibration: Calibration, site: Place, duration: float = 60.0) -> Trajectory:
     """Return a recorded motion as the calibrated unit felt it, from its first rest or its first attitude on.
 
     At rest the accelerometer tells the level, and what it reads is gravity; the gyroscope's mean there is taken off,
@@ -224,20 +237,19 @@ def of_recording(recording: Recording, calibration: Calibration, place: Place, d
     ready = compensate(calibration, recording)
     gyroscope, accelerometer = ready.gyroscope, ready.accelerometer
     assert gyroscope is not None
-    time = gyroscope.time
-    rate = gyroscope.values
-    force = np.stack([np.interp(time, accelerometer.time, each) for each in accelerometer.values.T], axis=1)
+    time, rate = gyroscope.time, gyroscope.values
+    force = np.stack([np.interp(time, accelerometer.time, column) for column in accelerometer.values.T], axis=1)
     notes: list[str] = []
     if recording.attitude is not None:
         first = float(recording.attitude.time[0])
-        attitude, gravity = recording.attitude.values[0], place.gravity.value
+        attitude, gravity = recording.attitude.values[0], site.gravity.value
         notes.append("the motion starts at the log's first attitude, and its velocity there is taken as zero.")
     else:
-        begin, end = _first_rest(time, force, rate, place.gravity.value, recording.name)
+        begin, end = _first_rest(time, force, rate, site.gravity.value, recording.name)
         first, resting = begin, (time >= begin) & (time <= min(end, begin + _LEVELLED))
         up = force[resting].mean(axis=0)
         attitude, gravity = attitude_of(up).as_quat(scalar_first=True), float(np.linalg.norm(up))
-        earth = earth_rate(np.radians(place.latitude))
+        earth = earth_rate(np.radians(site.latitude))
         rate = rate - rate[resting].mean(axis=0) + attitude_of(up).inv().apply(earth)
         notes.append(f"the motion starts at the log's first rest, {first:.1f} s in, levelled there; heading unknown.")
     kept = (time >= first) & (time < first + duration)
@@ -250,8 +262,9 @@ def of_recording(recording: Recording, calibration: Calibration, place: Place, d
     steps = np.diff(time[kept])
     bend = np.diff(steps[steps < 2.5 * np.median(steps)])  # of white jitter its variance is six times
     jitter = float(np.sqrt(np.mean(bend**2) / 6)) if len(bend) else 0.0
-    return Trajectory.of(_start(attitude, place, gravity), stimulus, np.diff(edges)[kept], words, tuple(notes), True,
-                         jitter)  # fmt: skip
+    return Trajectory.of(
+        _start(attitude, site, gravity), stimulus, np.diff(edges)[kept], words, tuple(notes), True, jitter
+    )
 
 
 def _first_rest(

@@ -46,11 +46,10 @@ residuals makes the fit count up the data's variance (its excess); W is that of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,12 +68,14 @@ from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
+from jaximu.planning.chunks import in_chunks
 from jaximu.planning.goals import goal_of, per_si, unit_of
 from jaximu.planning.setup_errors import (
     ErrorScheme,
     ErrorSource,
     Task,
     read_task,
+    scale_of,
     scheme_and_sources,
     task,
     with_effects,
@@ -165,52 +166,65 @@ class Budget(Document):
 
     def nonlinear(self) -> list[tuple[int, int]]:
         """Return (source, parameter) where the first order is off by more than 5 % of the total."""
-        found = (np.abs(self.off) > _OFF) & self.determined
-        return [(int(row), int(column)) for row, column in np.argwhere(found)]
+        wrong = (np.abs(self.off) > _OFF) & self.determined
+        return [(int(row), int(column)) for row, column in np.argwhere(wrong)]
 
     def order(self) -> list[int]:
         """Return the sources, dominant first: by their mean share of the parameters' variances."""
         share = self.sigma**2 / np.maximum(np.sum(self.sigma**2, axis=0), 1e-300)
         weight = share[:, self.determined].sum(axis=1)
-        return [int(place) for place in np.argsort(-weight, kind="stable")]
+        return [int(row) for row in np.argsort(-weight, kind="stable")]
 
     def document(self) -> dict[str, Any]:
         """Return the budget as the JSON document of schema `jaximu.budget/1`."""
         order, total, off = self.order(), self.total, self.nonlinear()
         parameters = []
-        for place, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
-            entry: dict[str, Any] = {"name": name, "unit": unit, "determined": bool(self.determined[place])}
-            if self.determined[place]:
-                ranked = sorted(order, key=lambda row: -self.sigma[row, place])
-                entry["sigma"] = float(total[place])
-                entry["contributions"] = {self.sources[row].name: float(self.sigma[row, place]) for row in ranked}
+        for index, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
+            entry: dict[str, Any] = {"name": name, "unit": unit, "determined": bool(self.determined[index])}
+            if self.determined[index]:
+                ranked = sorted(order, key=lambda row: -self.sigma[row, index])
+                entry["sigma"] = float(total[index])
+                entry["contributions"] = {self.sources[row].name: float(self.sigma[row, index]) for row in ranked}
                 entry["nonlinear"] = {
-                    self.sources[row].name: float(self.actual[row, place]) for row, column in off if column == place
+                    self.sources[row].name: float(self.actual[row, index]) for row, column in off if column == index
                 }
                 if self.check is not None:
-                    entry["monte_carlo"] = float(self.check.rms[place])
+                    entry["monte_carlo"] = float(self.check.rms[index])
             parameters.append(entry)
         return {
             "schema": SCHEMA,
             "source": self.source,
             "protocol": self.protocol,
             "sources": [
-                {"name": each.name, "words": each.words, "size": each.size, "sigma": each.value, "unit": each.unit}
-                for each in (self.sources[row] for row in order)
+                {
+                    "name": source.name,
+                    "words": source.words,
+                    "size": source.size,
+                    "sigma": source.value,
+                    "unit": source.unit,
+                }
+                for source in (self.sources[row] for row in order)
             ],
             "parameters": parameters,
             "goals": [
-                {"name": goal.name, "goal": goal.size, "unit": goal.unit, "reached": goal.reached, "worst": goal.worst,
-                 "alone": {need.sources[0]: need.times for need in goal.alone},
-                 "together": None if goal.together is None
-                 else {"sources": list(goal.together.sources), "times": goal.together.times}}
+                {
+                    "name": goal.name,
+                    "goal": goal.size,
+                    "unit": goal.unit,
+                    "reached": goal.reached,
+                    "worst": goal.worst,
+                    "alone": {need.sources[0]: need.times for need in goal.alone},
+                    "together": None
+                    if goal.together is None
+                    else {"sources": list(goal.together.sources), "times": goal.together.times},
+                }
                 for goal in self.goals
             ],
             "check": None if self.check is None else {"draws": self.check.draws, "failed": self.check.failed},
             "open": list(self.open),
             "notes": list(self.notes),
             "software": SOFTWARE,
-        }  # fmt: skip
+        }
 
 
 # --- computing --------------------------------------------------------------------------------------------------------
@@ -250,25 +264,41 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     errors = [_paired(source) for source in sources]
     means = _recorded(scheme, np.concatenate(errors))
     fixed = stations, start, parameters, excess
-    solved = scale * _chunks(lambda rows: stored.call(_lanes, "budget solutions", *fixed, rows), means)
+    solved = scale * in_chunks(lambda rows: stored.call(_lanes, "budget solutions", *fixed, rows), _CHUNK, means)
     solved -= np.concatenate(errors) @ truth.T
     parts = zip(sigma, errors, np.split(solved, len(errors)), strict=True)
-    actual = np.stack([np.sqrt(np.maximum(linear**2 + _mean_square(whole) - _mean_square(drawn @ slope.T), 0.0))
-                       for linear, drawn, whole in parts])  # fmt: skip
+    actual = np.stack(
+        [
+            np.sqrt(np.maximum(linear**2 + _mean_square(whole) - _mean_square(drawn @ slope.T), 0.0))
+            for linear, drawn, whole in parts
+        ]
+    )
 
-    known = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(names)) / TOLERANCE**2)
-    # what the data sheet's tolerance holds is as uncertain as the data sheet, which is no part of the budget
-    held = scale * np.linalg.norm(known, axis=1) / TOLERANCE
-    determined = (np.sqrt(np.diagonal(known)) <= UNDETERMINED) & (held <= _OFF * np.linalg.norm(sigma, axis=0))
     protocol = task.case.protocol
-    found = Budget(
-        task.name, "" if protocol is None else protocol.kind, start, names,
-        tuple(unit_of(name, start) for name in names), sources, sigma, actual,
-        determined, excess,
-        tuple(weak.text for weak in weak_directions(jacobian, names, np.asarray(parameters.size), start)[1]), (), notes,
-    )  # fmt: skip
-    found = replace(found, goals=tuple(_goal(found, what, size) for what, size in task.goals))
-    return replace(found, check=_check(task, found, scheme, per, truth, draws, seed)) if draws else found
+    result = Budget(
+        task.name,
+        "" if protocol is None else protocol.kind,
+        start,
+        names,
+        tuple(unit_of(name, start) for name in names),
+        sources,
+        sigma,
+        actual,
+        _determined(jacobian, scale, sigma),
+        excess,
+        tuple(weak.text for weak in weak_directions(jacobian, names, np.asarray(parameters.size), start)[1]),
+        (),
+        notes,
+    )
+    result = replace(result, goals=tuple(_goal(result, what, size) for what, size in task.goals))
+    return replace(result, check=_check(task, result, scheme, per, truth, draws, seed)) if draws else result
+
+
+def _determined(jacobian: FloatArray, scale: FloatArray, sigma: FloatArray) -> NDArray[np.bool_]:
+    """Which parameters (p,) the scheme determines: what the data sheet's tolerance holds is as uncertain as that."""
+    known = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(scale)) / TOLERANCE**2)
+    held = scale * np.linalg.norm(known, axis=1) / TOLERANCE
+    return (np.sqrt(np.diagonal(known)) <= UNDETERMINED) & (held <= _OFF * np.linalg.norm(sigma, axis=0))
 
 
 def _mean_square(values: FloatArray) -> FloatArray:
@@ -281,8 +311,8 @@ def _residual(unit: Imu, data) -> Array:
 
 def _solution(start: Imu, parameters: Parameters, stations: Stations, weights, means):
     """The fit's z, from the true parameters as zero, to mean outputs (2, S, 3)."""
-    seen = replace(stations, accelerometer_mean=means[0], gyroscope_mean=means[1])
-    problem = Problem(start, parameters, (seen, weights), _residual, tolerance=_LOOSE * TOLERANCE)
+    observed = replace(stations, accelerometer_mean=means[0], gyroscope_mean=means[1])
+    problem = Problem(start, parameters, (observed, weights), _residual, tolerance=_LOOSE * TOLERANCE)
     return solve(problem, jnp.zeros(len(parameters.index))).z
 
 
@@ -305,22 +335,12 @@ def _sensitivity(stations: Stations, start: Imu, parameters: Parameters, excess)
 
 def _lanes(stations: Stations, start: Imu, parameters: Parameters, excess, means):
     weights = station_weights(stations, excess)
-    return jax.lax.map(lambda each: _solution(start, parameters, stations, weights, each), means)
+    return jax.lax.map(lambda session: _solution(start, parameters, stations, weights, session), means)
 
 
 def _sessions(scheme: ErrorScheme, both):
     """Mean outputs at some errors, and their change along others: one compiled function for draws and derivatives."""
-    return jax.lax.map(lambda each: jnp.stack(jax.jvp(scheme.means, (each[0],), (each[1],))), both)
-
-
-def _chunks(function: Callable[[FloatArray], Any], values: FloatArray) -> FloatArray:
-    """Call a function of `_CHUNK` rows for all rows of values, the last chunk filled up with its last row."""
-    found = []
-    for first in range(0, len(values), _CHUNK):
-        part = values[first : first + _CHUNK]
-        padded = np.concatenate([part, np.repeat(part[-1:], _CHUNK - len(part), axis=0)])
-        found.append(np.asarray(function(padded))[: len(part)])
-    return np.concatenate(found)
+    return jax.lax.map(lambda pair: jnp.stack(jax.jvp(scheme.means, (pair[0],), (pair[1],))), both)
 
 
 def _paired(source: ErrorSource) -> FloatArray:
@@ -359,44 +379,44 @@ def _expected_excess(
 
 
 def _check(
-    task: Task, found: Budget, scheme: ErrorScheme, per: FloatArray, truth: FloatArray, draws: int, seed: int
+    task: Task, result: Budget, scheme: ErrorScheme, per: FloatArray, truth: FloatArray, draws: int, seed: int
 ) -> Trials:
     """Put sessions with all errors at once through `fit_turntable`, from the data sheet on."""
     rng = np.random.default_rng([seed, 1])
-    errors = np.sum([source.draw(rng, draws) for source in found.sources], axis=0)
-    unit = found.imu
-    places = [names_of(unit).index(name) for name in found.names]
+    errors = np.sum([source.draw(rng, draws) for source in result.sources], axis=0)
+    unit = result.imu
+    indices = [names_of(unit).index(name) for name in result.names]
 
     def sheet(triad: Triad) -> Triad:
-        gain = np.diag(np.linalg.norm(np.asarray(triad.gain), axis=1))
-        return eqx.tree_at(lambda t: (t.gain, t.bias), triad, (gain, np.zeros(3)))
+        gain = np.diag(scale_of(triad))
+        return replace(triad, gain=gain, bias=np.zeros(3))
 
     def many(leaf):
         return np.broadcast_to(np.asarray(leaf), (_CHUNK, *np.shape(leaf)))
 
     def fitted(means: FloatArray) -> FloatArray:
         """Errors of the parameters, and whether the fit went well, (n, p + 1)."""
-        sessions = eqx.tree_at(lambda each: (each.accelerometer_mean, each.gyroscope_mean),
-                               jax.tree.map(many, scheme.stations), (means[:, 0], means[:, 1]))  # fmt: skip
+        stations = jax.tree.map(many, scheme.stations)
+        sessions = replace(stations, accelerometer_mean=means[:, 0], gyroscope_mean=means[:, 1])
         fit = fit_turntable(jax.tree.map(many, start), sessions, task.fitted)
-        off = (np.asarray(fit.values) - flatten(unit)[places]) / per
+        off = (np.asarray(fit.values) - flatten(unit)[indices]) / per
         return np.column_stack([off, np.asarray(fit.converged & fit.finite, float)])
 
     start = Imu(sheet(unit.accelerometer), None if unit.gyroscope is None else sheet(unit.gyroscope), unit.setup)
-    *off, good = _chunks(fitted, _recorded(scheme, errors)).T
+    *off, good = in_chunks(fitted, _CHUNK, _recorded(scheme, errors)).T
     fine = good > 0
     return Trials(draws, np.sqrt(_mean_square((np.stack(off, axis=1) - errors @ truth.T)[fine])), int(np.sum(~fine)))
 
 
 def _truth(scheme: ErrorScheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
     """How the true values of the parameters (p) depend on the errors (n): an effect that is fitted is to follow."""
-    truth, place = np.zeros((len(names), sum(scheme.sizes))), sum(scheme.sizes[:2])
+    truth, first = np.zeros((len(names), sum(scheme.sizes))), sum(scheme.sizes[:2])
     for effect in scheme.effects:
         same = [key for key, fitted in unit.all_effects().items() if fitted.name == effect.name]
         for row, name in enumerate(names):
             if name.part == "coefficients" and (name.owner, name.effect) in same:
-                truth[row, place + name.axes[0]] = 1.0
-        place += effect.size
+                truth[row, first + name.axes[0]] = 1.0
+        first += effect.size
     return truth
 
 
@@ -415,7 +435,7 @@ def _reaction(scheme: ErrorScheme) -> FloatArray:
 
 
 def _simulated(scheme: ErrorScheme, both: FloatArray) -> FloatArray:
-    return _chunks(lambda rows: stored.call(_sessions, "budget sessions", scheme, rows), both)
+    return in_chunks(lambda rows: stored.call(_sessions, "budget sessions", scheme, rows), _CHUNK, both)
 
 
 def _added(errors: FloatArray) -> FloatArray:
@@ -426,29 +446,29 @@ def _added(errors: FloatArray) -> FloatArray:
 # --- parameters and goals ---------------------------------------------------------------------------------------------
 
 
-def _goal(found: Budget, what: str, text: str) -> Goal:
-    places, size = goal_of(what, text, found.names, found.imu, f"{found.source}: ")
-    unit = found.units[places[0]]
-    total = np.where(found.determined, found.total, np.inf)[places]
-    worst = places[int(np.argmax(total))]
-    names = tuple(found.names[place] for place in places)
+def _goal(result: Budget, what: str, text: str) -> Goal:
+    indices, size = goal_of(what, text, result.names, result.imu, f"{result.source}: ")
+    unit = result.units[indices[0]]
+    total = np.where(result.determined, result.total, np.inf)[indices]
+    worst = indices[int(np.argmax(total))]
+    names = tuple(result.names[index] for index in indices)
     reached = bool(np.max(total) <= size)
     alone, together = (), None
     if not reached and np.isfinite(total).all():
-        ranked = sorted(range(len(found.sources)), key=lambda row: -found.sigma[row, worst])
-        ranked = [row for row in ranked if np.any(found.sigma[row, places] > 1e-3 * size)]
-        alone = tuple(_need(found, (row,), places, size) for row in ranked)
-        several = (_need(found, tuple(ranked[: count + 1]), places, size) for count in range(1, len(ranked)))
+        ranked = sorted(range(len(result.sources)), key=lambda row: -result.sigma[row, worst])
+        ranked = [row for row in ranked if np.any(result.sigma[row, indices] > 1e-3 * size)]
+        alone = tuple(_need(result, (row,), indices, size) for row in ranked)
+        several = (_need(result, tuple(ranked[: count + 1]), indices, size) for count in range(1, len(ranked)))
         if all(need.times is None for need in alone):
             together = next((need for need in several if need.times is not None), None)
-    return Goal(what, text, size, unit, names, found.names[worst], reached, alone, together)
+    return Goal(what, text, size, unit, names, result.names[worst], reached, alone, together)
 
 
-def _need(found: Budget, rows: tuple[int, ...], places: Sequence[int], goal: float) -> Need:
+def _need(result: Budget, rows: tuple[int, ...], indices: Sequence[int], goal: float) -> Need:
     """How many times smaller these sources must become, all by the same factor, for every parameter to reach a goal."""
-    names = tuple(found.sources[row].name for row in rows)
-    mine = np.sum(found.sigma[list(rows)][:, places] ** 2, axis=0)
-    left = goal**2 - (found.total[places] ** 2 - mine)
+    names = tuple(result.sources[row].name for row in rows)
+    mine = np.sum(result.sigma[list(rows)][:, indices] ** 2, axis=0)
+    left = goal**2 - (result.total[indices] ** 2 - mine)
     if np.any(left <= 0):
         return Need(names, None)
     return Need(names, max(1.0, float(np.sqrt(np.max(mine / left)))))

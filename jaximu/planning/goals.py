@@ -7,12 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaximu.estimation.problem import Name
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, nearest
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.sensor import Imu
-from jaximu.planning.setup_errors import quantity
+from jaximu.planning.setup_errors import quantity, scale_of
 
-__all__ = ["goal_of", "group_of", "parse_goal", "per_si", "unit_of"]
+__all__ = ["goal_of", "goal_sigmas", "group_of", "parse_goal", "per_si", "unit_of"]
 
 
 def parse_goal(text: str) -> tuple[str, str]:
@@ -27,7 +28,7 @@ def per_si(name: Name, unit: Imu) -> float:
     """Return output units per SI unit of a gain's or a bias's axis; one for effects."""
     if name.effect is not None:
         return 1.0
-    return float(np.linalg.norm(np.asarray(unit.triads()[name.owner].gain)[name.axes[0]]))
+    return float(scale_of(unit.triads()[name.owner])[name.axes[0]])
 
 
 def group_of(name: Name) -> str:
@@ -49,16 +50,25 @@ def unit_of(name: Name, unit: Imu) -> str:
     return "1" if name.axes[0] == name.axes[1] else "rad"
 
 
+def goal_sigmas(what: str, text: str, names: Sequence[Name], unit: Imu, sigma: FloatArray) -> tuple[float, FloatArray]:
+    """Return the size of a goal, and the standard deviations of what it is for, both in its unit.
+
+    **Arguments:** `sigma` (p,): of the parameters, in output units; else, and errors, as of [`goal_of`].
+    """
+    indices, size = goal_of(what, text, names, unit)
+    return size, np.array([sigma[index] / per_si(names[index], unit) for index in indices])
+
+
 def goal_of(what: str, text: str, names: Sequence[Name], unit: Imu, where: str = "") -> tuple[list[int], float]:
     """Return which parameters a goal is for, as places in `names`, and its size in their unit.
 
     Raises `InputError`, beginning with `where`, where there is no such parameter or the size is none.
     """
-    places = [place for place, name in enumerate(names) if what in (name, group_of(name))]
-    if not places:
+    indices = [index for index, name in enumerate(names) if what in (name, group_of(name))]
+    if not indices:
         hint = nearest(what, [*dict.fromkeys(map(group_of, names)), *names])
         raise InputError(f"{where}there is no parameter {what!r} to set a goal for; {hint}")
-    size = quantity(text, unit_of(names[places[0]], unit), f"{where}goal {what}")
+    size = quantity(text, unit_of(names[indices[0]], unit), f"{where}goal {what}")
     if size == 0:
         raise InputError(f"{where}goal {what} must be greater than zero.")
-    return places, size
+    return indices, size

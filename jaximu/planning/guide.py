@@ -24,7 +24,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.model.sensor import Imu
-from jaximu.planning.goals import goal_of, parse_goal, per_si
+from jaximu.planning.chunks import in_chunks
+from jaximu.planning.goals import goal_of, goal_sigmas, parse_goal
 from jaximu.planning.information import Design, hand_held_information
 from jaximu.planning.optimisation import DesignQuestion
 from jaximu.planning.plan import EQUIPMENT, Known, question_of
@@ -105,20 +106,20 @@ class Guide:
     def update(self, recording: Recording) -> Moment:
         """Return where the capture stands. Raises `InputError` where a goal names no parameter of this unit."""
         try:
-            found = segment(recording, SegmentationOptions(fewest=1)).intervals
+            rests = segment(recording, SegmentationOptions(fewest=1)).intervals
         except NotPossibleError:
-            found = np.zeros((0, 2))
-        length = found[:, 1] - found[:, 0]
+            rests = np.zeros((0, 2))
+        length = rests[:, 1] - rests[:, 0]
         long = length >= self.rest
         now = recording.accelerometer.time[-1]
-        still = float(length[-1]) if len(found) and now - found[-1, 1] < _REACHED else 0.0
-        taken = found[long]
+        still = float(length[-1]) if len(rests) and now - rests[-1, 1] < _REACHED else 0.0
+        taken = rests[long]
         if len(taken) != len(self._seen) or np.any(np.abs(taken[:, 0] - self._seen[:, 0]) > _REACHED):
             self._seen = taken
             self._renew(recording)
-        short = float(length[-1]) if len(found) and not long[-1] and not still else 0.0
+        short = float(length[-1]) if len(rests) and not long[-1] and not still else 0.0
         goals = self._goals(recording)
-        done = all(each.reached for each in goals) if goals else len(taken) >= _USUAL
+        done = all(goal.reached for goal in goals) if goals else len(taken) >= _USUAL
         done = (done and self._calibration is not None) or len(taken) >= _MOST
         words = "" if self._next is None else box_words(self._next)
         return Moment(still, taken, short, self._next, words, tuple(goals), done, self._calibration)
@@ -144,10 +145,18 @@ class Guide:
         information = np.asarray(question.prior)
         if self._calibration is None:
             for before, after in pairwise(ups):
-                information = information + _told(question, before, after[None])[0]
-        told = _told(question, ups[-1], _BOX)
-        self._next = _BOX[int(np.argmin([self._left(question, information + each, up @ ups[-1])
-                                         for each, up in zip(told, _BOX, strict=True)]))]  # fmt: skip
+                information = information + _information(question, before, after[None])[0]
+        added = _information(question, ups[-1], _BOX)
+        self._next = _BOX[
+            int(
+                np.argmin(
+                    [
+                        self._left(question, information + more, up @ ups[-1])
+                        for more, up in zip(added, _BOX, strict=True)
+                    ]
+                )
+            )
+        ]
 
     def _ups(self, recording: Recording, known: Known) -> FloatArray:
         """Return the body's upward directions (P, 3) in the poses that count."""
@@ -163,45 +172,36 @@ class Guide:
             return np.inf
         if not self.goals:
             return -float(np.linalg.slogdet(information)[1])
-        covariance = np.linalg.inv(information) + np.outer(question.reach, question.reach)
+        covariance = np.linalg.inv(information) + np.outer(question.by_gravity, question.by_gravity)
         sigma = np.sqrt(np.diagonal(covariance)) * np.asarray(question.parameters.size)
-        over = []
+        total = 0.0
         for _, what, text in self.goals:
-            places, size = goal_of(what, text, question.parameters.names, question.imu)
-            names = [question.parameters.names[place] for place in places]
-            over += [sigma[place] / per_si(name, question.imu) / size
-                     for place, name in zip(places, names, strict=True)]  # fmt: skip
-        # the largest counts most, and where it cannot be helped at once, the others do
-        return float(np.log(np.sum(np.array(over) ** 4)))
+            size, now = goal_sigmas(what, text, question.parameters.names, question.imu, sigma)
+            total += np.sum((now / size) ** 4)  # the largest counts most; where it cannot be helped at once, the others
+        return float(np.log(total))
 
     def _goals(self, recording: Recording) -> list[GoalProgress]:
-        found, calibration = [], self._calibration
+        progress, calibration = [], self._calibration
         for text, what, size in self.goals:
             if calibration is None:
-                found.append(GoalProgress(text, 0.0, np.inf))
+                progress.append(GoalProgress(text, 0.0, np.inf))
                 continue
-            names, imu = calibration.names, calibration.imu
-            places, wanted = goal_of(what, size, names, imu)
             sigma = np.sqrt(np.diagonal(calibration.covariance))
-            found.append(GoalProgress(text, wanted, max(float(sigma[k]) / per_si(names[k], imu) for k in places)))
-        return found
+            wanted, now = goal_sigmas(what, size, calibration.names, calibration.imu, sigma)
+            progress.append(GoalProgress(text, wanted, float(now.max())))
+        return progress
 
 
-def _told(question: DesignQuestion, before: FloatArray, after: FloatArray) -> FloatArray:
+def _information(question: DesignQuestion, before: FloatArray, after: FloatArray) -> FloatArray:
     """Return the information (n, p, p) of a rest in each direction `after` (n, 3) and of the turn to it."""
-    pairs = np.array([_turned(before, each) for each in _padded(after)])
+    pairs = np.array([_turned(before, direction) for direction in after])
 
     def one(question, attitude):
         design = Design(attitude, attitude[:0], attitude[:0, 0])
         return hand_held_information(question.imu, question.parameters, design, question.accuracy, question.gravity)
 
     every = jax.vmap(one, (None, 0))
-    return stored.call(every, f"{question.key} guide", question, pairs)[: len(after)]
-
-
-def _padded(after: FloatArray) -> FloatArray:
-    """Return directions filled up to as many as a box has: one shape is compiled."""
-    return np.concatenate([after, np.repeat(after[-1:], len(_BOX) - len(after), axis=0)])
+    return in_chunks(lambda pairs: stored.call(every, f"{question.key} guide", question, pairs), len(_BOX), pairs)
 
 
 def _turned(before: FloatArray, after: FloatArray) -> FloatArray:
@@ -212,5 +212,5 @@ def _turned(before: FloatArray, after: FloatArray) -> FloatArray:
     axis = cross / size if size > 1e-9 else np.roll(before, 1)
     # the body turns by −angle about this axis for the level frame's up to come from `before` to `after`
     step = Rotation.from_rotvec(-np.arctan2(size, cosine) * axis)
-    pair = np.array([each.as_quat(scalar_first=True) for each in (first, first * step)])
+    pair = np.array([rotation.as_quat(scalar_first=True) for rotation in (first, first * step)])
     return pair * [[1.0], [1.0 if pair[0] @ pair[1] >= 0 else -1.0]]

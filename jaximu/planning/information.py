@@ -8,11 +8,13 @@ and the conditions' covariance (`jaximu.data.poses_covariance`) takes the place 
 those of `jaximu.data.attitude`, against the attitude it reports. Nothing of the physics is written here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
@@ -20,18 +22,31 @@ from jaxtyping import Float
 from jaximu.data.attitude import INTERVALS, WINDOW, Intervals, evaluated, shared_ends
 from jaximu.data.poses import condense
 from jaximu.data.poses_covariance import condition_covariance
-from jaximu.estimation.problem import Parameters
-from jaximu.ground.array_types import Array
+from jaximu.estimation.problem import Name, Parameters
+from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.ground.stored import compiled
 from jaximu.model.mounting import Mounting
-from jaximu.model.sensor import Imu, Triad
+from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Poses, Turns
 from jaximu.simulation.protocols.motion import smooth_course
 
-__all__ = ["COARSE", "RAMP", "STIMULI", "Accuracy", "Design", "hand_held_information", "robot_information",
-           "table_information", "turn_vectors", "up_vectors"]  # fmt: skip
+__all__ = [
+    "COARSE",
+    "RAMP",
+    "STIMULI",
+    "Accuracy",
+    "Design",
+    "gravity_sensitivity",
+    "hand_held_information",
+    "robot_information",
+    "root_of",
+    "table_information",
+    "turn_vectors",
+    "up_vectors",
+]
 
 STIMULI = ("specific_force", "angular_rate", "attitude")
 """What a design tells of the stimulus: effects that need no more can be among the parameters."""
@@ -98,11 +113,7 @@ def _plain(imu: Imu) -> Imu:
     """The unit without effects; with a perfect gyroscope where there is none, which no condition then looks at."""
     gyroscope = Imu.nominal().gyroscope if imu.gyroscope is None else imu.gyroscope
     assert gyroscope is not None
-
-    def plain(triad: Triad) -> Triad:
-        return eqx.tree_at(lambda t: t.effects, triad, ())
-
-    return Imu(plain(imu.accelerometer), plain(gyroscope))
+    return Imu(replace(imu.accelerometer, effects=()), replace(gyroscope, effects=()))
 
 
 def _observed(imu: Imu, attitude, accuracy: Accuracy, gravity) -> Observations:
@@ -125,10 +136,15 @@ def _observed(imu: Imu, attitude, accuracy: Accuracy, gravity) -> Observations:
 
     constant = jnp.zeros(count)
     poses = Poses(
-        accelerometer, same(accuracy.accelerometer),
-        jnp.zeros((count, 3)) if gyroscope is None else gyroscope, same(accuracy.gyroscope),
-        constant, constant, constant, jnp.ones(count, bool),
-    )  # fmt: skip
+        accelerometer,
+        same(accuracy.accelerometer),
+        jnp.zeros((count, 3)) if gyroscope is None else gyroscope,
+        same(accuracy.gyroscope),
+        constant,
+        constant,
+        constant,
+        jnp.ones(count, bool),
+    )
     turns = Turns(
         jnp.zeros((*steps, 3)) if turning is None else turning,
         jnp.full(steps, 1.0) * accuracy.turn / SAMPLES,
@@ -139,8 +155,22 @@ def _observed(imu: Imu, attitude, accuracy: Accuracy, gravity) -> Observations:
     return Observations(poses, turns, jnp.asarray(gravity))
 
 
-def _whiten(covariance, jacobian):
-    return solve_triangular(jnp.linalg.cholesky(covariance), jacobian, lower=True)
+def _information(covariance, jacobian):
+    """JᵀC⁻¹J (p, p), summed over leading axes."""
+    whitened = solve_triangular(jnp.linalg.cholesky(covariance), jacobian, lower=True).reshape(-1, jacobian.shape[-1])
+    return whitened.T @ whitened
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """Return a root R (..., n, n), R Rᵀ = C, of covariances or of information; what rounding makes negative is zero."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
+def gravity_sensitivity(imu: Imu, names: Sequence[Name], gravity: LocalGravity) -> FloatArray:
+    """Return what one sigma of gravity does to parameters (p,): the accelerometer's gain is in proportion to 1/g."""
+    gain = np.asarray(imu.accelerometer.gain) * gravity.sigma / gravity.value
+    return np.array([-gain[name.axes] if name.startswith("accelerometer.gain") else 0.0 for name in names])
 
 
 def hand_held_information(
@@ -164,8 +194,7 @@ def hand_held_information(
     jacobian = jax.jacfwd(found)(jnp.zeros(len(parameters.names)))
     observed = _observed(unit, design.attitude, accuracy, gravity)
     covariance = condition_covariance(unit, observed).dense().total(accuracy.excess)[:conditions, :conditions]
-    whitened = _whiten(covariance, jacobian)
-    return whitened.T @ whitened
+    return _information(covariance, jacobian)
 
 
 def table_information(
@@ -186,8 +215,8 @@ def table_information(
 
     def outputs(z):
         unit = parameters.model(imu, z)
-        found = unit.respond(at_rest)
-        return found if unit.gyroscope is None else (*found, jnp.mean(unit.respond(moving)[1], axis=1))  # pyright: ignore[reportArgumentType]
+        means = unit.respond(at_rest)
+        return means if unit.gyroscope is None else (*means, jnp.mean(unit.respond(moving)[1], axis=1))  # pyright: ignore[reportArgumentType]
 
     covariances = (
         (1 + accuracy.excess[0]) * accuracy.accelerometer,
@@ -198,8 +227,7 @@ def table_information(
     information = jnp.zeros((len(zero), len(zero)))
     for jacobian, covariance in zip(jax.jacfwd(outputs)(zero), covariances, strict=False):
         if jacobian is not None:
-            whitened = _whiten(jnp.broadcast_to(covariance, (len(jacobian), 3, 3)), jacobian).reshape(-1, len(zero))
-            information += whitened.T @ whitened
+            information += _information(jnp.broadcast_to(covariance, (len(jacobian), 3, 3)), jacobian)
     return information
 
 
@@ -210,9 +238,9 @@ def _course(design: Design, accuracy: Accuracy) -> tuple[Callable[[Array], Array
     still = jnp.concatenate([vectors, jnp.zeros((1, 3))])
 
     def at(time):
-        place = jnp.clip(jnp.floor(time / (rest + turn)).astype(int), 0, count - 1)
-        done = smooth_course(jnp.clip((time - place * (rest + turn) - rest) / turn, 0.0, 1.0), RAMP)
-        return multiply(design.attitude[place], exponential(done[..., None] * still[place]))
+        leg = jnp.clip(jnp.floor(time / (rest + turn)).astype(int), 0, count - 1)
+        done = smooth_course(jnp.clip((time - leg * (rest + turn) - rest) / turn, 0.0, 1.0), RAMP)
+        return multiply(design.attitude[leg], exponential(done[..., None] * still[leg]))
 
     return at, count * rest + (count - 1) * turn
 
@@ -230,20 +258,29 @@ def _reported(imu: Imu, design: Design, accuracy: Accuracy, gravity, count: int)
     slope = jnp.gradient(turning, axis=0) / step
     stamp = edges[:-1:_SPLIT] + step / 2
     return Intervals(
-        turning, slope, jnp.gradient(slope, axis=0) / step, force, edges[:-1], edges[1:], stamp, at(stamp),
-        jnp.zeros((count, 3)), jnp.ones(count, bool), jnp.asarray(gravity),
-    )  # fmt: skip
-
-
-def _grouped(count: int, group: int) -> int:
-    """The next lower number of intervals that makes whole windows."""
-    return count // group * group
+        turning,
+        slope,
+        jnp.gradient(slope, axis=0) / step,
+        force,
+        edges[:-1],
+        edges[1:],
+        stamp,
+        at(stamp),
+        jnp.zeros((count, 3)),
+        jnp.ones(count, bool),
+        jnp.asarray(gravity),
+    )
 
 
 def robot_information(
-    imu: Imu, parameters: Parameters, design: Design, accuracy: Accuracy, gravity: Float[Array, ""],
-    count: int = INTERVALS, duration: float = 60.0,
-) -> Float[Array, "p p"]:  # fmt: skip
+    imu: Imu,
+    parameters: Parameters,
+    design: Design,
+    accuracy: Accuracy,
+    gravity: Float[Array, ""],
+    count: int = INTERVALS,
+    duration: float = 60.0,
+) -> Float[Array, "p p"]:
     """Return the information about parameters in typical sizes, from a robot's rests and the turns between them.
 
     The attitude is reported throughout, with white errors from stamp to stamp; how the unit is mounted on the robot,
@@ -257,9 +294,10 @@ def robot_information(
     """
     unit = _plain(imu)
     group = max(1, round(WINDOW * count / duration))
-    count = _grouped(count, group)
-    place = jnp.clip(_SPLIT * jnp.arange(count)[:, None] + jnp.arange(-_BESIDE, _SPLIT + 1 + _BESIDE), 0,
-                     _SPLIT * count)  # fmt: skip
+    count = count // group * group  # of whole windows
+    samples = jnp.clip(
+        _SPLIT * jnp.arange(count)[:, None] + jnp.arange(-_BESIDE, _SPLIT + 1 + _BESIDE), 0, _SPLIT * count
+    )
     mounting = Mounting.effects(rotation=0.0, delay=0.0, tilt=0.0, filter_variance=0.0)
     sizes, effects_of = ravel_pytree([effect.typical_sizes(1.0) for effect in mounting])
     known = len(parameters.names)
@@ -267,7 +305,7 @@ def robot_information(
     def found(z):
         reported = _reported(parameters.model(imu, z[:known]), design, accuracy, gravity, count)
         conditions, spread, length, leaning, _ = evaluated(
-            unit.with_effects(*effects_of(sizes * z[known:])), reported, None, place, accuracy.density, group
+            unit.with_effects(*effects_of(sizes * z[known:])), reported, None, samples, accuracy.density, group
         )
         return conditions(unit), (spread, length, leaning, conditions.target)
 
@@ -288,7 +326,6 @@ def robot_information(
     noise = ends @ ends.T
     for rows, white in ((rotation, (1 + accuracy.excess[1]) * spread), (force, felt)):
         noise = noise.at[rows[:, :, None], rows[:, None, :]].add(white)
-    white = _whiten(noise, jacobian)
-    whole = white.T @ white
+    whole = _information(noise, jacobian)
     beside = whole[known:, known:] + jnp.eye(size - known) / _FREE**2
     return whole[:known, :known] - whole[:known, known:] @ jnp.linalg.solve(beside, whole[known:, :known])

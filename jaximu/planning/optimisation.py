@@ -18,9 +18,10 @@ from jaxtyping import Float
 from scipy.optimize import minimize
 
 from jaximu.data.attitude import INTERVALS
-from jaximu.estimation.problem import Parameters
+from jaximu.estimation.problem import Name, Parameters
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.errors import InputError, nearest
 from jaximu.ground.rotation import exponential, multiply
 from jaximu.model.sensor import Imu
 from jaximu.planning.information import (
@@ -34,7 +35,18 @@ from jaximu.planning.information import (
     up_vectors,
 )
 
-__all__ = ["CRITERIA", "FEW_STEPS", "STEPS", "DesignQuestion", "Step", "covariance", "objective", "optimise", "score"]
+__all__ = [
+    "CRITERIA",
+    "FEW_STEPS",
+    "STEPS",
+    "DesignCovariance",
+    "DesignQuestion",
+    "Step",
+    "covariance",
+    "objective",
+    "optimise",
+    "score",
+]
 
 
 CRITERIA: dict[str, Callable[[Array, Array], Array]] = {
@@ -44,6 +56,21 @@ CRITERIA: dict[str, Callable[[Array, Array], Array]] = {
 }
 """Logarithms of a standard deviation: the geometric mean along the axes of the uncertainty's ellipsoid, the root mean
 square of all parameters (both in typical sizes), that of one combination of parameters."""
+
+
+def criterion_of(criterion: str, parameter: str | None, names: Sequence[Name]) -> tuple[str, FloatArray]:
+    """Return the key of a criterion in `CRITERIA`, and the weights (p,) that it looks at.
+
+    Raises `InputError` for one that is not known, or for a `parameter` that is none of the names.
+    """
+    if parameter is None:
+        if criterion not in ("D", "A"):
+            raise InputError(f"the criterion {criterion!r} is not known; use D, A, or name one parameter.")
+        return criterion, np.zeros(len(names))
+    if parameter not in names:
+        raise InputError(f"there is no parameter {parameter!r} in this plan; {nearest(parameter, names)}")
+    return "parameter", np.array([float(name == parameter) for name in names])
+
 
 STEPS, FEW_STEPS = (40, 200), (15, 40)
 """Steps of every start and of the best; and where each takes long."""
@@ -55,7 +82,7 @@ class DesignQuestion(eqx.Module):
     """What a design is asked for, all but the design.
 
     imu, parameters: what may be unknown, effects included. prior: information about the parameters (in typical sizes)
-    that is there already. reach: what one sigma of gravity does to them, which no pose can tell. weights: the
+    that is there already. by_gravity: what one sigma of gravity does to them, which no pose can tell. weights: the
     combination of parameters that the criterion "parameter" looks at. turn_limit: rad, the largest turn by hand or of a
     robot. duration: s, of a robot's motion; None: it is none. coarse: whether its motion is cut into few intervals.
     """
@@ -63,7 +90,7 @@ class DesignQuestion(eqx.Module):
     imu: Imu
     parameters: Parameters
     prior: Float[Array, "p p"]
-    reach: Float[Array, " p"]
+    by_gravity: Float[Array, " p"]
     weights: Float[Array, " p"]
     accuracy: Accuracy
     gravity: Float[Array, ""]
@@ -106,18 +133,18 @@ def _covariance(question: DesignQuestion, design: Design) -> DesignCovariance:
         information = robot_information(*known, COARSE if question.coarse else INTERVALS, question.duration)
     else:
         information = (hand_held_information if question.by_hand else table_information)(*known)
-    total = jnp.linalg.inv(question.prior + information) + jnp.outer(question.reach, question.reach)
+    total = jnp.linalg.inv(question.prior + information) + jnp.outer(question.by_gravity, question.by_gravity)
     return DesignCovariance(total, information)
 
 
 def _limits(question: DesignQuestion, design: Design) -> Float[Array, " c"]:
     """What the equipment cannot do, as numbers that must not be negative."""
-    found = []
+    limits = []
     if question.chained:
-        found.append(1 - jnp.sum(turn_vectors(design.attitude) ** 2, axis=-1) / question.turn_limit**2)
+        limits.append(1 - jnp.sum(turn_vectors(design.attitude) ** 2, axis=-1) / question.turn_limit**2)
     if question.z_up:
-        found += [up_vectors(attitude)[:, 2] for attitude in (design.attitude, design.axis)]
-    return jnp.concatenate(found) if found else jnp.zeros(0)
+        limits += [up_vectors(attitude)[:, 2] for attitude in (design.attitude, design.axis)]
+    return jnp.concatenate(limits) if limits else jnp.zeros(0)
 
 
 def _moved(design: Design, step: Step) -> Design:
@@ -155,12 +182,12 @@ def _limited(question: DesignQuestion, design: Design, step: Step) -> tuple[Floa
     """The limits (c,) after a step, and their derivatives (c, n) by all its numbers."""
 
     def of(question, design, step):
-        found = _limits(question, _moved(design, step))
-        return found, found
+        limits = _limits(question, _moved(design, step))
+        return limits, limits
 
     slopes = jax.jacrev(of, argnums=2, has_aux=True)
     by_step, left = stored.call(slopes, f"{question.key} limits", question, design, step)
-    return left, np.concatenate([each.reshape(len(left), -1) for each in by_step], axis=1)
+    return left, np.concatenate([slope.reshape(len(left), -1) for slope in by_step], axis=1)
 
 
 def _descend(question: DesignQuestion, design: Design, fastest: float, iterations: int) -> tuple[float, Design]:
@@ -174,7 +201,7 @@ def _descend(question: DesignQuestion, design: Design, fastest: float, iteration
 
     def evaluate(vector):
         value, gradient = objective(question, design, step(vector))
-        return value, np.concatenate([np.ravel(each) for each in gradient])
+        return value, np.concatenate([np.ravel(part) for part in gradient])
 
     start = np.concatenate([np.zeros(ends[1]), design.rate])
     bounds = [(None, None)] * ends[1] + [(-fastest, fastest)] * turns
@@ -182,15 +209,25 @@ def _descend(question: DesignQuestion, design: Design, fastest: float, iteration
     if question.chained or question.z_up:
         known = lru_cache(maxsize=1)(lambda key: _limited(question, design, step(np.frombuffer(key))))
         limits = [{"type": "ineq", "fun": lambda x: known(x.tobytes())[0], "jac": lambda x: known(x.tobytes())[1]}]
-    found = minimize(evaluate, start, jac=True, method="SLSQP", bounds=bounds, constraints=limits,
-                     options={"maxiter": iterations, "ftol": _CLOSE})  # fmt: skip
-    return float(found.fun), stored.call(_moved, "plan moved", design, step(found.x))
+    solution = minimize(
+        evaluate,
+        start,
+        jac=True,
+        method="SLSQP",
+        bounds=bounds,
+        constraints=limits,
+        options={"maxiter": iterations, "ftol": _CLOSE},
+    )
+    return float(solution.fun), stored.call(_moved, "plan moved", design, step(solution.x))
 
 
 def optimise(
-    question: DesignQuestion, starts: Sequence[Design], fastest: float, report: Callable[[str], None] = lambda _: None,
+    question: DesignQuestion,
+    starts: Sequence[Design],
+    fastest: float,
+    report: Callable[[str], None] = lambda _: None,
     steps: tuple[int, int] = STEPS,
-) -> Design:  # fmt: skip
+) -> Design:
     """Return the best design that is reached from the starts.
 
     **Arguments:** `starts`: designs (NumPy) with the same numbers of poses and turns, none at a saddle such as a rate

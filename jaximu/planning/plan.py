@@ -16,13 +16,31 @@ from jaximu.estimation.problem import TOLERANCE, Name, Parameters, names_of, wit
 from jaximu.estimation.uncertainty import WeakDirection, weak_directions
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
-from jaximu.ground.errors import InputError, nearest
+from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
-from jaximu.planning.information import COARSE, RAMP, STIMULI, Accuracy, Design, turn_vectors
-from jaximu.planning.optimisation import CRITERIA, FEW_STEPS, STEPS, DesignQuestion, covariance, optimise, score
+from jaximu.planning.information import (
+    COARSE,
+    RAMP,
+    STIMULI,
+    Accuracy,
+    Design,
+    gravity_sensitivity,
+    root_of,
+    turn_vectors,
+)
+from jaximu.planning.optimisation import (
+    FEW_STEPS,
+    STEPS,
+    DesignCovariance,
+    DesignQuestion,
+    covariance,
+    criterion_of,
+    optimise,
+    score,
+)
 from jaximu.planning.poses import (
     attitude_words,
     first_heading,
@@ -38,11 +56,12 @@ from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specific
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.positions import directions, spiral
 
-__all__ = ["EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose", "question_of"]
+__all__ = ["AS_GOOD", "EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose", "question_of"]
 
 SCHEMA = "jaximu.plan/1"
 _STARTS, _FEW_STARTS = 10, 4
-_AS_GOOD = 1.001  # a simpler scheme is taken where the best is better by no more than this
+AS_GOOD = 1.001
+"""A well-known scheme is proposed where the best is better by no more than this."""
 _MOUNTING = TOLERANCE * 0.1
 """How far (rad) a table's frame may lie from that of a calibration by hand: as far as a misalignment may."""
 
@@ -117,20 +136,22 @@ class Known:
     @classmethod
     def from_calibration(cls, calibration: Calibration, source: str = "the calibration") -> Known:
         """Return what a calibration knows; its noise too where the recording is at hand (not from a file)."""
-        found = cls(calibration.imu, calibration.names, calibration.covariance, calibration.gravity, source=source)
+        known = cls(calibration.imu, calibration.names, calibration.covariance, calibration.gravity, source=source)
         observations = calibration.observations
         if observations is None:
-            return replace(found, excess=_left_over(calibration))
+            return replace(known, excess=_left_over(calibration))
         poses, turns = observations.poses, observations.turns
         real, turned = np.asarray(poses.mask), np.asarray(turns.mask)
         rest = (np.asarray(poses.stop) - np.asarray(poses.start))[real]
-        means = [np.asarray(each)[real] for each in (poses.accelerometer_covariance, poses.gyroscope_covariance)]
+        means = [
+            np.asarray(covariance)[real] for covariance in (poses.accelerometer_covariance, poses.gyroscope_covariance)
+        ]
         density = np.mean(means[0] * rest[:, None, None], axis=0)
         # variances as traces: the next rests and turns have other durations, their excess is the same
         excess = calibration.excess
         duration = float(np.sum(np.asarray(turns.interval)[turned], axis=1).mean()) if turned.any() else 0.0
         return replace(
-            found,
+            known,
             accelerometer_noise=density,
             gyroscope_noise=np.asarray(turns.noise) if "turns" in excess else None,
             excess=(
@@ -144,11 +165,15 @@ class Known:
     def from_specification(cls, specification: Specification) -> Known:
         """Return the first unit of a specification as its data sheet, with its white noise; nothing calibrated yet."""
         case = specification.case(0)
-        noise = {name: _in_output(triad, np.diag(white)) for name, triad in case.imu.triads().items()
-                 if (white := white_density(case, name)) is not None}  # fmt: skip
+        noise = {
+            name: _in_output(triad, np.diag(white))
+            for name, triad in case.imu.triads().items()
+            if (white := white_density(case, name)) is not None
+        }
         gravity = LocalGravity(float(case.plan.motion.gravity), 0.0)
-        return cls(case.imu, (), None, gravity, noise.get("accelerometer"), noise.get("gyroscope"),
-                   source=specification.name)  # fmt: skip
+        return cls(
+            case.imu, (), None, gravity, noise.get("accelerometer"), noise.get("gyroscope"), source=specification.name
+        )
 
 
 def _left_over(calibration: Calibration) -> tuple[float, float, float]:
@@ -241,11 +266,15 @@ class Proposal(Document):
         """
         lines, now, setting = ["start [s],stop [s],kind,x,y,z,angle [deg],heading [deg]"], 0.0, self.equipment.setting
         robot = self.equipment.chained and not self.equipment.by_hand
-        entries = [("pose", pose.up, 0.0, self.equipment.rest, heading_of(pose.attitude) if robot else 0.0)
-                   for pose in self.poses]  # fmt: skip
+        entries = [
+            ("pose", pose.up, 0.0, self.equipment.rest, heading_of(pose.attitude) if robot else 0.0)
+            for pose in self.poses
+        ]
         turns = [("turn", turn.axis, np.degrees(turn.angle), self.equipment.turn, 0.0) for turn in self.turns]
         if robot:
-            entries = [each for pair in zip(entries, [*turns, None], strict=True) for each in pair if each is not None]
+            entries = [
+                entry for pair in zip(entries, [*turns, None], strict=True) for entry in pair if entry is not None
+            ]
         else:
             entries += turns
         for kind, vector, angle, duration, heading in entries:
@@ -264,20 +293,37 @@ class Proposal(Document):
             "rest": self.equipment.rest,
             "turn": self.equipment.turn,
             "accuracy": None if self.equipment.accuracy is None else {"value": self.equipment.accuracy, "unit": "deg"},
-            "poses": [{"up": pose.up.tolist(), "attitude": pose.attitude.tolist(), "words": pose.words}
-                      for pose in self.poses],
-            "turns": [{"axis": turn.axis.tolist(), "angle": float(np.degrees(turn.angle)), "angle_unit": "deg",
-                       "rate": float(np.degrees(turn.rate)), "rate_unit": "deg/s", "words": turn.words}
-                      for turn in self.turns],
-            "criterion": {"name": self.criterion, "before": self.criterion_before, "after": self.criterion_after,
-                          "gain": self.gain, "rounding_loss": self.rounding_loss},
+            "poses": [
+                {"up": pose.up.tolist(), "attitude": pose.attitude.tolist(), "words": pose.words} for pose in self.poses
+            ],
+            "turns": [
+                {
+                    "axis": turn.axis.tolist(),
+                    "angle": float(np.degrees(turn.angle)),
+                    "angle_unit": "deg",
+                    "rate": float(np.degrees(turn.rate)),
+                    "rate_unit": "deg/s",
+                    "words": turn.words,
+                }
+                for turn in self.turns
+            ],
+            "criterion": {
+                "name": self.criterion,
+                "before": self.criterion_before,
+                "after": self.criterion_after,
+                "gain": self.gain,
+                "rounding_loss": self.rounding_loss,
+            },
             "sigma": {name: {"before": before, "after": after} for name, before, after in sigmas},
             "rank": self.rank,
             "parameters": len(self.names),
-            "open": [{"text": each.text, "sigma": each.sigma, "determined": each.determined} for each in self.open],
+            "open": [
+                {"text": direction.text, "sigma": direction.sigma, "determined": direction.determined}
+                for direction in self.open
+            ],
             "notes": list(self.notes),
             "software": SOFTWARE,
-        }  # fmt: skip
+        }
 
 
 def propose(
@@ -311,33 +357,52 @@ def propose(
         raise InputError(f"a plan {equipment.words} needs at least {'two poses' if equipment.chained else 'one'}.")
     if turns < 0:
         raise InputError(f"the number of turns must not be negative, found {turns}.")
+    exact, design, best, classical = _searched(question, poses, turns, equipment, seed, report)
+    if classical:
+        notes += ("well known positions do as well as any here, and are proposed.",)
+    names, size = question.parameters.names, np.asarray(question.parameters.size)
+    prior = np.linalg.inv(question.prior) + np.outer(question.by_gravity, question.by_gravity)
+    # what the data sheet adds is none of the data's: it must not hide a direction that no pose tells
+    root = root_of(best.information + question.prior - np.eye(len(size)) / TOLERANCE**2)
+    rank, weak = weak_directions(root.T, names, size, question.imu)
+    stages = prior, best.covariance, covariance(question, exact).covariance
+    before, after, _ = (np.sqrt(np.diagonal(stage)) * size for stage in stages)
+    unit = float(size @ question.weights) or 1.0  # of a parameter; else a typical size
+    criteria = (score(question, stage) * unit for stage in stages)
+    return Proposal(
+        equipment,
+        parameter or criterion,
+        _poses(design, equipment),
+        _turns(design, equipment),
+        question.imu,
+        names,
+        before,
+        after,
+        *criteria,
+        rank=rank,
+        open=weak,
+        source=known.source,
+        notes=notes,
+    )
+
+
+def _searched(
+    question: DesignQuestion, poses: int, turns: int, equipment: Equipment, seed: int, report: Callable[[str], None]
+) -> tuple[Design, Design, DesignCovariance, bool]:
+    """The best design; it rounded, or a classical one that does as well; what this leaves; whether it is classical."""
     fastest = np.radians(equipment.fastest)
     robot = equipment.accuracy is not None
     starts = _starts(poses, turns, equipment, seed)[: _FEW_STARTS if robot else None]
     sought = optimise(_coarsened(question), starts, fastest, report, FEW_STEPS if robot else STEPS)
     exact = _ordered(sought, equipment)
     design = _rounded(exact, equipment)
-    found = covariance(question, design)
+    best = covariance(question, design)
     if not equipment.chained and _classical(poses, equipment):
         simple = _ordered(starts[0], equipment)
         plain = covariance(question, simple)
-        if score(question, plain.covariance) <= _AS_GOOD * score(question, found.covariance):
-            design, found = simple, plain
-            notes += ("well known positions do as well as any here, and are proposed.",)
-    names, size = question.parameters.names, np.asarray(question.parameters.size)
-    prior = np.linalg.inv(question.prior) + np.outer(question.reach, question.reach)
-    # what the data sheet adds is none of the data's: it must not hide a direction that no pose tells
-    values, vectors = np.linalg.eigh(found.information + question.prior - np.eye(len(size)) / TOLERANCE**2)
-    jacobian = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    rank, weak = weak_directions(jacobian, names, size, question.imu)
-    stages = prior, found.covariance, covariance(question, exact).covariance
-    before, after, _ = (np.sqrt(np.diagonal(each)) * size for each in stages)
-    unit = float(size @ question.weights) if question.criterion == "parameter" else 1.0  # else a typical size
-    return Proposal(
-        equipment, criterion if parameter is None else _named(parameter, names), _poses(design, equipment),
-        _turns(design, equipment), question.imu, names, before, after,
-        *(score(question, each) * unit for each in stages), rank, weak, known.source, notes,  # pyright: ignore[reportCallIssue]
-    )  # fmt: skip
+        if score(question, plain.covariance) <= AS_GOOD * score(question, best.covariance):
+            return exact, simple, plain, True
+    return exact, design, best, False
 
 
 # --- the question -----------------------------------------------------------------------------------------------------
@@ -363,35 +428,38 @@ def question_of(
     def keep(name: Name) -> bool:
         if name.effect is not None:
             return name.part == "coefficients" and name.owner != "setup"
-        return without_equipment(name) if equipment.chained else True
+        return not equipment.chained or without_equipment(name)
 
     parameters = Parameters.select(imu, keep)
     names, size = parameters.names, np.asarray(parameters.size)
-    weights = np.zeros(len(names))
-    if parameter is not None:
-        criterion = "parameter"
-        weights[names.index(_named(parameter, names))] = 1.0
-    elif criterion not in CRITERIA or criterion == "parameter":
-        raise InputError(f"the criterion {criterion!r} is not known; use D, A, or name one parameter.")
-    gain, gravity = np.asarray(imu.accelerometer.gain), known.gravity
-    reach = np.array([-gain[name.axes] * gravity.sigma / gravity.value if name.startswith("accelerometer.gain") else 0.0
-                      for name in names]) / size  # fmt: skip
+    criterion, weights = criterion_of(criterion, parameter, names)
+    by_gravity = gravity_sensitivity(imu, names, known.gravity) / size
     if known.covariance is not None and not equipment.chained and _is_by_hand(known.names):
-        notes += ("a calibration by hand has the accelerometer's axes for its frame; how they lie to the table's is "
-                  "taken as open.",)  # fmt: skip
+        notes += (
+            "a calibration by hand has the accelerometer's axes for its frame; how they lie to the table's is "
+            "taken as open.",
+        )
     if robot:
         notes += (
             f"the attitude's error is taken as {equipment.accuracy:g}° (1 σ, each axis), independent from stamp to "
             "stamp, and the gyroscope's bias as constant; what is off alike in all poses, such as a bent arm, is not "
             "in the prediction.",
-        )  # fmt: skip
+        )
     accuracy, more = _accuracy(known, imu, equipment)
     question = DesignQuestion(
-        imu, parameters, _prior(known, imu, parameters, reach), reach, weights, accuracy,
-        np.asarray(known.gravity.value), np.asarray(equipment.largest_turn),
-        equipment.by_hand, equipment.z_up, criterion,
+        imu,
+        parameters,
+        _prior(known, imu, parameters, by_gravity),
+        by_gravity,
+        weights,
+        accuracy,
+        np.asarray(known.gravity.value),
+        np.asarray(equipment.largest_turn),
+        equipment.by_hand,
+        equipment.z_up,
+        criterion,
         poses * equipment.rest + (poses - 1) * equipment.turn if robot else None,
-    )  # fmt: skip
+    )
     return question, (*notes, *more)
 
 
@@ -407,19 +475,13 @@ def _coarsened(question: DesignQuestion) -> DesignQuestion:
 def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
     """The unit with its effects dormant, but for those that poses and turns do not excite or that do not last."""
     dormant, notes = [], []
-    for effect in (each for triad in imu.triads().values() for each in triad.effects):
+    for effect in (effect for triad in imu.triads().values() for effect in triad.effects):
         if effect.scope == "device" and set(effect.needs) <= set(STIMULI) and not effect.memory:
             inner = {key: getattr(effect, key) for key in effect.inner}
             dormant.append(CATALOGUE[effect.name].dormant(**inner))
         else:
             notes.append(f"{effect.title} is left as it is: poses and turns at one temperature do not determine it.")
     return jax.tree.map(np.asarray, imu.with_effects(*dormant)), tuple(notes)
-
-
-def _named(parameter: str, names: Sequence[Name]) -> Name:
-    if parameter in names:
-        return names[names.index(parameter)]
-    raise InputError(f"there is no parameter {parameter!r} in this plan; {nearest(parameter, names)}")
 
 
 def _in_output(triad: Triad, density: FloatArray) -> FloatArray:
@@ -445,31 +507,31 @@ def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, t
     rest = [density / equipment.rest for density in densities]
     white = np.trace(rest[0]), np.trace(densities[1]) * equipment.turn, np.trace(rest[1])
     excess = np.array([extra / noise for extra, noise in zip(known.excess, white, strict=True)])
-    said = np.asarray(np.radians(equipment.accuracy or 0.0))
+    attitude = np.asarray(np.radians(equipment.accuracy or 0.0))
     return Accuracy(
-        rest[0], rest[1], densities[1], excess, np.asarray(equipment.turn), np.asarray(equipment.rest), said
+        rest[0], rest[1], densities[1], excess, np.asarray(equipment.turn), np.asarray(equipment.rest), attitude
     ), tuple(notes)  # pyright: ignore[reportArgumentType]
 
 
-def _prior(known: Known, imu: Imu, parameters: Parameters, reach: FloatArray) -> FloatArray:
+def _prior(known: Known, imu: Imu, parameters: Parameters, by_gravity: FloatArray) -> FloatArray:
     """Information (typical sizes) about the parameters, gravity known: the calibration's, else the data sheet's."""
     names, size = parameters.names, np.asarray(parameters.size)
     total = TOLERANCE**2 * np.eye(len(names))
     if known.covariance is not None:
-        upper, by_hand = [place for place, name in enumerate(names) if name in _UPPER], _is_by_hand(known.names)
+        upper, by_hand = [index for index, name in enumerate(names) if name in _UPPER], _is_by_hand(known.names)
         covariance = known.covariance
         if not upper and not by_hand and set(_UPPER) <= set(known.names):
             covariance = _in_hand_frame(covariance, known.names, imu)
-        places = [place for place, name in enumerate(names) if name in known.names]
-        rows = [known.names.index(names[place]) for place in places]
-        total[np.ix_(places, places)] = covariance[np.ix_(rows, rows)] / size[places][:, None] / size[places]
+        indices = [index for index, name in enumerate(names) if name in known.names]
+        rows = [known.names.index(names[index]) for index in indices]
+        total[np.ix_(indices, indices)] = covariance[np.ix_(rows, rows)] / size[indices][:, None] / size[indices]
         if upper and by_hand:
             # by hand the accelerometer's axes are the frame; how they lie to a table's is open, for both triads alike
             frame = _frame(imu, names) / size[:, None]
             total[upper, :] = total[:, upper] = 0.0
             total += _MOUNTING**2 * frame @ frame.T
-        if known.gravity.sigma > 0 and reach.any():
-            total = _gravity_known(total, reach)
+        if known.gravity.sigma > 0 and by_gravity.any():
+            total = _gravity_known(total, by_gravity)
     try:
         np.linalg.cholesky(total)
     except np.linalg.LinAlgError as error:
@@ -488,12 +550,12 @@ def _is_by_hand(names: Sequence[Name]) -> bool:
 
 def _frame(imu: Imu, names: Sequence[Name]) -> FloatArray:
     """How gains (n, 3) react to a small rotation of the body frame: K → K (I + [ρ]×)."""
-    found = np.zeros((len(names), 3))
-    for place, name in enumerate(names):
+    change = np.zeros((len(names), 3))
+    for index, name in enumerate(names):
         if name.part == "gain":
             row, column = name.axes
-            found[place] = np.einsum("j,kj->k", np.asarray(imu.triads()[name.owner].gain)[row], _CROSS[:, :, column])
-    return found
+            change[index] = np.einsum("j,kj->k", np.asarray(imu.triads()[name.owner].gain)[row], _CROSS[:, :, column])
+    return change
 
 
 def _in_hand_frame(covariance: FloatArray, names: Sequence[Name], imu: Imu) -> FloatArray:
@@ -504,13 +566,13 @@ def _in_hand_frame(covariance: FloatArray, names: Sequence[Name], imu: Imu) -> F
     return turned @ covariance @ turned.T
 
 
-def _gravity_known(total: FloatArray, reach: FloatArray) -> FloatArray:
+def _gravity_known(total: FloatArray, by_gravity: FloatArray) -> FloatArray:
     """Take what an uncertain gravity adds off a covariance: it is no error that further poses could reduce.
 
     The share is large and along one direction, so that it is found in the covariance itself; plain subtraction would
     leave rounding. In that direction a ten thousandth of the variance is kept at least.
     """
-    along = reach / (reach @ reach)
+    along = by_gravity / (by_gravity @ by_gravity)
     variance = along @ total @ along
     response = total @ along / variance
     return total + (max(variance - 1.0, 1e-4 * variance) - variance) * np.outer(response, response)
@@ -552,7 +614,9 @@ def _ordered(design: Design, equipment: Equipment) -> Design:
     """Poses and turns of a table in an order with short ways; else the order is part of the design."""
     if equipment.chained:
         return design
-    poses, turns = (short_order(up_of(each)) if len(each) else [] for each in (design.attitude, design.axis))
+    poses, turns = (
+        short_order(up_of(attitudes)) if len(attitudes) else [] for attitudes in (design.attitude, design.axis)
+    )
     return Design(design.attitude[poses], design.axis[turns], design.rate[turns])
 
 
@@ -570,19 +634,25 @@ def _neighbourly(attitudes: FloatArray) -> FloatArray:
 def _rounded(design: Design, equipment: Equipment) -> Design:
     step, attitude = np.radians(equipment.step), np.asarray(design.attitude)
     if equipment.accuracy is not None:
-        round_ = np.array([round_attitude(each, step) for each in attitude])
+        round_ = np.array([round_attitude(quaternion, step) for quaternion in attitude])
         signs = np.where(np.sum(round_ * attitude, axis=1) >= 0, 1.0, -1.0)
         return replace(design, attitude=round_ * signs[:, None])  # each turn goes the way that was sought
     if equipment.by_hand:
         zero = first_heading(attitude[0])
-        return replace(design, attitude=_neighbourly(np.array([round_attitude(each, step, zero) for each in attitude])))
-    up, axis = (_attitudes(np.array([round_direction(each, step) for each in up_of(np.asarray(part))]))
-                for part in (attitude, design.axis))  # fmt: skip
+        return replace(
+            design, attitude=_neighbourly(np.array([round_attitude(quaternion, step, zero) for quaternion in attitude]))
+        )
+    up, axis = (
+        _attitudes(np.array([round_direction(direction, step) for direction in up_of(np.asarray(part))]))
+        for part in (attitude, design.axis)
+    )
     return Design(up, axis, np.radians(np.round(np.degrees(design.rate), 0)))  # pyright: ignore[reportArgumentType]
 
 
 def _poses(design: Design, equipment: Equipment) -> tuple[Pose, ...]:
-    return tuple(Pose(up_of(each), each, _words(each, equipment)) for each in np.asarray(design.attitude))
+    return tuple(
+        Pose(up_of(attitude), attitude, _words(attitude, equipment)) for attitude in np.asarray(design.attitude)
+    )
 
 
 def _words(attitude: FloatArray, equipment: Equipment) -> str:
@@ -599,19 +669,23 @@ def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
     if not equipment.chained:
         rates = np.asarray(design.rate)
         return tuple(
-            Turn(up, rate * equipment.turn, rate,
-                 f"{pose_words(up)}: {abs(np.degrees(rate)):.4g} °/s for {equipment.turn:g} s "
-                 f"({abs(np.degrees(rate)) * equipment.turn:.4g}°), {'anticlockwise' if rate > 0 else 'clockwise'} "
-                 "seen from above")
+            Turn(
+                up,
+                rate * equipment.turn,
+                rate,
+                f"{pose_words(up)}: {abs(np.degrees(rate)):.4g} °/s for {equipment.turn:g} s "
+                f"({abs(np.degrees(rate)) * equipment.turn:.4g}°), {'anticlockwise' if rate > 0 else 'clockwise'} "
+                "seen from above",
+            )
             for up, rate in zip(up_of(np.asarray(design.axis)), rates, strict=True)
-        )  # fmt: skip
-    found = []
+        )
+    turns = []
     for vector in np.asarray(turn_vectors(design.attitude)):
         angle = float(np.linalg.norm(vector))
         axis = vector / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
         words = f"the direct way, {np.degrees(angle):.0f}°"
         if equipment.accuracy is not None:
-            about = ", ".join(f"{each + 0.0:.3f}" for each in np.round(axis, 3))
+            about = ", ".join(f"{component + 0.0:.3f}" for component in np.round(axis, 3))
             words = f"{np.degrees(angle):.1f}° about ({about}) of the unit's axes"
-        found.append(Turn(axis, angle, angle / equipment.turn, words))
-    return tuple(found)
+        turns.append(Turn(axis, angle, angle / equipment.turn, words))
+    return tuple(turns)

@@ -40,12 +40,15 @@ def round_direction(up: FloatArray, step: float) -> FloatArray:
     axis, sign, tilt, azimuth = _polar(up)
     tilt, azimuth = (round(angle / step) * step for angle in (tilt, azimuth))
     while True:
-        found = np.zeros(3)
-        found[axis] = sign * np.cos(tilt)
-        found[(axis + 1) % 3], found[(axis + 2) % 3] = np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth)
-        found = np.where(np.abs(found) < 1e-12, 0.0, found)
-        if _polar(found)[0] == axis:
-            return found
+        rounded = np.zeros(3)
+        rounded[axis] = sign * np.cos(tilt)
+        rounded[(axis + 1) % 3], rounded[(axis + 2) % 3] = (
+            np.sin(tilt) * np.cos(azimuth),
+            np.sin(tilt) * np.sin(azimuth),
+        )
+        rounded = np.where(np.abs(rounded) < 1e-12, 0.0, rounded)
+        if _polar(rounded)[0] == axis:
+            return rounded
         tilt -= step  # near a corner of the cube: words about another axis would not be round
 
 
@@ -87,8 +90,8 @@ def short_order(up: FloatArray) -> NDArray[np.int64]:
     angle = np.arccos(np.clip(up @ up.T, -1, 1))
     order = [int(np.argmax(up[:, 2]))]
     while len(order) < len(up):
-        left = [place for place in range(len(up)) if place not in order]
-        order.append(min(left, key=lambda place: angle[order[-1], place]))
+        left = [index for index in range(len(up)) if index not in order]
+        order.append(min(left, key=lambda index: angle[order[-1], index]))
 
     def length(order):
         return float(np.sum(angle[order[:-1], order[1:]]))
@@ -121,7 +124,7 @@ def _between(azimuth: float, j: str, k: str) -> str:
 def pose_words(up: FloatArray) -> str:
     """Say which way a body direction (3,) that points up is, such as "z up, tilted by 35° so that +x rises"."""
     axis, sign, tilt, azimuth = _polar(up)
-    name, j, k = ("xyz"[(axis + place) % 3] for place in range(3))
+    name, j, k = ("xyz"[(axis + step) % 3] for step in range(3))
     base = f"{name} {'up' if sign > 0 else 'down'}"
     return base if tilt < 1e-6 else f"{base}, tilted by {_degrees(tilt)} so that {_between(azimuth, j, k)} rises"
 
@@ -140,8 +143,13 @@ def attitude_words(attitude: FloatArray) -> str:
     heading = _heading(attitude, up)
     name = f"+{'xyz'[_seen(up)[0]]}"
     turned = round(np.degrees(heading), 6)
-    sides = {0.0: "away from you", 90.0: "to your left", -90.0: "to your right", 180.0: "towards you",
-             -180.0: "towards you"}  # fmt: skip
+    sides = {
+        0.0: "away from you",
+        90.0: "to your left",
+        -90.0: "to your right",
+        180.0: "towards you",
+        -180.0: "towards you",
+    }
     side = sides.get(turned)
     if side is None:
         ahead = abs(turned) < 90

@@ -51,7 +51,7 @@ def next_ramps(blocks: RestBlocks) -> tuple[dict[str, Separation], tuple[Ramp, .
     length = sum(blocks.spans)
     shapes = ThermalShapes(blocks, float(np.mean(blocks.range)))
     now = separated(shapes)
-    weak = [name for name, each in now.items() if each.apart < ENOUGH] or list(now)
+    weak = [name for name, separation in now.items() if separation.apart < ENOUGH] or list(now)
     # a thousandth of its shape is nothing known of an effect: what rounding leaves is no information
     known = {name: now[name].information * max(1.0, 1e-6 / max(now[name].apart, 1e-12) ** 2) for name in weak}
     first = "cool" if legs[-1].up else "warm"
@@ -65,7 +65,7 @@ def next_ramps(blocks: RestBlocks) -> tuple[dict[str, Separation], tuple[Ramp, .
             parts = separated(ThermalShapes(tried, shapes.reference, shapes))
             gain = sum(0.5 * np.log(parts[name].information / known[name]) for name in weak)
             options.append(Ramp(text, duration, parts, float(gain)))
-    return now, tuple(sorted(options, key=lambda each: -each.gain / np.sqrt(length + each.duration)))
+    return now, tuple(sorted(options, key=lambda ramp: -ramp.gain / np.sqrt(length + ramp.duration)))
 
 
 def _with(blocks: RestBlocks, ends: Sequence[float], rate: float) -> tuple[RestBlocks, float]:
@@ -80,6 +80,7 @@ def _with(blocks: RestBlocks, ends: Sequence[float], rate: float) -> tuple[RestB
     means = {name: np.tile(values[-1], (count, 1)) for name, values in blocks.means.items()}
     none = np.zeros(count, np.int64)
     track = Track(Stimulus(temperature=path, temperature_rate=slope, time=time), np.arange(8 * count) // 8)
-    more = RestBlocks((), edges[:-1:8], edges[8::8], none, none, none, celsius, rates, means,
-                      (track,), None, blocks.duration, 0, ())  # fmt: skip
+    more = RestBlocks(
+        (), edges[:-1:8], edges[8::8], none, none, none, celsius, rates, means, (track,), None, blocks.duration, 0, ()
+    )
     return joined([blocks, more]), float(knots[-1])

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import orth
 
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.observe_stations import observe_stations
@@ -50,8 +51,10 @@ def options(diagnosis: Diagnosis, cause: Named) -> tuple[Option, ...]:
     effects = [cause.effect, *(_rival(diagnosis, cause, name) for name in cause.rivals if name in CATALOGUE)]
     imu = diagnosis.base.imu
     before = _powers(diagnosis.experiment, imu, effects)
-    return tuple(Option(text, _powers(_experiment(diagnosis, protocol, environment, imu), imu, effects), before)
-                 for text, protocol, environment in _candidates(diagnosis, effects))  # fmt: skip
+    return tuple(
+        Option(text, _powers(_experiment(diagnosis, protocol, environment, imu), imu, effects), before)
+        for text, protocol, environment in _candidates(diagnosis, effects)
+    )
 
 
 def advised(diagnosis: Diagnosis) -> Diagnosis:
@@ -59,18 +62,22 @@ def advised(diagnosis: Diagnosis) -> Diagnosis:
 
     Where a set-up's own error is the cause or a rival it is left as it is: no recording that is tried here shows one.
     """
-    unsettled = [each for each in diagnosis.named if each.rivals] or [each for each in diagnosis.named if each.weak]
-    causes = [CATALOGUE[name] for each in unsettled[:1] for name in (each.name, *each.rivals) if name in CATALOGUE]
+    unsettled = [cause for cause in diagnosis.named if cause.rivals] or [
+        cause for cause in diagnosis.named if cause.weak
+    ]
+    causes = [CATALOGUE[name] for cause in unsettled[:1] for name in (cause.name, *cause.rivals) if name in CATALOGUE]
     if not causes or any(cause.scope == "fixture" for cause in causes):
         return diagnosis
     cause = unsettled[0]
-    found = options(diagnosis, cause)
-    return replace(diagnosis, suggestion=suggestion(cause, found), options=found)
+    candidates = options(diagnosis, cause)
+    return replace(diagnosis, suggestion=suggestion(cause, candidates), options=candidates)
 
 
-def suggestion(cause: Named, found: Sequence[Option]) -> str:
+def suggestion(cause: Named, candidates: Sequence[Option]) -> str:
     """Return one sentence: the least effort that settles most, and what it leaves open."""
-    best = max(found, key=lambda each: (len(each.told), sum(each.powers.values()) if not each.told else 0.0))
+    best = max(
+        candidates, key=lambda option: (len(option.told), sum(option.powers.values()) if not option.told else 0.0)
+    )
 
     def listed(names: Sequence[str], powers: dict[str, float]) -> str:
         return ", ".join(f"{effect_title(name)} {100 * powers[name]:.0f} %" for name in names)
@@ -100,13 +107,13 @@ def _rival(diagnosis: Diagnosis, cause: Named, name: str) -> Effect:
     statistic = evidence.scores().statistic
 
     def best(name: str) -> int:
-        places = [k for k, block in enumerate(evidence.blocks) if block.name == name]
-        return max(places, key=lambda k: statistic[k])
+        indices = [k for k, block in enumerate(evidence.blocks) if block.name == name]
+        return max(indices, key=lambda k: statistic[k])
 
-    others = [each.name for each in diagnosis.effects if each.name != cause.name]
-    places = [best(each) for each in (name, *others) if any(block.name == each for block in evidence.blocks)]
-    block = evidence.blocks[places[0]]
-    coefficients = evidence.coefficients(places)[: len(block.sizes)] * block.sizes
+    others = [other.name for other in diagnosis.effects if other.name != cause.name]
+    indices = [best(wanted) for wanted in (name, *others) if any(block.name == wanted for block in evidence.blocks)]
+    block = evidence.blocks[indices[0]]
+    coefficients = evidence.coefficients(indices)[: len(block.sizes)] * block.sizes
     return CATALOGUE[name].make(coefficients, **block.inner)
 
 
@@ -123,8 +130,10 @@ def _candidates(diagnosis: Diagnosis, effects: Sequence[Effect]) -> Iterator[tup
     if warm or "time" in needs:
         for protocol, cycles, times in ((plain, 1, "up and down again"), (long, 2, "up and down twice")):
             length = protocol.poses * (protocol.pose_duration + protocol.turn_duration)
-            knots = [[float(time), middle + (_WARMING if k % 2 else 0.0)]
-                     for k, time in enumerate(np.linspace(0.0, length, 2 * cycles + 1))]  # fmt: skip
+            knots = [
+                [float(time), middle + (_WARMING if k % 2 else 0.0)]
+                for k, time in enumerate(np.linspace(0.0, length, 2 * cycles + 1))
+            ]
             text = f"record {protocol.poses} poses by hand while the temperature goes {_WARMING:g} K {times}"
             yield text, protocol, Environment(gravity=gravity, temperature=knots)
     if not warm:
@@ -171,8 +180,8 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
         return {effect.name: 0.0 for effect in (effects[1:] or effects)}
 
     def columns(kind: type[Effect], inner: Sequence[dict[str, float]]) -> FloatArray:
-        found = experiment.dormant_columns(imu, linear.details, {kind: inner})[kind]
-        return np.stack([np.linalg.solve(root, each[used]) for each in found])
+        matrices = experiment.dormant_columns(imu, linear.details, {kind: inner})[kind]
+        return np.stack([np.linalg.solve(root, matrix[used]) for matrix in matrices])
 
     def off(basis: FloatArray, values: FloatArray) -> FloatArray:
         return values - basis @ (basis.T @ values)
@@ -184,8 +193,10 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
     if len(effects) == 1:
         return {effects[0].name: _detected(float(signals[0] @ signals[0]), effects[0].size, LIMIT_LEVEL)}
     # a rival may take any inner parameters: the ones that imitate best count
-    spans = [[_basis(off(base, each)) for each in columns(type(effect), list(type(effect).grid(extent)))]
-             for effect in effects]  # fmt: skip
+    spans = [
+        [_basis(off(base, matrix)) for matrix in columns(type(effect), list(type(effect).grid(extent)))]
+        for effect in effects
+    ]
 
     def ruled_out(rival: int, there: int) -> float:
         rest = min(float(np.sum(off(span, signals[there]) ** 2)) for span in spans[rival])
@@ -195,8 +206,7 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
 
 
 def _basis(columns: NDArray[np.floating]) -> FloatArray:
-    u, s, _ = np.linalg.svd(np.asarray(columns, np.float64), full_matrices=False)
-    return u[:, s > 1e-6 * max(s[0], 1e-300)]
+    return orth(np.asarray(columns, np.float64), rcond=1e-6)
 
 
 def _detected(noncentrality: float, freedom: int, level: float) -> float:

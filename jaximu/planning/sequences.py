@@ -34,14 +34,15 @@ from jaximu.estimation.problem import Name, Parameters, flatten, without_equipme
 from jaximu.estimation.uncertainty import spoken_amount, weak_directions
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError, nearest
+from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
-from jaximu.planning.optimisation import CRITERIA
-from jaximu.planning.plan import EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, question_of
+from jaximu.planning.information import root_of
+from jaximu.planning.optimisation import CRITERIA, criterion_of
+from jaximu.planning.plan import AS_GOOD, EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, question_of
 from jaximu.planning.poses import pose_words, up_of
 from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Rotations
@@ -53,13 +54,13 @@ __all__ = ["FILTERED", "Filter", "filter_of", "propose_sequence"]
 FILTERED = replace(EQUIPMENT["table"], rest=20.0, turn=8.0, setting=0.0, in_sequence=True)
 """A table that turns a unit from one position to the next while it is recorded."""
 _CHOICES = [f"{axis}{angle}" for angle in (90, -90, 180) for axis in "xyz"]
+_UPRIGHT = attitude_of(np.array([0.0, 0.0, 1.0]))
 _WIDTH = 12
 """Sequences that are kept at every length."""
 _RATE = 50.0
 """Hz of the simulated motion: nothing but means and increments over half a second are made of it."""
 _BEFORE = 2.0
 """Seconds of rest before a simulated rotation."""
-_AS_GOOD = 1.001  # the well-known sequence is taken where the best is better by no more than this
 _SHOWN = 0.5
 """Share of its uncertainty beforehand down to which a number must come to count as shown."""
 
@@ -108,7 +109,7 @@ class Filter:
         recording, truth = simulate(
             self.imu.without(GyroEarthRotation), protocol, rate=_RATE, environment=Environment(gravity=self.gravity)
         )
-        rests = np.array([[each.start, each.stop] for each in truth.schedule if each.kind == "pose"])
+        rests = np.array([[station.start, station.stop] for station in truth.schedule if station.kind == "pose"])
         intervals, _ = cut(recording, rests, longest_rest(self.errors), self.beyond)
         return IntervalsOfMotion(intervals, self.errors, self.gravity), int(np.argmin(intervals.rest))
 
@@ -143,11 +144,11 @@ class Filter:
         """
         measurement, _ = self.measured(words)
         rows, start = self._rows(measurement, slice(0, int(np.sum(measurement.intervals.real))))
-        begun, states = self.begun(), self.errors.states
+        initial, states = self.begun(), self.errors.states
         if not known:
-            free = [place for place, name in enumerate(self.names) if place not in self.earth]
-            begun.root[states:, states:][free] = 0.0
-        return run(begun, self._headed(rows, start.inv()))[0]
+            free = [index for index, name in enumerate(self.names) if index not in self.earth]
+            initial.root[states:, states:][free] = 0.0
+        return run(initial, self._headed(rows, start.inv()))[0]
 
     @property
     def earth(self) -> tuple[int, ...]:
@@ -161,16 +162,16 @@ class Filter:
 
     def value(self, known: Knowledge, criterion: str, weights: FloatArray) -> float:
         """Return the logarithm of a criterion of all free numbers but the Earth's rotation."""
-        kept = [place for place in range(len(self.names)) if place not in self.earth]
+        kept = [index for index in range(len(self.names)) if index not in self.earth]
         spread = (self.numbers(known) / self.size[:, None] / self.size)[np.ix_(kept, kept)]
         return float(stored.call(CRITERIA[criterion], f"sequence's {criterion}", spread, weights[kept]))
 
     def _rows(self, measurement: IntervalsOfMotion, part: slice) -> tuple[WhiteRows, Rotation]:
         """Return rows of some intervals about the free numbers and gravity, and the attitude where they begin."""
-        found = measurement.filtered(self.imu)
+        filtered = measurement.filtered(self.imu)
         shared = np.append(self.index, len(flatten(self.imu)))
-        rows = WhiteRows(*(np.asarray(each)[part] for each in found.rows))
-        start = Rotation.from_quat(np.asarray(found.path.attitude)[part.start], scalar_first=True)
+        rows = WhiteRows(*(np.asarray(array)[part] for array in filtered.rows))
+        start = Rotation.from_quat(np.asarray(filtered.path.attitude)[part.start], scalar_first=True)
         return rows._replace(shared=rows.shared[..., shared]), start
 
     def _headed(self, rows: WhiteRows, ahead: Rotation) -> WhiteRows:
@@ -197,17 +198,16 @@ def filter_of(
     known: Known, equipment: Equipment, positions: int, effects: Sequence[str | Effect], noise: NoiseModel | None
 ) -> tuple[Filter, tuple[str, ...]]:
     """Return the filter of a unit and notes on what had to be assumed; arguments as in [`propose_sequence`]."""
-    chosen = [state_effect(effect_named(each)) for each in effects]
-    chosen = [each for each in chosen if each.name != GyroEarthRotation.name]
+    chosen = [state_effect(effect_named(effect)) for effect in effects]
+    chosen = [effect for effect in chosen if effect.name != GyroEarthRotation.name]
     plain = replace(known, imu=known.imu.with_effects())
     question, notes = question_of(plain, equipment, "D", None)
     if noise is None:
-        gyroscope = question.imu.gyroscope
-        assert gyroscope is not None
-        gains = [np.linalg.inv(np.asarray(triad.gain)) for triad in (question.imu.accelerometer, gyroscope)]
+        gains = [np.linalg.inv(np.asarray(triad.gain)) for triad in question.imu.triads().values()]
         densities = np.asarray(question.accuracy.accelerometer) * equipment.rest, np.asarray(question.accuracy.density)
         white = [
-            AxisNoise.of_white(np.diagonal(gain @ each @ gain.T)) for gain, each in zip(gains, densities, strict=True)
+            AxisNoise.of_white(np.diagonal(gain @ density @ gain.T))
+            for gain, density in zip(gains, densities, strict=False)
         ]
         duration = positions * equipment.rest + (positions - 1) * equipment.turn
         noise = with_usual_drift(NoiseModel(white[0], white[1]), equipment.rest, duration)
@@ -220,18 +220,26 @@ def filter_of(
     base = question.parameters
     inside = [free.names.index(name) for name in base.names]
     information[np.ix_(inside, inside)] = np.asarray(question.prior) / np.outer(base.size, base.size)
-    for place, name in enumerate(free.names):
+    for index, name in enumerate(free.names):
         if name.effect is not None:
             effect = imu.all_effects()[name.owner, name.effect]
-            information[place, place] = 1 / np.broadcast_to(spread[effect.name], effect.size)[name.axes[0]] ** 2
+            information[index, index] = 1 / np.broadcast_to(spread[effect.name], effect.size)[name.axes[0]] ** 2
     information[-1, -1] = 1 / max(known.gravity.sigma, 1e-6) ** 2
     scale = np.sqrt(np.diagonal(information))
     root = np.linalg.cholesky(information / np.outer(scale, scale)).T * scale
     prior = Knowledge(root, np.zeros(len(root)))
     return Filter(
-        imu, disturbances(noise), known.gravity.value, equipment.rest, equipment.turn, free.names, size,
-        np.asarray(free.index, int), prior, NEIGHBOURS if chosen else 0,
-    ), notes  # fmt: skip
+        imu,
+        disturbances(noise),
+        known.gravity.value,
+        equipment.rest,
+        equipment.turn,
+        free.names,
+        size,
+        np.asarray(free.index, int),
+        prior,
+        NEIGHBOURS if chosen else 0,
+    ), notes
 
 
 def propose_sequence(
@@ -265,8 +273,6 @@ def propose_sequence(
         raise InputError("the filter needs a gyroscope beside the accelerometer, and this unit has none.")
     if positions < 2:
         raise InputError("a sequence for the filter has at least two positions.")
-    if parameter is None and (criterion not in CRITERIA or criterion == "parameter"):
-        raise InputError(f"the criterion {criterion!r} is not known; use D, A, or name one parameter.")
     fastest = np.radians(equipment.fastest) * equipment.turn / 2 + 1e-9  # the rate peaks at twice its mean
     choices = [word for word in _CHOICES if np.linalg.norm(rotation_vector(word)) <= fastest]
     if not choices:
@@ -274,92 +280,120 @@ def propose_sequence(
             f"a rotation by 90° in {equipment.turn:g} s reaches {180 / equipment.turn:.3g} °/s, and the table's limit "
             f"is {equipment.fastest:g} °/s: give the turn more time, --turn {180 / equipment.fastest:.3g}."
         )
-    asked, notes = filter_of(known, equipment, positions, effects, noise)
-    weights = np.zeros(len(asked.names))
-    if parameter is not None:
-        criterion = "parameter"
-        weights[_place(parameter, asked.names)] = 1.0
-    begun = asked.rested()
-    upright = attitude_of(np.array([0.0, 0.0, 1.0]))
-    kept: list[tuple[float, tuple[str, ...], Rotation, Knowledge]] = [(0.0, (), upright, begun)]
+    estimator, notes = filter_of(known, equipment, positions, effects, noise)
+    label = parameter or criterion
+    criterion, weights = criterion_of(criterion, parameter, estimator.names)
+    words = _searched(estimator, choices, positions, criterion, weights, report)
+    knowledge = estimator.whole(words)
+    best = estimator.value(knowledge, criterion, weights)
+    classical = tuple(NINETEEN.split())
+    if positions == len(classical) + 1 and set(classical) <= set(choices):
+        other = estimator.whole(classical)
+        value = estimator.value(other, criterion, weights)
+        ratio = float(np.exp(value - best))
+        if ratio <= AS_GOOD:
+            words, knowledge, best = classical, other, value
+            notes += ("the well-known nineteen positions do as well as any here, and are proposed.",)
+        else:
+            notes += (f"the well-known nineteen positions, as long, leave {ratio:.3g} times as much.",)
+    return _proposal(estimator, words, knowledge, best, criterion, label, weights, equipment, known.source, notes)
+
+
+def _searched(
+    estimator: Filter,
+    choices: Sequence[str],
+    positions: int,
+    criterion: str,
+    weights: FloatArray,
+    report: Callable[[str], None],
+) -> tuple[str, ...]:
+    """The rotations that make the criterion smallest, of those that are tried."""
+    rested = estimator.rested()
+    kept: list[tuple[float, tuple[str, ...], Rotation, Knowledge]] = [(0.0, (), _UPRIGHT, rested)]
     for number in range(1, positions):
         report(f"position {number + 1} of {positions}")
         longer = []
         for _, words, attitude, before in kept:
             for word in choices:
-                after = asked.rotated(before, attitude, word)
+                after = estimator.rotated(before, attitude, word)
                 reached = attitude * Rotation.from_rotvec(rotation_vector(word))
-                longer.append((asked.value(after, criterion, weights), (*words, word), reached, after))
-        longer.sort(key=lambda each: each[0])
+                longer.append((estimator.value(after, criterion, weights), (*words, word), reached, after))
+        longer.sort(key=lambda option: option[0])
         kept = []
-        for each in longer:  # of sequences that are alike but for the names of axes one is enough
-            if len(kept) < _WIDTH and (not kept or each[0] - kept[-1][0] > 1e-7):
-                kept.append(each)
-    words = kept[0][1]
-    found = asked.whole(words)
-    best = asked.value(found, criterion, weights)
-    classical = tuple(NINETEEN.split())
-    if positions == len(classical) + 1 and set(classical) <= set(choices):
-        other = asked.whole(classical)
-        value = asked.value(other, criterion, weights)
-        ratio = float(np.exp(value - best))
-        if ratio <= _AS_GOOD:
-            words, found, best = classical, other, value
-            notes += ("the well-known nineteen positions do as well as any here, and are proposed.",)
-        else:
-            notes += (f"the well-known nineteen positions, as long, leave {ratio:.3g} times as much.",)
-    return _proposal(asked, words, found, best, criterion, parameter, weights, equipment, known.source, notes)
-
-
-def _place(parameter: str, names: Sequence[Name]) -> int:
-    places = [place for place, name in enumerate(names) if name == parameter]
-    if not places:
-        raise InputError(f"there is no parameter {parameter!r} in this plan; {nearest(parameter, names)}")
-    return places[0]
+        for option in longer:  # of sequences that are alike but for the names of axes one is enough
+            if len(kept) < _WIDTH and (not kept or option[0] - kept[-1][0] > 1e-7):
+                kept.append(option)
+    return kept[0][1]
 
 
 def _proposal(
-    asked: Filter, words: Sequence[str], found: Knowledge, value: float, criterion: str, parameter: str | None,
-    weights: FloatArray, equipment: Equipment, source: str, notes: tuple[str, ...],
-) -> Proposal:  # fmt: skip
-    start, size = asked.begun(), asked.size
-    before, after = (np.sqrt(np.diagonal(asked.numbers(each))) for each in (start, found))
-    states, earth = asked.errors.states, list(asked.earth)
-    root = asked.whole(words, known=False).root[states:, states:]
+    estimator: Filter,
+    words: Sequence[str],
+    knowledge: Knowledge,
+    value: float,
+    criterion: str,
+    label: str,
+    weights: FloatArray,
+    equipment: Equipment,
+    source: str,
+    notes: tuple[str, ...],
+) -> Proposal:
+    start, size = estimator.begun(), estimator.size
+    before, after = (np.sqrt(np.diagonal(estimator.numbers(stage))) for stage in (start, knowledge))
+    states, earth = estimator.errors.states, list(estimator.earth)
+    root = estimator.whole(words, known=False).root[states:, states:]
     # gravity's column comes last, so that the rows above it hold without it only where it is known
     information = root.T @ root
     alone = information[:-1, :-1] - np.outer(information[:-1, -1], information[-1, :-1]) / information[-1, -1]
-    values, vectors = np.linalg.eigh(alone * size[:, None] * size)
-    jacobian = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    rank, weak = weak_directions(jacobian, asked.names, size, asked.imu, state_advice)
-    of_earth = {asked.names[place] for place in earth}
-    weak = tuple(each for each in weak if not {name for name, _ in each.parameters} <= of_earth)
-    unshown = [place for place in earth if after[place] > _SHOWN * before[place]]
+    rank, weak = weak_directions(
+        root_of(alone * size[:, None] * size).T, estimator.names, size, estimator.imu, state_advice
+    )
+    of_earth = {estimator.names[index] for index in earth}
+    weak = tuple(direction for direction in weak if not {name for name, _ in direction.parameters} <= of_earth)
+    unshown = [index for index in earth if after[index] > _SHOWN * before[index]]
     if unshown:
-        left = spoken_amount(asked.names[unshown[0]], 1.96 * after[unshown[0]], asked.imu)
+        left = spoken_amount(estimator.names[unshown[0]], 1.96 * after[unshown[0]], estimator.imu)
         notes += (
             "the gyroscope's noise hides the Earth's rotation from this sequence: it is known to "
             f"± {left} (95 %), and is part of how uncertain the biases are.",
         )
-    unit = float(size @ weights) if criterion == "parameter" else 1.0
-    first = asked.value(start, criterion, weights)
-    attitude, poses, turns = attitude_of(np.array([0.0, 0.0, 1.0])), [], []
+    unit = float(size @ weights) or 1.0
+    first = estimator.value(start, criterion, weights)
+    poses, turns = _poses_and_turns(words, equipment)
+    at_first, at_last = (float(np.exp(logarithm)) * unit for logarithm in (first, value))
+    return Proposal(
+        equipment,
+        label,
+        poses,
+        turns,
+        estimator.imu,
+        estimator.names,
+        before,
+        after,
+        at_first,
+        at_last,
+        at_last,
+        rank,
+        weak,
+        source,
+        notes,
+    )
+
+
+def _poses_and_turns(words: Sequence[str], equipment: Equipment) -> tuple[tuple[Pose, ...], tuple[Turn, ...]]:
+    """The positions that rotations lead through, z up first, and the turns between them."""
+    attitude, turns = _UPRIGHT, []
 
     def stand(attitude: Rotation) -> Pose:
         quaternion = attitude.as_quat(scalar_first=True)
         return Pose(up_of(quaternion), quaternion, pose_words(np.round(up_of(quaternion))))
 
-    poses.append(stand(attitude))
+    poses = [stand(attitude)]
     for word in words:
         vector = rotation_vector(word)
         angle = float(np.linalg.norm(vector))
         attitude = attitude * Rotation.from_rotvec(vector)
         poses.append(stand(attitude))
-        said = f"{np.degrees(angle):.0f}° about {'+' if vector.sum() > 0 else '−'}{word[0]}"
-        turns.append(Turn(vector / angle, angle, angle / equipment.turn, said))
-    at_first, at_last = (float(np.exp(each)) * unit for each in (first, value))
-    named = criterion if parameter is None else asked.names[_place(parameter, asked.names)]
-    return Proposal(
-        equipment, named, tuple(poses), tuple(turns), asked.imu, asked.names, before, after, at_first, at_last, at_last,
-        rank, weak, source, notes,
-    )  # fmt: skip
+        turn_words = f"{np.degrees(angle):.0f}° about {'+' if vector.sum() > 0 else '−'}{word[0]}"
+        turns.append(Turn(vector / angle, angle, angle / equipment.turn, turn_words))
+    return tuple(poses), tuple(turns)

@@ -30,18 +30,28 @@ from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
 from jaximu.model import AxisNoise, parse_quantity, processes
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE
-from jaximu.model.sensor import Imu
+from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
+from jaximu.planning.information import root_of
 from jaximu.recordings.observations import Stations
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.protocols import Environment, Interval, Motion
 from jaximu.simulation.specification import Draw
 
-__all__ = ["ErrorScheme", "ErrorSource", "Task", "quantity", "read_task", "scheme_and_sources", "task", "white_density",
-           "with_effects"]  # fmt: skip
+__all__ = [
+    "ErrorScheme",
+    "ErrorSource",
+    "Task",
+    "quantity",
+    "read_task",
+    "scale_of",
+    "scheme_and_sources",
+    "task",
+    "white_density",
+    "with_effects",
+]
 
 _TURN_ONLY = ("rate-table", "single-axis-table")  # their angle about the vertical is all that is set
-_ONE_MOUNTING = ("dividing-head",)
 _FLICKER_INTERVAL = 0.01  # s; flicker noise faster than this averages out like white noise
 
 
@@ -72,8 +82,15 @@ class ErrorSource:
 # --- the specification ------------------------------------------------------------------------------------------------
 
 _ANGLE, _NONE = "rad", "1"
-_SINGLE = {"tilt": _ANGLE, "angle_setting": _ANGLE, "mounting": _ANGLE, "orthogonality": _ANGLE, "gravity": "m/s^2",
-           "rate": _NONE, "timing": "s"}  # fmt: skip
+_SINGLE = {
+    "tilt": _ANGLE,
+    "angle_setting": _ANGLE,
+    "mounting": _ANGLE,
+    "orthogonality": _ANGLE,
+    "gravity": "m/s^2",
+    "rate": _NONE,
+    "timing": "s",
+}
 _TABLES = {
     "drift": {"accelerometer": "m/s^3", "gyroscope": "rad/s^2"},
     "temperature": {"accelerometer": "m/s^2/K", "gyroscope": "rad/s/K", "span": "K"},
@@ -121,15 +138,15 @@ def read_task(path: str | os.PathLike[str]) -> Task:
 
 def task(document: Mapping[str, Any], name: str = "specification") -> Task:
     """Check a specification that was read already; as [`read_task`]."""
-    own = ("errors", "goal", "fitted")
+    extra = ("errors", "goal", "fitted")
     for key in document:
-        if key not in own and (near := difflib.get_close_matches(key, own, n=1, cutoff=0.75)):
+        if key not in extra and (near := difflib.get_close_matches(key, extra, n=1, cutoff=0.75)):
             raise InputError(f"{name}: unknown key {key!r}; did you mean {near[0]!r}?")
-    specification = Specification({key: value for key, value in document.items() if key not in own}, name)
+    specification = Specification({key: value for key, value in document.items() if key not in extra}, name)
     fitted = document.get("fitted", [])
     if not isinstance(fitted, list):
         raise InputError(f"{name}: fitted must be a list of effects, found {fitted!r}.")
-    only({str(each): None for each in fitted}, CATALOGUE, name, "fitted")
+    only({str(effect): None for effect in fitted}, CATALOGUE, name, "fitted")
     goals = document.get("goal", {})
     if not isinstance(goals, dict):
         raise InputError(f'{name}: goal must be a table such as [goal] "accelerometer.bias" = "0.2 mg".')
@@ -139,6 +156,11 @@ def task(document: Mapping[str, Any], name: str = "specification") -> Task:
     stated = tuple((str(key), str(value)) for key, value in goals.items())
     environment = specification.environment_of(Draw(specification.seed, 0))
     return Task(specification.case(0), environment, errors, tuple(fitted), stated, name)
+
+
+def _stated(errors: Mapping[str, tuple[Any, str]], name: str) -> dict[str, float]:
+    """The sizes of a table of errors, SI; empty where it is not stated."""
+    return errors.get(name, ({}, ""))[0]
 
 
 def quantity(value: Any, unit: str, where: str) -> float:
@@ -154,18 +176,18 @@ def quantity(value: Any, unit: str, where: str) -> float:
     return parsed
 
 
-def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
+def _errors(table: Any, name: str, environment: Mapping[str, Any]) -> dict[str, Any]:
     """Check the table; sizes in SI, with the text they were stated in."""
-    found: dict[str, Any] = {}
-    latitude = isinstance(environment, dict) and "latitude" in environment
+    sizes_of: dict[str, Any] = {}
+    latitude = "latitude" in environment
     for key, value in only(table, _ERRORS, name, "[errors]").items():
         where = f"{name}: errors.{key}"
         if key in _SINGLE:
-            found[key] = quantity(value, _SINGLE[key], where), str(value)
+            sizes_of[key] = quantity(value, _SINGLE[key], where), str(value)
         elif key in _TABLES:
             entries = only(value, _TABLES[key], name, f"errors.{key}")
-            sizes = {part: quantity(each, _TABLES[key][part], f"{where}.{part}") for part, each in entries.items()}
-            found[key] = sizes, ", ".join(f"{part} {each}" for part, each in entries.items())
+            sizes = {part: quantity(size, _TABLES[key][part], f"{where}.{part}") for part, size in entries.items()}
+            sizes_of[key] = sizes, ", ".join(f"{part} {size}" for part, size in entries.items())
         elif key == "earth_rotation":
             if value not in ("ignored", "modelled"):
                 raise InputError(f"{where} must be 'ignored' or 'modelled', found {value!r}.")
@@ -173,23 +195,23 @@ def _errors(table: Any, name: str, environment: Any) -> dict[str, Any]:
                 raise InputError(f"{where}: how the Earth turns depends on the latitude; state it in [environment].")
         else:
             effects = [effect for effect, kind in CATALOGUE.items() if kind.owner in INERTIAL_QUANTITIES]
-            for effect, each in only(value, effects, name, "[errors.truncated]").items():
-                place, kind = f"{where}.{effect}", CATALOGUE[effect]
+            for effect, stated in only(value, effects, name, "[errors.truncated]").items():
+                entry, kind = f"{where}.{effect}", CATALOGUE[effect]
                 unit = kind.coefficient_unit(SENSOR_UNITS[kind.owner])
-                sizes = each if isinstance(each, list) else [each] * kind.size
+                sizes = stated if isinstance(stated, list) else [stated] * kind.size
                 if len(sizes) != kind.size:
-                    raise InputError(f"{place} must be {kind.size} sizes or one, found {len(sizes)}.")
-                found[effect] = np.array([quantity(one, unit, place) for one in sizes]), f"{each} {unit}"
+                    raise InputError(f"{entry} must be {kind.size} sizes or one, found {len(sizes)}.")
+                sizes_of[effect] = np.array([quantity(one, unit, entry) for one in sizes]), f"{stated} {unit}"
     if latitude and table.get("earth_rotation", "ignored") == "ignored":
-        found["earth_rotation"] = float(environment["latitude"]), f"latitude {environment['latitude']}°"
-    vibration = found.get("vibration", ({}, ""))[0]
+        sizes_of["earth_rotation"] = float(environment["latitude"]), f"latitude {environment['latitude']}°"
+    vibration = _stated(sizes_of, "vibration")
     if ("rectification" in vibration) != ("rms" in vibration):
         raise InputError(f"{name}: errors.vibration: rms and rectification go together.")
-    knots = isinstance(environment, dict) and isinstance(environment.get("temperature"), list)
-    if "temperature" in found and knots == ("span" in found["temperature"][0]):
+    knots = isinstance(environment.get("temperature"), list)
+    if "temperature" in sizes_of and knots == ("span" in sizes_of["temperature"][0]):
         text = "both are there; leave one out" if knots else "neither is there"
         raise InputError(f"{name}: errors.temperature needs a span, or a path [environment] temperature: {text}.")
-    return found
+    return sizes_of
 
 
 # --- the set-up and what its errors do --------------------------------------------------------------------------------
@@ -225,13 +247,13 @@ class ErrorScheme(eqx.Module):
         """How many errors act by the simulation: all but what is added."""
         return sum(self.sizes[:3])
 
-    def stimulus(self, late: Float[Array, ""] | float, turned: Float[Array, "A 3"]) -> Stimulus:
-        """Return what the unit goes through where stations begin `late` (s) and its attitude is off by `turned` at the
+    def stimulus(self, delay: Float[Array, ""] | float, turned: Float[Array, "A 3"]) -> Stimulus:
+        """Return what the unit goes through where stations begin `delay` (s) and its attitude is off by `turned` at the
         stops, and between in proportion to how much of a turn is done.
         """
         stations, nodes = self.stations, self.done.shape[1]
         step = jnp.where(stations.stop > stations.start, stations.stop - stations.start, 1.0) / nodes
-        edges = stations.start[:, None] + late + step[:, None] * jnp.arange(nodes + 1)
+        edges = stations.start[:, None] + delay + step[:, None] * jnp.arange(nodes + 1)
         edge = self.motion.attitude_at(edges.ravel()).reshape(*edges.shape, 4)
         middle = (edges[:, 1:] + edges[:, :-1]) / 2
         attitude = self.motion.attitude_at(middle.ravel()).reshape(*middle.shape, 4)
@@ -253,18 +275,20 @@ class ErrorScheme(eqx.Module):
 
     def means(self, errors: Float[Array, " n"]) -> Float[Array, "2 S 3"]:
         """Return the mean outputs, accelerometer's first, where the set-up has these errors (those simulated)."""
-        late, turned, coefficients = jnp.split(errors, np.cumsum(self.sizes[:2]))
+        delay, turned, coefficients = jnp.split(errors, np.cumsum(self.sizes[:2]))
         first = np.cumsum([0, *(effect.size for effect in self.effects)])
         parts = [coefficients[low:high] for low, high in pairwise(first)]
-        true = self.stimulus(late[0], turned.reshape(-1, 3))
+        true = self.stimulus(delay[0], turned.reshape(-1, 3))
         outputs = with_effects(self.unit, self.effects, parts).respond(true)
-        return jnp.stack([jnp.sum(self.stations.weight[..., None] * each, axis=-2) for each in outputs])
+        return jnp.stack([jnp.sum(self.stations.weight[..., None] * output, axis=-2) for output in outputs])
 
 
 def with_effects(unit: Imu, effects: Sequence[Effect], coefficients: Sequence[Array]) -> Imu:
     """Return the unit with more effects beside those it has."""
-    made = [eqx.tree_at(lambda e: e.coefficients, effect, each)
-            for effect, each in zip(effects, coefficients, strict=True)]  # fmt: skip
+    made = [
+        eqx.tree_at(lambda e: e.coefficients, effect, values)
+        for effect, values in zip(effects, coefficients, strict=True)
+    ]
     return unit.with_effects(*unit.all_effects().values(), *made)
 
 
@@ -279,7 +303,9 @@ class _Stops:
     ends: NDArray[np.int64]
 
 
-def _stops(intervals: tuple[Interval, ...], begin: list[Rotation]) -> _Stops:
+def _stops(intervals: tuple[Interval, ...], motion: Motion) -> _Stops:
+    segment = np.searchsorted(motion.start, [interval.start + 1e-9 for interval in intervals], side="right") - 1
+    begin = [Rotation.from_quat(motion.attitude[row], scalar_first=True) for row in segment]
     up: list[FloatArray] = []
     setting, ends = [], []
     last: Rotation | None = None
@@ -288,13 +314,13 @@ def _stops(intervals: tuple[Interval, ...], begin: list[Rotation]) -> _Stops:
         up.append(attitude.inv().apply([0.0, 0.0, 1.0]))
         setting.append((setting[-1] + new) if setting else 0)
 
-    for each, attitude in zip(intervals, begin, strict=True):
+    for interval, attitude in zip(intervals, begin, strict=True):
         if last is None or (last.inv() * attitude).magnitude() > 1e-6:  # moved meanwhile
             stop(attitude, True)
         first, last = len(up) - 1, attitude
-        if each.kind == "turn":
-            last = attitude * Rotation.from_rotvec(each.angle * each.vector)
-            stop(last, abs(attitude.apply(each.vector)[2]) < 1 - 1e-9)
+        if interval.kind == "turn":
+            last = attitude * Rotation.from_rotvec(interval.angle * interval.vector)
+            stop(last, abs(attitude.apply(interval.vector)[2]) < 1 - 1e-9)
         ends.append((first, len(up) - 1))
     return _Stops(np.array(up), np.array(setting), np.array(ends))
 
@@ -306,7 +332,7 @@ def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
     across = np.eye(3) - stops.up[:, :, None] * stops.up[:, None, :]
     about = np.eye(count)[:, None, :] * stops.up[:, :, None]  # (A, 3, A)
     others = np.einsum("aij,as->aisj", across, member).reshape(count, 3, -1)
-    mounted = np.ones((count, 1)) if kind in _ONE_MOUNTING else member
+    mounted = np.ones((count, 1)) if kind == "dividing-head" else member  # one mounting
     mounting = np.einsum("as,ij->aisj", mounted, np.eye(3)).reshape(count, 3, -1)
     polar = np.arccos(np.clip(stops.up[:, 2], -1, 1))
     level = np.hypot(stops.up[:, 0], stops.up[:, 1]) < 1e-9
@@ -333,23 +359,23 @@ def _mean_covariances(noise: tuple[processes.Process, ...], density: FloatArray,
     def sized(value) -> FloatArray:
         return np.broadcast_to(np.asarray(value, float), (3,))
 
-    for each in noise:
-        if isinstance(each, processes.Quantisation):
-            fast = fast + AxisNoise(none, sized(each.Q) ** 2, np.zeros((3, 0)), np.zeros(0)).covariance(start, stop)
-        elif isinstance(each, processes.BiasInstability):
-            times = each.bank(_FLICKER_INTERVAL)
-            variance = np.outer(sized(each.B) ** 2 * np.log(times[1] / times[0]) / np.pi, np.ones(len(times)))
+    for process in noise:
+        if isinstance(process, processes.Quantisation):
+            fast = fast + AxisNoise(none, sized(process.Q) ** 2, np.zeros((3, 0)), np.zeros(0)).covariance(start, stop)
+        elif isinstance(process, processes.BiasInstability):
+            times = process.bank(_FLICKER_INTERVAL)
+            variance = np.outer(sized(process.B) ** 2 * np.log(times[1] / times[0]) / np.pi, np.ones(len(times)))
             slow = slow + AxisNoise(none, none, variance, times).covariance(start, stop)
-        elif isinstance(each, processes.RandomWalk):
+        elif isinstance(process, processes.RandomWalk):
             # the means of min(s, t) = (s + t)/2 − |s − t|/2; the latter's second integral is −|h|³/12
             def cube(first, second):
                 return np.abs(second[None, :] - first[:, None]) ** 3 / 12
 
             apart = cube(start, start) + cube(stop, stop) - cube(start, stop) - cube(stop, start)
             shared = (middle[:, None] + middle) / 2 + apart / np.outer(stop - start, stop - start)
-            slow = slow + sized(each.K)[:, None, None] ** 2 * shared
-        elif isinstance(each, processes.RateRamp):
-            ramp = np.hypot(ramp, sized(each.R))
+            slow = slow + sized(process.K)[:, None, None] ** 2 * shared
+        elif isinstance(process, processes.RateRamp):
+            ramp = np.hypot(ramp, sized(process.R))
     return fast, slow, ramp
 
 
@@ -366,27 +392,32 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
             f"{task.name}: a budget needs poses and turns that a table knows, and the protocol {protocol.kind} has "
             "none: take positions, dividing-head, single-axis-table or rate-table."
         )
-    temperature = errors.get("temperature", ({}, ""))[0]
+    temperature = _stated(errors, "temperature")
     if "span" in temperature:
         knots = ((0.0, 25.0), (case.plan.motion.length, 25.0 + temperature["span"]))
         environment = replace(environment, temperature=knots)
     plan = protocol.plan(np.random.default_rng(0), environment)
-    segment = np.searchsorted(plan.motion.start, [each.start + 1e-9 for each in plan.intervals], side="right") - 1
-    begin = [Rotation.from_quat(plan.motion.attitude[place], scalar_first=True) for place in segment]
     stations = scheme_stations(protocol, case.imu, TYPICAL_NOISE, environment)
     size = stations.turn.shape[0]
     stations, fast, slow, ramps, notes = _with_noise(case, stations, plan.intervals)
 
     effects = _effects_by_source(errors, case.imu, ramps)
-    stops = _stops(plan.intervals, begin)
-    scheme = _scheme(case.imu, plan.motion, tuple(each for found in effects.values() for each, _ in found), stations,
-                     plan.intervals, stops, errors)  # fmt: skip
-    late, turned, coefficient, added = np.cumsum([0, *scheme.sizes])[:4]  # where each kind of error begins
+    stops = _stops(plan.intervals, plan.motion)
+    scheme = _scheme(
+        case.imu,
+        plan.motion,
+        tuple(effect for group in effects.values() for effect, _ in group),
+        stations,
+        plan.intervals,
+        stops,
+        errors,
+    )
+    delay, turned, coefficient, added = np.cumsum([0, *scheme.sizes])[:4]  # where each kind of error begins
     roots: dict[str, FloatArray] = {}
 
-    def add(name: str, block: FloatArray, place: int) -> None:
+    def add(name: str, block: FloatArray, first: int) -> None:
         root = np.zeros((sum(scheme.sizes), block.shape[1]))
-        root[place : place + len(block)] = block
+        root[first : first + len(block)] = block
         root = np.concatenate([roots[name], root], axis=1) if name in roots else root
         roots[name] = root[:, np.any(root != 0, axis=0)]
 
@@ -394,25 +425,30 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
         if name in errors:
             add(name, errors[name][0] * root, turned)
     if "timing" in errors:
-        add("timing", np.array([[errors["timing"][0]]]), late)
-    for name, found in effects.items():
-        sizes = np.concatenate([each for _, each in found])
+        add("timing", np.array([[errors["timing"][0]]]), delay)
+    for name, group in effects.items():
+        sizes = np.concatenate([size for _, size in group])
         add(name, np.diag(sizes), coefficient)
         coefficient += len(sizes)
-    if shaken := errors.get("vibration", ({}, ""))[0].get("noise", 0.0):
+    if shaken := _stated(errors, "vibration").get("noise", 0.0):
         during = np.asarray(stations.turn & stations.gyroscope_used) / np.sqrt(_durations(stations))
-        scale = np.linalg.norm(np.asarray(case.imu.triads()["gyroscope"].gain), axis=1)
+        scale = scale_of(case.imu.triads()["gyroscope"])
         add("vibration", np.diag((shaken * scale[:, None] * during).ravel()), added + 3 * size)
     for name, covariances in (("noise", fast), ("bias_instability", slow)):
-        values, vectors = np.linalg.eigh(covariances)
-        add(name, np.asarray(block_diag(*vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])), added)
+        add(name, np.asarray(block_diag(*root_of(covariances))), added)
 
-    def source(name: str, root: FloatArray) -> ErrorSource:
-        value, text = errors.get(name, (None, "by the noise"))
-        single = value if name in _SINGLE else None
-        return ErrorSource(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), root)
+    return scheme, tuple(_source(errors, name, root) for name, root in roots.items() if root.size), notes
 
-    return scheme, tuple(source(name, root) for name, root in roots.items() if root.size), notes
+
+def _source(errors: Mapping[str, tuple[Any, str]], name: str, root: FloatArray) -> ErrorSource:
+    value, text = errors.get(name, (None, "by the noise"))
+    single = value if name in _SINGLE else None
+    return ErrorSource(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), root)
+
+
+def scale_of(triad: Triad) -> FloatArray:
+    """Return how many output units each axis has per SI unit, (3,)."""
+    return np.linalg.norm(np.asarray(triad.gain), axis=1)
 
 
 def _durations(stations: Stations) -> FloatArray:
@@ -424,7 +460,7 @@ def _durations(stations: Stations) -> FloatArray:
 def white_density(case: Case, triad: str) -> FloatArray | None:
     """Return the density N² (3,), SI² · s, of the white noise that is stated for a triad; None where none is."""
     stated = case.noise[triad].processes if triad in case.noise else ()
-    white = [np.asarray(each.N, float) ** 2 for each in stated if isinstance(each, processes.White)]
+    white = [np.asarray(process.N, float) ** 2 for process in stated if isinstance(process, processes.White)]
     return np.broadcast_to(np.sum(white, axis=0), (3,)) if white else None
 
 
@@ -432,11 +468,11 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[Interval]):
     """The stations with the covariances of the noise that is stated; those (6, S, S) of its white part and of its slow
     bias, zero where not used; rate ramps (3,), SI, by triad; notes.
     """
-    span = np.array([(each.start, each.stop) for each in intervals])
+    span = np.array([(interval.start, interval.stop) for interval in intervals])
     count, size = len(span), stations.turn.shape[0]
     notes, ramps, fast, slow = [], {}, np.zeros((6, size, size)), np.zeros((6, size, size))
     used = {"accelerometer": stations.accelerometer_used, "gyroscope": stations.gyroscope_used}
-    for place, (name, triad) in enumerate(case.imu.triads().items()):
+    for number, (name, triad) in enumerate(case.imu.triads().items()):
         stated = case.noise[name].processes if name in case.noise else ()
         density = white_density(case, name)
         if density is None:
@@ -444,12 +480,12 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[Interval]):
             unit = "m/s²/√Hz" if name == "accelerometer" else "rad/s/√Hz"
             notes.append(f"no white noise is stated for the {name}: {np.sqrt(density[0]):.2g} {unit} is assumed.")
         *parts, ramps[name] = _mean_covariances(stated, density, *span.T)
-        scale = np.linalg.norm(np.asarray(triad.gain), axis=1)[:, None, None]
+        scale = scale_of(triad)[:, None, None]
         there = np.asarray(used[name])[:count]
         for whole, part in zip((fast, slow), parts, strict=True):
-            whole[3 * place : 3 * place + 3, :count, :count] = np.where(there[:, None] & there, part * scale**2, 0.0)
+            whole[3 * number : 3 * number + 3, :count, :count] = np.where(there[:, None] & there, part * scale**2, 0.0)
     total = fast + slow
-    unused = np.concatenate([np.tile(~np.asarray(each), (3, 1)) for each in used.values()])
+    unused = np.concatenate([np.tile(~np.asarray(mask), (3, 1)) for mask in used.values()])
     total += unused[:, :, None] * np.eye(size)
     stations = replace(stations, accelerometer_covariance=total[:3], gyroscope_covariance=total[3:])
     return stations, fast, slow, ramps, tuple(notes)
@@ -457,7 +493,7 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[Interval]):
 
 def _effects_by_source(errors: Mapping[str, tuple[Any, str]], unit: Imu, ramps: Mapping[str, FloatArray]):
     """By source: effects that make its errors, each with the sizes of its coefficients."""
-    gains = {name: np.linalg.norm(np.asarray(triad.gain), axis=1) for name, triad in unit.triads().items()}
+    gains = {name: scale_of(triad) for name, triad in unit.triads().items()}
 
     def effect(name: str, sizes) -> tuple[Effect, FloatArray]:
         made = CATALOGUE[name].dormant()
@@ -467,35 +503,47 @@ def _effects_by_source(errors: Mapping[str, tuple[Any, str]], unit: Imu, ramps: 
             scale = np.repeat(axes, made.size // 3) if made.size % 3 == 0 else np.full(made.size, axes.mean())
         return made, scale * np.broadcast_to(sizes, (made.size,))
 
-    found: dict[str, list[tuple[Effect, FloatArray]]] = {}
-    for source, name in (("tilt", "setup.table_tilt"), ("gravity", "setup.gravity"),
-                         ("rate", "setup.table_rate_scale")):  # fmt: skip
+    sources: dict[str, list[tuple[Effect, FloatArray]]] = {}
+    for source, name in (
+        ("tilt", "setup.table_tilt"),
+        ("gravity", "setup.gravity"),
+        ("rate", "setup.table_rate_scale"),
+    ):
         if source in errors:
-            found[source] = [effect(name, errors[source][0])]
+            sources[source] = [effect(name, errors[source][0])]
     if "earth_rotation" in errors:
         latitude = np.radians(errors["earth_rotation"][0])
         level = np.cos(latitude) / np.sqrt(2)
-        found["earth_rotation"] = [effect("gyro.earth_rotation", EARTH_RATE * np.abs([level, level, np.sin(latitude)]))]
-    drifts, temperature = (errors.get(name, ({}, ""))[0] for name in ("drift", "temperature"))
+        sources["earth_rotation"] = [
+            effect("gyro.earth_rotation", EARTH_RATE * np.abs([level, level, np.sin(latitude)]))
+        ]
+    drifts, temperature = (_stated(errors, name) for name in ("drift", "temperature"))
     drifts = {name: np.hypot(drifts.get(name, 0.0), ramp) for name, ramp in ramps.items()}
     for source, stem, sizes in (("drift", "bias_ramp", drifts), ("temperature", "temperature", temperature)):
-        found[source] = [effect(f"{PREFIXES[name]}.{stem}", sizes.get(name, 0.0)) for name in INERTIAL_QUANTITIES]
-    vibration = errors.get("vibration", ({}, ""))[0]
-    found["vibration"] = [effect("gyro.vibration_rectification", vibration.get("rectification", 0.0))]
-    found |= {name: [effect(name, size)] for name, (size, _) in errors.items() if name in CATALOGUE}
-    return {source: kept for source, each in found.items() if (kept := [(e, size) for e, size in each if size.any()])}
+        sources[source] = [effect(f"{PREFIXES[name]}.{stem}", sizes.get(name, 0.0)) for name in INERTIAL_QUANTITIES]
+    vibration = _stated(errors, "vibration")
+    sources["vibration"] = [effect("gyro.vibration_rectification", vibration.get("rectification", 0.0))]
+    sources |= {name: [effect(name, size)] for name, (size, _) in errors.items() if name in CATALOGUE}
+    return {
+        source: kept for source, pairs in sources.items() if (kept := [(e, size) for e, size in pairs if size.any()])
+    }
 
 
 def _scheme(
-    unit: Imu, motion: Motion, effects: tuple[Effect, ...], stations: Stations, intervals: Sequence[Interval],
-    stops: _Stops, errors: Mapping[str, tuple[Any, str]],
-) -> ErrorScheme:  # fmt: skip
+    unit: Imu,
+    motion: Motion,
+    effects: tuple[Effect, ...],
+    stations: Stations,
+    intervals: Sequence[Interval],
+    stops: _Stops,
+    errors: Mapping[str, tuple[Any, str]],
+) -> ErrorScheme:
     count, size = len(intervals), stations.turn.shape[0]
     ends, axis, angle = np.zeros((size, 2), np.int64), np.zeros((size, 3)), np.full(size, np.inf)
-    ends[:count], axis[:count] = stops.ends, [each.vector for each in intervals]
-    angle[:count] = [each.angle if each.kind == "turn" else np.inf for each in intervals]
+    ends[:count], axis[:count] = stops.ends, [interval.vector for interval in intervals]
+    angle[:count] = [interval.angle if interval.kind == "turn" else np.inf for interval in intervals]
     pace = np.einsum("sqi,si->sq", np.asarray(stations.stimulus.angular_rate), axis) / angle[:, None]
     done = (np.cumsum(pace, axis=1) - pace / 2) * (_durations(stations) / pace.shape[1])[:, None]
-    rms = errors.get("vibration", ({}, ""))[0].get("rms", 0.0)
+    rms = _stated(errors, "vibration").get("rms", 0.0)
     power = np.where(np.asarray(stations.turn)[:, None], rms**2, np.zeros_like(pace))
     return ErrorScheme(unit, effects, stations, motion, ends, done, pace, power, len(stops.up))

@@ -158,7 +158,7 @@ def _chart_figure(line: Line, drawn: list[tuple[FollowedQuantity, str]]) -> Figu
         dated = bool(np.isfinite(days).all() and np.ptp(days) > 0)
         across = (days * 86400).astype("datetime64[s]") if dated else np.arange(len(places))
         ranges = np.abs(np.diff(chart.values, prepend=np.nan))
-        limit = chart.reach * chart.deviation
+        limit = chart.bound * chart.deviation
         for axes, values, hits, ends in (
             (above, chart.values, chart.beyond, (chart.centre - limit, chart.centre + limit)),
             (below, ranges, chart.jumps, (np.sqrt(2) * limit,)),
@@ -173,7 +173,7 @@ def _chart_figure(line: Line, drawn: list[tuple[FollowedQuantity, str]]) -> Figu
         above.plot(across, factor * chart.average, color=_AVERAGE, linewidth=1.5)
         above.plot(across[chart.drifting], factor * chart.average[chart.drifting], ".", color=_OUT, markersize=4)
         for side in (-1, 1):
-            end = chart.centre + side * chart.average_reach * chart.deviation
+            end = chart.centre + side * chart.average_bound * chart.deviation
             above.plot(across, factor * end, color=_AVERAGE, linestyle=":", linewidth=1)
         dressed(above, spoken(quantity.name) + (f", station {station}" if station else ""), ylabel=f"[{unit}]")
         dressed(below, xlabel="" if dated else "unit", ylabel=f"moving range\n[{unit}]")

@@ -1,0 +1,25 @@
+"""Many rows by a function that is compiled for a fixed number of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+__all__ = ["in_chunks"]
+
+
+def in_chunks(function: Callable[..., Any], size: int, *trees: Any) -> Any:
+    """Return a function of `size` rows for all rows of its arguments' arrays, in NumPy.
+
+    The last chunk is filled up with the last row, so that one shape is compiled.
+    """
+    count = len(jax.tree.leaves(trees)[0])
+    results = []
+    for start in range(0, count, size):
+        rows = np.minimum(np.arange(start, start + size), count - 1)
+        result = function(*jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], trees))
+        results.append(jax.tree.map(lambda leaf, kept=count - start: np.asarray(leaf)[:kept], result))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *results)
