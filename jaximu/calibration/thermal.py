@@ -192,8 +192,9 @@ def calibrate_thermal(
     identifiability = identifiable(blocks, shapes)
 
     def fitted(noise: NoiseModel) -> dict[str, TriadFit]:
-        return {name: fit_triad(Whitened(blocks, name, noise, shapes), identifiability, families)
-                for name in blocks.means}  # fmt: skip
+        return {
+            name: fit_triad(Whitened(blocks, name, noise, shapes), identifiability, families) for name in blocks.means
+        }
 
     fits = fitted(noise)
     nets = [shapes.column(term) for fit in fits.values() for term in fit.candidate.terms if term.net is not None]
@@ -318,7 +319,7 @@ def _calibration(
         triad = unit.triads()[name]
         kept = tuple(effect for effect in triad.effects if effect.plain not in THERMAL)
         if base is None and name == "gyroscope":
-            bias = np.asarray(fit.fit.imu.triads()[name].bias)
+            bias = fit.fit.imu.triads()[name].bias
         else:
             temperature = reference
             if base is not None and len(kept) == len(triad.effects):
@@ -328,13 +329,15 @@ def _calibration(
                         "the calibration does not say at which temperature its biases hold: "
                         f"{reference:g} °C is assumed."
                     )
-            bias = np.asarray(triad.bias - steady(fit.effects, temperature, 0.0, reference)[0][0])
+            bias = triad.bias - steady(fit.effects, temperature, 0.0, reference)[0][0]
         triads[name] = replace(triad, bias=bias, effects=(*kept, *fit.effects), temperature_reference=reference)
         numbers, covariance = _numbers(
             fit, base is None and name == "gyroscope", recording.signals[name], blocks.levels
         )
-        names += [number if number.effect is None else Name(name, number.part, number.axes, len(kept) + number.effect)
-                  for number in numbers]  # fmt: skip
+        names += [
+            number if number.effect is None else Name(name, number.part, number.axes, len(kept) + number.effect)
+            for number in numbers
+        ]
         covariances.append(covariance)
     if base is None:
         triads.setdefault("gyroscope", None)
@@ -351,18 +354,26 @@ def _calibration(
     }
     if base is not None:
         data["base"] = {key: base.data[key] for key in ("file", "sha256", "temperature") if key in base.data}
-    norms = {name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)), SENSOR_UNITS[name])
-             for name, fit in fits.items()}  # fmt: skip
+    norms = {
+        name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)), SENSOR_UNITS[name])
+        for name, fit in fits.items()
+    }
     ended = [fit.fit.failure() for fit in fits.values() if NETWORK not in fit.candidate.names]  # they are solved before
     return Calibration(
-        imu=jax.tree.map(np.asarray, replace(unit, **triads)), names=tuple(names),
-        covariance=scipy.linalg.block_diag(*covariances), gravity=STANDARD if base is None else base.gravity,
-        method="thermal", loss="linear", rms=norms if base is None else base.rms | norms, rank=len(names),
+        imu=jax.tree.map(np.asarray, replace(unit, **triads)),
+        names=tuple(names),
+        covariance=scipy.linalg.block_diag(*covariances),
+        gravity=STANDARD if base is None else base.gravity,
+        method="thermal",
+        loss="linear",
+        rms=norms if base is None else base.rms | norms,
+        rank=len(names),
         weak=() if base is None else base.weak,
         excess={name: float(np.max(fit.fit.excess)) for name, fit in fits.items()},
-        solver=next((each for each in ended if each is not Failure.NONE), Failure.NONE).value, data=data,
+        solver=next((failure for failure in ended if failure is not Failure.NONE), Failure.NONE).value,
+        data=data,
         reading=recording.reading if base is None or base.reading is None else base.reading,
-    ), notes  # fmt: skip
+    ), notes
 
 
 def _numbers(fit: TriadFit, with_bias: bool, signal: Signal, levels: int) -> tuple[list[Name], FloatArray]:
@@ -375,7 +386,7 @@ def _numbers(fit: TriadFit, with_bias: bool, signal: Signal, levels: int) -> tup
     coefficients = [name for name in effect_numbers(fit.fit.imu)[0] if name in fitted or name.part == "coefficients"]
     names = list(dict.fromkeys((*coefficients, *fitted)))
     rows = [fitted.get(name, -1) for name in names]
-    covariance = np.pad(np.asarray(fit.fit.covariance), (0, 1))[np.ix_(rows, rows)]
+    covariance = np.pad(fit.fit.covariance, (0, 1))[np.ix_(rows, rows)]
     if with_bias and levels > 1:
         covariance[-3:, -3:] += np.diag(np.var(fit.level, axis=1, ddof=1) * signal.nominal_scale**2 / levels)
     return names, covariance
@@ -384,7 +395,7 @@ def _numbers(fit: TriadFit, with_bias: bool, signal: Signal, levels: int) -> tup
 def steady_change(calibration: Calibration, name: str, celsius: FloatArray) -> FloatArray:
     """Return what steady temperatures (m,) °C add to a triad's bias, (m, 3), SI: the calibration's `bias` left out."""
     triad = calibration.triads()[name]
-    scale = np.linalg.norm(np.asarray(triad.gain), axis=1) if triad.output_unit == "count" else np.ones(3)
+    scale = np.linalg.norm(triad.gain, axis=1) if triad.output_unit == "count" else np.ones(3)
     effects = [effect for effect in triad.effects if effect.plain in THERMAL]
     return steady(effects, celsius, 0.0, triad.temperature_reference)[0] / scale
 
@@ -427,8 +438,12 @@ def steady(
     count = len(celsius)
     ends = np.pad(celsius, (0, padded_count(count) - count), "edge")
     time = np.broadcast_to([-_LONG, 0.0], (len(ends), 2))
-    stimulus = Stimulus(specific_force=np.full((len(ends), 2, 3), force), temperature=ends[:, None] + rate * time,
-                        temperature_rate=np.full((len(ends), 2), rate), time=time,
-                        temperature_reference=reference)  # pyright: ignore[reportArgumentType] # fmt: skip
+    stimulus = Stimulus(
+        specific_force=np.full((len(ends), 2, 3), force),
+        temperature=ends[:, None] + rate * time,
+        temperature_rate=np.full((len(ends), 2), rate),
+        time=time,
+        temperature_reference=reference,
+    )  # pyright: ignore[reportArgumentType]
     now = np.minimum(np.arange(len(ends)), count)
     return mean_terms(effects, [Track(stimulus, np.stack([np.full(len(ends), count), now], axis=1))], count)

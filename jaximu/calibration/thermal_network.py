@@ -88,8 +88,12 @@ def _about(plain: Sequence[ThermalTerm], net: Net) -> tuple[ThermalTerm, ...]:
 def _functions(data: Whitened, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
     """Return what levels and terms leave of smooth functions of temperature and its rate, whitened, orthonormal."""
     first, second = (chebvander(data.shapes.inputs[:, k], order) for k, order in enumerate(_ORDERS))
-    both = [first[:, i] * second[:, j] for i in range(_ORDERS[0] + 1) for j in range(_ORDERS[1] + 1)
-            if i / _ORDERS[0] + j / _ORDERS[1] <= 1]  # fmt: skip
+    both = [
+        first[:, i] * second[:, j]
+        for i in range(_ORDERS[0] + 1)
+        for j in range(_ORDERS[1] + 1)
+        if i / _ORDERS[0] + j / _ORDERS[1] <= 1
+    ]
     white = data.root[axis] @ np.stack(both, axis=1)
     base = orthonormal(data.design(axis, terms))
     free = orthonormal(white - base @ (base.T @ white))
@@ -155,8 +159,16 @@ def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: b
         beside = data.means[:, axis] - basis @ (basis.T @ data.means[:, axis])
         size.append(max(float(np.std(beside)), _LEAST_SIZE))
     starts = 0.5 * np.random.default_rng(_SEED).normal(size=(_STARTS, WEIGHTS))
-    priors = np.array([[np.repeat([share * rms, inside, inside if rated else 1e-6, _CONSTANT], UNITS)
-                        for share, inside in _PRIORS for _ in starts] for rms in size])  # fmt: skip
+    priors = np.array(
+        [
+            [
+                np.repeat([share * rms, inside, inside if rated else 1e-6, _CONSTANT], UNITS)
+                for share, inside in _PRIORS
+                for _ in starts
+            ]
+            for rms in size
+        ]
+    )
     z, evidence, _ = solved(smooth, priors, np.tile(starts, (3, len(_PRIORS), 1)))
     best = range(3), np.argmax(evidence[..., 0], axis=1)
     z, _, determined = solved(whole, priors[best][:, None], z[best][:, None])

@@ -138,8 +138,8 @@ def exchanged(
     kept = list(full)
     now = criterion(kept)
     while True:
-        moves = [[term for term in kept if term != each] for each in kept if not stays(each, kept)]
-        moves += [[term for term in full if term in kept or term == each] for each in full if each not in kept]
+        moves = [[term for term in kept if term != old] for old in kept if not stays(old, kept)]
+        moves += [[term for term in full if term in kept or term == new] for new in full if new not in kept]
         costs = [criterion(move) for move in moves]
         if not costs or min(costs) >= now - 1e-9:
             return kept

@@ -46,8 +46,13 @@ def _shapes(names: Sequence[str], count: int, track: Track, *grids):
     They count from the reference temperature, those of a curve, too.
     """
     celsius = track.stimulus.temperature_reference
-    reference = Stimulus(jnp.zeros(3), temperature=jnp.asarray(celsius), temperature_rate=jnp.zeros(()),
-                         time=jnp.zeros(()), temperature_reference=celsius)  # fmt: skip
+    reference = Stimulus(
+        jnp.zeros(3),
+        temperature=jnp.asarray(celsius),
+        temperature_rate=jnp.zeros(()),
+        time=jnp.zeros(()),
+        temperature_reference=celsius,
+    )
 
     def at(kind, values):
         def of(share):
@@ -57,8 +62,10 @@ def _shapes(names: Sequence[str], count: int, track: Track, *grids):
         return jax.vmap(of, out_axes=-1)(jnp.eye(kind.size // 3))
 
     kinds = [CATALOGUE[f"accel.{name}"] for name in names]
-    return tuple(at(kind, grid[0])[None] if len(grid) == 1 else jax.lax.map(partial(at, kind), grid)
-                 for kind, grid in zip(kinds, grids, strict=True))  # fmt: skip
+    return tuple(
+        at(kind, grid[0])[None] if len(grid) == 1 else jax.lax.map(partial(at, kind), grid)
+        for kind, grid in zip(kinds, grids, strict=True)
+    )
 
 
 class ThermalShapes:
@@ -76,8 +83,10 @@ class ThermalShapes:
         low, high = blocks.range
         duration = max(blocks.spans)
         # a lag shorter than the path's own nodes is none; one as long as the recording is drift
-        spans = {"s": np.geomspace(max(blocks.duration / 2, 1e-3 * duration), 0.4 * duration, GRID),
-                 "K": np.geomspace(0.01, 0.45, GRID) * (high - low)}  # fmt: skip
+        spans = {
+            "s": np.geomspace(max(blocks.duration / 2, 1e-3 * duration), 0.4 * duration, GRID),
+            "K": np.geomspace(0.01, 0.45, GRID) * (high - low),
+        }
         units = {name: CATALOGUE[f"accel.{name}"].inner[inner].unit for name, inner in HISTORY.items()}
         self.grids = {name: spans[unit] for name, unit in units.items()} if like is None else like.grids
         fastest = float(np.max(np.abs(blocks.rate)))

@@ -91,8 +91,11 @@ def fit_triad(data: Whitened, identifiability: Identifiability, families: Sequen
     """
     folds, beyond = folds_of(identifiability.legs), beyond_bias(data, identifiability)
     scale = richest(data, identifiability)[1]
-    offered = {family: effects for family, effects in families_of(identifiability.told, beyond).items()
-               if family == "constant" or families is None or family in families}  # fmt: skip
+    offered = {
+        family: effects
+        for family, effects in families_of(identifiability.told, beyond).items()
+        if family == "constant" or families is None or family in families
+    }
     models: dict[str, Model] = {}
     for family, (names, fixed) in offered.items():
         model = tuned(data, (terms_of(names, data.shapes),) * 3, scale)
@@ -102,9 +105,9 @@ def fit_triad(data: Whitened, identifiability: Identifiability, families: Sequen
         return candidate_of(data, family, models[family], folds, scale)
 
     tried = {family: candidate(family) for family in models}
-    if remembering := [each for each in tried.values() if memories(each.names)]:
-        best = max(each.score for each in remembering)
-        anchor = min((each for each in remembering if each.score > best - PAYS), key=lambda each: each.parameters)
+    if remembering := [one for one in tried.values() if memories(one.names)]:
+        best = max(one.score for one in remembering)
+        anchor = min((one for one in remembering if one.score > best - PAYS), key=lambda one: one.parameters)
         memory = {BESIDE.get(term.name, term.name): term for term in anchor.terms if memories([term.name])}
         for family, (names, fixed) in offered.items():
             if family != anchor.family and set(memory) & set(names):
@@ -137,9 +140,9 @@ def _joined(chosen: Sequence[Candidate]) -> Candidate:
     model = completed(parts)
     more = [len(terms) - len(part) for terms, part in zip(model, parts, strict=True)]
     families = dict.fromkeys(candidate.family for candidate in chosen if candidate.family != "constant")
-    held = Held(own(lambda each: each.held.rms), own(lambda each: each.held.by_axis))
-    numbers = own(lambda each: each.numbers) + more
-    return Candidate(", ".join(families) or "constant", model, numbers, own(lambda each: each.costs), held)
+    held = Held(own(lambda candidate: candidate.held.rms), own(lambda candidate: candidate.held.by_axis))
+    numbers, costs = own(lambda candidate: candidate.numbers) + more, own(lambda candidate: candidate.costs)
+    return Candidate(", ".join(families) or "constant", model, numbers, costs, held)
 
 
 def _concluded(data: Whitened, by_axis: Sequence[Candidate], candidates: Sequence[Candidate]) -> TriadFit:
@@ -152,8 +155,9 @@ def _concluded(data: Whitened, by_axis: Sequence[Candidate], candidates: Sequenc
     scale = blocks.recordings[0].signals[data.name].nominal_scale
     added = mean_terms(effects, data.shapes.tracks, len(blocks))[0] / scale
     rest = data.means - added
-    level = np.stack([np.linalg.lstsq(data.levels[axis], data.root[axis] @ rest[:, axis], rcond=None)[0]
-                      for axis in range(3)])  # fmt: skip
+    level = np.stack(
+        [np.linalg.lstsq(data.levels[axis], data.root[axis] @ rest[:, axis], rcond=None)[0] for axis in range(3)]
+    )
     before, after = (blocks.left(data.name, output) for output in (data.means, rest))
     rest = rest - level.T[blocks.level]
     white = np.einsum("aij,ja->ai", data.root, rest)
@@ -172,8 +176,9 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
     kinds = {term.name: CATALOGUE[f"{PREFIXES[name]}.{term.name}"] for terms in model for term in terms}
     order = list(kinds)
     values = {plain: np.zeros(kind.size) for plain, kind in kinds.items()}
-    inner = {plain: {key: shapes.bounds[key] for key in kind.inner if key in shapes.bounds}
-             for plain, kind in kinds.items()}  # fmt: skip
+    inner = {
+        plain: {key: shapes.bounds[key] for key in kind.inner if key in shapes.bounds} for plain, kind in kinds.items()
+    }
     used, known = set(), {}
     for axis, terms in enumerate(model):
         for term, value in zip(terms, data.coefficients(axis, terms), strict=True):
@@ -192,16 +197,20 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
             return number.owner == name and number.part == "bias"
         return number.owner == name and (number in used or number.part in HISTORY.values())
 
-    effects = [kind(values[plain], **{key: np.float64(value) for key, value in inner[plain].items()})
-               for plain, kind in kinds.items()]  # fmt: skip
+    effects = [
+        kind(values[plain], **{key: np.float64(value) for key, value in inner[plain].items()})
+        for plain, kind in kinds.items()
+    ]
     outputs = blocks.means[name] * signal.nominal_scale + signal.nominal_offset
     weights = data.root / signal.nominal_scale[:, None, None]
     measurement = RestOverTemperature(name, outputs, weights, blocks.level, shapes.tracks)
-    triads: dict[str, Any] = {owner: replace(triad, temperature_reference=shapes.reference)
-                              for owner, triad in Imu.nominal().triads().items()}  # fmt: skip
+    triads: dict[str, Any] = {
+        owner: replace(triad, temperature_reference=shapes.reference) for owner, triad in Imu.nominal().triads().items()
+    }
     triads[name] = replace(triads[name], gain=np.diag(signal.nominal_scale), bias=outputs.mean(axis=0))
     unit = replace(Imu.nominal(), **triads).with_effects(*effects)
     # a network is solved already, and is asked for its uncertainty: full steps, as the passes take, lead it astray
     prior = Prior(tuple(known), np.zeros(len(known)), np.diag(1 / np.array(list(known.values())))) if known else None
-    return fit(unit, measurement, free, prior=prior, excess=scale - 1, estimate_excess=not known,
-               max_passes=1 if known else 32)  # fmt: skip
+    return fit(
+        unit, measurement, free, prior=prior, excess=scale - 1, estimate_excess=not known, max_passes=1 if known else 32
+    )
