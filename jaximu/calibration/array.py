@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import jax
 import numpy as np
 import scipy
+from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
 from jaximu.calibration.attitude import delay_of_speeds, fitted_mounting
@@ -79,32 +81,37 @@ def calibrate_array(
     require_float64()
     if len(recordings) < 2:
         raise InputError("an array has two units or more: give a recording of each, made at the same time.")
-    files = [source.sha256 for each in recordings for source in each.sources]
+    files = [source.sha256 for recording in recordings for source in recording.sources]
     if len(set(files)) < len(files):
         raise InputError(
             "the same file is given twice: an array needs a recording of each unit. Where one file holds several units "
             "side by side (imu1, imu2), write one file for each."
         )
-    for each in recordings:
-        if each.gyroscope is None:
-            raise InputError(f"{each.name} has no gyroscope, by which units on one body are matched.")
-    calibrations = [calibrate(each, gravity, static=static, loss=loss, repair=repair) for each in recordings]
-    ready = [prepare(each, repair) for each in recordings]
-    recordings = [each.recording for each in ready]
-    corrected = [compensate(found, each) for found, each in zip(calibrations, recordings, strict=True)]
-    delays = [0.0, *(_coarse_delay(each, corrected[0]) for each in corrected[1:])]
-    unseen = [np.concatenate([stamps + delay for stamps in each.left_out.values()] or [np.zeros(0)])
-              for each, delay in zip(ready, delays, strict=True)]  # fmt: skip
-    shared = _Shared.of(corrected, delays, calibrations[0], np.sort(np.concatenate(unseen)))
-    pairs = [_pair(shared, calibrations[0], *each, gravity, loss)
-             for each in zip(recordings[1:], calibrations[1:], corrected[1:], delays[1:], strict=True)]  # fmt: skip
+    for recording in recordings:
+        if recording.gyroscope is None:
+            raise InputError(f"{recording.name} has no gyroscope, by which units on one body are matched.")
+    calibrations = [calibrate(recording, gravity, static=static, loss=loss, repair=repair) for recording in recordings]
+    ready = [prepare(recording, repair) for recording in recordings]
+    recordings = [prepared.recording for prepared in ready]
+    corrected = list(map(compensate, calibrations, recordings))
+    delays = [0.0, *(_coarse_delay(recording, corrected[0]) for recording in corrected[1:])]
+    unseen = [
+        stamps + delay for prepared, delay in zip(ready, delays, strict=True) for stamps in prepared.left_out.values()
+    ]
+    shared = _Shared.of(corrected, delays, calibrations[0], np.sort(np.concatenate([np.zeros(0), *unseen])))
+    pairs = [
+        _pair(shared, calibrations[0], *unit, gravity, loss)
+        for unit in zip(recordings[1:], calibrations[1:], corrected[1:], delays[1:], strict=True)
+    ]
     scatter = _scatter([errors for _, errors in pairs])
     none = np.zeros(3)
-    itself = ArrayUnit(recordings[0].name, calibrations[0], np.array([1.0, 0.0, 0.0, 0.0]), none, none, none, 0.0,
-                       0.0, 0.0, (0.0, 0.0))  # fmt: skip
+    itself = ArrayUnit(
+        recordings[0].name, calibrations[0], np.array([1.0, 0.0, 0.0, 0.0]), none, none, none, 0.0, 0.0, 0.0, (0.0, 0.0)
+    )
     bare = itself, *(unit for unit, _ in pairs)
-    units = tuple(replace(unit, rate_scatter=rate, force_scatter=force)
-                  for unit, (rate, force) in zip(bare, scatter, strict=True))  # fmt: skip
+    units = tuple(
+        replace(unit, rate_scatter=rate, force_scatter=force) for unit, (rate, force) in zip(bare, scatter, strict=True)
+    )
     notes = tuple(f"{unit.name}: {note}" for unit in units for note in unit.calibration.notes)
     return Array(units, _averaged(shared, corrected, units), gravity, notes)
 
@@ -130,24 +137,20 @@ class _Shared:
         reads too little, and arms would come out too long.
         """
         first = corrected[0]
-        gyroscopes = [each.gyroscope for each in corrected]
-        slowest = min(each.rate for each in gyroscopes if each is not None)
+        gyroscopes = [recording.signals["gyroscope"] for recording in corrected]
+        slowest = min(signal.rate for signal in gyroscopes)
         length = _LENGTH / slowest
-        begin = max(each.time[0] + delay for each, delay in zip(gyroscopes, delays, strict=True)) + 2 * length  # pyright: ignore
-        end = min(each.time[-1] + delay for each, delay in zip(gyroscopes, delays, strict=True)) - 2 * length  # pyright: ignore
+        begin = max(signal.time[0] + delay for signal, delay in zip(gyroscopes, delays, strict=True)) + 2 * length
+        end = min(signal.time[-1] + delay for signal, delay in zip(gyroscopes, delays, strict=True)) - 2 * length
         rests = calibration.segmentations[0].intervals
         rests = rests[(rests[:, 0] > begin) & (rests[:, 1] < end)]
         start = np.arange(begin, end - length, length)
         still = ((start[:, None] < rests[:, 1]) & (start[:, None] + length > rests[:, 0])).any(axis=1)
         near = _NEAR / slowest
-        seen = np.searchsorted(unseen, start - near) == np.searchsorted(unseen, start + length + near)
-        start = start[~still & seen]
-        gyroscope = first.gyroscope
-        assert gyroscope is not None
-        rate = Integral(gyroscope, gyroscope.values).over(start, start + length) / length
-        speed = np.linalg.norm(rate, axis=1)
-        turned = speed > _SLOW
-        start, speed = start[turned], speed[turned]
+        measured = np.searchsorted(unseen, start - near) == np.searchsorted(unseen, start + length + near)
+        start = start[~still & measured]
+        speed = np.linalg.norm(_means(gyroscopes[0], np.stack([start, start + length], axis=1)), axis=1)
+        start, speed = start[speed > _SLOW], speed[speed > _SLOW]
         if len(start) < _FEWEST or len(rests) < 3:
             raise NotPossibleError(
                 f"{first.name}: the units were at rest {len(rests)} times and turned together for "
@@ -162,8 +165,8 @@ class _Shared:
 
     def means(self, recording: Recording, delay: float) -> tuple[FloatArray, FloatArray]:
         """Return a unit's mean forces at rest (P, 3) and mean rates in motion (S, 3)."""
-        assert recording.gyroscope is not None
-        return (_means(recording.accelerometer, self.rests - delay), _means(recording.gyroscope, self.moving - delay))
+        gyroscope = recording.signals["gyroscope"]
+        return _means(recording.accelerometer, self.rests - delay), _means(gyroscope, self.moving - delay)
 
 
 def _means(signal: Signal, span: FloatArray) -> FloatArray:
@@ -178,23 +181,27 @@ def _later(recording: Recording, first: Recording) -> float:
 
 def _coarse_delay(recording: Recording, first: Recording) -> float:
     """Return by how much (s) the first's stamps are late, to a sample."""
-    gyroscope, other = first.gyroscope, recording.gyroscope
-    assert gyroscope is not None and other is not None
-    later = _later(recording, first)
+    gyroscope, later = first.signals["gyroscope"], _later(recording, first)
     speed = np.linalg.norm(gyroscope.values, axis=1)
-    return delay_of_speeds(other, gyroscope.time + later, speed, 1 / gyroscope.rate) - later
+    return delay_of_speeds(recording.signals["gyroscope"], gyroscope.time + later, speed, 1 / gyroscope.rate) - later
 
 
 # --- one unit beside the first ----------------------------------------------------------------------------------------
 
 
 def _pair(
-    shared: _Shared, known: Calibration, recording: Recording, calibration: Calibration, corrected: Recording,
-    delay: float, gravity: LocalGravity, loss: Loss,
-) -> tuple[ArrayUnit, FloatArray]:  # fmt: skip
+    shared: _Shared,
+    known: Calibration,
+    recording: Recording,
+    calibration: Calibration,
+    corrected: Recording,
+    delay: float,
+    gravity: LocalGravity,
+    loss: Loss,
+) -> tuple[ArrayUnit, FloatArray]:
     """Return a unit of the array, and its errors (S, 6), m/s² and rad/s, less the first's, in the first's axes."""
     back = _rotation(shared, corrected, delay)
-    turned = scipy.spatial.transform.Rotation.from_matrix(back)
+    turned = Rotation.from_matrix(back)
     setup = Mounting.effects(np.ptp(shared.moving), rotation=turned.as_rotvec(), delay=0.0, lever_arm=0.0)
     start = jax.tree.map(np.asarray, calibration.imu.with_effects(*setup))
     noise = _noise(recording, shared, start, back, delay)
@@ -202,11 +209,11 @@ def _pair(
         shared_stations(recording, shared.first, span - delay, delay, noise, gravity.value, still)
         for span, still in ((shared.rests, True), (shared.moving, False))
     ]
-    measurements = [KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[None], each)) for each in stations]
+    measurements = [KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[None], part)) for part in stations]
     prior = _prior(start, calibration, known, back)
-    found = fit(start, measurements, lambda name: name in prior.names, prior=prior, loss=loss)
-    require_solved(found, recording.name)
-    unit, errors = _unit(recording.name, calibration, found, delay, stations[1])
+    fitted = fit(start, measurements, lambda name: name in prior.names, prior=prior, loss=loss)
+    require_solved(fitted, recording.name)
+    unit, errors = _unit(recording.name, calibration, fitted, delay, stations[1])
     return replace(unit, time_offset=unit.time_offset - _later(recording, shared.first)), errors
 
 
@@ -227,16 +234,16 @@ def _rotation(shared: _Shared, corrected: Recording, delay: float) -> FloatArray
 
 def _noise(recording: Recording, shared: _Shared, imu: Imu, back: FloatArray, delay: float):
     """Return the white noise (3, 3), output² s, of a unit's accelerometer and gyroscope, the first's included."""
-    found = []
-    for name in ("accelerometer", "gyroscope"):
-        own = rest_statistics(getattr(recording, name), shared.rests - delay)[0]
-        other = rest_statistics(getattr(shared.first, name), shared.rests)[0]
-        across = np.asarray(imu.triads()[name].gain) @ back.T
-        found.append(own + across @ other @ across.T)
-    return tuple(found)
+    noise = []
+    for name, triad in imu.triads().items():
+        of_unit = rest_statistics(recording.signals[name], shared.rests - delay)[0]
+        of_first = rest_statistics(shared.first.signals[name], shared.rests)[0]
+        across = triad.gain @ back.T
+        noise.append(of_unit + across @ of_first @ across.T)
+    return tuple(noise)
 
 
-def _prior(imu: Imu, own: Calibration, first: Calibration, back: FloatArray) -> Prior:
+def _prior(imu: Imu, calibration: Calibration, first: Calibration, back: FloatArray) -> Prior:
     """Return what is known of a unit beside the first: its own calibration, blurred by the first's, and the set-up.
 
     Where the first's gain is off by δK and its bias by δb, the motion that it tells is off, and the unit looks as if
@@ -246,41 +253,50 @@ def _prior(imu: Imu, own: Calibration, first: Calibration, back: FloatArray) -> 
     was found of them counts as unknown here, or their noise would be counted twice.
     """
     bare = imu.with_effects()
-    names, effects = names_of(bare), Prior.of_effects(imu)
+    names, effects, sizes = names_of(bare), Prior.of_effects(imu), flatten(typical_sizes(bare))
     assert effects is not None
     blur = np.zeros((len(names), len(names)))
     for triad, model in imu.triads().items():
-        across = np.asarray(model.gain) @ back.T @ np.linalg.inv(np.asarray(first.imu.triads()[triad].gain))
+        across = model.gain @ back.T @ np.linalg.inv(first.imu.triads()[triad].gain)
         for part, matrix in (("gain", np.kron(across, back.T)), ("bias", across)):
-            rows = [place for place, name in enumerate(names) if (name.owner, name.part) == (triad, part)]
+            rows = [row for row, name in enumerate(names) if (name.owner, name.part) == (triad, part)]
             blur[np.ix_(rows, rows)] = -matrix
-    covariance = own.covariance_of(names) + blur @ first.covariance_of(names) @ blur.T
-    found = np.diagonal(own.covariance_of(names)) > 0  # the accelerometer's axes stand: they say what is turned
-    seen = [place for place, name in enumerate(names)
-            if found[place] and (name.owner == "accelerometer" or name.part == "gain")]  # fmt: skip
-    covariance[seen, seen] += flatten(typical_sizes(bare))[seen] ** 2
-    covariance += np.diag((_LITTLE * flatten(typical_sizes(bare))) ** 2)
+    known = calibration.covariance_of(names)
+    covariance = known + blur @ first.covariance_of(names) @ blur.T + np.diag((_LITTLE * sizes) ** 2)
+    # what is not known stands: it says what is turned
+    rows = [
+        row
+        for row, name in enumerate(names)
+        if known[row, row] > 0 and (name.owner == "accelerometer" or name.part == "gain")
+    ]
+    covariance[rows, rows] += sizes[rows] ** 2
     root = scipy.linalg.block_diag(np.linalg.inv(np.linalg.cholesky(covariance)), effects.root)
     return Prior((*names, *effects.names), np.concatenate([flatten(bare), effects.mean]), root)
 
 
 def _unit(
-    name: str, calibration: Calibration, found: Fit, delay: float, motion: Stations
+    name: str, calibration: Calibration, fitted: Fit, delay: float, motion: Stations
 ) -> tuple[ArrayUnit, FloatArray]:
     """Return what the fit says of a unit, and its errors in motion."""
-    mounting, covariance = fitted_mounting(found.imu, found.names, found.covariance)
-    turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation)
-    own, back = np.asarray(right_jacobian(mounting.rotation)), turned.as_matrix()
-    errors = {each.name: each.error for each in station_errors(found.imu, motion, np.zeros(3))}
+    mounting, covariance = fitted_mounting(fitted.imu, fitted.names, fitted.covariance)
+    turned = Rotation.from_rotvec(mounting.rotation)
+    slope, back = np.asarray(right_jacobian(mounting.rotation)), turned.as_matrix()
+    errors = {kind.name: kind.error for kind in station_errors(fitted.imu, motion, np.zeros(3))}
     length = np.asarray(motion.stop - motion.start)[np.asarray(motion.gyroscope_used)]
     both = np.concatenate([back @ errors["specific_force"], back @ (np.radians(errors["turn_angle"]) / length)]).T
-    rms = [float(np.sqrt(np.mean(both[:, columns] ** 2))) for columns in (slice(3, 6), slice(3))]
+    rate, force = (float(np.sqrt(np.mean(both[:, columns] ** 2))) for columns in (slice(3, 6), slice(3)))
     unit = ArrayUnit(
-        name, calibration, turned.inv().as_quat(canonical=True, scalar_first=True),
-        np.sqrt(np.diagonal(own @ covariance.rotation @ own.T)), back @ mounting.lever_arm,
-        np.sqrt(np.diagonal(back @ covariance.lever_arm @ back.T)), -(delay + float(mounting.delay)),
-        float(np.sqrt(covariance.delay[0, 0])), float(mounting.clock_scale), (rms[0], rms[1]),
-    )  # fmt: skip
+        name,
+        calibration,
+        turned.inv().as_quat(canonical=True, scalar_first=True),
+        np.sqrt(np.diagonal(slope @ covariance.rotation @ slope.T)),
+        back @ mounting.lever_arm,
+        np.sqrt(np.diagonal(back @ covariance.lever_arm @ back.T)),
+        -(delay + float(mounting.delay)),
+        float(np.sqrt(covariance.delay[0, 0])),
+        float(mounting.clock_scale),
+        (rate, force),
+    )
     return unit, both
 
 
@@ -297,35 +313,38 @@ def _scatter(errors: Sequence[FloatArray]) -> list[tuple[float | None, float | N
     if count < 3:
         return [(None, None)] * count
     whole = [np.zeros_like(errors[0]), *errors]
-    pairs = [(i, j) for i in range(count) for j in range(i)]
+    pairs = list(combinations(range(count), 2))
     design = np.zeros((len(pairs), count))
-    for row, pair in enumerate(pairs):
-        design[row, list(pair)] = 1.0
-    found = []
+    for row, pair in zip(design, pairs, strict=True):
+        row[list(pair)] = 1.0
+    scatter = []
     for columns in (slice(3, 6), slice(3)):
         variances = [np.mean((whole[i] - whole[j])[:, columns] ** 2) for i, j in pairs]
-        found.append(np.sqrt(np.maximum(np.linalg.lstsq(design, np.array(variances), rcond=None)[0], 0.0)).tolist())
-    return list(zip(*found, strict=True))
+        scatter.append(np.sqrt(np.maximum(np.linalg.lstsq(design, np.array(variances), rcond=None)[0], 0.0)).tolist())
+    return list(zip(*scatter, strict=True))
 
 
 def _averaged(shared: _Shared, corrected: Sequence[Recording], units: Sequence[ArrayUnit]) -> Averaged:
     """Return the scatter at rest of a typical unit and of the mean of all, each weighted by its own variance."""
     edges = [np.arange(a, b - _BLOCK, _BLOCK) for a, b in shared.rests]
-    start, rest = np.concatenate(edges), np.repeat(np.arange(len(edges)), [len(each) for each in edges])
-    found = []
+    start, rest = np.concatenate(edges), np.repeat(np.arange(len(edges)), list(map(len, edges)))
+    freedom = 3 * (len(rest) - len(edges))
+    averaged = []
     for name in ("gyroscope", "accelerometer"):
         outputs = []
         for recording, unit in zip(corrected, units, strict=True):
-            signal: Signal = getattr(recording, name)
             begin = start + unit.time_offset + _later(recording, shared.first)
-            values = Integral(signal, signal.values).over(begin, begin + _BLOCK) / _BLOCK
-            back = scipy.spatial.transform.Rotation.from_quat(unit.rotation, scalar_first=True).inv()
-            values = back.apply(values)
+            values = _means(recording.signals[name], np.stack([begin, begin + _BLOCK], axis=1))
+            values = Rotation.from_quat(unit.rotation, scalar_first=True).inv().apply(values)
             means = np.stack([np.bincount(rest, axis) for axis in values.T], 1) / np.bincount(rest)[:, None]
             outputs.append(values - means[rest])
-        freedom = 3 * (len(rest) - len(edges))
-        variance = np.array([np.sum(each**2) / freedom for each in outputs])
+        variance = np.array([np.sum(values**2) / freedom for values in outputs])
         mean = np.einsum("u,uik->ik", (1 / variance) / np.sum(1 / variance), np.array(outputs))
-        found.append((float(np.sqrt(np.median(variance))), float(np.sqrt(np.sum(mean**2) / freedom)),
-                      float(np.sqrt(1 / np.sum(1 / variance)))))  # fmt: skip
-    return Averaged(found[0], found[1])
+        averaged.append(
+            (
+                float(np.sqrt(np.median(variance))),
+                float(np.sqrt(np.sum(mean**2) / freedom)),
+                float(np.sqrt(1 / np.sum(1 / variance))),
+            )
+        )
+    return Averaged(*averaged)

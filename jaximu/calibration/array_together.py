@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from jaximu.calibration.array_units import Array, ArrayUnit
+from jaximu.calibration.array_units import Array
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.refusals import require_solved
 from jaximu.data.array import UnitsOnOneBody
@@ -29,7 +29,7 @@ from jaximu.ground.precision import require_float64
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
-from jaximu.recordings.segmentation import Segmentation, observed_poses
+from jaximu.recordings.segmentation import observed_poses
 
 __all__ = ["LeftOutTurns", "Together", "fit_together", "leave_out_turns"]
 
@@ -51,8 +51,7 @@ class Together:
 
     def units_alone(self) -> tuple[Imu, ...]:
         """Return the units, each calibrated by itself."""
-        count = len(self.observations.gravity)
-        return tuple(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], self.alone.imu) for k in range(count))
+        return _units(self.alone)
 
     def units_together(self) -> tuple[Imu, ...]:
         """Return the units calibrated together; `setup.reference_rotation` says how each is turned to the first."""
@@ -62,8 +61,8 @@ class Together:
     @property
     def in_common(self) -> float:
         """Share of the variance of turns, beyond the noise at rest, that all units have in common."""
-        _, own, _, common = np.asarray(self.together.excess)
-        return float(common / max(own + common, 1e-300))
+        _, turns, _, common = self.together.excess
+        return float(common / max(turns + common, 1e-300))
 
 
 @dataclass(frozen=True)
@@ -103,39 +102,37 @@ def leave_out_turns(found: Array, parts: int = 2) -> LeftOutTurns:
     """
     require_float64()
     observations = _observed(found)
-    seen = np.flatnonzero(np.all(observations.turns.mask, axis=0))
-    if len(seen) < _FEWEST:
+    measured = np.flatnonzero(np.all(observations.turns.mask, axis=0))
+    if len(measured) < _FEWEST:
         raise NotPossibleError(
-            f"{found.units[0].name}: all units measured {len(seen)} turns from rest to rest; leaving some out takes "
-            f"{_FEWEST} or more."
+            f"{found.units[0].name}: all units measured {len(measured)} turns from rest to rest; leaving some out "
+            f"takes {_FEWEST} or more."
         )
-    gravity, apart, common = [], [], []
+    known = np.array([unit.rotation for unit in found.units[1:]])
+    errors, common = [], []
     for part in range(parts):
-        own = seen[part::parts]
-        fitted = _fitted(found, observations, own)
-        alone, together = fitted.units_alone(), fitted.units_together()
-        known = np.array([unit.rotation for unit in found.units[1:]])
-        met = [_met(alone, known, observations), _met(together, _mountings(together), observations)]
-        gravity.append([carried[:, own].ravel() for carried, _ in met])
-        apart.append([each[:, own].ravel() for _, each in met])
+        turns = measured[part::parts]
+        fitted = _fitted(found, observations, turns)
+        together = fitted.units_together()
+        met = (*_met(fitted.units_alone(), known, observations), *_met(together, _mountings(together), observations))
+        errors.append([angle[:, turns].ravel() for angle in met])
         common.append(fitted.in_common)
-    rms = [[float(np.sqrt(np.mean(np.concatenate([row[k] for row in rows]) ** 2))) for k in range(2)]
-           for rows in (gravity, apart)]  # fmt: skip
-    count = sum(len(row[0]) for row in gravity)
-    return LeftOutTurns(count, (rms[0][0], rms[0][1]), (rms[1][0], rms[1][1]), float(np.mean(common)))
+    whole = [np.concatenate(angles) for angles in zip(*errors, strict=True)]
+    alone, apart_alone, together, apart = (float(np.sqrt(np.mean(angles**2))) for angles in whole)
+    return LeftOutTurns(len(whole[0]), (alone, together), (apart_alone, apart), float(np.mean(common)))
 
 
-def _observed(found: Array) -> Observations:
+def _observed(array: Array) -> Observations:
     """Return what all units measured of the first one's rests and the turns between them, along a leading axis."""
-    rests = found.units[0].calibration.segmentations[0].intervals
-    for unit in found.units:
+    rests = array.units[0].calibration.segmentations[0].intervals
+    for unit in array.units:
         time = unit.calibration.segmentations[0].recording.accelerometer.time - unit.time_offset
         rests = rests[(rests[:, 0] > time[0]) & (rests[:, 1] < time[-1])]
-    parts = [_segmented(unit, rests) for unit in found.units]
-    gravity = found.gravity.value
+    parts = [replace(unit.calibration.segmentations[0], intervals=rests + unit.time_offset) for unit in array.units]
+    gravity = array.gravity.value
     samples = max(observed_poses(part, gravity).turns.output.shape[1] for part in parts)
     observed = []
-    for part, unit in zip(parts, found.units, strict=True):
+    for part, unit in zip(parts, array.units, strict=True):
         observations = observed_poses(part, gravity, bucket=(len(rests), samples))
         imu = unit.calibration.imu
         if effects := tuple(imu.all_effects().values()):
@@ -144,24 +141,27 @@ def _observed(found: Array) -> Observations:
     return _stacked(observed)
 
 
-def _segmented(unit: ArrayUnit, rests: FloatArray) -> Segmentation:
-    return replace(unit.calibration.segmentations[0], intervals=rests + unit.time_offset)
-
-
-def _fitted(found: Array, observations: Observations, left_out: Sequence[int] | NDArray[np.int64]) -> Together:
+def _fitted(array: Array, observations: Observations, left_out: Sequence[int] | NDArray[np.int64]) -> Together:
     mask = np.array(observations.turns.mask)
     mask[:, list(left_out)] = False
-    observations = eqx.tree_at(lambda each: each.turns.mask, observations, mask)
-    alone = fit_hand_held(_stacked([unit.calibration.imu.with_effects() for unit in found.units]), observations)
-    units = [jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], alone.imu) for k in range(len(found.units))]
-    back = Rotation.from_quat([unit.rotation for unit in found.units], scalar_first=True).inv()
-    turned = [unit.with_effects(SetupReferenceRotation.make(vector))
-              for unit, vector in zip(units, back.as_rotvec(), strict=True)]  # fmt: skip
+    observations = eqx.tree_at(lambda tree: tree.turns.mask, observations, mask)
+    alone = fit_hand_held(_stacked([unit.calibration.imu.with_effects() for unit in array.units]), observations)
+    back = Rotation.from_quat([unit.rotation for unit in array.units], scalar_first=True).inv()
+    turned = [
+        unit.with_effects(SetupReferenceRotation.make(vector))
+        for unit, vector in zip(_units(alone), back.as_rotvec(), strict=True)
+    ]
     begin, most = np.append(np.median(alone.excess, axis=0), 1.0), np.full(4, np.inf)
     most[-1] = _most_in_common(alone, observations)
     together = fit(Board.of(turned), UnitsOnOneBody(observations), _free, excess=begin, most=most, follow=True)
-    require_solved(together, ", ".join(unit.name for unit in found.units))
+    require_solved(together, ", ".join(unit.name for unit in array.units))
     return Together(observations, alone, together)
+
+
+def _units(fitted: Fit) -> tuple[Imu, ...]:
+    """Return the units of a fit along a leading axis."""
+    count = len(fitted.values)
+    return tuple(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], fitted.imu) for k in range(count))
 
 
 def _most_in_common(alone: Fit, observations: Observations) -> float:
@@ -170,9 +170,9 @@ def _most_in_common(alone: Fit, observations: Observations) -> float:
     A few turns would else do without a maximum of the likelihood: the gains that all units share run after this size.
     """
     assert alone.imu.gyroscope is not None
-    back = np.linalg.inv(np.asarray(alone.imu.gyroscope.gain))
-    noise = np.trace(back @ np.asarray(observations.turns.noise) @ back.swapaxes(1, 2), axis1=1, axis2=2)
-    return float(np.max(np.asarray(alone.excess)[:, EXCESS_NAMES.index("turns")] * noise) / noise[0])
+    back = np.linalg.inv(alone.imu.gyroscope.gain)
+    noise = np.trace(back @ observations.turns.noise @ back.swapaxes(1, 2), axis1=1, axis2=2)
+    return float(np.max(alone.excess[:, EXCESS_NAMES.index("turns")] * noise) / noise[0])
 
 
 def _free(name: Name) -> bool:
@@ -186,21 +186,20 @@ def _met(units: Sequence[Imu], mounted: FloatArray, observations: Observations) 
 
     mounted: quaternions (U − 1, 4), w first, from the first unit's axes to the others'.
     """
-    bare = _stacked([unit.with_effects() for unit in units])
-    found = condensed(bare, observations)
-    turned = [Rotation.from_quat(each, scalar_first=True) for each in np.asarray(found.conditions.rotation)]
+    carried = condensed(_stacked([unit.with_effects() for unit in units]), observations)
+    turned = [Rotation.from_quat(turns, scalar_first=True) for turns in np.asarray(carried.conditions.rotation)]
     apart = []
     for other, quaternion in zip(turned[1:], mounted, strict=True):
         back = Rotation.from_quat(quaternion, scalar_first=True)
         apart.append(((back * turned[0] * back.inv()).inv() * other).magnitude())
-    return found.angle, np.stack(apart)
+    return carried.angle, np.stack(apart)
 
 
 def _mountings(units: Sequence[Imu]) -> FloatArray:
     """Return quaternions (U − 1, 4), w first, from the first unit's axes to the others'."""
-    vectors = [np.asarray(unit.coefficients(SetupReferenceRotation)) for unit in units[1:]]
+    vectors = [unit.coefficients(SetupReferenceRotation) for unit in units[1:]]
     return Rotation.from_rotvec(vectors).inv().as_quat(scalar_first=True)
 
 
 def _stacked(trees: Sequence[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)

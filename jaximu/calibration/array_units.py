@@ -71,8 +71,10 @@ class Averaged:
 
     def document(self) -> dict[str, Any]:
         """Return it as `array.json` has it."""
-        return {name: dict(zip(("unit", "mean", "expected"), values, strict=True))
-                for name, values in (("rate", self.rate), ("force", self.force))}  # fmt: skip
+        return {
+            name: dict(zip(("unit", "mean", "expected"), values, strict=True))
+            for name, values in (("rate", self.rate), ("force", self.force))
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,26 +88,29 @@ class Array(Document):
 
     def document(self) -> dict[str, Any]:
         """Return the array as the JSON document of schema `jaximu.array/1`."""
-        sources = [each.calibration.data for each in self.units]
+        sources = [unit.calibration.data for unit in self.units]
         return {
             "schema": SCHEMA,
             "convention": "rotation: unit quaternion w, x, y, z that turns components in the first unit's axes into "
             "this unit's; position: m, of this unit in the first unit's axes; time_offset: positive if this unit's "
             "stamps are late; sigmas: rad, m, s; scatter and residual: rad/s and m/s²",
-            "units": [each.document() for each in self.units],
+            "units": [unit.document() for unit in self.units],
             "averaging": self.averaged.document(),
-            "data": [{key: each[key] for key in ("file", "sha256", "rows") if key in each} for each in sources],
+            "data": [{key: data[key] for key in ("file", "sha256", "rows") if key in data} for data in sources],
             "notes": list(self.notes),
         }
 
     def suspects(self) -> list[tuple[ArrayUnit, str, float]]:
         """Return units that scatter about the shared motion far more than the others, in what, how many times."""
-        found = []
+        suspects = []
         for field, words in (("rate_scatter", "rate"), ("force_scatter", "specific force")):
-            values = [getattr(each, field) for each in self.units]
+            values = [getattr(unit, field) for unit in self.units]
             if None in values:
                 continue
             typical = float(np.median(values))
-            found += [(unit, words, value / typical) for unit, value in zip(self.units, values, strict=True)
-                      if typical > 0 and value > _SUSPECT * typical]  # fmt: skip
-        return found
+            suspects += [
+                (unit, words, value / typical)
+                for unit, value in zip(self.units, values, strict=True)
+                if typical > 0 and value > _SUSPECT * typical
+            ]
+        return suspects

@@ -11,10 +11,13 @@ from jaximu.ground.array_types import Array
 
 __all__ = ["ferraris", "linear_least_squares", "remove_curvature", "six_position", "turn_pairs"]
 
+Matrix = Float[Array, "... 3 3"]
+Vector = Float[Array, "... 3"]
+Rows = Float[Array, "... S 3"]
+Number = Float[ArrayLike, "..."]
 
-def six_position(
-    up: Float[Array, "... 3 3"], down: Float[Array, "... 3 3"], gravity: Float[ArrayLike, "..."]
-) -> tuple[Float[Array, "... 3 3"], Float[Array, "... 3"]]:
+
+def six_position(up: Matrix, down: Matrix, gravity: Number) -> tuple[Matrix, Vector]:
     """Return the accelerometer's gain and bias from each axis up and down (S8a).
 
     K_:i = (y_up,i − y_down,i) / (2 g), b the mean of the three (y_up,i + y_down,i) / 2.
@@ -26,12 +29,12 @@ def six_position(
 
 
 def turn_pairs(
-    anticlockwise: Float[Array, "... 3 3"],
-    clockwise: Float[Array, "... 3 3"],
-    angle: Float[ArrayLike, "..."],
+    anticlockwise: Matrix,
+    clockwise: Matrix,
+    angle: Number,
     durations: Float[Array, "... 3 2"] | None = None,
-    bias: Float[Array, "... 3"] | None = None,
-) -> Float[Array, "... 3 3"]:
+    bias: Vector | None = None,
+) -> Matrix:
     """Return the gyroscope's gain from a turn each way about each axis (S9): K_:i = (Θ⁺ − Θ⁻) / (2 θ).
 
     **Arguments:**
@@ -48,8 +51,8 @@ def turn_pairs(
 
 
 def linear_least_squares(
-    inputs: Float[Array, "... S 3"], outputs: Float[Array, "... S 3"], weights: Float[Array, "... S"] | None = None
-) -> tuple[Float[Array, "... 3 3"], Float[Array, "... 3"]]:
+    inputs: Rows, outputs: Rows, weights: Float[Array, "... S"] | None = None
+) -> tuple[Matrix, Vector]:
     """Return gain and bias of a triad, twelve numbers, from known inputs by QR (S8b): Y = (U 1) (K b)ᵀ.
 
     The factorisation is Gram and Schmidt's in the modified form, carried on through the right-hand sides, which makes
@@ -69,31 +72,33 @@ def linear_least_squares(
         unit = columns[pivot] / length[..., None]
         row = [jnp.sum(unit * column, axis=-1) for column in columns[pivot + 1 :]]
         columns = columns[: pivot + 1] + [
-            column - unit * each[..., None] for column, each in zip(columns[pivot + 1 :], row, strict=True)
+            column - unit * along[..., None] for column, along in zip(columns[pivot + 1 :], row, strict=True)
         ]
         upper.append([length, *row])
     solution: list[list[Array]] = []
     for pivot in reversed(range(4)):
         diagonal, *rest = upper[pivot]
         others, right = rest[: 3 - pivot], rest[3 - pivot :]
-        known = [sum((a * x[axis] for a, x in zip(others, solution, strict=True)), start=jnp.zeros_like(diagonal))
-                 for axis in range(3)]  # fmt: skip
-        solution.insert(0, [(y - each) / diagonal for y, each in zip(right, known, strict=True)])
-    gain = jnp.stack([jnp.stack(each, axis=-1) for each in solution[:3]], axis=-1)
+        known = [
+            sum((a * x[axis] for a, x in zip(others, solution, strict=True)), start=jnp.zeros_like(diagonal))
+            for axis in range(3)
+        ]
+        solution.insert(0, [(y - taken) / diagonal for y, taken in zip(right, known, strict=True)])
+    gain = jnp.stack([jnp.stack(column, axis=-1) for column in solution[:3]], axis=-1)
     return gain, jnp.stack(solution[3], axis=-1)
 
 
 def ferraris(
-    up: Float[Array, "... 3 3"],
-    down: Float[Array, "... 3 3"],
-    rest_up: Float[Array, "... 3 3"],
-    rest_down: Float[Array, "... 3 3"],
-    turned: Float[Array, "... 3 3"],
-    turned_force: Float[Array, "... 3 3"],
-    durations: Float[Array, "... 3"],
-    angles: Float[Array, "... 3"],
-    gravity: Float[ArrayLike, "..."],
-    rest: Float[Array, "... 3"] | None = None,
+    up: Matrix,
+    down: Matrix,
+    rest_up: Matrix,
+    rest_down: Matrix,
+    turned: Matrix,
+    turned_force: Matrix,
+    durations: Vector,
+    angles: Vector,
+    gravity: Number,
+    rest: Vector | None = None,
 ) -> dict[str, Float[Array, "..."]]:
     """Return gains and biases by the procedure of Ferraris, Grimaldi and Parvis (Sensors and Materials 7, 1995).
 
@@ -119,13 +124,16 @@ def ferraris(
     moved = flip(turned_force) - bias[..., :, None] * durations[..., None, :]
     force = jnp.linalg.solve(gain, moved)  # integrated, m/s
     turning = flip(turned) - cross @ force - still[..., :, None] * durations[..., None, :]
-    return {"accelerometer_gain": gain, "accelerometer_bias": bias, "gyroscope_gain": turning / angles[..., None, :],
-            "gyroscope_bias": still, "cross": cross}  # fmt: skip
+    return {
+        "accelerometer_gain": gain,
+        "accelerometer_bias": bias,
+        "gyroscope_gain": turning / angles[..., None, :],
+        "gyroscope_bias": still,
+        "cross": cross,
+    }
 
 
-def remove_curvature(
-    inputs: Float[Array, "... S 3"], outputs: Float[Array, "... S 3"], order: int = 2
-) -> tuple[Float[Array, "... S 3"], Float[Array, "... 3 C"]]:
+def remove_curvature(inputs: Rows, outputs: Rows, order: int = 2) -> tuple[Rows, Float[Array, "... 3 C"]]:
     """Return outputs without the curvature of each axis in its own input, and the coefficients of u², u³ … (S7).
 
     "Linearise first": each axis's output is fitted by a polynomial in its own input alone, and all above the straight
@@ -142,6 +150,6 @@ def remove_curvature(
     design = jnp.swapaxes(powers, -3, -2)
     basis, upper = jnp.linalg.qr(design)
     right = jnp.sum(basis * jnp.swapaxes(outputs, -1, -2)[..., None], axis=-2)
-    found = jnp.linalg.solve(upper, right[..., None])[..., 0][..., 2:]
-    curvature = jnp.sum(powers[..., 2:] * found[..., None, :, :], axis=-1)
-    return outputs - curvature, found / scale[..., 0, :, None] ** jnp.arange(2, order + 1)
+    curved = jnp.linalg.solve(upper, right[..., None])[..., 0][..., 2:]
+    curvature = jnp.sum(powers[..., 2:] * curved[..., None, :, :], axis=-1)
+    return outputs - curvature, curved / scale[..., 0, :, None] ** jnp.arange(2, order + 1)

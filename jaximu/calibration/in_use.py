@@ -20,6 +20,7 @@ from jaximu.calibration.systematic import (
     known_scale,
     noise_at_rest,
     places_of,
+    require_gyroscope,
     seen_from_outside,
 )
 from jaximu.data.gravity_direction import level
@@ -120,15 +121,22 @@ class FilterInUse:
     """
 
     def __init__(
-        self, calibration: Calibration, noise: NoiseModel, rate: float, gravity: LocalGravity | None = None,
-        mounted: Mounted | None = None, changing: Mapping[str, float] = POWER_ON, magnetic: bool = False,
-    ):  # fmt: skip
+        self,
+        calibration: Calibration,
+        noise: NoiseModel,
+        rate: float,
+        gravity: LocalGravity | None = None,
+        mounted: Mounted | None = None,
+        changing: Mapping[str, float] = POWER_ON,
+        magnetic: bool = False,
+    ):
         require_float64()
         calibration = calibration.inertial()
         if "gyroscope" not in calibration.triads():
             raise InputError("following a unit in use needs a calibrated gyroscope, and this calibration has none.")
-        self.gravity = self._gravity = float((gravity or calibration.gravity).value)
-        kept = [each for each in calibration.imu.transferable().all_effects().values()]
+        gravity = calibration.gravity if gravity is None else gravity
+        self.gravity = self._gravity = float(gravity.value)
+        kept = list(calibration.imu.transferable().all_effects().values())
         for effect in kept:
             if "temperature" in " ".join(effect.needs):
                 raise NotPossibleError(
@@ -140,30 +148,28 @@ class FilterInUse:
         self.imu: Imu = jax.tree.map(
             np.asarray, calibration.imu.with_effects(*kept, GyroEarthRotation.dormant(), *outside)
         )
-        known = {name: place for place, name in enumerate(calibration.names) if name.effect is None}
-        beside = {at: EARTH_RATE if isinstance(each, GyroEarthRotation) else each.known
-                  for at, each in self.imu.all_effects().items()
-                  if isinstance(each, (GyroEarthRotation, *MOUNTING_EFFECTS))}  # fmt: skip
-        free = Parameters.select(self.imu, lambda name: name in known or (name.owner, name.effect) in beside)
+        known = calibration.of_numbers(lambda name: name.effect is None)
+        beside = {
+            key: EARTH_RATE if isinstance(effect, GyroEarthRotation) else effect.known
+            for key, effect in self.imu.all_effects().items()
+            if isinstance(effect, (GyroEarthRotation, *MOUNTING_EFFECTS))
+        }
+        free = Parameters.select(self.imu, lambda name: name in known.names or (name.owner, name.effect) in beside)
         self.names, self._index = free.names, np.asarray(free.index, int)
-        rows = [known[name] for name in free.names if name in known]
-        inside = [number for number, name in enumerate(free.names) if name in known]
-        spread = [1.0 if name in known else beside[name.owner, name.effect] for name in free.names]
-        covariance = np.diag(np.square([*spread, 1.0]))
-        covariance[np.ix_(inside, inside)] = calibration.covariance[np.ix_(rows, rows)]
-        for number, name in enumerate(free.names):
+        spread = [0.0 if name in known.names else beside[name.owner, name.effect] for name in free.names]
+        covariance = np.pad(known.covariance_of(free.names), (0, 1)) + np.diag(np.square([*spread, 0.0]))
+        for row, name in enumerate(free.names):
             if name.part == "bias":
-                scale = np.linalg.norm(np.asarray(getattr(self.imu, name.owner).gain)[name.axes[0]])
-                covariance[number, number] += (changing.get(name.owner, 0.0) * scale) ** 2
-        covariance[-1, -1] = max((gravity or calibration.gravity).sigma, 1e-6) ** 2
+                scale = np.linalg.norm(self.imu.triads()[name.owner].gain[name.axes[0]])
+                covariance[row, row] += (changing.get(name.owner, 0.0) * scale) ** 2
+        covariance[-1, -1] = max(gravity.sigma, 1e-6) ** 2
         self.prior = np.linalg.inv(np.linalg.cholesky(covariance))
         self.errors: Disturbances = seen_from_outside(disturbances(noise, known_scale(calibration)), mounted)
         self._mounted, self._magnetic = mounted, magnetic
         self._moves = mounted is not None and mounted.attitude.velocities() is not None
         self._pending: deque[tuple[float, float, FloatArray, FloatArray | None]] = deque()
         self._floor = np.asarray(disturbances(noise).white) * rate
-        self._count, self._padded = round(INTERVAL * rate), int(np.ceil(_SPAN * INTERVAL * rate))
-        self._rate = rate
+        self._count, self._padded, self._rate = round(INTERVAL * rate), int(np.ceil(_SPAN * INTERVAL * rate)), rate
         self._numbers = flatten(self.imu)
         self.begun = self._numbers[self._index]
         self._known: Knowledge | None = None
@@ -175,9 +181,13 @@ class FilterInUse:
         self._recent: deque[tuple[float, int]] = deque(maxlen=_WINDOW)
 
     def update(
-        self, time: FloatArray, accelerometer: FloatArray, gyroscope: FloatArray, attitude: Attitude | None = None,
+        self,
+        time: FloatArray,
+        accelerometer: FloatArray,
+        gyroscope: FloatArray,
+        attitude: Attitude | None = None,
         field: FloatArray | None = None,
-    ) -> list[FilterState]:  # fmt: skip
+    ) -> list[FilterState]:
         """Take n samples, time (n,) in s rising, outputs (n, 3) in the calibration's units; return what was learnt.
 
         **Arguments:** `attitude`: what the reference said since the last call, by its own clock. What it says of a
@@ -189,26 +199,25 @@ class FilterInUse:
         """
         if attitude is not None:
             self._hand_over(attitude)
-        time, accelerometer, gyroscope = (np.asarray(each, float) for each in (time, accelerometer, gyroscope))
-        before = np.concatenate([[-np.inf if self._last is None else self._last], time[:-1]])
-        if not (time > before).all():
+        time, accelerometer, gyroscope = (np.asarray(values, float) for values in (time, accelerometer, gyroscope))
+        if not (np.diff(time, prepend=-np.inf if self._last is None else self._last) > 0).all():
             raise InputError("the stamps of a stream must rise.")
         if not (np.isfinite(accelerometer).all() and np.isfinite(gyroscope).all()):
             raise InputError("a stream holds a sample that is not finite: leave it out.")
         if field is not None and not self._magnetic:
             raise InputError("a magnetic field was handed over, and the filter follows none: see `magnetic`.")
         field = np.full((len(time), 3), np.nan) if field is None else np.asarray(field, float)
-        found = []
+        states = []
         for sample in map(_Sample._make, zip(time.tolist(), accelerometer, gyroscope, field, strict=True)):
             self._waiting.append(sample)
             if self._due(sample.time):
-                found += self._interval()
+                states += self._interval()
                 self._waiting = []
-        return found
+        return states
 
     def diverged(self) -> str | None:
         """Say whether the last innovations are too large to be noise; None where they are not."""
-        total, freedom = (sum(each) for each in zip(*self._recent, strict=True)) if self._recent else (0.0, 0)
+        total, freedom = np.sum([(0.0, 0), *self._recent], axis=0).tolist()
         if total <= _LARGE * freedom or chi2_sf(total, freedom) > _IMPLAUSIBLE:
             return None
         return (
@@ -242,18 +251,19 @@ class FilterInUse:
         """Return the mean field of an interval; it counts where a rest begins, of which more would say no more."""
         if not self._magnetic:
             return ()
-        values = np.stack([each.field for each in self._waiting])
+        values = np.stack([sample.field for sample in self._waiting])
         values = values[np.isfinite(values).all(axis=1)]
-        mean, counts = (values.mean(axis=0), begins) if len(values) else (np.zeros(3), False)
-        return (FieldSeen(np.float64(end), np.float64(end), np.float64(counts), mean),)  # pyright: ignore
+        if not len(values):
+            return (_sighting(FieldSeen, end, end, False, np.zeros(3)),)
+        return (_sighting(FieldSeen, end, end, begins, values.mean(axis=0)),)
 
     def _begin_field(self, sightings: tuple[Sighting, ...]) -> None:
         """Take the field, of which nothing was known, as it is where it is seen first; its noise is a share of it."""
-        places = self._index[list(places_of(SetupMagneticField, self.imu, self.names))]
-        for each in sightings:
-            if isinstance(each, FieldSeen) and each.measured > 0 and not self._numbers[places].any():
-                self._numbers[places] = np.asarray(rotate(self._path.attitude, each.value))
-                self.errors = replace(self.errors, field=np.float64(FIELD * np.linalg.norm(each.value)))
+        index = self._index[list(places_of(SetupMagneticField, self.imu, self.names))]
+        for sighting in sightings:
+            if isinstance(sighting, FieldSeen) and sighting.measured > 0 and not self._numbers[index].any():
+                self._numbers[index] = np.asarray(rotate(self._path.attitude, sighting.value))
+                self.errors = replace(self.errors, field=np.float64(FIELD * np.linalg.norm(sighting.value)))
 
     def _sightings(self, start: float, end: float, holds: bool) -> tuple[Sighting, ...]:
         """Return what a reference said last in an interval, where any of it counts (`holds`) or by its last sample."""
@@ -263,109 +273,127 @@ class FilterInUse:
         while self._pending and self._pending[0][0] <= end:
             latest = self._pending.popleft()
         since = start if holds else end - 1 / self._rate
-        seen = latest is not None and latest[0] > since
-        _, stamp, quaternion, velocity = latest if latest is not None and seen else _NOTHING
-        found: list[Sighting] = [
-            AttitudeSeen(np.float64(stamp), np.float64(end), np.float64(seen), quaternion)  # pyright: ignore
-        ]
+        counts = latest is not None and latest[0] > since
+        _, stamp, quaternion, velocity = latest if latest is not None and counts else _NOTHING
+        sightings = [_sighting(AttitudeSeen, stamp, end, counts, quaternion)]
         if self._moves:
             moved = np.zeros(3) if velocity is None else velocity
-            counts = seen and velocity is not None
-            found.append(VelocitySeen(np.float64(stamp), np.float64(end), np.float64(counts), moved))  # pyright: ignore
-        return tuple(found)
+            sightings.append(_sighting(VelocitySeen, stamp, end, counts and velocity is not None, moved))
+        return tuple(sightings)
 
     def _upright(self, force: FloatArray, sightings: tuple[Sighting, ...]) -> MotionPath:
         """Return the path's beginning at rest: upright as the force has it, and as was measured."""
         unit = unflatten(self.imu, self._numbers)
         attitude = level(self._path.attitude, unit.with_effects().accelerometer.recover(force.mean(axis=0)))
-        for each in sightings:
-            attitude = each.placed(attitude, Mounting.of(unit))
+        for sighting in sightings:
+            attitude = sighting.placed(attitude, Mounting.of(unit))
         return MotionPath(attitude, np.zeros(3))  # pyright: ignore[reportArgumentType]
 
-    def _interval(self) -> list[FilterState]:
-        time = np.array([each.time for each in self._waiting])
-        force, rate = (np.stack(each) for each in list(zip(*self._waiting, strict=True))[1:3])
-        period = 1 / self._rate
-        start = time[0] - period if self._last is None else self._last
-        step = np.diff(time, prepend=start)
-        lost = float(np.sum(np.where(step > 2.5 * period, step - period, 0.0)))
-        self._last = float(time[-1])
-        imu = self.imu
-        assert imu.gyroscope is not None
-        scales = [np.linalg.norm(np.asarray(triad.gain), axis=1) for triad in (imu.gyroscope, imu.accelerometer)]
-        outputs = np.concatenate([rate / scales[0], force / scales[1]], axis=1)
+    def _rests(self, rate: FloatArray, force: FloatArray, lost: float) -> tuple[bool, bool, bool, float]:
+        """Return whether the unit rests in an interval, arrives at a rest, begins one; and its mean speed, rad/s."""
+        triads = self.imu.triads()
+        outputs = np.concatenate(
+            [
+                rate / np.linalg.norm(triads["gyroscope"].gain, axis=1),
+                force / np.linalg.norm(triads["accelerometer"].gain, axis=1),
+            ],
+            axis=1,
+        )
         mean = outputs.mean(axis=0)
-        variance = outputs.var(axis=0, ddof=1)
-        scatter, floor = (each.reshape(2, 3).sum(axis=1) for each in (variance, self._floor))
+        scatter, floor = (values.reshape(2, 3).sum(axis=1) for values in (outputs.var(axis=0, ddof=1), self._floor))
         self._least = np.minimum(self._least, scatter)
         still = np.minimum(_QUIET * np.maximum(self._least, floor), _LOUD * floor)
         quiet = bool(lost == 0 and (scatter < still).all())
-        alike = bool(
-            np.linalg.norm(mean[:3] - self._mean[:3]) < _TURNING + 6 * np.sqrt(self._floor[:3].sum() / len(time))
-        )
-        rest = quiet and self._quiet and alike
-        arrival = quiet and not self._quiet
+        alike = np.linalg.norm(mean[:3] - self._mean[:3]) < _TURNING + 6 * np.sqrt(self._floor[:3].sum() / len(rate))
+        rest, arrival = bool(quiet and self._quiet and alike), quiet and not self._quiet
         begins = rest and not self._resting
         self._quiet, self._mean, self._resting = quiet, mean, rest
-        half = period / 2
-        sightings = self._sightings(start + half, float(time[-1]) + half, rest or arrival)
-        seen = bool(sightings) and bool(sightings[0].measured)
+        return rest, arrival, begins, float(np.linalg.norm(mean[:3]))
+
+    def _interval(self) -> list[FilterState]:
+        time = np.array([sample.time for sample in self._waiting])
+        force = np.stack([sample.accelerometer for sample in self._waiting])
+        rate = np.stack([sample.gyroscope for sample in self._waiting])
+        period = 1 / self._rate
+        start, end = time[0] - period if self._last is None else self._last, float(time[-1])
+        self._last = end
+        step = np.diff(time, prepend=start)
+        lost = float(np.sum(np.where(step > 2.5 * period, step - period, 0.0)))
+        rest, arrival, begins, speed = self._rests(rate, force, lost)
+        sightings = self._sightings(start + period / 2, end + period / 2, rest or arrival)
         absolute = bool(sightings)
-        sightings = (*sightings, *self._field_seen(float(time[-1]) + half, begins))
-        if self._known is None and not (rest and (seen or self._mounted is None)):
+        measured = absolute and bool(sightings[0].measured)
+        sightings = (*sightings, *self._field_seen(end + period / 2, begins))
+        if self._known is None and not (rest and (measured or not absolute)):
             return []
-        turned_unseen = lost * float(np.linalg.norm(mean[:3]))
-        self._moving = 0.0 if rest else self._moving + float(time[-1] - start)
-        self._unseen = 0.0 if rest else self._unseen + turned_unseen
+        self._moving = 0.0 if rest else self._moving + float(end - start)
+        self._unseen = 0.0 if rest else self._unseen + lost * speed
         lost_track = self._moving > LONGEST_MOTION or self._unseen > FARTHEST_UNSEEN
-        if lost_track and not (arrival and (seen or self._mounted is None)):
+        if lost_track and not (arrival and (measured or not absolute)):
             return []
-        if lost_track:  # attitude is told anew; what is known of the unit stays
-            arrival, self._moving, self._unseen = False, 0.0, 0.0
+        if lost_track:  # attitude is determined again; what is known of the unit stays
             self._path = self._upright(force, sightings)
-        elif seen and not arrival:
-            self._moving, self._unseen = 0.0, 0.0
         if arrival or lost_track:
-            sightings = tuple(replace(each, measured=np.float64(0.0)) for each in sightings)
+            sightings = tuple(replace(sighting, measured=np.float64(0.0)) for sighting in sightings)
+        if lost_track or (measured and not arrival):
+            self._moving, self._unseen = 0.0, 0.0
+        arrival = arrival and not lost_track
         missing = self._padded - len(time)
         part = MotionIntervals(
-            np.pad(force, [(0, missing), (0, 0)], "edge"), np.pad(rate, [(0, missing), (0, 0)], "edge"),
-            np.pad(step, (0, missing)), np.pad(time, (0, missing), "edge"),
-            np.float64(rest), np.float64(arrival), np.float64(lost_track), np.float64(lost), np.float64(1.0),
+            np.pad(force, [(0, missing), (0, 0)], "edge"),
+            np.pad(rate, [(0, missing), (0, 0)], "edge"),
+            np.pad(step, (0, missing)),
+            np.pad(time, (0, missing), "edge"),
+            np.float64(rest),
+            np.float64(arrival),
+            np.float64(lost_track),
+            np.float64(lost),
+            np.float64(1.0),
             sightings,
-        )  # pyright: ignore # fmt: skip
+        )  # pyright: ignore
+        states = self.errors.states
         if self._known is None:
             self._path = self._upright(force, sightings)
             self._known = first_knowledge(self.errors, self._path.velocity, len(self.prior), absolute)
-            states = self.errors.states
             self._known.root[states:, states:] = np.linalg.qr(self.prior, mode="r")
         self._begin_field(sightings)
         after, rows = stored.call(
             _rows_after, "in use", self.imu, self._numbers, self.gravity, part, self.errors, self._path
         )
-        columns, states = np.append(self._index, len(self._numbers)), self.errors.states
+        columns = np.append(self._index, len(self._numbers))
         known, _, innovation = advance(self._known, rows._replace(shared=rows.shared[:, columns]))
-        found, covariance = estimate(known)
-        if not np.isfinite(found).all():
+        change, covariance = estimate(known)
+        if not np.isfinite(change).all():
             raise NotPossibleError(
-                f"the filter lost the unit at {time[-1]:.3g} s: begin again with a rest, or with another calibration."
+                f"the filter lost the unit at {end:.3g} s: begin again with a rest, or with another calibration."
             )
-        moved = found.copy()
+        moved = change.copy()
         moved[6:states] = 0.0  # drift is no part of the path
         self._known = known._replace(right=known.right - known.root @ moved)
-        attitude = np.asarray(turned(after.attitude, found[:3]))
-        self._path = MotionPath(attitude, after.velocity + found[3:6])  # pyright: ignore[reportArgumentType]
+        attitude = np.asarray(turned(after.attitude, change[:3]))
+        self._path = MotionPath(attitude, after.velocity + change[3:6])  # pyright: ignore[reportArgumentType]
         self._numbers = self._numbers.copy()
-        self._numbers[self._index] += found[states:-1]
-        self.gravity += float(found[-1])
+        self._numbers[self._index] += change[states:-1]
+        self.gravity += float(change[-1])
         summed = np.tile(np.eye(6), len(self.errors.variance))
-        drift, spread = summed @ found[6:states], summed @ covariance[6:states, 6:states] @ summed.T
-        deviation, sigmas = np.sqrt(np.diagonal(spread)), np.sqrt(np.diagonal(covariance)[states:-1])
-        freedom = 6 * rest + 3 * arrival + 3 * sum(int(each.measured > 0) for each in sightings)
+        drift, spread = summed @ change[6:states], summed @ covariance[6:states, 6:states] @ summed.T
+        freedom = 6 * rest + 3 * arrival + 3 * sum(int(sighting.measured > 0) for sighting in sightings)
         if freedom:
             self._recent.append((innovation, freedom))
-        return [FilterState(float(time[-1]), rest, self._numbers[self._index], sigmas, innovation, freedom, attitude,
-                      drift, deviation)]  # fmt: skip
+        sigmas = np.sqrt(np.diagonal(covariance)[states:-1])
+        return [
+            FilterState(
+                end,
+                rest,
+                self._numbers[self._index],
+                sigmas,
+                innovation,
+                freedom,
+                attitude,
+                drift,
+                np.sqrt(np.diagonal(spread)),
+            )
+        ]
 
     @property
     def change(self) -> FloatArray:
@@ -381,6 +409,10 @@ class FilterInUse:
     def model(self) -> Imu:
         """Return the unit as it is known now, drift of its biases included, without the Earth's rotation and field."""
         return unflatten(self.imu, self._numbers).without(GyroEarthRotation, SetupMagneticField)
+
+
+def _sighting(kind: type[Sighting], stamp: float, end: float, counts: bool, value: FloatArray) -> Sighting:
+    return kind(np.float64(stamp), np.float64(end), np.float64(counts), value)  # pyright: ignore[reportArgumentType]
 
 
 def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[MotionPath, WhiteRows]:
@@ -413,8 +445,7 @@ def followed_in_use(
     Raises `InputError` for other units than were calibrated, and without a magnetometer where one is to be used;
     `NotPossibleError` where the unit never rests.
     """
-    if recording.gyroscope is None:
-        raise InputError(f"{recording.name}: the filter needs a gyroscope beside the accelerometer, and there is none.")
+    require_gyroscope(recording)
     for name in calibration.inertial().triads():
         calibration.triad_of(name, recording)
     with prepared([recording]) as (ready,):
@@ -432,68 +463,80 @@ def follow(
 
     Raises `NotPossibleError` where the unit never rests.
     """
-    gyroscope, accelerometer = recording.gyroscope, recording.accelerometer
-    assert gyroscope is not None
+    gyroscope, accelerometer = recording.signals["gyroscope"], recording.accelerometer
     force = accelerometer.values
     if not np.array_equal(accelerometer.time, gyroscope.time):
-        force = np.stack([np.interp(gyroscope.time, accelerometer.time, each) for each in force.T], 1)
-    around, steps, said, when = None, [], None, 0.0
+        force = np.stack([np.interp(gyroscope.time, accelerometer.time, axis) for axis in force.T], 1)
+    fields, steps, diverged = None, [], None
     if field is not None:
         outside = {"left": np.nan, "right": np.nan}
-        around = np.stack([np.interp(gyroscope.time, field.time, each, **outside) for each in field.values.T], 1)
+        fields = np.stack([np.interp(gyroscope.time, field.time, axis, **outside) for axis in field.values.T], 1)
     for first in range(0, len(gyroscope), 1000):
         rows = slice(first, first + 1000)
-        seen = None if around is None else around[rows]
-        steps += follower.update(gyroscope.time[rows], force[rows], gyroscope.values[rows], said_by, seen)
+        around = None if fields is None else fields[rows]
+        steps += follower.update(gyroscope.time[rows], force[rows], gyroscope.values[rows], said_by, around)
         said_by = None
-        if said is None and (said := follower.diverged()) is not None:
-            when = float(gyroscope.time[rows][-1])
-    if not any(each.rest for each in steps):
+        if diverged is None and (reason := follower.diverged()) is not None:
+            diverged = f"By {gyroscope.time[rows][-1]:.0f} s {reason}"
+    if not any(step.rest for step in steps):
         raise NotPossibleError(
             f"{recording.name}: the unit never rests for a second, and the filter begins with a rest: record two "
             "seconds or more without motion first."
         )
-    if said is not None:
-        said = f"By {when:.0f} s {said}"
     time, rest, values, sigmas, innovations, freedom, _, drift, spread = (
-        np.array(each) for each in zip(*steps, strict=True)
+        np.array(parts) for parts in zip(*steps, strict=True)
     )
     earth = places_of(GyroEarthRotation, follower.imu, follower.names)
-    return History(time, rest, follower.names, values, sigmas, drift, spread, innovations, freedom, earth), said
+    history = History(time, rest, follower.names, values, sigmas, drift, spread, innovations, freedom, earth)
+    return history, diverged
 
 
 def _through(
-    calibration: Calibration, ready: Prepared, noise: NoiseModel | None, gravity: LocalGravity | None,
-    attitude: Attitude | None, field: Signal | None,
-) -> tuple[Calibration, History]:  # fmt: skip
+    calibration: Calibration,
+    ready: Prepared,
+    noise: NoiseModel | None,
+    gravity: LocalGravity | None,
+    attitude: Attitude | None,
+    field: Signal | None,
+) -> tuple[Calibration, History]:
     """Return what `followed_in_use` does, of a recording whose mistakes are known."""
     recording = ready.recording
-    assert recording.gyroscope is not None
     noise = noise_at_rest(segment(recording)) if noise is None else noise
-    mounted, said_by = None, None
+    mounted, measured = None, None
     if attitude is not None:
         mounted = mounted_on(recording, attitude, gravity or calibration.gravity, noise, calibration.inertial())
-        said_by = replace(mounted.attitude, velocity=mounted.attitude.velocities())
-    magnetic = field is not None
-    follower = FilterInUse(calibration, noise, recording.gyroscope.rate, gravity, mounted, magnetic=magnetic)
-    history, said = follow(follower, recording, said_by, field)
-    kept = [place for place, name in enumerate(follower.names) if name.effect is None]
-    names = tuple(follower.names[place] for place in kept)
-    root, states = follower.root, follower.errors.states
-    inverse = np.linalg.inv(root[states:-1, states:-1])
-    covariance = (inverse @ inverse.T)[np.ix_(kept, kept)]
-    converged = {name: history.converged(place) for place, name in zip(kept, names, strict=True)}
+        measured = replace(mounted.attitude, velocity=mounted.attitude.velocities())
+    rate = recording.signals["gyroscope"].rate
+    follower = FilterInUse(calibration, noise, rate, gravity, mounted, magnetic=field is not None)
+    history, diverged = follow(follower, recording, measured, field)
+    rows = [row for row, name in enumerate(follower.names) if name.effect is None]
+    names = tuple(follower.names[row] for row in rows)
+    states = follower.errors.states
+    inverse = np.linalg.inv(follower.root[states:-1, states:-1])[rows]
+    converged = {name: history.converged(row) for row, name in zip(rows, names, strict=True)}
+    path = ("attitude", "velocity", "drift")
     summary = {
-        "states": ["attitude", "velocity", "drift", *names, "gravity", *(["magnetic field"] if magnetic else [])],
+        "states": [*path, *names, "gravity", *([] if field is None else ["magnetic field"])],
         "nis": float(history.innovations.sum() / max(history.freedom.sum(), 1)),
         "open": [
             f"{describe(name)} is known no better than before." for name, when in converged.items() if when is None
         ],
-        "converged": [{"name": name, "seconds": after} for name, after in converged.items()],
-        "diverged": said,
+        "converged": [{"name": name, "seconds": when} for name, when in converged.items()],
+        "diverged": diverged,
     }
-    known = replace(calibration, data=provenance([recording]), notes=(*ready.notes, *recording.notes, *noise.notes))
-    after = replace(known, imu=follower.model(), names=names, covariance=covariance, method="filter in use",
-                    fit=None, observations=None, rms={}, weak=(), filter=summary,
-                    reference=None if mounted is None else mounted.summary)  # fmt: skip
+    after = replace(
+        calibration,
+        imu=follower.model(),
+        names=names,
+        covariance=inverse @ inverse.T,
+        method="filter in use",
+        data=provenance([recording]),
+        notes=(*ready.notes, *recording.notes, *noise.notes),
+        fit=None,
+        observations=None,
+        rms={},
+        weak=(),
+        filter=summary,
+        reference=None if mounted is None else mounted.summary,
+    )
     return after, history

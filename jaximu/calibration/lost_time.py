@@ -89,37 +89,36 @@ class _Turned:
     lost: FloatArray
     constant: float = 0.0
 
-    def at(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def at(self, covariance: FloatArray) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Return NᵀPN and NᵀPr where the turns scatter by `covariance` (T, 2, 2), by Woodbury's identity."""
         inner = np.eye(len(self.pull)) + self.gram @ _diagonal(covariance)
-        return _solved(inner, self.gram), _solved(inner, self.pull)
+        return np.linalg.solve(inner, self.gram), np.linalg.solve(inner, self.pull)
 
-    def deviations(self, variance: float, gone: Sequence[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what each turn is off (T, 2) as the others tell it, its covariance (T, 2, 2), and the squared
-        deviation (T,); zero where the others do not tell. `gone`: turns, by place here, that are not among the others.
+    def deviations(self, variance: float, gone: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Return what each turn is off (T, 2) as the others tell it, and the squared deviation (T,).
+
+        Both are zero where the others do not tell. `gone`: turns, by place here, that are not among the others.
         """
         covariance = variance * self.scatter
         covariance[list(gone)] = _FREE * np.eye(2)
         gram, pull = self.at(covariance)
-        off, spread, squared = np.zeros((len(self.real), 2)), np.zeros((len(self.real), 2, 2)), np.zeros(len(self.real))
-        for turn in range(len(self.real)):
-            rows = slice(2 * turn, 2 * turn + 2)
-            own = gram[rows, rows]
-            least, most = np.linalg.eigvalsh(own)[0], np.linalg.eigvalsh(covariance[turn])[1]
-            if least * (1.0 + most) < 1.0:  # known to a radian, or worse
-                continue
-            inverse = np.linalg.inv(own)
-            off[turn] = inverse @ pull[rows]
-            spread[turn] = inverse - covariance[turn] + variance * self.scatter[turn]
-            squared[turn] = off[turn] @ np.linalg.solve(spread[turn], off[turn])
-        return off, spread, squared
+        turn = np.arange(len(self.real))
+        blocks = gram.reshape(len(turn), 2, len(turn), 2)[turn, :, turn]
+        # the others are not asked where they know a turn to a radian, or worse
+        known = np.linalg.eigvalsh(blocks)[:, 0] * (1.0 + np.linalg.eigvalsh(covariance)[:, 1]) >= 1.0
+        off, squared = np.zeros((len(turn), 2)), np.zeros(len(turn))
+        inverse = np.linalg.inv(blocks[known])
+        off[known] = np.einsum("tab,tb->ta", inverse, pull.reshape(-1, 2)[known])
+        spread = inverse - covariance[known] + variance * self.scatter[known]
+        squared[known] = np.einsum("ta,tab,tb->t", off[known], np.linalg.inv(spread), off[known])
+        return off, squared
 
     def usual(self, gone: Sequence[int]) -> float:
         """Return the excess variance at which half of the other turns are off by no more than noise would have it."""
         others = np.setdiff1d(np.arange(len(self.real)), gone)
 
         def too_much(exponent: float) -> bool:
-            squared = self.deviations(10.0**exponent, gone)[2][others]
+            squared = self.deviations(10.0**exponent, gone)[1][others]
             return bool(np.median(np.concatenate([squared[squared > 0], [0.0]])) > _MEDIAN)
 
         low, high = -2.0, 7.0
@@ -130,43 +129,49 @@ class _Turned:
             low, high = (middle, high) if too_much(middle) else (low, middle)
         return 10.0**high
 
-    def beside(self, effect: _Beside) -> _Turned:
-        """Return the same with an effect beside, whose coefficients are known to its usual sizes beforehand."""
-        taken = effect.across @ np.linalg.inv(effect.own + np.eye(len(effect.own)))
+    def beside(self, across: FloatArray, within: FloatArray, pull: FloatArray) -> _Turned:
+        """Return the same with an effect beside, whose coefficients are known to its usual sizes beforehand.
+
+        With its derivatives E by coefficients in usual sizes: `across` NᵀP₀E (2T, q), `within` EᵀP₀E (q, q), `pull`
+        EᵀP₀r (q,).
+        """
+        whole = within + np.eye(len(within))
+        taken = across @ np.linalg.inv(whole)
+        gained = float(pull @ np.linalg.solve(whole, pull) - np.linalg.slogdet(whole)[1]) / 2
         return replace(
-            self, gram=self.gram - taken @ effect.across.T, pull=self.pull - taken @ effect.pulled,
-            constant=self.constant + effect.gained,
-        )  # fmt: skip
+            self,
+            gram=self.gram - taken @ across.T,
+            pull=self.pull - taken @ pull,
+            constant=self.constant + gained,
+        )
 
     def without(self, turns: NDArray[np.int64]) -> _Turned:
         """Return the same with some turns, by place, free."""
         free = np.ravel(2 * turns[:, None] + np.arange(2))
         size = np.sqrt(_FREE)
-        return self.beside(_Beside(size * self.gram[:, free], _FREE * self.gram[np.ix_(free, free)],
-                                   size * self.pull[free]))  # fmt: skip
+        return self.beside(size * self.gram[:, free], _FREE * self.gram[np.ix_(free, free)], size * self.pull[free])
 
     def evidence(self, share: float) -> tuple[float, float]:
         """Return the logarithm of the probability of the turns where a share of the samples was lost, and the excess.
 
         Over the grids of scatter and of what sampling misses, up to a constant: −½ log |1 + GB| + ½ qᵀB(1 + GB)⁻¹q.
         """
-        found = np.zeros((len(_SCATTER), len(_SAMPLING)))
+        evidence = np.zeros((len(_SCATTER), len(_SAMPLING)))
         for (k, scatter), (m, sampling) in product(enumerate(_SCATTER), enumerate(_SAMPLING)):
             covariance = scatter**2 * self.scatter + sampling**2 * self.sampling + share * self.lost
             whole = _diagonal(covariance)
             inner = np.eye(len(self.pull)) + self.gram @ whole
-            found[k, m] = (self.pull @ whole @ np.linalg.solve(inner, self.pull) - np.linalg.slogdet(inner)[1]) / 2
-        beforehand = -(
-            np.square(np.log(_SCATTER / _USUAL_SCATTER) / _SCATTER_SPREAD)[:, None]
-            + np.square(np.log(np.maximum(_SAMPLING, 0.02) / _USUAL_SAMPLING) / _SAMPLING_SPREAD)
-        ) / 2  # fmt: skip
-        found += beforehand - np.logaddexp.reduce(beforehand, axis=None)
-        likeliest = int(np.argmax(found)) // len(_SAMPLING)
-        return self.constant + float(np.logaddexp.reduce(found, axis=None)), float(_SCATTER[likeliest] ** 2)
-
-
-def _solved(matrix: FloatArray, values: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.solve(matrix, values), np.float64)
+            evidence[k, m] = (self.pull @ whole @ np.linalg.solve(inner, self.pull) - np.linalg.slogdet(inner)[1]) / 2
+        beforehand = (
+            -(
+                np.square(np.log(_SCATTER / _USUAL_SCATTER) / _SCATTER_SPREAD)[:, None]
+                + np.square(np.log(np.maximum(_SAMPLING, 0.02) / _USUAL_SAMPLING) / _SAMPLING_SPREAD)
+            )
+            / 2
+        )
+        evidence += beforehand - np.logaddexp.reduce(beforehand, axis=None)
+        likeliest = int(np.argmax(evidence)) // len(_SAMPLING)
+        return self.constant + float(np.logaddexp.reduce(evidence, axis=None)), float(_SCATTER[likeliest] ** 2)
 
 
 def _diagonal(blocks: FloatArray) -> FloatArray:
@@ -177,89 +182,66 @@ def _diagonal(blocks: FloatArray) -> FloatArray:
     return whole.reshape(2 * count, 2 * count)
 
 
-@dataclass(frozen=True)
-class _Beside:
-    """An effect, its derivatives E by coefficients in usual sizes: NᵀP₀E (2T, q), EᵀP₀E (q, q) and EᵀP₀r (q,)."""
-
-    across: FloatArray
-    own: FloatArray
-    pulled: FloatArray
-
-    @property
-    def gained(self) -> float:
-        """What it adds to the logarithm of the probability where turns do not scatter."""
-        whole = self.own + np.eye(len(self.own))
-        return float(self.pulled @ np.linalg.solve(whole, self.pulled) - np.linalg.slogdet(whole)[1]) / 2
-
-
 class _Recorded:
     """A calibration's recordings, its turns' conditions, and the samples of each turn."""
 
-    def __init__(self, found: Calibration) -> None:
-        assert found.fit is not None and found.observations is not None and found.imu.gyroscope is not None
-        self.found, self.observations = found, found.observations
-        unit = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (found.fit.imu.with_effects(), self.observations))
-        self.about: Condensed = condensed(*unit)
-        assert self.about.reaction is not None and self.about.running is not None
-        turns, gyroscope = self.observations.turns, found.imu.gyroscope
-        self.turns: Turns = turns
-        chain = jax.tree.map(lambda leaf: np.asarray(leaf)[0], self.about.covariance)
-        residual, slope = (rows[np.asarray(chain.used) > 0] for rows in unwhitened(found.fit, chain))
+    def __init__(self, calibration: Calibration) -> None:
+        fitted, observations, gyroscope = calibration.fit, calibration.observations, calibration.imu.gyroscope
+        assert fitted is not None and observations is not None and gyroscope is not None
+        self.calibration, self.observations, self.gyroscope = calibration, observations, gyroscope
+        self.signals = [part.recording.signals["gyroscope"] for part in calibration.segmentations]
+        unit = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (fitted.imu.with_effects(), observations))
+        about: Condensed = condensed(*unit)
+        assert about.reaction is not None and about.running is not None
+        self.turns: Turns = observations.turns
+        self.force, self.running = about.force[0], np.asarray(about.running)
+        self.output, self.interval = np.asarray(self.turns.output), np.asarray(self.turns.interval)
+        chain = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)
+        self.residual, slope = (rows[np.asarray(chain.used) > 0] for rows in unwhitened(fitted, chain))
         covariance = chain.dense()
-        self.used = used = covariance.used > 0
-        poses, turned, means = (covariance.component(number)[np.ix_(used, used)] for number in range(3))
-        excess = np.asarray(found.fit.excess)
-        known = covariance.measured[np.ix_(used, used)] + excess[0] * poses + excess[2] * means
-        inverse = np.linalg.inv(known)
-        seen = inverse @ slope
-        self.projector = inverse - seen @ np.linalg.pinv(slope.T @ seen, rcond=1e-12, hermitian=True) @ seen.T
-        self.residual = residual
-        real = np.flatnonzero(turns.mask)
-        place = np.cumsum(used) - 1
-        self.rows = rows = place[len(self.observations.poses.mask) + 2 * real[:, None] + np.arange(2)]
-        every = rows.ravel()
+        self.used = covariance.used > 0
+        used = np.ix_(self.used, self.used)
+        poses, turned, means = (covariance.component(number)[used] for number in range(3))
+        excess = fitted.excess
+        inverse = np.linalg.inv(covariance.measured[used] + excess[0] * poses + excess[2] * means)
+        weighted = inverse @ slope
+        self.projector = inverse - weighted @ np.linalg.pinv(slope.T @ weighted, 1e-12, hermitian=True) @ weighted.T
+        real = np.flatnonzero(self.turns.mask)
+        first = len(observations.poses.mask) + 2 * real[:, None]
+        rows = self.rows = (np.cumsum(self.used) - 1)[first + np.arange(2)]
         # (T, S, 2): what a sample that is lost takes off its turn
-        interval = np.asarray(turns.interval)
         self.lacking = -np.einsum(
-            "tasi,tsi->tsa", np.asarray(self.about.reaction.turn),
-            (np.asarray(turns.output) - np.asarray(gyroscope.bias)) * (interval > 0)[..., None],
-        )[real]  # fmt: skip
-        missed = missed_by_sampling(turns, gyroscope, self.about.running)[real]
+            "tasi,tsi->tsa",
+            np.asarray(about.reaction.turn),
+            (self.output - gyroscope.bias) * (self.interval > 0)[..., None],
+        )[real]
+        missed = missed_by_sampling(self.turns, gyroscope, about.running)[real]
         self.turned = _Turned(
-            self.projector[np.ix_(every, every)], (self.projector @ residual)[every], real,
-            turned[rows[:, :, None], rows[:, None, :]], np.sum(missed**2, axis=1)[:, None, None] / 3 * np.eye(2),
+            self.projector[np.ix_(rows.ravel(), rows.ravel())],
+            (self.projector @ self.residual)[rows.ravel()],
+            real,
+            turned[rows[:, :, None], rows[:, None, :]],
+            np.sum(missed**2, axis=1)[:, None, None] / 3 * np.eye(2),
             np.einsum("tsa,tsb->tab", self.lacking, self.lacking),
-        )  # fmt: skip
+        )
         self.excess = float(excess[1])
         self.samples = [self._samples(int(turn)) for turn in real]
-        self.counts = np.sum(interval[real] > 0, axis=1)
+        self.counts = np.sum(self.interval[real] > 0, axis=1)
 
     def _samples(self, turn: int) -> tuple[int, int, int]:
         """Return the recording of a turn, its first sample in it and the one after its last."""
-        counts = np.cumsum([len(part.intervals) for part in self.found.segmentations])
+        counts = np.cumsum([len(part.intervals) for part in self.calibration.segmentations])
         part = int(np.searchsorted(counts, turn, "right"))
-        gyroscope = self.found.segmentations[part].recording.gyroscope
-        assert gyroscope is not None
         poses = self.observations.poses
-        first, last = np.searchsorted(gyroscope.time, [np.asarray(poses.stop)[turn], np.asarray(poses.start)[turn + 1]])
+        ends = [poses.stop[turn], poses.start[turn + 1]]
+        first, last = np.searchsorted(self.signals[part].time, ends)
         return part, int(first), int(last)
-
-    def stamps(self, part: int) -> FloatArray:
-        """Return a recording's stamps (n,), s, of the gyroscope."""
-        signal = self.found.segmentations[part].recording.gyroscope
-        assert signal is not None
-        return signal.time
 
     def span(self, turn: int) -> str:
         """Return when a turn, by place, begins and ends."""
         part, first, last = self.samples[turn]
-        return f"{self.stamps(part)[first]:.1f} to {self.stamps(part)[last - 1]:.1f} s"
-
-    def rates(self, part: int) -> FloatArray:
-        """Return a recording's rates (n, 3), rad/s."""
-        signal, triad = self.found.segmentations[part].recording.gyroscope, self.found.imu.gyroscope
-        assert signal is not None and triad is not None
-        return triad.recover_on_host(signal.values)
+        time = self.signals[part].time
+        return f"{time[first]:.1f} to {time[last - 1]:.1f} s"
 
     def jumps(self) -> list[FloatArray]:
         """Return for each turn (S − 1,) by how many times its usual step the course of the rate jumps in an interval.
@@ -268,22 +250,20 @@ class _Recorded:
         intervals around, and at least three times that of half of all intervals in turns.
         """
         bends = []
-        for part, segmentation in enumerate(self.found.segmentations):
-            gyroscope = segmentation.recording.gyroscope
-            assert gyroscope is not None
-            difference = np.diff(self.rates(part), axis=0)
+        for signal in self.signals:
+            difference = np.diff(self.gyroscope.recover_on_host(signal.values), axis=0)
             bend = np.zeros(len(difference))
             bend[1:-1] = np.linalg.norm(difference[1:-1] - (difference[2:] + difference[:-2]) / 2, axis=1)
-            gaps = np.flatnonzero(np.diff(gyroscope.time) > 1.6 / gyroscope.rate)
+            gaps = np.flatnonzero(np.diff(signal.time) > 1.6 / signal.rate)
             bend[np.clip(gaps[:, None] + np.arange(-1, 2), 0, len(bend) - 1)] = 0.0
             bends.append(bend)
         usual = float(np.median(np.concatenate([bends[p][a : b - 1] for p, a, b in self.samples])))
-        found = []
+        jumps = []
         for part, first, last in self.samples:
-            places = np.clip(np.arange(first, last - 1)[:, None] + np.array([-3, -2, 2, 3]), 0, len(bends[part]) - 1)
-            around = np.mean(bends[part][places] ** 2, axis=1)
-            found.append(bends[part][first : last - 1] / np.sqrt(around + (_LEAST_JUMP * usual) ** 2 + 1e-30))
-        return found
+            beside = np.arange(first, last - 1)[:, None] + np.array([-3, -2, 2, 3])
+            around = np.mean(bends[part][np.clip(beside, 0, len(bends[part]) - 1)] ** 2, axis=1)
+            jumps.append(bends[part][first : last - 1] / np.sqrt(around + (_LEAST_JUMP * usual) ** 2 + 1e-30))
+        return jumps
 
     def missing(self, turn: int, off: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return for every interval (S − 1,) of a turn, by place, the time that must be missing there for the turn to
@@ -293,59 +273,56 @@ class _Recorded:
         as carried from after: by an angle about a known axis, whose closed form it has.
         """
         real = int(self.turned.real[turn])
-        count = self.counts[turn]
-        assert self.about.running is not None
-        force = self.about.force[0][real + 1]
+        force = self.force[real + 1]
         after = force / np.linalg.norm(force)
         before = after - np.asarray(self.turns.basis)[real].T @ off
         before /= np.linalg.norm(before)
-        running = np.asarray(self.about.running)[real][:count]
+        running = self.running[real][: self.counts[turn]]
         back = multiply(conjugate(running), np.broadcast_to(running[-1], running.shape))
-        carried, wanted = (np.asarray(rotate(back, np.broadcast_to(each, (count, 3))))[:-1] for each in (before, after))
-        triad = self.found.imu.gyroscope
-        assert triad is not None
-        rate = (np.asarray(self.turns.output)[real][:count] - np.asarray(triad.bias)) @ np.linalg.inv(
-            np.asarray(triad.gain)
-        ).T
+        carried, wanted = (
+            np.asarray(rotate(back, np.broadcast_to(gravity, (len(running), 3))))[:-1] for gravity in (before, after)
+        )
+        rate = self.gyroscope.recover_on_host(self.output[real][: len(running)])
         middle = (rate[1:] + rate[:-1]) / 2
         speed = np.maximum(np.linalg.norm(middle, axis=1), 1e-9)
         axis = middle / speed[:, None]
         along = np.sum((wanted - carried) * axis, axis=1)
         left = np.abs(along) / np.maximum(np.linalg.norm(wanted - carried, axis=1), 1e-12)
-        flat = [each - axis * np.sum(each * axis, axis=1)[:, None] for each in (carried, wanted)]
-        angle = -np.arctan2(np.sum(axis * np.cross(*flat), axis=1), np.sum(flat[0] * flat[1], axis=1))
+        carried, wanted = (
+            gravity - axis * np.sum(gravity * axis, axis=1, keepdims=True) for gravity in (carried, wanted)
+        )
+        angle = -np.arctan2(np.sum(axis * np.cross(carried, wanted), axis=1), np.sum(carried * wanted, axis=1))
         return angle / speed, left
 
 
-def tells_losses(found: Calibration) -> bool:
+def tells_losses(calibration: Calibration) -> bool:
     """Whether a calibration has turns enough for some to tell what is missing in others."""
-    observations = found.observations
-    return observations is not None and found.imu.gyroscope is not None and int(observations.turns.mask.sum()) > _FEWEST
+    turns = None if calibration.observations is None else calibration.observations.turns
+    return turns is not None and calibration.imu.gyroscope is not None and int(turns.mask.sum()) > _FEWEST
 
 
-def without_lost_stretches(found: Calibration) -> tuple[list[Recording], list[Finding]]:
+def without_lost_stretches(calibration: Calibration) -> tuple[list[Recording], list[Finding]]:
     """Return a calibration's recordings without the rows around stretches of samples that were lost, and the findings.
 
     A turn is off that lies far out of the others' scatter. It lost a stretch where that explains it better than a tail
     of the scatter does: time is missing and not too much, the rate there turns the way that is missing, and the rate
     jumps there as it does in few other places.
     """
-    recordings = [part.recording for part in found.segmentations]
-    recorded = _Recorded(found)
+    recordings = [part.recording for part in calibration.segmentations]
+    recorded = _Recorded(calibration)
     turned, count = recorded.turned, len(recorded.turned.real)
-    if turned.deviations(recorded.excess, [])[2].max(initial=0.0) < _GATE:
+    if turned.deviations(recorded.excess, [])[1].max(initial=0.0) < _GATE:
         return recordings, []
     gone: list[int] = []
     while len(gone) <= _MOST * count:
-        variance = turned.usual(gone)
-        off, _, squared = turned.deviations(variance, gone)
+        squared = turned.deviations(turned.usual(gone), gone)[1]
         squared[gone] = 0.0
         if squared.max() < _OUT:
             break
         gone.append(int(np.argmax(squared)))
     if not gone:
         return recordings, []
-    off, _, squared = turned.deviations(turned.usual(gone), gone)
+    off, squared = turned.deviations(turned.usual(gone), gone)
     judged = gone if len(gone) <= _MOST * count else gone[:1]  # a gross one may move all others: it goes first
     jumps = recorded.jumps()
     others = np.sort(np.concatenate([jumps[turn] for turn in range(count) if turn not in gone]))
@@ -356,42 +333,46 @@ def without_lost_stretches(found: Calibration) -> tuple[list[Recording], list[Fi
             continue
         rare = (1 + len(others) - np.searchsorted(others, jumps[turn])) / (1 + len(others))
         sure = (
-            (_TAIL + 2) / 2 * np.log1p(squared[turn] / _TAIL) - np.log(2 * _SLACK * squared[turn])
-            - (left / _SLACK) ** 2 / 2 - np.log(len(time) * rare)
-        )  # fmt: skip
+            (_TAIL + 2) / 2 * np.log1p(squared[turn] / _TAIL)
+            - np.log(2 * _SLACK * squared[turn])
+            - (left / _SLACK) ** 2 / 2
+            - np.log(len(time) * rare)
+        )
         # where the rate is nearly zero, the time could be anything: nothing is lost for longer than the recording
-        sure[(time <= 0) | (time > np.ptp(recorded.stamps(recorded.samples[turn][0])))] = -np.inf
-        place = int(np.argmax(sure))
-        if sure[place] < _SURE:
+        sure[(time <= 0) | (time > np.ptp(recorded.signals[recorded.samples[turn][0]].time))] = -np.inf
+        interval = int(np.argmax(sure))
+        if sure[interval] < _SURE:
             continue
-        (clipped if _reaches_a_limit(recorded, turn) else stretches).append((turn, place, float(time[place])))
+        (clipped if _reaches_a_limit(recorded, turn) else stretches).append((turn, interval, float(time[interval])))
     return _left_out(recorded, recordings, off, stretches, clipped)
 
 
 def _reaches_a_limit(recorded: _Recorded, turn: int) -> bool:
     """Whether an axis stays at the greatest or least value of its recording for two samples of a turn or more."""
     part, first, last = recorded.samples[turn]
-    signal = recorded.found.segmentations[part].recording.gyroscope
-    assert signal is not None
-    extremes = np.stack([signal.values.max(axis=0), signal.values.min(axis=0)])
-    return bool(np.max(np.sum(signal.values[first:last] == extremes[:, None], axis=1)) > 1)
+    values = recorded.signals[part].values
+    extremes = np.stack([values.max(axis=0), values.min(axis=0)])
+    return bool(np.max(np.sum(values[first:last] == extremes[:, None], axis=1)) > 1)
 
 
 def _left_out(
-    recorded: _Recorded, recordings: list[Recording], off: FloatArray, stretches: list[tuple[int, int, float]],
+    recorded: _Recorded,
+    recordings: list[Recording],
+    off: FloatArray,
+    stretches: list[tuple[int, int, float]],
     clipped: list[tuple[int, int, float]],
-) -> tuple[list[Recording], list[Finding]]:  # fmt: skip
+) -> tuple[list[Recording], list[Finding]]:
     rows: dict[int, list[int]] = {}
-    told, places = [], []
-    for turn, place, time in sorted(stretches):
+    losses, spots = [], []
+    for turn, interval, time in sorted(stretches):
         part, first, last = recorded.samples[turn]
-        stamps = recorded.stamps(part)
-        told.append(
+        stamps = recorded.signals[part].time
+        losses.append(
             f"between {stamps[first]:.1f} and {stamps[last - 1]:.1f} s gravity turned by "
             f"{np.degrees(np.linalg.norm(off[turn])):.2g}° more than the gyroscope says, as if about {time:.2g} s were "
-            f"missing at {stamps[first + place]:.2f} s, where the rate jumps"
+            f"missing at {stamps[first + interval]:.2f} s, where the rate jumps"
         )
-        places.append(first + place + 2)
+        spots.append(first + interval + 2)
     for turn, _, _ in (*stretches, *clipped):
         part, first, last = recorded.samples[turn]
         rows.setdefault(part, []).extend(range(first, last))
@@ -399,37 +380,43 @@ def _left_out(
     for part, gone in rows.items():
         kept[part] = without_rows(recordings[part], {"gyroscope": np.array(gone)})
     findings = []
-    if told:
-        findings.append(Finding(
-            "data.lost_samples", tuple(places[:5]),
-            f"Samples were lost although the stamps go on evenly: {'; '.join(told[:3])}"
-            f"{' …' if len(told) > 3 else ''}. {counted(len(told), 'turn')} left out. Log the sensor's own stamps or a "
-            "counter, and look for what holds the logger up.", rivals=("data.order",),
-        ))  # fmt: skip
+    if losses:
+        findings.append(
+            Finding(
+                "data.lost_samples",
+                tuple(spots[:5]),
+                f"Samples were lost although the stamps go on evenly: {'; '.join(losses[:3])}"
+                f"{' …' if len(losses) > 3 else ''}. {counted(len(losses), 'turn')} left out. Log the sensor's own "
+                "stamps or a counter, and look for what holds the logger up.",
+                rivals=("data.order",),
+            )
+        )
     if clipped:
-        spans = [recorded.samples[turn] for turn, _, _ in clipped]
         where = ", ".join(recorded.span(turn) for turn, _, _ in clipped[:3])
-        findings.append(Finding(
-            "data.clipping", tuple(a + 1 for _, a, _ in spans[:5]),
-            f"gyroscope: it turned further than it says in turns that stop at its greatest or least value ({where}): "
-            "its range is too small for this motion. These turns are left out; choose a larger range, or turn more "
-            "slowly.",
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "data.clipping",
+                tuple(recorded.samples[turn][1] + 1 for turn, _, _ in clipped[:5]),
+                "gyroscope: it turned further than it says in turns that stop at its greatest or least value "
+                f"({where}): its range is too small for this motion. These turns are left out; choose a larger range, "
+                "or turn more slowly.",
+            )
+        )
     return kept, findings
 
 
-def lost_share(found: Calibration) -> list[Finding]:
+def lost_share(calibration: Calibration) -> list[Finding]:
     """Return whether samples were lost here and there in all turns, what share of them, and in which turns most."""
-    assert found.fit is not None
-    if float(np.asarray(found.fit.excess)[1]) < _COARSE:
+    assert calibration.fit is not None
+    if calibration.fit.excess[1] < _COARSE:
         return []
-    recorded = _Recorded(found)
+    recorded = _Recorded(calibration)
     turned = recorded.turned
     share, gain = _gain(turned)
     if gain < _SHOWN:
         return []
     # samples lost everywhere show without the turns that are off most, which may be off for another reason
-    squared = turned.deviations(turned.usual([]), [])[2]
+    squared = turned.deviations(turned.usual([]), [])[1]
     others = turned.without(np.argsort(squared)[-_WORST:])
     if others.evidence(share)[0] - others.evidence(0.0)[0] < _ALSO:
         return []
@@ -441,16 +428,20 @@ def lost_share(found: Calibration) -> list[Finding]:
     missing = share * (recorded.counts + np.einsum("tsa,ta->t", recorded.lacking, pull))
     total = share * recorded.counts.sum()
     worst = np.argsort(missing)[::-1][:3]
-    period = float(np.median(np.asarray(recorded.turns.interval)[np.asarray(recorded.turns.interval) > 0]))
+    period = float(np.median(recorded.interval[recorded.interval > 0]))
     where = "; ".join(f"{missing[turn]:.0f} from {recorded.span(turn)}" for turn in worst if missing[turn] >= 1)
-    return [Finding(
-        "data.lost_samples", tuple(recorded.samples[turn][1] + 1 for turn in worst),
-        f"Turns misfit as if about {100 * share:.2g} % of the samples were lost, and the rest stamped as if none were: "
-        f"about {total:.0f} samples, {total * period:.2g} s, in the turns"
-        + (f" (most: {where})" if where else "")
-        + ". Which ones cannot be determined, and all rates read too small by that share. Log the sensor's own stamps "
-        "or a counter, and record again.", spoils=True,
-    )]  # fmt: skip
+    return [
+        Finding(
+            "data.lost_samples",
+            tuple(recorded.samples[turn][1] + 1 for turn in worst),
+            f"Turns misfit as if about {100 * share:.2g} % of the samples were lost, and the rest stamped as if none "
+            f"were: about {total:.0f} samples, {total * period:.2g} s, in the turns"
+            + (f" (most: {where})" if where else "")
+            + ". Which ones cannot be determined, and all rates read too small by that share. Log the sensor's own "
+            "stamps or a counter, and record again.",
+            spoils=True,
+        )
+    ]
 
 
 def _gain(turned: _Turned) -> tuple[float, float]:
@@ -464,37 +455,47 @@ def _effects(recorded: _Recorded) -> float:
     """Return the logarithm of the probability of the turns with the effects that explain most, one after another."""
     from jaximu.model.effects.catalogue import CATALOGUE  # a tenth of a second, which few recordings need
 
-    found = recorded.found
-    fitted = {effect.name for effect in found.imu.all_effects().values()}
-    fields = {"temperature", "temperature_rate"} if found.segmentations[0].recording.temperature is not None else set()
+    calibration = recorded.calibration
+    fitted = {effect.name for effect in calibration.imu.all_effects().values()}
+    temperature = calibration.segmentations[0].recording.temperature
+    unknown = _UNKNOWN if temperature is None else _UNKNOWN - {"temperature", "temperature_rate"}
     kinds = [
-        kind for name, kind in CATALOGUE.items()
-        if kind.cause and kind.owner in ("accelerometer", "gyroscope", "setup") and kind.scope != "fixture"
-        and not (_UNKNOWN - fields) & set(kind.needs) and name not in fitted
-    ]  # fmt: skip
-    bare = found.imu.with_effects()
-    measurement = RecordedByHand(found.segmentations, recorded.observations)
+        kind
+        for name, kind in CATALOGUE.items()
+        if kind.cause
+        and kind.owner in ("accelerometer", "gyroscope", "setup")
+        and kind.scope != "fixture"
+        and not unknown & set(kind.needs)
+        and name not in fitted
+    ]
+    bare = calibration.imu.with_effects()
+    measurement = RecordedByHand(calibration.segmentations, recorded.observations)
     linear = linearise(bare, measurement, without_equipment)
     extent = measurement.extent()
     reactions = measurement.dormant_columns(bare, linear.details, {kind: kind.grid(extent) for kind in kinds})
     candidates = [
-        (columns[recorded.used] * _PLAUSIBLE * effect_numbers(bare.with_effects(kind.dormant()))[2][: kind.size],
-         len(grid))
-        for kind, grid in reactions.items() for columns in grid
-    ]  # fmt: skip
+        (
+            columns[recorded.used] * _PLAUSIBLE * effect_numbers(bare.with_effects(kind.dormant()))[2][: kind.size],
+            len(grid),
+        )
+        for kind, grid in reactions.items()
+        for columns in grid
+    ]
     projector, turned = recorded.projector, recorded.turned
     total = turned.evidence(0.0)[0]
     for _ in range(_MOST_EFFECTS):
         tried = []
         for columns, choices in candidates:
-            seen = projector @ columns
-            beside = turned.beside(_Beside(seen[recorded.rows.ravel()], columns.T @ seen,
-                                           seen.T @ recorded.residual))  # fmt: skip
+            weighted = projector @ columns
+            beside = turned.beside(
+                weighted[recorded.rows.ravel()], columns.T @ weighted, weighted.T @ recorded.residual
+            )
             tried.append((beside.evidence(0.0)[0] - np.log(choices), beside, columns))
-        best, beside, columns = max(tried, key=lambda each: each[0])
+        best, beside, columns = max(tried, key=lambda candidate: candidate[0])
         if best < total + _SHOWN:
             break
-        seen = projector @ columns
-        projector = projector - seen @ np.linalg.solve(columns.T @ seen + np.eye(columns.shape[1]), seen.T)
+        weighted = projector @ columns
+        whole = columns.T @ weighted + np.eye(columns.shape[1])
+        projector = projector - weighted @ np.linalg.solve(whole, weighted.T)
         total, turned = best, beside
     return total

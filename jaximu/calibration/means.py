@@ -55,16 +55,16 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     free = [name for name in names_of(nominal) if name.owner == "accelerometer" and without_equipment_or_effects(name)]
     prior = None
     if means.accelerometer_sigma is None and poses < len(free) + _SPARE:
-        found, prior = _with_few_poses(means, nominal, free, gravity.value, method, loss)
+        fitted, prior = _with_few_poses(means, nominal, free, gravity.value, method, loss)
         notes += (
             f"{poses} poses leave misalignments open: they were taken to be zero within ±{200 * _ACROSS:g} % (95 %), "
             "as data sheets state the cross-axis sensitivity. The means are taken to be as good as their digits.",
         )
     else:
-        found = fit_hand_held(nominal, observations, method, loss)
-    require_determined(found, where, poses=poses)
+        fitted = fit_hand_held(nominal, observations, method, loss)
+    require_determined(fitted, where, poses=poses)
     if method == "accelerometer":
-        found = replace(found, imu=Imu(found.imu.accelerometer, None))
+        fitted = replace(fitted, imu=Imu(fitted.imu.accelerometer, None))
     stated = {"accelerometer": means.accelerometer_sigma is not None or prior is not None}
     if method == "joint":
         stated["gyroscope"] = means.gyroscope_sigma is not None
@@ -74,12 +74,19 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
         notes += (f"how far the means of the {unknown} are off is not stated: intervals are from their misfit.",)
     data = {key: value for key, value in provenance([recording]).items() if "rate" not in key}
     calibration = concluded(
-        found, gravity=gravity, method=method, loss=loss, excess_names=EXCESS_NAMES,
-        rms=[residual_rms(imu, observations, method == "joint") for imu in (nominal, found.imu)],
+        fitted,
+        gravity=gravity,
+        method=method,
+        loss=loss,
+        excess_names=EXCESS_NAMES,
+        rms=[residual_rms(imu, observations, method == "joint") for imu in (nominal, fitted.imu)],
         known=() if prior is None else prior.names,
-        data=data | {"poses": poses, "turns": 0}, notes=(*recording.notes, *notes), observations=observations,
-        nominal=nominal, reading=recording.reading,
-    )  # fmt: skip
+        data=data | {"poses": poses, "turns": 0},
+        notes=(*recording.notes, *notes),
+        observations=observations,
+        nominal=nominal,
+        reading=recording.reading,
+    )
     known = {name: size for name, size in calibration.excess.items() if stated.get(name)}
     return replace(calibration, excess=known)
 
@@ -107,7 +114,7 @@ def _with_few_poses(
             f"means are: add {-spare} poses or more (each axis up and down once are six), or columns "
             "accel_sigma_x [m/s^2], … with the samples' standard deviations, and samples, their number."
         )
-    scale = np.linalg.norm(np.asarray(nominal.accelerometer.gain), axis=1)
+    scale = np.linalg.norm(nominal.accelerometer.gain, axis=1)
     sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
     prior = Prior(tuple(across), np.zeros(len(across)), np.diag(1 / sigma))
     spread = np.full((len(signal), 3), _step(signal.values) / np.sqrt(12))  # of rounding

@@ -25,23 +25,23 @@ _TIMES, _RIVAL = 10.0, 2.0
 """Times by which that variance must fall with a limit, and be below that with a cube."""
 
 
-def saturation(found: Calibration) -> list[Finding]:
+def saturation(calibration: Calibration) -> list[Finding]:
     """Return whether the gyroscope's output saturates softly."""
-    gyroscope, observations, nominal = found.imu.gyroscope, found.observations, found.nominal
-    assert gyroscope is not None and observations is not None and found.fit is not None
-    assert nominal is not None and nominal.gyroscope is not None
-    turns, variance = observations.turns, 1.0 + float(found.fit.excess[1])
+    fitted, observations, nominal = calibration.fit, calibration.observations, calibration.nominal
+    assert fitted is not None and observations is not None and nominal is not None
+    turns, variance = observations.turns, 1.0 + float(fitted.excess[1])
     if variance < _COARSE:
         return []
     # the limit is the output's: the fitted gain is wrong by what it bends
-    scale = np.linalg.norm(np.asarray(nominal.gyroscope.gain), axis=1)
-    bias, output, inside = np.asarray(gyroscope.bias), np.asarray(turns.output), np.asarray(turns.interval) > 0
-    rate = np.where(inside[..., None], (output - bias) / scale, 0.0)
+    scale = np.linalg.norm(nominal.triads()["gyroscope"].gain, axis=1)
+    bias, inside = calibration.imu.triads()["gyroscope"].bias, turns.interval > 0
+    rate = np.where(inside[..., None], (turns.output - bias) / scale, 0.0)
     greatest = float(np.max(np.abs(rate)))
 
     def scatter(changed) -> float:
-        fitted = fit_hand_held(nominal, replace(observations, turns=replace(turns, output=bias + scale * changed)))
-        return 1.0 + float(fitted.excess[1]) if fitted.converged and fitted.finite else np.inf
+        turned = replace(turns, output=bias + scale * changed)
+        bent = fit_hand_held(nominal, replace(observations, turns=turned))
+        return 1.0 + float(bent.excess[1]) if bent.converged and bent.finite else np.inf
 
     limits = greatest * np.array(_LIMITS)
     bent = [scatter(limit * np.arctanh(rate / limit)) for limit in limits]
@@ -51,10 +51,14 @@ def saturation(found: Calibration) -> list[Finding]:
     cubes = [scatter(rate + rate**3 / (3 * limit**2)) for limit in greatest * np.array([0.6, 0.8, 1.0, 1.3])]
     if bent[best] * _RIVAL > min(cubes):
         return []
-    return [Finding(
-        "data.saturation", (),
-        f"gyroscope: its output bends towards a limit of about {np.degrees(limits[best]):.3g} °/s: straightened, it "
-        f"carries gravity over the turns {np.sqrt(variance / bent[best]):.2g} times better. Quick turns read too "
-        "little, and the gain is wrong. Choose a larger range, or turn more slowly, and record again.",
-        rivals=("gyro.cubic",), spoils=True,
-    )]  # fmt: skip
+    return [
+        Finding(
+            "data.saturation",
+            (),
+            f"gyroscope: its output bends towards a limit of about {np.degrees(limits[best]):.3g} °/s: straightened, "
+            f"it carries gravity over the turns {np.sqrt(variance / bent[best]):.2g} times better. Quick turns read "
+            "too little, and the gain is wrong. Choose a larger range, or turn more slowly, and record again.",
+            rivals=("gyro.cubic",),
+            spoils=True,
+        )
+    ]

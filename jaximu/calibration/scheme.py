@@ -41,22 +41,27 @@ class Scheme:
 def describe_scheme(stations: Stations) -> tuple[Scheme, ...]:
     """Return what the stations determine of the accelerometer and of the gyroscope, 12 parameters each."""
     weight = np.asarray(stations.weight)[..., None]
-    found = []
-    for triad, quantity, used in (
-        ("accelerometer", stations.stimulus.specific_force, stations.accelerometer_used),
-        ("gyroscope", stations.stimulus.angular_rate, stations.gyroscope_used),
-    ):
-        inputs = np.sum(weight * np.asarray(quantity), axis=1)[np.asarray(used)]
-        found.append(_scheme(triad, inputs))
-    return tuple(found)
+    stimulus = stations.stimulus
+    return tuple(
+        _scheme(triad, np.sum(weight * np.asarray(quantity), axis=1)[np.asarray(used)])
+        for triad, quantity, used in (
+            ("accelerometer", stimulus.specific_force, stations.accelerometer_used),
+            ("gyroscope", stimulus.angular_rate, stations.gyroscope_used),
+        )
+    )
+
+
+def _spectrum(design: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the four singular values of a design (n, 4), and its right singular vectors, a row each."""
+    _, values, right = np.linalg.svd(design)
+    return np.pad(values, (0, 4 - len(values))), right
 
 
 def _scheme(triad: str, inputs: FloatArray) -> Scheme:
     size = np.linalg.norm(inputs, axis=1).max(initial=0.0)
     design = np.column_stack([inputs / (size or 1.0), np.ones(len(inputs))]).reshape(-1, 4)
-    _, values, right = np.linalg.svd(design)
-    values = np.pad(values, (0, 4 - len(values)))
-    rank = int(np.sum(values > _OPEN * values[0])) if values[0] > 0 else 0
+    values, right = _spectrum(design)
+    rank = int(np.sum(values > _OPEN * values[0]))
     condition = float(values[0] / values[rank - 1]) if rank else np.inf
     share = np.linalg.norm(right[rank:], axis=0)
     open_columns = [k for k in range(4) if share[k] > 1e-3]
@@ -72,17 +77,16 @@ def _scheme(triad: str, inputs: FloatArray) -> Scheme:
     else:
         alone = [_column(k) for k in open_columns if share[k] > 1 - 1e-6]
         tied = [_column(k) for k in open_columns if share[k] <= 1 - 1e-6]
-        said = ([f"nothing determines {listed(alone)}"] if alone else []) + (
-            [f"{listed(tied)} cannot be told apart"] if tied else []
-        )
-        text = f"{known}: {'; '.join(said)}. What adds them: {'; '.join(remedy)}."
+        parts = [f"nothing determines {listed(alone)}"] if alone else []
+        parts += [f"{listed(tied)} cannot be told apart"] if tied else []
+        text = f"{known}: {'; '.join(parts)}. What adds them: {'; '.join(remedy)}."
     return Scheme(triad, 3 * rank, 12, condition, undetermined, remedy, text)
 
 
-def _column(place: int) -> str:
-    if place == 3:
+def _column(column: int) -> str:
+    if column == 3:
         return "the bias"
-    axis = "xyz"[place]
+    axis = "xyz"[column]
     others = [f"{other} from {axis}" for other in "xyz" if other != axis]
     return f"the response to {axis} (scale {axis}, misalignments {' and '.join(others)})"
 
@@ -98,8 +102,7 @@ def _remedies(triad: str, design: FloatArray) -> tuple[str, ...]:
         names = ["a rest", *(f"a turn about {sign}{axis}" for axis in "xyz" for sign in "+−")]
     added = []
     for _ in range(4):
-        _, values, right = np.linalg.svd(design)
-        values = np.pad(values, (0, 4 - len(values)))
+        values, right = _spectrum(design)
         left = right[values <= _OPEN * max(values[0], 1e-300)]
         if not len(left):
             break

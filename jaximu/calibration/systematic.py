@@ -47,12 +47,26 @@ from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.attitude import Attitude
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, rest_statistics
 
-__all__ = ["FIELD", "NEIGHBOURS", "History", "calibrate_by_filter", "disturbances", "field_of", "known_scale",
-           "noise_at_rest", "places_of", "plausible_sizes", "seen_from_outside", "state_advice",
-           "state_effect"]  # fmt: skip
+__all__ = [
+    "FIELD",
+    "NEIGHBOURS",
+    "History",
+    "calibrate_by_filter",
+    "disturbances",
+    "field_of",
+    "known_scale",
+    "noise_at_rest",
+    "places_of",
+    "plausible_sizes",
+    "require_gyroscope",
+    "seen_from_outside",
+    "state_advice",
+    "state_effect",
+]
 
 DRIFTS = 2
 """Gauss–Markov processes an axis that stand for all of a noise model's."""
@@ -103,11 +117,10 @@ class History:
 
 def noise_at_rest(segmentation: Segmentation) -> NoiseModel:
     """Return white noise as a recording's rests show it, and the drift that is usual of such sensors."""
-    recording, rests = segmentation.recording, segmentation.intervals
-    assert recording.gyroscope is not None
+    signals, rests = segmentation.recording.signals, segmentation.intervals
     white = [
-        AxisNoise.of_white(np.diagonal(rest_statistics(signal, rests)[0]) / signal.nominal_scale**2)
-        for signal in (recording.accelerometer, recording.gyroscope)
+        AxisNoise.of_white(np.diagonal(rest_statistics(signals[name], rests)[0]) / signals[name].nominal_scale ** 2)
+        for name in ("accelerometer", "gyroscope")
     ]
     duration = float(rests[-1, 1] - rests[0, 0])
     return with_usual_drift(NoiseModel(white[0], white[1]), float(np.median(np.diff(rests, axis=1))), duration)
@@ -118,8 +131,8 @@ def known_scale(calibration: Calibration) -> Mapping[str, float]:
 
     One by poses and turns knows it of motion: what its turns missed beyond the noise.
     """
-    found = (calibration.filter or {}).get("noise")
-    return found or {"rest": 1.0, "motion": 1.0 + calibration.excess.get("turns", 0.0)}
+    noise = (calibration.filter or {}).get("noise")
+    return noise or {"rest": 1.0, "motion": 1.0 + calibration.excess.get("turns", 0.0)}
 
 
 def disturbances(noise: NoiseModel, scale: Mapping[str, float] | None = None) -> Disturbances:
@@ -159,6 +172,12 @@ def field_of(calibration: Calibration, recording: Recording) -> Signal:
     return field
 
 
+def require_gyroscope(recording: Recording) -> None:
+    """Raise `InputError` for a recording that a filter cannot follow."""
+    if recording.gyroscope is None:
+        raise InputError(f"{recording.name}: the filter needs a gyroscope beside the accelerometer, and there is none.")
+
+
 def calibrate_by_filter(
     recording: Recording,
     gravity: LocalGravity = STANDARD,
@@ -196,92 +215,142 @@ def calibrate_by_filter(
     filter does not converge.
     """
     require_float64()
-    if recording.gyroscope is None:
-        raise InputError(f"{recording.name}: the filter needs a gyroscope beside the accelerometer, and there is none.")
-    chosen = [state_effect(effect_named(each)) for each in effects]
+    require_gyroscope(recording)
+    chosen = [state_effect(effect_named(effect)) for effect in effects]
     with prepared([recording], repair) as (ready,):
         known = noise_of(static)
         choices = Choices(gravity, known, segmentation)
-        start, findings = calibrate_ready([ready.recording], choices, repair, losses=not chosen)
+        start, findings, noise = _start(ready.recording, choices, known, repair, bool(chosen))
         rests = start.segmentations[0]
-        noise = noise_at_rest(rests) if known is None else known
-        if not chosen and sees_earth(disturbances(noise)):  # or turns would count it as noise of motion
-            with suppress(NotPossibleError):
-                turning = replace(choices, effects=(GyroEarthRotation.name,))
-                start, findings = calibrate_ready([ready.recording], turning, repair)
         errors = disturbances(noise, None if chosen else known_scale(start))
-        still, beyond = longest_rest(errors), NEIGHBOURS if chosen else 0
         mounted = None if attitude is None else mounted_on(rests.recording, attitude, gravity, noise, start)
-        errors = seen_from_outside(errors, mounted)
-        seen: dict[str, Any] = {} if mounted is None else {"attitude": mounted.attitude, "mounting": mounted.mounting}
-        outside = () if mounted is None else mounted.effects
-        seen["field"] = None if magnetometer is None else field_of(magnetometer, rests.recording)
-        intervals, notes = cut(rests.recording, rests.intervals, still, beyond, **seen)
-        if magnetometer is not None:
-            place = first_field(intervals, start.imu.with_effects(*outside))
-            outside = (*outside, SetupMagneticField.make(place))
-            errors = replace(errors, field=np.float64(FIELD * np.linalg.norm(place)))
-        measurement = IntervalsOfMotion(intervals, errors, gravity.value)
+        field = None if magnetometer is None else field_of(magnetometer, rests.recording)
+        beyond = NEIGHBOURS if chosen else 0
+        measurement, outside, notes = _measured(start, errors, mounted, field, beyond, gravity)
         unknown = GyroEarthRotation.dormant(), np.full(3, EARTH_RATE)
         earth, spread = unknown if latitude is None else GyroEarthRotation.at(latitude)
-        chosen = [each for each in chosen if each.name != earth.name]
+        chosen = [effect for effect in chosen if effect.name != earth.name]
         imu = jax.tree.map(np.asarray, start.imu.with_effects(earth, *chosen, *outside))
-        usual = {each.name: each.known for each in outside}
-        stated = {**usual, **(effect_sigmas or {}), earth.name: spread}
+        stated = {**{effect.name: effect.known for effect in outside}, **(effect_sigmas or {}), earth.name: spread}
         known_before, prior = Prior.of_effects(imu, stated), Prior.of_effects(imu, plausible_sizes(imu) | stated)
         assert known_before is not None and prior is not None
+        free = Parameters.select(imu, without_equipment_or_effects)
         for _ in range(_ROUNDS):
-            found = fit(imu, measurement, prior=prior, follow=True)
+            fitted = fit(imu, measurement, prior=prior, follow=True)
             if mounted is None:  # else the attitude tells what poses and turns leave open
-                _require_enough_turned(found, start, recording.name)
-            require_solved(found, recording.name)
-            imu = jax.tree.map(np.asarray, found.imu)
-            followed, names = _followed(measurement, imu, prior, gravity, start)
+                _require_enough_turned(fitted, start, recording.name)
+            require_solved(fitted, recording.name)
+            imu = jax.tree.map(np.asarray, fitted.imu)
+            followed = _followed(measurement, imu, free, prior, gravity, start)
             matched = _matched(measurement, followed)
             if matched is None:
                 break
             measurement = matched
-    refuse_undetermined(found, known_before, wholly=True)
+    refuse_undetermined(fitted, known_before, wholly=True)
     assert start.observations is not None and start.nominal is not None
-    before = residual_rms(start.nominal, start.observations)
-    cleaned = start.observations
+    before, cleaned = residual_rms(start.nominal, start.observations), start.observations
     if chosen:
-        names_chosen = {each.name for each in chosen}
-        terms = tuple(each for each in imu.all_effects().values() if each.name in names_chosen)
+        names = {effect.name for effect in chosen}
+        terms = tuple(effect for effect in imu.all_effects().values() if effect.name in names)
         cleaned = RecordedByHand(start.segmentations, start.observations).along(imu, terms).observations
     calibration = concluded(
-        found, advice=state_advice, gravity=gravity, method="filter", loss="linear",
+        fitted,
+        advice=state_advice,
+        gravity=gravity,
+        method="filter",
+        loss="linear",
         excess_names=measurement.excess_names,
-        rms=[before, residual_rms(imu.with_effects(), cleaned)], known=known_before.names, data=start.data,
-        notes=[*ready.notes, *(() if mounted is None else mounted.attitude.notes), *(each.text for each in findings),
-               *start.notes, *notes, *noise.notes],
-        observations=start.observations, segmentations=start.segmentations, nominal=start.nominal,
+        rms=[before, residual_rms(imu.with_effects(), cleaned)],
+        known=known_before.names,
+        data=start.data,
+        notes=[
+            *ready.notes,
+            *(() if mounted is None else mounted.attitude.notes),
+            *(finding.text for finding in findings),
+            *start.notes,
+            *notes,
+            *noise.notes,
+        ],
+        observations=start.observations,
+        segmentations=start.segmentations,
+        nominal=start.nominal,
         reading=start.reading,
-    )  # fmt: skip
+    )
     if mounted is not None:
         smoothed = {"filter": mounted.summary["filter"]}  # as it was found first
         calibration = replace(calibration, reference=reference_summary(calibration) | smoothed)
-    history = _history(measurement, followed, names, imu)
-    states = ["attitude", "velocity", *(f"{triad} drift, {time:.3g} s" for time in measurement.errors.correlation_time
-                                        for triad in ("gyroscope", "accelerometer"))]  # fmt: skip
-    of_effects = {name for name in names if name.effect is not None}
-    summary = {  # of effects, weak directions that are determined all the same are no open states
-        "states": [*states, *(label(name, imu) for name in names), "gravity"],
-        "noise": _scaled_noise(measurement.errors, noise, float(found.excess[0])),
-        "nis": float(history.innovations.sum() / history.freedom.sum()),
-        "open": [
-            each.text
-            for each in calibration.weak
-            if not (each.determined and {name for name, _ in each.parameters} <= of_effects)
-        ],
-    }
+    history = _history(measurement, followed, free, imu)
+    scale = _scaled_noise(measurement.errors, noise, float(fitted.excess[0]))
+    summary = _summary(calibration, history, free.names, measurement.errors.correlation_time, scale)
     return replace(calibration, filter=summary), history
 
 
-def _require_enough_turned(found: Fit, start: Calibration, where: str) -> None:
+def _summary(
+    calibration: Calibration,
+    history: History,
+    names: Sequence[Name],
+    correlation_time: FloatArray,
+    scale: Mapping[str, float],
+) -> dict[str, Any]:
+    """Return the states of the filter, the scale of its noise, how large innovations were, and what it leaves open.
+
+    Of effects, weak directions that are determined all the same are no open states.
+    """
+    drifts = [f"{triad} drift, {time:.3g} s" for time in correlation_time for triad in ("gyroscope", "accelerometer")]
+    of_effects = {name for name in names if name.effect is not None}
+    return {
+        "states": ["attitude", "velocity", *drifts, *(label(name, calibration.imu) for name in names), "gravity"],
+        "noise": scale,
+        "nis": float(history.innovations.sum() / history.freedom.sum()),
+        "open": [
+            weak.text
+            for weak in calibration.weak
+            if not (weak.determined and {name for name, _ in weak.parameters} <= of_effects)
+        ],
+    }
+
+
+def _start(
+    recording: Recording, choices: Choices, known: NoiseModel | None, repair: bool, extended: bool
+) -> tuple[Calibration, Sequence[Finding], NoiseModel]:
+    """Return the calibration by poses and turns, what is unusual, and the noise; `extended`: effects are to follow."""
+    start, findings = calibrate_ready([recording], choices, repair, losses=not extended)
+    noise = noise_at_rest(start.segmentations[0]) if known is None else known
+    if not extended and sees_earth(disturbances(noise)):  # or turns would count it as noise of motion
+        with suppress(NotPossibleError):
+            turning = replace(choices, effects=(GyroEarthRotation.name,))
+            start, findings = calibrate_ready([recording], turning, repair)
+    return start, findings, noise
+
+
+def _measured(
+    start: Calibration,
+    errors: Disturbances,
+    mounted: Mounted | None,
+    field: Signal | None,
+    beyond: int,
+    gravity: LocalGravity,
+) -> tuple[IntervalsOfMotion, tuple[Effect, ...], list[str]]:
+    """Return the recording in intervals, the effects of what was measured from outside, and notes.
+
+    **Arguments:** `field`: magnetic, in the body frame, µT; `beyond`: samples about an interval that are kept.
+    """
+    rests, outside, reference = start.segmentations[0], (), {}
+    if mounted is not None:
+        errors, outside = seen_from_outside(errors, mounted), mounted.effects
+        reference = {"attitude": mounted.attitude, "mounting": mounted.mounting}
+    intervals, notes = cut(rests.recording, rests.intervals, longest_rest(errors), beyond, field=field, **reference)
+    if field is not None:
+        first = first_field(intervals, start.imu.with_effects(*outside))
+        outside = (*outside, SetupMagneticField.make(first))
+        errors = replace(errors, field=np.float64(FIELD * np.linalg.norm(first)))
+    return IntervalsOfMotion(intervals, errors, gravity.value), outside, notes
+
+
+def _require_enough_turned(fitted: Fit, start: Calibration, where: str) -> None:
     """Refuse a filter that does not converge where poses and turns left open what its path depends on."""
-    left = [sentence(each.text) for each in start.weak if not each.determined]
-    if left and found.failure() is Failure.MAX_STEPS:
+    left = [sentence(weak.text) for weak in start.weak if not weak.determined]
+    if left and fitted.failure() is Failure.MAX_STEPS:
         raise NotPossibleError(
             f"{where}: the filter did not converge, most likely because these rotations leave too much open. "
             f"{' '.join(left)} `jaximu plan --for filter` proposes rotations; `jaximu calibrate` gives what these "
@@ -311,7 +380,7 @@ def state_effect(effect: Effect) -> Effect:
 def plausible_sizes(imu: Imu) -> dict[str, FloatArray]:
     """Return how large the coefficients of a unit's effects may be, by effect: what is open stays where it starts."""
     sizes = typical_sizes(imu).all_effects()
-    return {each.name: each.plausible * np.asarray(sizes[at].coefficients) for at, each in imu.all_effects().items()}
+    return {effect.name: effect.plausible * sizes[key].coefficients for key, effect in imu.all_effects().items()}
 
 
 def state_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
@@ -328,29 +397,28 @@ def state_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, m
 
 def _scaled_noise(errors: Disturbances, noise: NoiseModel, excess: float) -> dict[str, float]:
     """Return how much larger the variances in rests and in motion were than the noise says, misfit included."""
-    white = merged_drift(noise, SHORTEST, DRIFTS)[0]
+    white = disturbances(noise).white
     return {
-        "rest": (1 + excess) * float(np.mean(np.asarray(errors.rest) / white)),
-        "motion": (1 + excess) * float(np.mean(np.asarray(errors.white) / white)),
+        name: (1 + excess) * float(np.mean(density / white))
+        for name, density in (("rest", errors.rest), ("motion", errors.white))
     }
 
 
 def _followed(
-    measurement: IntervalsOfMotion, imu: Imu, prior: Prior, gravity: LocalGravity, start: Calibration
-) -> tuple[FilterPass, tuple[Name, ...]]:
+    measurement: IntervalsOfMotion, imu: Imu, free: Parameters, prior: Prior, gravity: LocalGravity, start: Calibration
+) -> FilterPass:
     """Return how a filter that begins with the data sheet comes to know the free numbers."""
-    free = Parameters.select(imu, without_equipment_or_effects)
     assert start.nominal is not None
     nominal = start.nominal.with_effects(*imu.all_effects().values())
     index = list(free.index)
-    mean = (flatten(nominal) - flatten(imu))[index]
+    reference = flatten(imu)[index]
+    mean = flatten(nominal)[index] - reference
     sigma = TOLERANCE * flatten(typical_sizes(imu))[index]
-    for name, value, root in zip(prior.names, prior.mean, np.diagonal(prior.root), strict=True):
-        place = free.names.index(name)
-        mean[place], sigma[place] = value - flatten(imu)[index[place]], 1 / root
+    rows = [free.names.index(name) for name in prior.names]
+    mean[rows], sigma[rows] = prior.mean - reference[rows], 1 / np.diagonal(prior.root)
     sigma = np.append(sigma, max(gravity.sigma, 1e-6))
     known = Knowledge(np.diag(1 / sigma), np.append(mean, 0.0) / sigma)  # pyright: ignore[reportArgumentType]
-    return measurement.followed(imu, index, known), free.names
+    return measurement.followed(imu, index, known)
 
 
 def _matched(measurement: IntervalsOfMotion, followed: FilterPass) -> IntervalsOfMotion | None:
@@ -359,39 +427,48 @@ def _matched(measurement: IntervalsOfMotion, followed: FilterPass) -> IntervalsO
 
     The noise within rests may not tell what differs from rest to rest, nor how far velocity is off where motion ends.
     """
-    rest, arrival = (np.asarray(each) > 0 for each in (measurement.intervals.rest, measurement.intervals.arrival))
+    intervals, errors = measurement.intervals, measurement.errors
+    rest, arrival = intervals.rest > 0, intervals.arrival > 0
     parts = [(rest & ~np.roll(arrival, 1), 0), (arrival, 0)]
-    parts += [(np.ones_like(rest), place + 1) for place in range(len(measurement.intervals.sightings))]
+    parts += [(np.ones_like(rest), column + 1) for column in range(len(intervals.sightings))]
     shares = []
-    for intervals, kind in parts:
-        innovations, freedom = (each[intervals, kind].sum() for each in (followed.innovations, followed.freedom))
+    for chosen, column in parts:
+        innovations, freedom = (values[chosen, column].sum() for values in (followed.innovations, followed.freedom))
         shares.append(max(float(innovations / freedom), 0.25) if freedom else 1.0)
-    if all(abs(each - 1) < _MATCHED for each in shares):
+    if all(abs(share - 1) < _MATCHED for share in shares):
         return None
-    errors = measurement.errors
-    seen = {each.noise: getattr(errors, each.noise) * np.sqrt(share)
-            for each, share in zip(measurement.intervals.sightings, shares[2:], strict=True)}  # fmt: skip
-    scaled = replace(errors, rest=errors.rest * shares[0], arrival=errors.arrival * np.sqrt(shares[1]), **seen)
+    outside = {
+        sighting.noise: getattr(errors, sighting.noise) * np.sqrt(share)
+        for sighting, share in zip(intervals.sightings, shares[2:], strict=True)
+    }
+    scaled = replace(errors, rest=errors.rest * shares[0], arrival=errors.arrival * np.sqrt(shares[1]), **outside)
     return replace(measurement, errors=scaled)
 
 
-def _history(measurement: IntervalsOfMotion, followed: FilterPass, names: tuple[Name, ...], imu: Imu) -> History:
+def _history(measurement: IntervalsOfMotion, followed: FilterPass, free: Parameters, imu: Imu) -> History:
     intervals = measurement.intervals
-    real = np.asarray(intervals.real) > 0
-    inside = np.asarray(intervals.length) > 0
-    time = np.where(inside, np.asarray(intervals.time)[:, -inside.shape[1] :], -np.inf).max(axis=1)[real]
-    index = list(Parameters.select(imu, without_equipment_or_effects).index)
-    values = followed.values[real, :-1] + flatten(imu)[index]
+    real = intervals.real > 0
+    inside = intervals.length > 0
+    time = np.where(inside, intervals.time[:, -inside.shape[1] :], -np.inf).max(axis=1)[real]
+    values = followed.values[real, :-1] + flatten(imu)[list(free.index)]
     drift = followed.states[real, 6:].reshape(len(time), -1, 6).sum(axis=1)
     spread = np.sqrt((followed.state_sigmas[real, 6:] ** 2).reshape(len(time), -1, 6).sum(axis=1))
-    innovations, freedom = (each[real].sum(axis=1) for each in (followed.innovations, followed.freedom))
+    innovations, freedom = (counts[real].sum(axis=1) for counts in (followed.innovations, followed.freedom))
     return History(
-        time, (np.asarray(intervals.rest) > 0)[real], names, values, followed.sigmas[real, :-1], drift, spread,
-        innovations, freedom, places_of(GyroEarthRotation, imu, names),
-    )  # fmt: skip
+        time,
+        (intervals.rest > 0)[real],
+        free.names,
+        values,
+        followed.sigmas[real, :-1],
+        drift,
+        spread,
+        innovations,
+        freedom,
+        places_of(GyroEarthRotation, imu, free.names),
+    )
 
 
 def places_of(kind: type[Effect], imu: Imu, names: Sequence[Name]) -> tuple[int, ...]:
     """Return where the numbers of a unit's effect are among some names."""
-    own = {at for at, effect in imu.all_effects().items() if isinstance(effect, kind)}
-    return tuple(place for place, name in enumerate(names) if (name.owner, name.effect) in own)
+    keys = {key for key, effect in imu.all_effects().items() if isinstance(effect, kind)}
+    return tuple(row for row, name in enumerate(names) if (name.owner, name.effect) in keys)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -20,8 +21,8 @@ from jaximu.calibration.thermal_selection import richest
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.calibration.thermal_terms import BESIDE, HISTORY, LEARNED, NETWORK, POWERS, RATES, SCALE
 from jaximu.calibration.thermal_triad import TriadFit, fit_triad
-from jaximu.data.rest import mean_terms
-from jaximu.data.rest_blocks import RATE_BANDWIDTH, RestBlocks, own_noise, rest_blocks
+from jaximu.data.rest import mean_terms, padded_count
+from jaximu.data.rest_blocks import RATE_BANDWIDTH, WAYS, RestBlocks, own_noise, rest_blocks
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
@@ -35,7 +36,6 @@ from jaximu.ground.quantities import size
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.model.effects import Effect
 from jaximu.model.noise_model import NoiseModel
-from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, Signal
@@ -45,7 +45,6 @@ __all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady_change"]
 SCHEMA = "jaximu.thermal/1"
 THERMAL = (*POWERS, *RATES, *HISTORY, *BESIDE, LEARNED, NETWORK, SCALE)
 _GRID = 41
-_BUCKET = 512
 _LONG = 1e6  # s that a steady way has lasted
 _BESIDE, _FEWEST = 4, 40  # blocks on each side of a jump; edges from which on jumps are sought
 _JUMP = 10.0  # times the standard deviation of such changes
@@ -84,8 +83,7 @@ class ThermalCalibration(Document):
 
     def document(self) -> dict[str, Any]:
         """Return everything as the JSON document of schema `jaximu.thermal/1`."""
-        low, high = self.blocks.range
-        grid = np.linspace(low, high, _GRID)
+        grid = np.linspace(*self.blocks.range, _GRID)
 
         def triad(name: str, fit: TriadFit) -> dict[str, Any]:
             value, sigma = self.bias(name, grid)
@@ -93,7 +91,7 @@ class ThermalCalibration(Document):
                 "unit": SENSOR_UNITS[name],
                 "model": fit.candidate.family,
                 "model_by_axis": list(fit.families),
-                "effects": [f"{PREFIXES[name]}.{each}" for each in fit.candidate.names],
+                "effects": fit.candidate.effects(name),
                 "inner": {
                     f"{PREFIXES[name]}.{effect}.{key}": {"value": value, "sigma": spread}
                     for (effect, key), (value, spread) in fit.inner.items()
@@ -103,26 +101,27 @@ class ThermalCalibration(Document):
                 "chi_squared_per_freedom": fit.chi_squared.tolist(),
                 "candidates": [
                     {
-                        "family": each.family,
-                        "effects": [f"{PREFIXES[name]}.{effect}" for effect in each.names],
-                        "terms": len(each.terms),
-                        "heldout_rms": each.held.rms.tolist(),
-                        "heldout_loglik": each.held.log_likelihood,
-                        "criterion": float(np.sum(each.costs)),
-                        "score": float(np.sum(each.scores)),
-                        "score_by_axis": each.scores.tolist(),
+                        "family": candidate.family,
+                        "effects": candidate.effects(name),
+                        "terms": len(candidate.terms),
+                        "heldout_rms": candidate.held.rms.tolist(),
+                        "heldout_loglik": candidate.held.log_likelihood,
+                        "criterion": float(np.sum(candidate.costs)),
+                        "score": candidate.score,
+                        "score_by_axis": candidate.scores.tolist(),
                     }
-                    for each in fit.candidates
+                    for candidate in fit.candidates
                 ],
                 "bias_over_temperature": {
-                    key: each.tolist() for key, each in (("temperature", grid), ("value", value), ("sigma", sigma))
+                    "temperature": grid.tolist(),
+                    "value": value.tolist(),
+                    "sigma": sigma.tolist(),
                 },
             }
 
         return {
             "schema": SCHEMA,
-            "temperature_range": [low, high],
-            "temperature_rate_range": [float(self.blocks.rate.min()), float(self.blocks.rate.max())],
+            **_ranges(self.blocks),
             "temperature_reference": self.reference,
             "block": self.blocks.duration,
             "rate_window": TEMPERATURE_WINDOW,
@@ -184,44 +183,64 @@ def calibrate_thermal(
     if missing:
         raise InputError(f"the recording at rest has no {missing[0]}, whose noise is needed.")
     shapes = ThermalShapes(blocks, reference)
-    noise, left = _noise(blocks, shapes, known)
-    edges, jumps = _jumps(blocks, left)
+    noise, residuals = _noise(blocks, shapes, known)
+    edges, jumps = _jumps(blocks, residuals)
     if edges:  # what comes after a jump has a level of its own
         blocks = blocks.parted(edges)
         shapes = ThermalShapes(blocks, reference, shapes)
         noise, _ = _noise(blocks, shapes, known)
-    found = identifiable(blocks, shapes)
-    fits = {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
-    nets = [shapes.column(term) for fit in fits.values() for term in fit.candidate.terms
-            if term.net is not None]  # fmt: skip
+    identifiability = identifiable(blocks, shapes)
+
+    def fitted(noise: NoiseModel) -> dict[str, TriadFit]:
+        return {
+            name: fit_triad(Whitened(blocks, name, noise, shapes), identifiability, families) for name in blocks.means
+        }
+
+    fits = fitted(noise)
+    nets = [shapes.column(term) for fit in fits.values() for term in fit.candidate.terms if term.net is not None]
     if nets and known is None:  # what a network follows passed for slow noise
         noise = own_noise(blocks, np.concatenate([shapes.generous().T, *nets]).T)
-        fits = {name: fit_triad(Whitened(blocks, name, noise, shapes), found, families) for name in blocks.means}
-    fits = {name: _from_reference(fit, getattr(blocks.recordings[0], name), reference) for name, fit in fits.items()}
+        fits = fitted(noise)
+    fits = {name: _from_reference(fit, blocks.recordings[0].signals[name], reference) for name, fit in fits.items()}
     calibration, notes = _calibration(blocks, fits, base, reference)
     notes = [*blocks.notes, *noise.notes, *notes]
     for name, fit in fits.items():
-        if NETWORK in fit.candidate.names:
-            notes.append(
-                f"the {name}'s model is a neural network, whose 95 % band holds a network's uncertainty only: where "
-                "the truth is another curve it covers less, about four fifths in simulations. Check it on another ramp."
-            )
-        worst = float(np.max(fit.chi_squared))
-        if worst > _MISFIT:
-            notes.append(
-                f"the {name}'s residuals are {np.sqrt(worst):.2g} times what the noise explains: something depends on "
-                "more than this model has (a field of temperatures in the device, tilt, another cause); intervals are "
-                "widened by as much."
-            )
-        plain = ["xyz"[axis] for axis, family in enumerate(fit.families) if family == "constant"]
-        if plain:
-            notes.append(
-                f"the {name}'s {', '.join(plain)} output is left as it is: no model of temperature corrects it on "
-                f"{'stretches' if len(found.legs) < 4 else 'ways'} left out."
-            )
+        notes += _notes(name, fit, "stretches" if len(identifiability.legs) < WAYS else "ways")
     notes = tuple(dict.fromkeys((*notes, *jumps)))
     times = tuple((int(blocks.log[edge]), float(blocks.start[edge])) for edge in edges)
-    return ThermalCalibration(replace(calibration, notes=notes), blocks, noise, found, fits, reference, notes, times)
+    calibration = replace(calibration, notes=notes)
+    return ThermalCalibration(calibration, blocks, noise, identifiability, fits, reference, notes, times)
+
+
+def _notes(name: str, fit: TriadFit, parts: str) -> list[str]:
+    """Say where a triad's model is to be taken with care; `parts`: what was left out in turn."""
+    notes = []
+    if NETWORK in fit.candidate.names:
+        notes.append(
+            f"the {name}'s model is a neural network, whose 95 % band holds a network's uncertainty only: where "
+            "the truth is another curve it covers less, about four fifths in simulations. Check it on another ramp."
+        )
+    worst = float(np.max(fit.chi_squared))
+    if worst > _MISFIT:
+        notes.append(
+            f"the {name}'s residuals are {np.sqrt(worst):.2g} times what the noise explains: something depends on "
+            "more than this model has (a field of temperatures in the device, tilt, another cause); intervals are "
+            "widened by as much."
+        )
+    plain = ["xyz"[axis] for axis, family in enumerate(fit.families) if family == "constant"]
+    if plain:
+        notes.append(
+            f"the {name}'s {', '.join(plain)} output is left as it is: no model of temperature corrects it on {parts} "
+            "left out."
+        )
+    return notes
+
+
+def _ranges(blocks: RestBlocks) -> dict[str, list[float]]:
+    return {
+        "temperature_range": list(blocks.range),
+        "temperature_rate_range": [float(blocks.rate.min()), float(blocks.rate.max())],
+    }
 
 
 def _noise(
@@ -232,51 +251,50 @@ def _noise(
     Noise that is not known is what no function of temperature explains; it is estimated again with lag and hysteresis
     taken off as they are.
     """
-    found = identifiable(blocks, shapes)
-    noise = own_noise(blocks, shapes.generous()) if known is None else known
-    left, columns = {}, [shapes.generous().T]
+    identifiability, columns = identifiable(blocks, shapes), [shapes.generous().T]
+    noise = own_noise(blocks, columns[0].T) if known is None else known
+    residuals = {}
     for name in blocks.means:
         data = Whitened(blocks, name, noise, shapes)
-        model = richest(data, found)[0]
+        model = richest(data, identifiability)[0]
         columns += [shapes.column(term) for term in model[0] if term.name in (*HISTORY, SCALE)]
         white = [data.solve(axis, terms)[1] for axis, terms in enumerate(model)]
-        left[name] = np.stack([np.linalg.solve(*each) for each in zip(data.root, white, strict=True)], axis=1)
-    return own_noise(blocks, np.concatenate(columns).T) if known is None else noise, left
+        residuals[name] = np.linalg.solve(data.root, np.stack(white)[:, :, None])[:, :, 0].T
+    return own_noise(blocks, np.concatenate(columns).T) if known is None else noise, residuals
 
 
-def _jumps(blocks: RestBlocks, left: dict[str, FloatArray]) -> tuple[list[int], list[str]]:
+def _jumps(blocks: RestBlocks, residuals: dict[str, FloatArray]) -> tuple[list[int], list[str]]:
     """Return the blocks before which what a model leaves jumps inside a rest, by far more than elsewhere, and say so.
 
-    **Arguments:** `left`: by triad (n, 3), SI.
+    **Arguments:** `residuals`: by triad (n, 3), SI.
     """
     edges = np.arange(_BESIDE, len(blocks) - _BESIDE + 1)
     edges = edges[blocks.level[edges - _BESIDE] == blocks.level[edges + _BESIDE - 1]]
     if len(edges) < _FEWEST:
         return [], []
     around = edges[:, None] + np.arange(_BESIDE)
-    places: list[int] = []
-    said = []
-    for name, residual in left.items():
+    jumps: list[int] = []
+    notes = []
+    for name, residual in residuals.items():
         change = np.median(residual[around], axis=1) - np.median(residual[around - _BESIDE], axis=1)
         usual = np.maximum(np.median(np.abs(change), axis=0) / 0.6745, 0.05 * np.std(change, axis=0))  # coarse steps
         times = np.abs(change) / np.maximum(usual, 1e-300)
         # a jump is over within two blocks; what takes longer is a lag that was not in equilibrium
         near = [np.abs(residual[edges + b] - residual[edges + a]) for a, b in ((-1, 0), (-1, 1), (-2, 0))]
         times[np.max(near, axis=0) < _SHARP * np.abs(change)] = 0.0
-        while len(said) < _MOST_JUMPS and np.max(times) > _JUMP:
-            place, axis = np.unravel_index(int(np.argmax(times)), times.shape)
-            at = int(edges[place])
-            jump, ratio = size(float(change[place, axis]), SENSOR_UNITS[name], 2), times[place, axis]
-            said.append(
-                f"the {name}'s {'xyz'[axis]} output jumps by {jump} at {blocks.start[at]:.0f} s, "
-                f"{blocks.temperature[at]:.1f} °C, {ratio:.0f} times the usual change: a knock, or a part that gave "
-                "way. It was kept apart from temperature: what comes after has its own bias. `compensate` leaves the "
-                "jump in."
+        while len(notes) < _MOST_JUMPS and np.max(times) > _JUMP:
+            row, axis = np.unravel_index(int(np.argmax(times)), times.shape)
+            block = int(edges[row])
+            notes.append(
+                f"the {name}'s {'xyz'[axis]} output jumps by {size(float(change[row, axis]), SENSOR_UNITS[name], 2)} "
+                f"at {blocks.start[block]:.0f} s, {blocks.temperature[block]:.1f} °C, {times[row, axis]:.0f} times the "
+                "usual change: a knock, or a part that gave way. It was kept apart from temperature: what comes after "
+                "has its own bias. `compensate` leaves the jump in."
             )
-            places.append(at)
-            times[np.abs(edges - at) < 2 * _BESIDE] = 0.0
-    apart = [at for k, at in enumerate(sorted(places)) if not k or at - sorted(places)[k - 1] >= 2 * _BESIDE]
-    return apart, said
+            jumps.append(block)
+            times[np.abs(edges - block) < 2 * _BESIDE] = 0.0
+    jumps.sort()
+    return [after for before, after in pairwise([-2 * _BESIDE, *jumps]) if after - before >= 2 * _BESIDE], notes
 
 
 def _from_reference(fit: TriadFit, signal: Signal, reference: float) -> TriadFit:
@@ -290,72 +308,94 @@ def _calibration(
 ) -> tuple[Calibration, list[str]]:
     """Put the fitted terms into a unit: the base calibration's, or the data sheet's."""
     recording, notes = blocks.recordings[0], []
-    start = nominal_imu(recording)[0] if base is None else base.imu
-    names: list[Name] = [] if base is None else list(base.names)
-    covariance = np.zeros((0, 0)) if base is None else np.array(base.covariance)
-    triads: dict[str, Triad] = {}
+    unit = nominal_imu(recording)[0] if base is None else base.imu
+    names: list[Name] = []
+    covariances = []
+    if base is not None:  # what the fits replace is no longer known
+        rest = base.of_numbers(lambda number: number.owner not in fits or number.effect is None)
+        names, covariances = list(rest.names), [rest.covariance]
+    triads: dict[str, Any] = {}
     for name, fit in fits.items():
-        triad, found = start.triads()[name], fit.fit
-        kept = tuple(e for e in triad.effects if e.plain not in THERMAL)
-        told, at = base is None and name == "gyroscope", reference
-        if base is not None and len(kept) == len(triad.effects):
-            at = float(base.data.get("temperature", reference))
-            if "temperature" not in base.data:
-                notes.append(
-                    f"the calibration does not say at which temperature its biases hold: {reference:g} °C is assumed."
-                )
-        bias = found.imu.triads()[name].bias if told else triad.bias - steady(fit.effects, at, 0.0, reference)[0][0]
-        triads[name] = replace(triad, bias=np.asarray(bias), effects=(*kept, *fit.effects),
-                               temperature_reference=reference)  # fmt: skip
-        known = {number: row for row, number in enumerate(found.names) if told or number.part != "bias"}
-        # a coefficient that its axis does without is zero, and known to be
-        rows = {number: known.get(number, -1) for number in (*effect_numbers(found.imu)[0], *known)
-                if number in known or number.part == "coefficients"}  # fmt: skip
-        own = [number if number.effect is None else Name(name, number.part, number.axes, len(kept) + number.effect)
-               for number in rows]  # fmt: skip
-        block = np.pad(np.asarray(found.covariance), (0, 1))[np.ix_(list(rows.values()), list(rows.values()))]
-        if told and blocks.levels > 1:
-            spread = np.var(fit.level, axis=1, ddof=1) * getattr(recording, name).nominal_scale ** 2 / blocks.levels
-            block[-3:, -3:] += np.diag(spread)
-        outside = [k for k, each in enumerate(names) if each.owner != name or each.effect is None]
-        names = [names[k] for k in outside] + own
-        covariance = scipy.linalg.block_diag(covariance[np.ix_(outside, outside)], block)
+        triad = unit.triads()[name]
+        kept = tuple(effect for effect in triad.effects if effect.plain not in THERMAL)
+        if base is None and name == "gyroscope":
+            bias = fit.fit.imu.triads()[name].bias
+        else:
+            temperature = reference
+            if base is not None and len(kept) == len(triad.effects):
+                temperature = float(base.data.get("temperature", reference))
+                if "temperature" not in base.data:
+                    notes.append(
+                        "the calibration does not say at which temperature its biases hold: "
+                        f"{reference:g} °C is assumed."
+                    )
+            bias = triad.bias - steady(fit.effects, temperature, 0.0, reference)[0][0]
+        triads[name] = replace(triad, bias=bias, effects=(*kept, *fit.effects), temperature_reference=reference)
+        numbers, covariance = _numbers(
+            fit, base is None and name == "gyroscope", recording.signals[name], blocks.levels
+        )
+        names += [
+            number if number.effect is None else Name(name, number.part, number.axes, len(kept) + number.effect)
+            for number in numbers
+        ]
+        covariances.append(covariance)
     if base is None:
+        triads.setdefault("gyroscope", None)
         notes.append(
             "gain and the accelerometer's bias are the data sheet's: a recording at rest does not determine them. "
             "--calibration CALIBRATION adds the thermal part to a calibration of the unit."
         )
-    imu = Imu(triads["accelerometer"], triads.get("gyroscope", start.gyroscope if base is not None else None),
-              start.setup)  # fmt: skip
-    low, high = blocks.range
-    given = {name: getattr(recording, name) for name in fits}
     data = provenance(blocks.recordings) | {
-        "nominal_offset": {name: signal.nominal_offset.tolist() for name, signal in given.items()},
+        "nominal_offset": {name: recording.signals[name].nominal_offset.tolist() for name in fits},
         "poses": blocks.levels,
         "turns": 0,
         "blocks": len(blocks),
-        "temperature_range": [low, high],
-        "temperature_rate_range": [float(blocks.rate.min()), float(blocks.rate.max())],
+        **_ranges(blocks),
     }
     if base is not None:
         data["base"] = {key: base.data[key] for key in ("file", "sha256", "temperature") if key in base.data}
-    norms = {name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)), SENSOR_UNITS[name])
-             for name, fit in fits.items()}  # fmt: skip
+    norms = {
+        name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)), SENSOR_UNITS[name])
+        for name, fit in fits.items()
+    }
     ended = [fit.fit.failure() for fit in fits.values() if NETWORK not in fit.candidate.names]  # they are solved before
     return Calibration(
-        imu=jax.tree.map(np.asarray, imu), names=tuple(names), covariance=covariance,
-        gravity=STANDARD if base is None else base.gravity, method="thermal", loss="linear",
-        rms=norms if base is None else base.rms | norms, rank=len(names), weak=() if base is None else base.weak,
+        imu=jax.tree.map(np.asarray, replace(unit, **triads)),
+        names=tuple(names),
+        covariance=scipy.linalg.block_diag(*covariances),
+        gravity=STANDARD if base is None else base.gravity,
+        method="thermal",
+        loss="linear",
+        rms=norms if base is None else base.rms | norms,
+        rank=len(names),
+        weak=() if base is None else base.weak,
         excess={name: float(np.max(fit.fit.excess)) for name, fit in fits.items()},
-        solver=next((each for each in ended if each is not Failure.NONE), Failure.NONE).value, data=data,
+        solver=next((failure for failure in ended if failure is not Failure.NONE), Failure.NONE).value,
+        data=data,
         reading=recording.reading if base is None or base.reading is None else base.reading,
-    ), notes  # fmt: skip
+    ), notes
+
+
+def _numbers(fit: TriadFit, with_bias: bool, signal: Signal, levels: int) -> tuple[list[Name], FloatArray]:
+    """Return a triad's numbers that are known with its fit, and their covariance, output units.
+
+    A coefficient that its axis does without is zero, and known to be. The rests of a gyroscope (`with_bias`) are off
+    by what their `levels` differ by.
+    """
+    fitted = {name: row for row, name in enumerate(fit.fit.names) if with_bias or name.part != "bias"}
+    coefficients = [name for name in effect_numbers(fit.fit.imu)[0] if name in fitted or name.part == "coefficients"]
+    names = list(dict.fromkeys((*coefficients, *fitted)))
+    rows = [fitted.get(name, -1) for name in names]
+    covariance = np.pad(fit.fit.covariance, (0, 1))[np.ix_(rows, rows)]
+    if with_bias and levels > 1:
+        covariance[-3:, -3:] += np.diag(np.var(fit.level, axis=1, ddof=1) * signal.nominal_scale**2 / levels)
+    return names, covariance
 
 
 def steady_change(calibration: Calibration, name: str, celsius: FloatArray) -> FloatArray:
     """Return what steady temperatures (m,) °C add to a triad's bias, (m, 3), SI: the calibration's `bias` left out."""
     triad = calibration.triads()[name]
-    scale = np.linalg.norm(np.asarray(triad.gain), axis=1) if triad.output_unit == "count" else np.ones(3)
+    scale = np.linalg.norm(triad.gain, axis=1) if triad.output_unit == "count" else np.ones(3)
     effects = [effect for effect in triad.effects if effect.plain in THERMAL]
     return steady(effects, celsius, 0.0, triad.temperature_reference)[0] / scale
 
@@ -375,19 +415,15 @@ def change(
     of an accelerometer, or as many rad/s about a gyroscope's.
     """
     triad = calibration.triads()[owner]
-    places = [place for place, effect in enumerate(triad.effects) if effect.plain in names]
-    effects, reference = [triad.effects[place] for place in places], triad.temperature_reference
-    there, back = (steady(effects, *at, reference, force) for at in ((celsius, rate), (reference, 0.0)))
-    values, slopes = (each - origin for each, origin in zip(there, back, strict=True))
-    names_alone = effect_numbers(calibration.imu.with_effects(*effects))[0]
-    numbers = [Name(owner, name.part, name.axes, places[name.effect])
-               for name in names_alone if name.effect is not None]  # fmt: skip
-    known = [(column, calibration.names.index(name)) for column, name in enumerate(numbers)
-             if name in calibration.names]  # fmt: skip
-    columns, rows = np.array(known, int).reshape(-1, 2).T
-    slopes = slopes[:, :, columns]
-    variance = np.einsum("mak,kl,mal->ma", slopes, calibration.covariance[np.ix_(rows, rows)], slopes)
-    return values, np.sqrt(np.maximum(variance, 0.0))
+    rows = [row for row, effect in enumerate(triad.effects) if effect.plain in names]
+    effects, reference = [triad.effects[row] for row in rows], triad.temperature_reference
+    values, slopes = steady(effects, celsius, rate, reference, force)
+    origin, origin_slopes = steady(effects, reference, 0.0, reference, force)
+    alone = effect_numbers(calibration.imu.with_effects(*effects))[0]
+    numbers = [Name(owner, name.part, name.axes, rows[name.effect]) for name in alone if name.effect is not None]
+    slopes = slopes - origin_slopes
+    variance = np.einsum("mak,kl,mal->ma", slopes, calibration.covariance_of(numbers), slopes)
+    return values - origin, np.sqrt(np.maximum(variance, 0.0))
 
 
 def steady(
@@ -399,11 +435,15 @@ def steady(
     what it is; `reference`: °C from which effects count; `force`: along each axis.
     """
     celsius = np.atleast_1d(np.asarray(celsius, float))
-    ends = np.pad(celsius, (0, -len(celsius) % _BUCKET), "edge")
+    count = len(celsius)
+    ends = np.pad(celsius, (0, padded_count(count) - count), "edge")
     time = np.broadcast_to([-_LONG, 0.0], (len(ends), 2))
-    stimulus = Stimulus(specific_force=np.full((len(ends), 2, 3), force), temperature=ends[:, None] + rate * time,
-                    temperature_rate=np.full((len(ends), 2), rate), time=time,
-                    temperature_reference=reference)  # pyright: ignore[reportArgumentType] # fmt: skip
-    now = np.minimum(np.arange(len(ends)), len(celsius))
-    track = Track(stimulus, np.stack([np.full(len(ends), len(celsius)), now], axis=1))
-    return mean_terms(effects, [track], len(celsius))
+    stimulus = Stimulus(
+        specific_force=np.full((len(ends), 2, 3), force),
+        temperature=ends[:, None] + rate * time,
+        temperature_rate=np.full((len(ends), 2), rate),
+        time=time,
+        temperature_reference=reference,
+    )  # pyright: ignore[reportArgumentType]
+    now = np.minimum(np.arange(len(ends)), count)
+    return mean_terms(effects, [Track(stimulus, np.stack([np.full(len(ends), count), now], axis=1))], count)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.thermal_shapes import ThermalShapes
-from jaximu.calibration.thermal_terms import Model, Net, ThermalTerm
+from jaximu.calibration.thermal_terms import Model, ThermalTerm, net_of
 from jaximu.data.rest_blocks import RestBlocks
 from jaximu.estimation.leave_out import LeftOut, leave_out
 from jaximu.ground.array_types import FloatArray
@@ -76,17 +76,13 @@ class Whitened:
         """Return an axis's levels and coefficients (L + k,) and whitened residuals (n,)."""
         return self._solve(self.design(axis, terms), self.target(axis, terms))
 
-    def solve_beside(self, axis: int, terms: Sequence[ThermalTerm], net: Net) -> tuple[FloatArray, FloatArray]:
-        """Return the same of terms beside a network whose weights stay."""
-        network = self.root[axis] @ self.shapes.network(net)[0][axis]
-        return self._solve(self.design(axis, terms), self.output[axis] - network)
-
     def coefficients(self, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
         """Return an axis's coefficients (k,); the weights of a network are those about which it is linear."""
-        net = next((term.net for term in terms if term.net is not None), None)
+        net = net_of(terms)
         if net is None:
             return self.solve(axis, terms)[0][self.blocks.levels :]
-        beside = self.solve_beside(axis, terms[:-WEIGHTS], net)[0][self.blocks.levels :]
+        output = self.output[axis] - self.root[axis] @ self.shapes.network(net)[0][axis]
+        beside = self._solve(self.design(axis, terms[:-WEIGHTS]), output)[0][self.blocks.levels :]
         return np.concatenate([beside, np.reshape(net.weights, (3, WEIGHTS))[axis]])
 
     def misfit(self, axis: int, terms: Sequence[ThermalTerm]) -> float:
@@ -114,9 +110,9 @@ class Whitened:
                     float(np.sum(np.log(values))) - chi - len(values) * np.log(2 * np.pi * scale[axis])
                 )
         for level in range(self.blocks.levels):
-            own = self.blocks.level == level
-            if not np.isnan(errors[:, own]).all():
-                errors[:, own] -= np.nanmean(errors[:, own], axis=1)[:, None]
+            inside = self.blocks.level == level
+            if not np.isnan(errors[:, inside]).all():
+                errors[:, inside] -= np.nanmean(errors[:, inside], axis=1)[:, None]
         return Held(np.sqrt(np.nanmean(errors**2, axis=1)), likelihood)
 
     def left_out(

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from jaximu.calibration.thermal_linear import Whitened
 from jaximu.calibration.thermal_selection import Candidate, candidate_of
 from jaximu.calibration.thermal_terms import NETWORK, POWERS, Model, Net, ThermalTerm
+from jaximu.data.rest import padded_count
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.estimation.solver import solve
 from jaximu.ground import stored
@@ -43,7 +44,6 @@ _LEAST_SIZE = 1e-15  # SI, of an output that never changes
 _STARTS = 4
 _SEED = 7
 _STEPS = 60
-_BUCKET = 256
 _MODES, _ORDERS = 64, (13, 6)  # smooth functions kept, and the highest order in temperature and in its rate
 _PATTERN = 1e-3
 """Probability of what the best model leaves, were it noise, below which a network is tried."""
@@ -70,15 +70,15 @@ def with_network(
     plain = (ThermalTerm(POWERS[0]), *(ThermalTerm(name) for name in more))
     scale, left, freedom = float(np.mean(scales)), np.zeros(3), 1.0
     for _ in range(_ROUNDS):
-        net, told = _fitted(data, plain, scale, rated)
+        net, determined = _fitted(data, plain, scale, rated)
         left = np.array([data.misfit(axis, _about(plain, net)) for axis in range(3)])
-        before, freedom = scale, len(data.blocks) - data.blocks.levels - len(plain) - told / 3
+        before, freedom = scale, len(data.blocks) - data.blocks.levels - len(plain) - determined / 3
         scale = float(np.clip(left.sum() / (3 * freedom), 1.0, scale))
         if scale > 0.7 * before:
             break
     scales = np.minimum(scales, np.maximum(left / freedom, 1.0))
     model = (_about(plain, net),) * 3
-    return candidate_of(data, "network", model, folds, scales, len(plain) + told / 3), scales
+    return candidate_of(data, "network", model, folds, scales, len(plain) + determined / 3), scales
 
 
 def _about(plain: Sequence[ThermalTerm], net: Net) -> tuple[ThermalTerm, ...]:
@@ -88,8 +88,12 @@ def _about(plain: Sequence[ThermalTerm], net: Net) -> tuple[ThermalTerm, ...]:
 def _functions(data: Whitened, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
     """Return what levels and terms leave of smooth functions of temperature and its rate, whitened, orthonormal."""
     first, second = (chebvander(data.shapes.inputs[:, k], order) for k, order in enumerate(_ORDERS))
-    both = [first[:, i] * second[:, j] for i in range(_ORDERS[0] + 1) for j in range(_ORDERS[1] + 1)
-            if i / _ORDERS[0] + j / _ORDERS[1] <= 1]  # fmt: skip
+    both = [
+        first[:, i] * second[:, j]
+        for i in range(_ORDERS[0] + 1)
+        for j in range(_ORDERS[1] + 1)
+        if i / _ORDERS[0] + j / _ORDERS[1] <= 1
+    ]
     white = data.root[axis] @ np.stack(both, axis=1)
     base = orthonormal(data.design(axis, terms))
     free = orthonormal(white - base @ (base.T @ white))
@@ -115,10 +119,10 @@ class _Axis(eqx.Module):
 def _solved(matrix, target, prior, start, inputs, origin):
     def one(axis):
         matrix, target, prior, start = axis
-        found = solve(_Axis(matrix, target, prior, inputs, origin), start, _STEPS, 1e-6)
-        sizes = jnp.linalg.svd(found.jacobian, compute_uv=False) ** 2
-        evidence = -found.cost - 0.5 * jnp.sum(jnp.log1p(sizes))
-        return found.z, evidence, jnp.sum(sizes / (1 + sizes))
+        solution = solve(_Axis(matrix, target, prior, inputs, origin), start, _STEPS, 1e-6)
+        sizes = jnp.linalg.svd(solution.jacobian, compute_uv=False) ** 2
+        evidence = -solution.cost - 0.5 * jnp.sum(jnp.log1p(sizes))
+        return solution.z, evidence, jnp.sum(sizes / (1 + sizes))
 
     return jax.lax.map(one, (matrix, target, prior, start))
 
@@ -129,36 +133,44 @@ def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: b
 
     **Returns:** the networks, and how many numbers the data determine.
     """
-    count, missing = len(data.blocks), -len(data.blocks) % _BUCKET
+    count = len(data.blocks)
+    missing = padded_count(count) - count
     inputs = np.pad(data.shapes.inputs, ((0, missing), (0, 0)))
 
     def solved(matrices: Sequence[FloatArray], *lanes: FloatArray) -> list[FloatArray]:
-        """Solve axes; of each a matrix (m, n), what is known a priori and a start (k, 16): z, evidence and told."""
+        """Solve axes, each of a matrix (m, n), known a priori, from starts (k, 16): z, evidence, numbers determined."""
         stacked = np.pad(np.stack(matrices) / np.sqrt(scale), ((0, 0), (0, 0), (0, missing)))
         targets = np.einsum("amn,na->am", stacked[:, :, :count], data.means)
-        tried = lanes[0].shape[1]
-        given = (np.repeat(each, tried, axis=0) for each in (stacked, targets))
-        rows = (each.reshape(3 * tried, WEIGHTS) for each in lanes)
-        found = stored.call(_solved, "thermal network", *given, *rows, inputs, data.shapes.origin)
-        return [each.reshape(3, tried, -1) for each in found]
+        starts = lanes[0].shape[1]
+        problems = (np.repeat(values, starts, axis=0) for values in (stacked, targets))
+        rows = (values.reshape(3 * starts, WEIGHTS) for values in lanes)
+        solutions = stored.call(_solved, "thermal network", *problems, *rows, inputs, data.shapes.origin)
+        return [values.reshape(3, starts, -1) for values in solutions]
 
     smooth, whole, size = [], [], []
     for axis in range(3):
         modes = _functions(data, axis, plain)[:, :_MODES]
         smooth.append(np.pad(modes.T @ data.root[axis], ((0, _MODES - modes.shape[1]), (0, 0))))
         base = orthonormal(data.design(axis, plain))
-        left = data.root[axis] - base @ (base.T @ data.root[axis])  # of levels and plain terms
-        whole.append(np.pad(left, ((0, missing), (0, 0))))
-        linear = np.column_stack([np.eye(data.blocks.levels)[data.blocks.level],
-                                  *(data.shapes.column(term)[axis] for term in plain)])  # fmt: skip
-        basis = np.linalg.qr(linear)[0]
+        apart = data.root[axis] - base @ (base.T @ data.root[axis])  # from levels and plain terms
+        whole.append(np.pad(apart, ((0, missing), (0, 0))))
+        columns = [data.shapes.column(term)[axis] for term in plain]
+        basis = np.linalg.qr(np.column_stack([np.eye(data.blocks.levels)[data.blocks.level], *columns]))[0]
         beside = data.means[:, axis] - basis @ (basis.T @ data.means[:, axis])
         size.append(max(float(np.std(beside)), _LEAST_SIZE))
     starts = 0.5 * np.random.default_rng(_SEED).normal(size=(_STARTS, WEIGHTS))
-    priors = np.array([[np.repeat([share * each, inside, inside if rated else 1e-6, _CONSTANT], UNITS)
-                        for share, inside in _PRIORS for _ in starts] for each in size])  # fmt: skip
+    priors = np.array(
+        [
+            [
+                np.repeat([share * rms, inside, inside if rated else 1e-6, _CONSTANT], UNITS)
+                for share, inside in _PRIORS
+                for _ in starts
+            ]
+            for rms in size
+        ]
+    )
     z, evidence, _ = solved(smooth, priors, np.tile(starts, (3, len(_PRIORS), 1)))
     best = range(3), np.argmax(evidence[..., 0], axis=1)
-    z, _, told = solved(whole, priors[best][:, None], z[best][:, None])
-    weights, known = priors[best] * z[:, 0], priors[best] / np.sqrt(scale)
-    return Net(tuple(weights.ravel().tolist()), tuple(known.ravel().tolist())), float(np.sum(told))
+    z, _, determined = solved(whole, priors[best][:, None], z[best][:, None])
+    weights, prior = priors[best] * z[:, 0], priors[best] / np.sqrt(scale)
+    return Net(tuple(weights.ravel().tolist()), tuple(prior.ravel().tolist())), float(np.sum(determined))

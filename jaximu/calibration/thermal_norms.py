@@ -42,7 +42,7 @@ class _Norms(Conditions):
 
     def at_magnitude(self, magnitude: Float[Array, ""]) -> _Norms:
         """Return the same with another gravity."""
-        return eqx.tree_at(lambda each: each.magnitude, self, magnitude)
+        return eqx.tree_at(lambda norms: norms.magnitude, self, magnitude)
 
 
 class _Windows(Data):
@@ -85,12 +85,12 @@ def calibrate_norms(
     def free(name: Name) -> bool:
         return name.owner == "accelerometer" and (name.part == "coefficients" or without_equipment(name))
 
-    found = fit(unit, measured, free, loss=loss)
-    require_solved(found, f"{len(means)} windows")
-    sizes = np.linalg.svd(found.jacobian, compute_uv=False)
+    fitted = fit(unit, measured, free, loss=loss)
+    require_solved(fitted, f"{len(means)} windows")
+    sizes = np.linalg.svd(fitted.jacobian, compute_uv=False)
     if sizes[-1] < _BLIND * sizes[0]:
         raise NotPossibleError(
             "the windows do not determine bias, gain and what temperature does to them: more poses at more "
             "temperatures are needed, each axis up and down."
         )
-    return found
+    return fitted

@@ -36,7 +36,8 @@ def multifactor(factors: Mapping[str, FloatArray], truth: FloatArray) -> tuple[l
 
     def stays(term: str, kept: Sequence[str]) -> bool:
         # a product keeps its factors, or what is kept would depend on where they count from
-        return term == "1" or any(term in (each.removesuffix("²"), *each.split("·")) for each in kept if each != term)
+        products = (other for other in kept if other != term)
+        return term == "1" or any(term in (product.removesuffix("²"), *product.split("·")) for product in products)
 
     kept = exchanged(tuple(columns), criterion, stays)
     parts = leave_out(np.eye(count), matrix(kept), truth, np.array_split(np.arange(count), _FOLDS))

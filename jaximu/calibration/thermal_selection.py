@@ -29,10 +29,25 @@ from jaximu.calibration.thermal_terms import (
     memories,
 )
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.units import PREFIXES
 
-__all__ = ["CUBIC", "PAYS", "VAGUE", "Candidate", "best_by_axis", "beyond_bias", "candidate_of", "completed",
-           "exchanged", "families_of", "parameters_of", "richest", "stepwise", "terms_of",
-           "tuned"]  # fmt: skip
+__all__ = [
+    "CUBIC",
+    "PAYS",
+    "VAGUE",
+    "Candidate",
+    "best_by_axis",
+    "beyond_bias",
+    "candidate_of",
+    "completed",
+    "exchanged",
+    "families_of",
+    "parameters_of",
+    "richest",
+    "stepwise",
+    "terms_of",
+    "tuned",
+]
 
 T = TypeVar("T")
 CUBIC = "cubic"
@@ -76,9 +91,18 @@ class Candidate:
         return self.held.by_axis - self.costs / 2
 
     @property
+    def score(self) -> float:
+        """That of the three axes together."""
+        return float(np.sum(self.scores))
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The effects in it, without prefix."""
         return tuple(dict.fromkeys(term.name for term in self.terms))
+
+    def effects(self, triad: str) -> list[str]:
+        """Return the effects in it as the catalogue names those of a triad."""
+        return [f"{PREFIXES[triad]}.{name}" for name in self.names]
 
 
 def parameters_of(terms: Sequence[ThermalTerm]) -> float:
@@ -94,7 +118,7 @@ def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArr
     """
     offered = ReducedTerms(data, [term for terms in model for term in terms])
     penalty = float(np.log(len(data.blocks)))
-    found = []
+    kept = []
     for axis, full in enumerate(model):
 
         def criterion(chosen: Sequence[ThermalTerm], axis: int = axis) -> float:
@@ -103,8 +127,8 @@ def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArr
         def stays(term: ThermalTerm, kept: Sequence[ThermalTerm]) -> bool:
             return term.name in fixed or (term.name in _AT_ONCE and bool(memories(other.name for other in kept)))
 
-        found.append(tuple(exchanged(full, criterion, stays)))
-    return tuple(found)
+        kept.append(tuple(exchanged(full, criterion, stays)))
+    return tuple(kept)
 
 
 def exchanged(
@@ -114,8 +138,8 @@ def exchanged(
     kept = list(full)
     now = criterion(kept)
     while True:
-        moves = [[term for term in kept if term != each] for each in kept if not stays(each, kept)]
-        moves += [[term for term in full if term in kept or term == each] for each in full if each not in kept]
+        moves = [[term for term in kept if term != old] for old in kept if not stays(old, kept)]
+        moves += [[term for term in full if term in kept or term == new] for new in full if new not in kept]
         costs = [criterion(move) for move in moves]
         if not costs or min(costs) >= now - 1e-9:
             return kept
@@ -136,6 +160,11 @@ def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
     plain = [term for axis in touched for term in model[axis] if not memories([term.name])]
     beside = [(ThermalTerm(name), leader) for name, leader in BESIDE.items() if name in used]
     best: tuple[ThermalTerm, ...] = ()
+
+    def at(chosen: tuple[ThermalTerm, ...]) -> Model:
+        by_name = {term.name: term for term in chosen}
+        return tuple(tuple(at_inner(term, by_name) for term in terms) for terms in model)
+
     for zoom in range(_ZOOMS):
         if zoom:
             tried = {}
@@ -148,25 +177,22 @@ def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
         offered = ReducedTerms(data, [*plain, *(term for terms in options.values() for term in terms), *others])
 
         def cost(chosen: tuple[ThermalTerm, ...], offered: ReducedTerms = offered) -> float:
-            own = {term.name: term for term in chosen}
-            return sum(
-                offered.misfit(axis, [at_inner(term, own) for term in model[axis]]) / scale[axis] for axis in touched
-            )
+            tuned_model = at(chosen)
+            return sum(offered.misfit(axis, tuned_model[axis]) / scale[axis] for axis in touched)
 
         best = min(product(*options.values()), key=cost)
-    own = {term.name: term for term in best}
-    return tuple(tuple(at_inner(term, own) for term in terms) for terms in model)
+    return at(best)
 
 
-def families_of(told: Sequence[str], more: Sequence[str]) -> dict[str, tuple[list[str], tuple[str, ...]]]:
+def families_of(observable: Sequence[str], more: Sequence[str]) -> dict[str, tuple[list[str], tuple[str, ...]]]:
     """Return the families of models: their effects, and those that stepwise selection must keep.
 
     `more`: effects that all but the autopilots' cubic may have beside.
     """
-    rates = [name for name in RATES if name in told]
-    memory = [name for name in HISTORY if name in told]
+    rates = [name for name in RATES if name in observable]
+    memory = [name for name in HISTORY if name in observable]
     beside = [name for name, leader in BESIDE.items() if leader in memory]
-    found: dict[str, tuple[list[str], tuple[str, ...]]] = {
+    families: dict[str, tuple[list[str], tuple[str, ...]]] = {
         "constant": ([], ()),
         CUBIC: (list(POWERS), POWERS),
         "polynomial": ([*POWERS, *rates, *more], ()),
@@ -174,36 +200,38 @@ def families_of(told: Sequence[str], more: Sequence[str]) -> dict[str, tuple[lis
     }
     for name in memory:
         with_it = [other for other in beside if BESIDE[other] == name]
-        found[name.replace("_", " ")] = ([*POWERS, name, *with_it, *more], (name,))
+        families[name.replace("_", " ")] = ([*POWERS, name, *with_it, *more], (name,))
     if memory:
-        found["all"] = ([*POWERS, *rates, *memory, *beside, *more], ())
-        found["spline and memory"] = ([LEARNED, *rates, *memory, *beside, *more], ())
-    return found
+        families["all"] = ([*POWERS, *rates, *memory, *beside, *more], ())
+        families["spline and memory"] = ([LEARNED, *rates, *memory, *beside, *more], ())
+    return families
 
 
 def terms_of(names: Sequence[str], shapes: ThermalShapes) -> tuple[ThermalTerm, ...]:
     """Return the terms of effects, those with memory at a typical inner parameter."""
-    found: list[ThermalTerm] = []
+    terms: list[ThermalTerm] = []
     for name in names:
+        leader = BESIDE.get(name, name)
         if name == LEARNED:
-            found += [ThermalTerm(LEARNED, (), k) for k in range(SPLINES)]
+            terms += [ThermalTerm(LEARNED, (), k) for k in range(SPLINES)]
+        elif leader in HISTORY:
+            terms.append(history(name, shapes.grids[leader][GRID // 2]))
         else:
-            leader = BESIDE.get(name, name)
-            found.append(history(name, shapes.grids[leader][GRID // 2]) if leader in HISTORY else ThermalTerm(name))
-    return tuple(found)
+            terms.append(ThermalTerm(name))
+    return tuple(terms)
 
 
-def richest(data: Whitened, found: Identifiability) -> tuple[Model, FloatArray]:
+def richest(data: Whitened, identifiability: Identifiability) -> tuple[Model, FloatArray]:
     """Return the model with all that can be separated from temperature, and the scale (3,) of the noise beside it."""
-    terms = terms_of([LEARNED, *(name for name in (*RATES, *HISTORY) if name in found.told), *beyond_bias(data, found)],
-                   data.shapes)  # fmt: skip
+    separable = [name for name in (*RATES, *HISTORY) if name in identifiability.told]
+    terms = terms_of([LEARNED, *separable, *beyond_bias(data, identifiability)], data.shapes)
     model = tuned(data, (terms,) * 3, np.ones(3))
     freedom = max(len(data.blocks) - data.blocks.levels - parameters_of(terms), 1)
     return model, np.array([max(1.0, data.misfit(axis, model[axis]) / freedom) for axis in range(3)])
 
 
-def beyond_bias(data: Whitened, found: Identifiability) -> list[str]:
-    return [SCALE] if SCALE in found.told and data.name == "accelerometer" else []
+def beyond_bias(data: Whitened, identifiability: Identifiability) -> list[str]:
+    return [SCALE] if SCALE in identifiability.told and data.name == "accelerometer" else []
 
 
 def completed(model: Model) -> Model:
@@ -215,9 +243,10 @@ def completed(model: Model) -> Model:
     unique = {term.name: term for term in memory}
     return tuple(
         (*(term for term in terms if term.name not in HISTORY), *unique.values())
-        if any(term.name in HISTORY for term in terms) else terms
+        if any(term.name in HISTORY for term in terms)
+        else terms
         for terms in model
-    )  # fmt: skip
+    )
 
 
 def best_by_axis(candidates: Sequence[Candidate]) -> list[int]:
@@ -226,28 +255,36 @@ def best_by_axis(candidates: Sequence[Candidate]) -> list[int]:
     A slow walk predicts a stretch from its neighbours nearly as well as a model does, and only the model corrects
     another recording: what the terms alone leave of the stretches left out decides between what is about as likely.
     """
-    (constant,) = (k for k, each in enumerate(candidates) if each.family == "constant")
-    plain, found = candidates[constant], []
+    (plain,) = (candidate for candidate in candidates if candidate.family == "constant")
+    chosen = []
     for axis in range(3):
-        known = plain.held.rms[axis], plain.costs[axis]
-        helping = [k for k, each in enumerate(candidates)
-                   if k == constant or (each.held.rms[axis] < known[0] and each.costs[axis] < known[1])]  # fmt: skip
-        best = max(candidates[k].scores[axis] for k in helping)
-        close = [k for k in helping if candidates[k].scores[axis] > best - PAYS]
-        least = min(candidates[k].held.rms[axis] for k in close)
-        close = [k for k in close if candidates[k].held.rms[axis] <= _ALIKE * least]
-        # a spline of few pieces is no simpler than a polynomial
-        found.append(min(close, key=lambda k: (any(term.name == LEARNED for term in candidates[k].model[axis]),
-                                               candidates[k].numbers[axis], -candidates[k].scores[axis])))  # fmt: skip
-    return found
+        rms = np.array([candidate.held.rms[axis] for candidate in candidates])
+        costs = np.array([candidate.costs[axis] for candidate in candidates])
+        scores = np.array([candidate.scores[axis] for candidate in candidates])
+        helps = (rms < plain.held.rms[axis]) & (costs < plain.costs[axis])
+        helps |= [candidate is plain for candidate in candidates]
+        close = helps & (scores > scores[helps].max() - PAYS)
+        close &= rms <= _ALIKE * rms[close].min()
+
+        def complexity(k: int, axis: int = axis) -> tuple[bool, float, float]:
+            # a spline of few pieces is no simpler than a polynomial
+            learned = any(term.name == LEARNED for term in candidates[k].model[axis])
+            return learned, candidates[k].numbers[axis], -candidates[k].scores[axis]
+
+        chosen.append(min(np.flatnonzero(close).tolist(), key=complexity))
+    return chosen
 
 
 def candidate_of(
-    data: Whitened, family: str, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray,
-    told: float | None = None,
-) -> Candidate:  # fmt: skip
-    """Return a model with how it did; `told`: how many numbers of an axis the data determine, where not all."""
-    numbers = np.array([float(parameters_of(terms)) if told is None else told for terms in model])
+    data: Whitened,
+    family: str,
+    model: Model,
+    folds: Sequence[NDArray[np.int64]],
+    scale: FloatArray,
+    determined: float | None = None,
+) -> Candidate:
+    """Return a model with how it did; `determined`: how many numbers of an axis the data determine, where not all."""
+    numbers = np.array([parameters_of(terms) if determined is None else determined for terms in model])
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(model)])
     costs = misfit / scale + float(np.log(len(data.blocks))) * numbers
     return Candidate(family, model, numbers, costs, data.held_out(model, folds, scale))

@@ -22,6 +22,7 @@ from jaximu.calibration.thermal_terms import (
     ThermalTerm,
     history,
     memories,
+    net_of,
 )
 from jaximu.data.rest import mean_terms, padded_count
 from jaximu.data.rest_blocks import RestBlocks
@@ -37,7 +38,6 @@ __all__ = ["GRID", "ThermalShapes"]
 
 GRID = 12
 """Values of an inner parameter that are tried at once."""
-_BUCKET = 256
 
 
 def _shapes(names: Sequence[str], count: int, track: Track, *grids):
@@ -46,8 +46,13 @@ def _shapes(names: Sequence[str], count: int, track: Track, *grids):
     They count from the reference temperature, those of a curve, too.
     """
     celsius = track.stimulus.temperature_reference
-    reference = Stimulus(jnp.zeros(3), temperature=jnp.asarray(celsius), temperature_rate=jnp.zeros(()),
-                         time=jnp.zeros(()), temperature_reference=celsius)  # fmt: skip
+    reference = Stimulus(
+        jnp.zeros(3),
+        temperature=jnp.asarray(celsius),
+        temperature_rate=jnp.zeros(()),
+        time=jnp.zeros(()),
+        temperature_reference=celsius,
+    )
 
     def at(kind, values):
         def of(share):
@@ -57,8 +62,10 @@ def _shapes(names: Sequence[str], count: int, track: Track, *grids):
         return jax.vmap(of, out_axes=-1)(jnp.eye(kind.size // 3))
 
     kinds = [CATALOGUE[f"accel.{name}"] for name in names]
-    return tuple(at(kind, grid[0])[None] if len(grid) == 1 else jax.lax.map(partial(at, kind), grid)
-                 for kind, grid in zip(kinds, grids, strict=True))  # fmt: skip
+    return tuple(
+        at(kind, grid[0])[None] if len(grid) == 1 else jax.lax.map(partial(at, kind), grid)
+        for kind, grid in zip(kinds, grids, strict=True)
+    )
 
 
 class ThermalShapes:
@@ -76,12 +83,14 @@ class ThermalShapes:
         low, high = blocks.range
         duration = max(blocks.spans)
         # a lag shorter than the path's own nodes is none; one as long as the recording is drift
-        spans = {"s": np.geomspace(max(blocks.duration / 2, 1e-3 * duration), 0.4 * duration, GRID),
-                 "K": np.geomspace(0.01, 0.45, GRID) * (high - low)}  # fmt: skip
+        spans = {
+            "s": np.geomspace(max(blocks.duration / 2, 1e-3 * duration), 0.4 * duration, GRID),
+            "K": np.geomspace(0.01, 0.45, GRID) * (high - low),
+        }
         units = {name: CATALOGUE[f"accel.{name}"].inner[inner].unit for name, inner in HISTORY.items()}
         self.grids = {name: spans[unit] for name, unit in units.items()} if like is None else like.grids
-        reach = float(np.max(np.abs(blocks.rate)))
-        self.bounds = {"low": low + ZERO_CELSIUS, "high": high + ZERO_CELSIUS, "reach": reach}
+        fastest = float(np.max(np.abs(blocks.rate)))
+        self.bounds = {"low": low + ZERO_CELSIUS, "high": high + ZERO_CELSIUS, "reach": fastest}
         self.force = blocks.by_rest(blocks.means["accelerometer"])
         self.tracks = blocks.tracks(self.force, reference)
         self._columns: dict[ThermalTerm, FloatArray] = {}
@@ -89,8 +98,8 @@ class ThermalShapes:
         self._add(dict.fromkeys((*POWERS, *RATES, SCALE), none) | {LEARNED: curve})
         self.prepare({})
         celsius, rates = np.append(blocks.temperature, reference), np.append(blocks.rate, 0.0)
-        both = np.stack([(2 * celsius - low - high) / (high - low), rates / max(reach, 1e-12)], axis=1)
-        inputs = np.clip(both, -1.0, 1.0)
+        inputs = np.stack([(2 * celsius - low - high) / (high - low), rates / max(fastest, 1e-12)], axis=1)
+        inputs = np.clip(inputs, -1.0, 1.0)
         self.inputs, self.origin = inputs[:-1], inputs[-1]
         self._nets: dict[Net, tuple[FloatArray, FloatArray]] = {}
 
@@ -101,16 +110,16 @@ class ThermalShapes:
         self._add({name: grid[:, None] for name, grid in values.items()})
         return {name: [history(name, value) for value in values] for name, values in tried.items()}
 
-    def _add(self, asked: Mapping[str, FloatArray]) -> None:
+    def _add(self, grids: Mapping[str, FloatArray]) -> None:
         """Take the shapes of effects at inner parameters (G, i)."""
-        count, names = len(self.blocks), tuple(asked)
+        count, names = len(self.blocks), tuple(grids)
         rows = padded_count(count)
         of, key = partial(_shapes, names, rows), f"thermal {','.join(names)} {rows}"
-        recordings = [stored.call(of, key, track, *asked.values()) for track in self.tracks]
-        for name, grid, *parts in zip(names, asked.values(), *recordings, strict=True):
-            for values, own in zip(grid, np.sum([part[:, :count] for part in parts], axis=0), strict=True):
+        recordings = [stored.call(of, key, track, *grids.values()) for track in self.tracks]
+        for name, grid, *parts in zip(names, grids.values(), *recordings, strict=True):
+            for values, columns in zip(grid, np.sum([part[:, :count] for part in parts], axis=0), strict=True):
                 term = history(name, values[0]) if memories([name]) else ThermalTerm(name)
-                for shape, column in enumerate(own.T):  # (3, n)
+                for shape, column in enumerate(columns.T):  # (3, n)
                     self._columns[term._replace(shape=shape) if name == LEARNED else term] = column
 
     def column(self, term: ThermalTerm) -> FloatArray:
@@ -124,19 +133,19 @@ class ThermalShapes:
     def network(self, net: Net) -> tuple[FloatArray, FloatArray]:
         """Return a network's outputs (3, n) over the blocks and their derivatives (3, n, 16) by its weights."""
         if net not in self._nets:
-            blocks, missing = self.blocks, -len(self.blocks) % _BUCKET
-            celsius, rate = (np.pad(each, (0, missing), "edge") for each in (blocks.temperature, blocks.rate))
+            blocks, missing = self.blocks, padded_count(len(self.blocks)) - len(self.blocks)
+            celsius, rate = (np.pad(values, (0, missing), "edge") for values in (blocks.temperature, blocks.rate))
             stimulus = Stimulus(temperature=celsius, temperature_rate=rate, temperature_reference=self.reference)
             effect = CATALOGUE[f"accel.{NETWORK}"](np.array(net.weights), **self.bounds)
             track = Track(stimulus, np.arange(len(celsius)))
             value, slopes = mean_terms([effect], [track], len(blocks))
-            own = [slopes[:, axis, axis * WEIGHTS : (axis + 1) * WEIGHTS] for axis in range(3)]
-            self._nets[net] = value.T, np.stack(own)
+            by_axis = [slopes[:, axis, axis * WEIGHTS : (axis + 1) * WEIGHTS] for axis in range(3)]
+            self._nets[net] = value.T, np.stack(by_axis)
         return self._nets[net]
 
     def offset(self, terms: Sequence[ThermalTerm]) -> FloatArray:
         """Return what a network linearised among the terms is beside weights times shapes, (3, n), SI."""
-        net = next((term.net for term in terms if term.net is not None), None)
+        net = net_of(terms)
         if net is None:
             return np.zeros((3, len(self.blocks)))
         value, slope = self.network(net)

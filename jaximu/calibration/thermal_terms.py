@@ -8,8 +8,23 @@ from typing import NamedTuple
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import SHAPES
 
-__all__ = ["BESIDE", "HISTORY", "LEARNED", "NETWORK", "POWERS", "RATES", "SCALE", "SPLINES", "Model", "Net",
-           "ThermalTerm", "at_inner", "history", "memories"]  # fmt: skip
+__all__ = [
+    "BESIDE",
+    "HISTORY",
+    "LEARNED",
+    "NETWORK",
+    "POWERS",
+    "RATES",
+    "SCALE",
+    "SPLINES",
+    "Model",
+    "Net",
+    "ThermalTerm",
+    "at_inner",
+    "history",
+    "memories",
+    "net_of",
+]
 
 POWERS = ("temperature", "temperature_squared", "temperature_cubed")
 RATES = ("temperature_rate", "temperature_rate_squared", "temperature_times_rate")
@@ -50,6 +65,11 @@ def history(name: str, value: float) -> ThermalTerm:
 def memories(names: Iterable[str]) -> set[str]:
     """Return whose inner parameters effects have, by name."""
     return {BESIDE.get(name, name) for name in names} & set(HISTORY)
+
+
+def net_of(terms: Iterable[ThermalTerm]) -> Net | None:
+    """Return the network that is linearised among terms, if any is."""
+    return next((term.net for term in terms if term.net is not None), None)
 
 
 def at_inner(term: ThermalTerm, chosen: Mapping[str, ThermalTerm]) -> ThermalTerm:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -70,89 +71,99 @@ class TriadFit:
     @property
     def held_before(self) -> Held:
         """What was left out, without a model."""
-        return next(each.held for each in self.candidates if each.family == "constant")
+        return next(candidate.held for candidate in self.candidates if candidate.family == "constant")
 
     @property
     def inner(self) -> dict[tuple[str, str], tuple[float, float]]:
         """Value and standard deviation of each inner parameter, by effect and name."""
-        sigmas = self.fit.sigmas()
         return {
-            (self.effects[name.effect].plain, name.part): (float(self.fit.values[place]), float(sigmas[place]))
-            for place, name in enumerate(self.fit.names)
+            (self.effects[name.effect].plain, name.part): (float(value), float(sigma))
+            for name, value, sigma in zip(self.fit.names, self.fit.values, self.fit.sigmas(), strict=True)
             if name.effect is not None and name.part != "coefficients"
         }
 
 
-def fit_triad(data: Whitened, found: Identifiability, families: Sequence[str] | None = None) -> TriadFit:
+def fit_triad(data: Whitened, identifiability: Identifiability, families: Sequence[str] | None = None) -> TriadFit:
     """Fit every family of models, choose for each axis by what was left out, and return the choice, with uncertainty.
 
     Inner parameters are those of the model that is best for all axes together: each axis then chooses its terms at
     them. An axis is left as it is where no model predicts what was left out better than a constant does.
     """
-    folds, beyond = folds_of(found.legs), beyond_bias(data, found)
-    scale = richest(data, found)[1]
-    offered = {family: each for family, each in families_of(found.told, beyond).items()
-               if family == "constant" or families is None or family in families}  # fmt: skip
-    tried: dict[str, Model] = {}
+    folds, beyond = folds_of(identifiability.legs), beyond_bias(data, identifiability)
+    scale = richest(data, identifiability)[1]
+    offered = {
+        family: effects
+        for family, effects in families_of(identifiability.told, beyond).items()
+        if family == "constant" or families is None or family in families
+    }
+    models: dict[str, Model] = {}
     for family, (names, fixed) in offered.items():
         model = tuned(data, (terms_of(names, data.shapes),) * 3, scale)
-        tried[family] = tuned(data, stepwise(data, model, fixed, scale), scale)
-    candidates = [candidate_of(data, family, model, folds, scale) for family, model in tried.items()]
-    if remembering := [each for each in candidates if memories(each.names)]:
-        best = max(float(np.sum(each.scores)) for each in remembering)
-        anchor = min((each for each in remembering if np.sum(each.scores) > best - PAYS), key=lambda c: c.parameters)
-        own = {BESIDE.get(term.name, term.name): term for term in anchor.terms if memories([term.name])}
-        for place, each in enumerate(candidates):
-            names, fixed = offered[each.family]
-            terms = tuple(at_inner(term, own) for term in terms_of(names, data.shapes))
-            if each is not anchor and set(own) & set(names):
-                tried[each.family] = stepwise(data, (terms,) * 3, fixed, scale)
-                candidates[place] = candidate_of(data, each.family, tried[each.family], folds, scale)
+        models[family] = tuned(data, stepwise(data, model, fixed, scale), scale)
+
+    def candidate(family: str) -> Candidate:
+        return candidate_of(data, family, models[family], folds, scale)
+
+    tried = {family: candidate(family) for family in models}
+    if remembering := [one for one in tried.values() if memories(one.names)]:
+        best = max(one.score for one in remembering)
+        anchor = min((one for one in remembering if one.score > best - PAYS), key=lambda one: one.parameters)
+        memory = {BESIDE.get(term.name, term.name): term for term in anchor.terms if memories([term.name])}
+        for family, (names, fixed) in offered.items():
+            if family != anchor.family and set(memory) & set(names):
+                terms = tuple(at_inner(term, memory) for term in terms_of(names, data.shapes))
+                models[family] = stepwise(data, (terms,) * 3, fixed, scale)
+                tried[family] = candidate(family)
+    candidates = list(tried.values())
     if families is None or "network" in families:
         best = tuple(candidates[k].model[axis] for axis, k in enumerate(best_by_axis(candidates)))
         if families is not None or patterned(data, best, scale):
-            rated = any(name in found.told for name in RATES)
+            rated = any(name in identifiability.told for name in RATES)
             network, scale = with_network(data, beyond, rated, folds, scale)
-            candidates = [candidate_of(data, family, model, folds, scale) for family, model in tried.items()]
-            candidates.append(network)
+            candidates = [*map(candidate, models), network]
     chosen = [candidates[k] for k in best_by_axis(candidates)]
-    model = completed(tuple(each.model[axis] for axis, each in enumerate(chosen)))
-
-    def of(values: Callable[[Candidate], Sequence[float] | FloatArray]) -> FloatArray:
-        return np.array([values(each)[axis] for axis, each in enumerate(chosen)])
-
-    more = [len(terms) - len(each.model[axis]) for axis, (terms, each) in enumerate(zip(model, chosen, strict=True))]
-    families_chosen = tuple(each.family for each in chosen)
-    named = tuple(dict.fromkeys(family for family in families_chosen if family != "constant")) or ("constant",)
-    held = Held(of(lambda each: each.held.rms), of(lambda each: each.held.by_axis))
-    numbers = of(lambda each: each.numbers) + more
-    whole = Candidate(", ".join(named), model, numbers, of(lambda each: each.costs), held)
-    fit = _concluded(data, whole, families_chosen, tuple(candidates))
+    fit = _concluded(data, chosen, candidates)
     vague = memories(effect for (effect, _), (value, sigma) in fit.inner.items() if sigma > VAGUE * value)
     if not vague:
         return fit
-    told = tuple(name for name in found.told if name not in vague)
-    return fit_triad(data, replace(found, told=told), families)
+    observable = tuple(name for name in identifiability.told if name not in vague)
+    return fit_triad(data, replace(identifiability, told=observable), families)
 
 
-def _concluded(
-    data: Whitened, chosen: Candidate, families: tuple[str, ...], candidates: tuple[Candidate, ...]
-) -> TriadFit:
-    """Return the core's fit of the chosen model, and what it leaves of the blocks."""
-    blocks, count = data.blocks, len(data.blocks)
-    freedom = count - blocks.levels - chosen.numbers
+def _joined(chosen: Sequence[Candidate]) -> Candidate:
+    """Return the model that has the terms of one candidate on each axis."""
+
+    def own(values: Callable[[Candidate], FloatArray]) -> FloatArray:
+        return np.diagonal(np.array([values(candidate) for candidate in chosen]))
+
+    parts = tuple(candidate.model[axis] for axis, candidate in enumerate(chosen))
+    model = completed(parts)
+    more = [len(terms) - len(part) for terms, part in zip(model, parts, strict=True)]
+    families = dict.fromkeys(candidate.family for candidate in chosen if candidate.family != "constant")
+    held = Held(own(lambda candidate: candidate.held.rms), own(lambda candidate: candidate.held.by_axis))
+    numbers, costs = own(lambda candidate: candidate.numbers) + more, own(lambda candidate: candidate.costs)
+    return Candidate(", ".join(families) or "constant", model, numbers, costs, held)
+
+
+def _concluded(data: Whitened, by_axis: Sequence[Candidate], candidates: Sequence[Candidate]) -> TriadFit:
+    """Return the core's fit of the candidates chosen axis by axis, and what it leaves of the blocks."""
+    blocks, chosen = data.blocks, _joined(by_axis)
+    freedom = len(blocks) - blocks.levels - chosen.numbers
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(chosen.model)])
-    found = _fitted(data, chosen.model, np.maximum(misfit / freedom, 1.0))
-    effects = tuple(getattr(found.imu, data.name).effects)
-    added = mean_terms(effects, data.shapes.tracks, count)[0] / getattr(blocks.recordings[0], data.name).nominal_scale
+    fitted = _fitted(data, chosen.model, np.maximum(misfit / freedom, 1.0))
+    effects = tuple(fitted.imu.triads()[data.name].effects)
+    scale = blocks.recordings[0].signals[data.name].nominal_scale
+    added = mean_terms(effects, data.shapes.tracks, len(blocks))[0] / scale
     rest = data.means - added
-    level = np.stack([np.linalg.lstsq(data.levels[axis], data.root[axis] @ rest[:, axis], rcond=None)[0]
-                      for axis in range(3)])  # fmt: skip
+    level = np.stack(
+        [np.linalg.lstsq(data.levels[axis], data.root[axis] @ rest[:, axis], rcond=None)[0] for axis in range(3)]
+    )
     before, after = (blocks.left(data.name, output) for output in (data.means, rest))
     rest = rest - level.T[blocks.level]
     white = np.einsum("aij,ja->ai", data.root, rest)
     chi = np.sum(white**2, axis=1) / freedom
-    return TriadFit(chosen, families, candidates, found, effects, level, rest, added, before, after, chi)
+    families = tuple(candidate.family for candidate in by_axis)
+    return TriadFit(chosen, families, tuple(candidates), fitted, effects, level, rest, added, before, after, chi)
 
 
 def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
@@ -161,21 +172,22 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
     The fit starts where the terms have their inner parameters. `scale` (3,): of the noise's variance, to begin with.
     """
     name, blocks, shapes = data.name, data.blocks, data.shapes
-    signal = getattr(blocks.recordings[0], name)
+    signal = blocks.recordings[0].signals[name]
     kinds = {term.name: CATALOGUE[f"{PREFIXES[name]}.{term.name}"] for terms in model for term in terms}
-    places = {plain: place for place, plain in enumerate(kinds)}
-    numbers = {plain: np.zeros(kind.size) for plain, kind in kinds.items()}
-    inner = {plain: {key: shapes.bounds[key] for key in kind.inner if key in shapes.bounds}
-             for plain, kind in kinds.items()}  # fmt: skip
-    told, known = set(), {}
+    order = list(kinds)
+    values = {plain: np.zeros(kind.size) for plain, kind in kinds.items()}
+    inner = {
+        plain: {key: shapes.bounds[key] for key in kind.inner if key in shapes.bounds} for plain, kind in kinds.items()
+    }
+    used, known = set(), {}
     for axis, terms in enumerate(model):
         for term, value in zip(terms, data.coefficients(axis, terms), strict=True):
             shape = term.shape or 0
             unit = signal.nominal_scale[axis] if term.net is None or shape < UNITS else 1.0  # inside tanh there is none
-            place = axis * kinds[term.name].size // 3 + shape
-            number = Name(name, "coefficients", (place,), places[term.name])
-            told.add(number)
-            numbers[term.name][place] = value * unit
+            index = axis * kinds[term.name].size // 3 + shape
+            number = Name(name, "coefficients", (index,), order.index(term.name))
+            used.add(number)
+            values[term.name][index] = value * unit
             inner[term.name] |= dict(term.inner)
             if term.net is not None:
                 known[number] = np.reshape(term.net.prior, (3, WEIGHTS))[axis, shape] * np.sqrt(scale[axis]) * unit
@@ -183,18 +195,22 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
     def free(number: Name) -> bool:
         if number.effect is None:
             return number.owner == name and number.part == "bias"
-        return number.owner == name and (number in told or number.part in HISTORY.values())
+        return number.owner == name and (number in used or number.part in HISTORY.values())
 
-    effects = [kind(numbers[plain], **{key: np.float64(each) for key, each in inner[plain].items()})
-               for plain, kind in kinds.items()]  # fmt: skip
+    effects = [
+        kind(values[plain], **{key: np.float64(value) for key, value in inner[plain].items()})
+        for plain, kind in kinds.items()
+    ]
     outputs = blocks.means[name] * signal.nominal_scale + signal.nominal_offset
     weights = data.root / signal.nominal_scale[:, None, None]
     measurement = RestOverTemperature(name, outputs, weights, blocks.level, shapes.tracks)
-    triads = {owner: replace(triad, temperature_reference=shapes.reference)
-              for owner, triad in Imu.nominal().triads().items()}  # fmt: skip
+    triads: dict[str, Any] = {
+        owner: replace(triad, temperature_reference=shapes.reference) for owner, triad in Imu.nominal().triads().items()
+    }
     triads[name] = replace(triads[name], gain=np.diag(signal.nominal_scale), bias=outputs.mean(axis=0))
-    unit = Imu(triads["accelerometer"], triads["gyroscope"]).with_effects(*effects)
+    unit = replace(Imu.nominal(), **triads).with_effects(*effects)
     # a network is solved already, and is asked for its uncertainty: full steps, as the passes take, lead it astray
     prior = Prior(tuple(known), np.zeros(len(known)), np.diag(1 / np.array(list(known.values())))) if known else None
-    return fit(unit, measurement, free, prior=prior, excess=scale - 1, estimate_excess=not known,
-               max_passes=1 if known else 32)  # fmt: skip
+    return fit(
+        unit, measurement, free, prior=prior, excess=scale - 1, estimate_excess=not known, max_passes=1 if known else 32
+    )
