@@ -412,3 +412,18 @@ def test_multi_resolution_is_refused_where_it_is_not_defined():
         deviation(np.ones(100), 1.0, resolution="half")
     with pytest.raises(NotPossibleError, match="fewer than two differences"):
         deviation(np.where(np.arange(1000) % 100 == 50, np.nan, 1.0), 1.0, factors=[100], resolution="multi")
+
+
+@pytest.mark.parametrize(
+    ("kind", "count"), [("overlapping", 2000), ("overlapping", 450), ("overlapping-hadamard", 2000)]
+)
+def test_freedom_of_white_phase_is_that_of_its_draws(kind, count):
+    """Twice the squared mean over the variance of what 4000 recordings give; 7 % is three sigmas of that ratio."""
+    factor, order = 120, 2 if kind == "overlapping" else 3
+    phase = np.random.default_rng(5).normal(size=(4000, count))
+    differences = phase
+    for _ in range(order):
+        differences = differences[:, factor:] - differences[:, :-factor]
+    squares = np.mean(differences**2, axis=1)
+    drawn = 2 * squares.mean() ** 2 / squares.var()
+    assert degrees_of_freedom(kind, count, factor, 2) == pytest.approx(drawn, rel=0.07)

@@ -357,19 +357,22 @@ def degrees_of_freedom(kind: str, points: int, factor: int, exponent: int, lag: 
     filtering = 1.0 if averaged else (np.inf if exponent <= 0 or factor > _FINE else float(factor))
     stride = float(lag or factor) if difference.overlapping else 1.0
     length = (factor if averaged else 1) + factor * d  # phase points that one difference spans
-    terms = 1 + np.floor(stride * (points - length) / factor)
-    terms = max(terms, 1.0)
+    terms = max(1.0, 1 + np.floor(stride * (points - length) / factor))
+    if exponent > 0 and filtering > _FINE:  # white phase: differences share points at whole averages apart only
+        middle, *others = _CENTRAL[d]
+        shared = [max(0.0, 1 - k * stride / terms) * (w / middle) ** 2 for k, w in enumerate(others, start=1)]
+        return float(terms / (1 + 2 * sum(shared)))
     if stride > _FINE:  # the sum is smooth in its index: as many terms of a coarser grid give the same
         terms, stride = terms * _FINE / stride, _FINE
     highest = int(min(terms, (d + 1) * stride))
     shape = _correlation(d, exponent, filtering, stride, highest)
-    if shape is None:
-        return terms
     j = np.arange(1, highest)
     total = 1.0 + (1 - highest / terms) * shape[highest] + 2 * np.sum((1 - j / terms) * shape[1:-1])
     return float(max(1.0, terms / total))
 
 
+_CENTRAL = {2: (6, -4, 1), 3: (20, -15, 6, -1)}
+"""Weights of the central difference of twice an order, from its middle on."""
 _FINE = 100.0
 """Terms an averaging time beyond which the sums of Greenhall and Riley are taken as integrals."""
 
@@ -384,8 +387,6 @@ def _correlation(d: int, exponent: int, filtering: float, stride: float, highest
             logarithm = np.where(t > 0, np.log(np.where(t > 0, t, 1.0)), 0.0)
         power = exponent + (2 if filtering > _FINE else 0)
         forms = {
-            4: t**0 * 0,
-            3: t * 0,
             2: -t,
             1: t**2 * logarithm,
             0: t**3,
@@ -402,9 +403,9 @@ def _correlation(d: int, exponent: int, filtering: float, stride: float, highest
         return filtering**2 * (2 * walk(t) - walk(t - 1 / filtering) - walk(t + 1 / filtering))
 
     def differenced(t):  # s_z: the central difference of order 2d
-        weights = {2: (6, -4, 1), 3: (20, -15, 6, -1)}[d]
-        sides = (w * (filtered(t - k) + filtered(t + k)) for k, w in enumerate(weights[1:], start=1))
-        return weights[0] * filtered(t) + sum(sides)
+        middle, *others = _CENTRAL[d]
+        sides = (w * (filtered(t - k) + filtered(t + k)) for k, w in enumerate(others, start=1))
+        return middle * filtered(t) + sum(sides)
 
     z = differenced(np.arange(highest + 1) / stride)
-    return None if z[0] == 0 else (z / z[0]) ** 2
+    return (z / z[0]) ** 2
