@@ -13,6 +13,7 @@ from jaximu.calibration.thermal_regression import multifactor
 from jaximu.cli.app import main
 from jaximu.data import without_startup
 from jaximu.data.rest_blocks import folds_of, rest_blocks
+from jaximu.estimation.problem import Name
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model import NoiseModel
 from jaximu.model.effects import CATALOGUE
@@ -237,6 +238,18 @@ def test_the_base_calibration_keeps_its_gain_and_its_bias_at_its_temperature(fou
     assert np.array_equal(joined.imu.accelerometer.gain, UNIT.accelerometer.gain)
     at = truth_of("accelerometer", [10.0])[0]
     assert np.allclose(joined.imu.accelerometer.bias + at, UNIT.accelerometer.bias, atol=2e-3)
+
+
+def test_the_base_calibration_keeps_what_is_known_of_its_other_effects(found, chamber):
+    """The thermal part takes the place of the base's own; an effect behind that moves up, with its uncertainty."""
+    names = [Name("gyroscope", "coefficients", (k,), 1) for k in range(9)]
+    effects = CATALOGUE["gyro.temperature"].make(1e-6), CATALOGUE["gyro.g_sensitivity"].make(1e-5)
+    imu = replace(UNIT, gyroscope=replace(UNIT.gyroscope, effects=effects))
+    base = replace(found.calibration, imu=imu, names=tuple(names), covariance=np.diag(np.arange(1.0, 10.0) ** 2))
+    joined = calibrate_thermal(chamber, base=base, block=60.0).calibration
+    document = joined.document()["gyroscope"]["effects"]
+    assert document["gyro.g_sensitivity"]["sigma"] == list(np.arange(1.0, 10.0))
+    assert None not in document["gyro.temperature"]["sigma"]
 
 
 # --- noise ------------------------------------------------------------------------------------------------------------

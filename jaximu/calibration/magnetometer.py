@@ -670,7 +670,7 @@ def _open_words(names: Sequence[Name], wide: NDArray[np.bool_]) -> str:
     """Name what is known no better than from the data sheet; where no number is by itself, their combinations."""
     axes: dict[str, list[str]] = {}
     for name, open_ in zip(names, wide, strict=True):
-        if open_:
+        if open_ and name.effect is None:
             if name.owner == "gyroscope":
                 part = "the gyroscope's bias about"
             elif name.part == "bias":

@@ -311,9 +311,9 @@ def _calibration(
     unit = nominal_imu(recording)[0] if base is None else base.imu
     names: list[Name] = []
     covariances = []
-    if base is not None:  # what the fits replace is no longer known
-        rest = base.of_numbers(lambda number: number.owner not in fits or number.effect is None)
-        names, covariances = list(rest.names), [rest.covariance]
+    if base is not None:
+        names, rest = _kept_numbers(base, fits)
+        covariances.append(rest)
     triads: dict[str, Any] = {}
     for name, fit in fits.items():
         triad = unit.triads()[name]
@@ -374,6 +374,28 @@ def _calibration(
         data=data,
         reading=recording.reading if base is None or base.reading is None else base.reading,
     ), notes
+
+
+def _kept_numbers(base: Calibration, fits: Mapping[str, TriadFit]) -> tuple[list[Name], FloatArray]:
+    """Return the numbers of a calibration that thermal fits do not replace, and their covariance.
+
+    Effects that stay move up to where those before them are gone.
+    """
+    places: dict[tuple[str, int | None], int] = {
+        (owner, index): place
+        for owner, triad in base.imu.triads().items()
+        for place, index in enumerate(k for k, effect in enumerate(triad.effects) if effect.plain not in THERMAL)
+    }
+
+    def fixed(name: Name) -> bool:
+        return name.owner not in fits or name.effect is None
+
+    rest = base.of_numbers(lambda name: fixed(name) or (name.owner, name.effect) in places)
+    names = [
+        name if fixed(name) else Name(name.owner, name.part, name.axes, places[name.owner, name.effect])
+        for name in rest.names
+    ]
+    return names, rest.covariance
 
 
 def _numbers(fit: TriadFit, with_bias: bool, signal: Signal, levels: int) -> tuple[list[Name], FloatArray]:
