@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -382,9 +382,9 @@ def _kept_numbers(base: Calibration, fits: Mapping[str, TriadFit]) -> tuple[list
     Effects that stay move up to where those before them are gone.
     """
     places: dict[tuple[str, int | None], int] = {
-        (owner, index): place
+        (owner, index): position
         for owner, triad in base.imu.triads().items()
-        for place, index in enumerate(k for k, effect in enumerate(triad.effects) if effect.plain not in THERMAL)
+        for position, index in enumerate(k for k, effect in enumerate(triad.effects) if effect.plain not in THERMAL)
     }
 
     def fixed(name: Name) -> bool:

@@ -15,6 +15,7 @@ from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.systematic import History, noise_at_rest
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.diagnosis.comparison import FollowedUnit, Fresh, Old, Question, Widened, candidates, scatter_about_a_fit
+from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS
 from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.noise import usual_noise
 from jaximu.diagnosis.selection import Selection, select
@@ -43,8 +44,6 @@ _OTHER_UNIT = 0.05
 """Difference of gains, in scales, that no unit's calibration makes: it is another unit, or its axes or units are."""
 _FAR_OFF = (0.05 * STANDARD_GRAVITY, 0.2)
 """Errors (m/s² of gravity's norm, rad over a turn) that no calibration's age makes, in the median."""
-_FEWEST = 12
-"""Dimensions that the parameters must leave for effects to be asked for."""
 _FEWEST_POSES = 3
 """Poses below which motion between them tells more."""
 _WARMTH = 1.0  # K
@@ -145,7 +144,7 @@ def _compared(
     scatter = np.ones(len(experiment.real.kinds))
     fresh = Fresh.fit(old, experiment, scatter)
     _same_gains(old, fresh, name)
-    enough = len(conditions) - len(old.names) >= _FEWEST and bool(fresh.known(old).all())
+    enough = len(conditions) - len(old.names) >= FEWEST_DIMENSIONS and bool(fresh.known(old).all())
     others = candidates(old, experiment) if enough else []
     question = Question.ask(old, Widened(experiment, scatter).predict(old.imu), others)
     selection = select(question.evidence, level)

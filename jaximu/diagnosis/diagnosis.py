@@ -18,7 +18,7 @@ from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import with_usual_drift
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.drift import DriftComponents, drifted, estimate_drift, hands_of
-from jaximu.diagnosis.evidence import LIMIT_POWER
+from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
@@ -63,8 +63,6 @@ _LITTLE = 0.95
 SCHEMA = "jaximu.diagnosis/1"
 _OTHER_UNIT = 0.005
 """Difference of gains, in scales, from which two recordings are hardly of one unit."""
-_FEWEST = 12
-"""Dimensions that the base parameters must leave, or nothing can be asked."""
 _STEADY = ("bias_ramp", "temperature")
 """Effects that change as slowly as drift does."""
 _GUESSED = 10.0
@@ -894,7 +892,7 @@ def _moved(remade: Callable[[NoiseModel], Experiment], drift: DriftComponents | 
 
 
 def _require_freedom(base: State, calibration: Calibration) -> None:
-    if base.evidence.freedom < _FEWEST:
+    if base.evidence.freedom < FEWEST_DIMENSIONS:
         raise NotPossibleError(
             f"{calibration.data.get('file', 'the recording')}: its observations leave {base.evidence.freedom} "
             "dimensions beyond the parameters of bias, scale and misalignment, too few to test anything: record twenty "

@@ -37,6 +37,8 @@ LIMIT_LEVEL = 0.05 / 28
 FAMILY_LEVEL = 0.05
 """Level of all questions together, at which detection limits hold."""
 LIMIT_POWER = 0.9
+FEWEST_DIMENSIONS = 12
+"""Dimensions that the parameters must leave for anything to be asked."""
 
 
 @dataclass(frozen=True)
