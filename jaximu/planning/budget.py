@@ -50,6 +50,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -396,8 +397,11 @@ def _check(
 
     def fitted(means: FloatArray) -> FloatArray:
         """Errors of the parameters, and whether the fit went well, (n, p + 1)."""
-        stations = jax.tree.map(many, scheme.stations)
-        sessions = replace(stations, accelerometer_mean=means[:, 0], gyroscope_mean=means[:, 1])
+        sessions = eqx.tree_at(
+            lambda stations: (stations.accelerometer_mean, stations.gyroscope_mean),
+            jax.tree.map(many, scheme.stations),
+            (means[:, 0], means[:, 1]),
+        )
         fit = fit_turntable(jax.tree.map(many, start), sessions, task.fitted)
         off = (np.asarray(fit.values) - flatten(unit)[indices]) / per
         return np.column_stack([off, np.asarray(fit.converged & fit.finite, float)])
