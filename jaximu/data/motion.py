@@ -591,7 +591,7 @@ class _Pieces:
             pieces += [(*part, True, False) for part in _parts(time, start, stop, longest)]
             moved_from = stop
         begin, end, rest, restart = map(np.array, zip(*pieces, strict=True))
-        return cls(begin, end, rest, restart, skipped, jumped, bridged)
+        return cls(begin, end, rest, restart, skipped, int(jumped), bridged)
 
     def notes(self, name: str) -> list[str]:
         """Say what of a recording was left out."""

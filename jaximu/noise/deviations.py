@@ -361,7 +361,7 @@ def degrees_of_freedom(kind: str, points: int, factor: int, exponent: int, lag: 
     if exponent > 0 and filtering > _FINE:  # white phase: differences share points at whole averages apart only
         middle, *others = _CENTRAL[d]
         shared = [max(0.0, 1 - k * stride / terms) * (w / middle) ** 2 for k, w in enumerate(others, start=1)]
-        return float(terms / (1 + 2 * sum(shared)))
+        return terms / (1 + 2 * sum(shared))
     if stride > _FINE:  # the sum is smooth in its index: as many terms of a coarser grid give the same
         terms, stride = terms * _FINE / stride, _FINE
     highest = int(min(terms, (d + 1) * stride))
@@ -378,7 +378,7 @@ _FINE = 100.0
 
 
 @lru_cache(maxsize=1024)
-def _correlation(d: int, exponent: int, filtering: float, stride: float, highest: int) -> FloatArray | None:
+def _correlation(d: int, exponent: int, filtering: float, stride: float, highest: int) -> FloatArray:
     """Squared autocorrelation of the differences at 0 … `highest` terms of `stride` an averaging time."""
 
     def walk(t):  # s_w

@@ -159,7 +159,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
                 "Hz for long enough to separate rest from motion."
             )
     floors = [_floor(variance, running) for variance, running in zip(variances, moments, strict=True)]
-    ratio = np.max([variance / floor for variance, floor in zip(variances, floors, strict=True)], axis=0)
+    ratio = np.stack([variance / floor for variance, floor in zip(variances, floors, strict=True)]).max(axis=0)
     turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
     sums = np.vstack([np.zeros(3), np.cumsum(means[0], axis=0)])
 
