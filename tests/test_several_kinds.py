@@ -145,5 +145,9 @@ def test_a_table_s_data_are_diagnosed_and_checked():
     moved = jaximu.check(known, table(replace(truth, gyroscope=gyroscope), 4), EXACT)
     assert moved.verdict == "shifted" and [str(shift.parameter) for shift in moved.moved] == ["gyroscope.gain[0,0]"]
     log = simulate(truth, HandHeld(14, 2.0), consumer_noise(), rate=50.0, seed=5)[0]
+    with pytest.raises(jaximu.InputError, match=r"gravity of 9.80665 m/s² and 9.81"):
+        jaximu.check(known, flawed, 9.81)
+    with pytest.raises(jaximu.InputError, match="data that hold their recordings"):
+        jaximu.check(known, jaximu.observe(log, EXACT), EXACT)
     with pytest.raises(jaximu.NotPossibleError, match="Check a calibration that was made in the set-up"):
         jaximu.check(jaximu.calibrate(log, EXACT), flawed, EXACT)

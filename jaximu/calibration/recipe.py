@@ -40,6 +40,7 @@ __all__ = [
     "calibrate",
     "calibrate_ready",
     "errors_of",
+    "require_gravity",
 ]
 
 _SAME = 1e-9
@@ -132,12 +133,7 @@ def _calibrated_jointly(
             raise InputError(f"{type(one).__name__} cannot be fitted with other data: use jaximu.fit.")
         if np.shape(one.gravity):
             raise InputError("data of several units make no calibration of one: take one unit's, or use jaximu.fit.")
-        known, stated = float(one.gravity), choices.gravity.value
-        if abs(known / stated - 1) > _SAME:
-            raise InputError(
-                f"some data were observed at a gravity of {known:.6g} m/s² and {stated:.6g} m/s² was given: state the "
-                "same, gravity=…, for all."
-            )
+        require_gravity(one, choices.gravity)
     kinds, noise, parts = list(data), noise_of(choices.static), ()
     with prepared(recordings, repair) as ready:
         if ready:
@@ -179,6 +175,16 @@ def _calibrated_jointly(
         reading=recorded[0].reading if recorded else None,
     )
     return replace(calibration, covariance=fitted.total_covariance(choices.gravity.sigma, clock_sigma(parts)))
+
+
+def require_gravity(data: Data, gravity: LocalGravity) -> None:
+    """Raise `InputError` where data of one unit were observed at another gravity."""
+    known, stated = float(data.gravity), gravity.value
+    if abs(known / stated - 1) > _SAME:
+        raise InputError(
+            f"some data were observed at a gravity of {known:.6g} m/s² and {stated:.6g} m/s² was given: state the "
+            "same, gravity=…, for all."
+        )
 
 
 def errors_of(kinds: Sequence[Data], imu: Imu) -> dict[str, tuple[float, str]]:

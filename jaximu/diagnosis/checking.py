@@ -12,6 +12,7 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import provenance, require_another, require_calibration
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
+from jaximu.calibration.recipe import require_gravity
 from jaximu.calibration.systematic import History, noise_at_rest
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.diagnosis.comparison import FollowedUnit, Fresh, Old, Question, Widened, candidates, scatter_about_a_fit
@@ -78,7 +79,7 @@ def check(
 
     **Arguments:** `recordings`, `gravity`, `static`, `segmentation` as for [`jaximu.diagnosis.diagnose`]; gravity
     stated as it was for the old calibration is taken for the same place, whose uncertainty is common to both.
-    Recordings may be data of another kind, such as `jaximu.data.RecordedStations`. `level`: rate of false alarms.
+    Recordings may be data that hold them, such as `jaximu.data.RecordedStations`. `level`: rate of false alarms.
 
     A recording with too few poses is followed by the filter in use (`jaximu.calibration.followed_in_use`) from its
     first rest: its innovations say whether the calibration holds, and which parameters moved, as far as they tell.
@@ -90,11 +91,17 @@ def check(
     require_float64()
     require_calibration(calibration)
     gravity, noise = as_gravity(gravity), noise_of(static)
-    several = recordings.recordings if isinstance(recordings, Data) else recordings_of(recordings)
+    if isinstance(recordings, Data):
+        data, several = recordings, recordings.recordings
+        if segmentation is not None or not several:
+            raise InputError("a check takes data that hold their recordings, and no segmentation beside them.")
+        require_gravity(data, gravity)
+    else:
+        data, several = None, recordings_of(recordings)
     _same_sensors(calibration, several)
     require_another(calibration, [source.sha256 for recording in several for source in recording.sources])
-    if isinstance(recordings, Data):
-        return _compared(calibration, Old.of(calibration, gravity, recordings.free), recordings, noise, level)
+    if data is not None:
+        return _compared(calibration, Old.of(calibration, gravity, data.free), data, noise, level)
     with prepared(several) as ready:
         validity = _checked(calibration, [one.recording for one in ready], gravity, noise, segmentation, level)
         if validity.verdict != "valid" and any(one.spoiling for one in ready):
