@@ -26,7 +26,7 @@ from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings import write_recording
 from jaximu.recordings.recording import Signal
-from jaximu.report.validity import write_validity
+from jaximu.report.html import write_report
 
 GRAVITY = LocalGravity(synthetic.GRAVITY, 0.0)
 NOISE = NoiseModel(AxisNoise.of_white(np.full(3, 2e-6)), AxisNoise.of_white(np.full(3, 1e-8)))
@@ -248,7 +248,7 @@ def test_what_moved_together_is_named_together(calibration, tmp_path):
     change = 2e-3 * np.random.default_rng(3).normal(size=(3, 3))
     found = check(calibration, recorded(5, moved(lambda imu: imu.gyroscope.gain, change)), GRAVITY, static=NOISE)
     assert [each.sentence for each in found.causes] == ["the gyroscope's gains moved"]
-    page = write_validity(found, tmp_path).read_text(encoding="utf-8")
+    page = write_report(found, tmp_path).read_text(encoding="utf-8")
     assert "the gyroscope&#39;s gains moved" in page and "largest error of the gyroscope" in page
 
 

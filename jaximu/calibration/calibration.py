@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -18,9 +17,10 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage, read_document
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
-from jaximu.ground.quantities import Z95, change, number, size, unit_text
+from jaximu.ground.page import Result
+from jaximu.ground.quantities import unit_text
 from jaximu.ground.reexport import later
-from jaximu.ground.summary import Described, Parameter, ParameterTable, Summary, sentence
+from jaximu.ground.summary import Parameter, ParameterTable
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu, Triad
@@ -44,25 +44,12 @@ __all__ = [
 SCHEMA = "jaximu.calibration/1"
 MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
 """What a document with a magnetometer says beside its triad."""
-_ERRORS = {
-    "gravity_norm": "Error against gravity at rest",
-    "gravity_direction": "Direction of gravity lost over a turn",
-    "static_gyroscope": "Rate at rest",
-    "specific_force": "Error of the specific force",
-    "rate_at_rest": "Error of the rate in poses",
-    "turn_angle": "Error of the angle of turns",
-    "rotation": "Error of the rate against the reference",
-    "field_strength": "Error of the field's strength",
-    "accelerometer": "Specific force at rest over temperature",
-    "gyroscope": "Rate at rest over temperature",
-}
 EXACT = 1e-6
 """Share of an error before the fit below which what is left is rounding: as many parameters as conditions."""
-_BEYOND = 3.0  # excess variance, in multiples of the noise's, from which an unmodelled effect is suspected
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Calibration(Described, Document):
+class Calibration(Result, Document, page="calibration"):
     """A calibrated unit: y = gain·u + bias + Σ effects, u in SI, with uncertainty and provenance.
 
     imu: the model. names, covariance: the free parameters and their covariance (p, p), gravity's uncertainty included,
@@ -103,10 +90,6 @@ class Calibration(Described, Document):
     filter: dict[str, Any] | None = None
     absent: tuple[str, ...] = ()
     reading: Reading | None = None
-
-    def summary(self) -> Summary:
-        """Return errors before and after, parameters with value, standard uncertainty and unit, and what is open."""
-        return _summary_of(self)
 
     def plot_residuals(self) -> Figure:
         """Return a figure of the errors by pose and turn, before and after, with what the noise explains.
@@ -494,70 +477,3 @@ def _parameters_of(calibration: Calibration) -> ParameterTable:
 
     sigmas = np.sqrt(np.diagonal(calibration.covariance)).tolist()
     return ParameterTable([parameter(*entry) for entry in zip(calibration.names, sigmas, strict=True)])
-
-
-def _error_words(name: str) -> str:
-    """Return what a kind of residual is called; of several kinds of data it may have a number."""
-    kind, _, number = name.partition(" ")
-    words = _ERRORS.get(kind) or f"Error of the {kind.replace('_', ' ')}"
-    return f"{words} {number}".strip()
-
-
-def _summary_of(calibration: Calibration) -> Summary:
-    """Return the errors before and after, whether the fit is to be trusted, the parameters, and what is open."""
-    data = calibration.data
-    files = ", ".join(Path(str(file["file"])).name for file in data.get("files", ())) or "a recording"
-    counts = [f"{data[kind]} {kind}" for kind in ("poses", "turns", "intervals", "windows") if data.get(kind)]
-    title = f"Calibration of {files}: {', '.join([*counts, f'{calibration.method} fit'])}"
-    verdict = []
-    for name, (before, after, unit) in calibration.rms.items():
-        verdict.append(
-            f"{_error_words(name)}: {size(before, unit)} before calibration (rms); after it none by construction, for "
-            "there are as many parameters as conditions: no degrees of freedom are left to check it by."
-            if name in calibration.exact
-            else f"{_error_words(name)}: {change(before, after, unit)} (rms, before → after calibration)."
-        )
-    count, undetermined = len(calibration.names), sum(not direction.determined for direction in calibration.weak)
-    if undetermined:
-        what = f"{undetermined} combination{'s' * (undetermined > 1)} of the {count} parameters"
-        verdict.append(f"The recording does not determine {what} (marked *).")
-    elif calibration.weak:
-        verdict.append("All parameters are determined, those marked * only weakly.")
-    else:
-        verdict.append(f"All {count} parameters are determined.")
-    verdict += _scatter(calibration)
-    if calibration.diagnosis:
-        verdict.append(f"Diagnosis: {calibration.diagnosis['verdict']}.")
-    notes = [
-        *_gravity(calibration),
-        *(sentence(direction.text) for direction in calibration.weak),
-        *map(sentence, calibration.notes),
-    ]
-    return Summary(title, tuple(verdict), _parameters_of(calibration).block(), tuple(notes))
-
-
-def _scatter(calibration: Calibration) -> list[str]:
-    large = {name: np.sqrt(1 + excess) for name, excess in calibration.excess.items() if excess > _BEYOND}
-    if not large:
-        return []
-    parts = ", ".join(f"{name} {times:.1f} × noise" for name, times in large.items())
-    return [
-        f"Residual scatter: {parts}. The uncertainties include it, but an unmodelled effect may bias the result: run "
-        "`jaximu diagnose`."
-    ]
-
-
-def _gravity(calibration: Calibration) -> list[str]:
-    gravity, triads = calibration.gravity, calibration.triads()
-    share = 100 * Z95 * gravity.sigma / gravity.value
-    if "accelerometer" not in triads or share <= 0.01:
-        return []
-    scales = [Name("accelerometer", "gain", (axis, axis)) for axis in range(3)]
-    sigmas = np.sqrt(np.diag(calibration.covariance_of(scales)))
-    if np.all(100 * Z95 * sigmas < 0.9 * share * np.diag(triads["accelerometer"].gain)):  # what was felt is not gravity
-        return []
-    return [
-        f"Gravity was taken as {gravity.value:.5f} ± {number(Z95 * gravity.sigma, 2)} m/s² (95 %). This alone leaves "
-        f"the accelerometer's scale uncertain by ±{number(share, 2)} %; state local gravity (--gravity, or --latitude "
-        "and --height) to narrow it."
-    ]

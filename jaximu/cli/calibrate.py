@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jaximu.estimation.problem import Loss
     from jaximu.ground.gravity import LocalGravity
 
-__all__ = ["give_calibration", "print_calibration", "run"]
+__all__ = ["run"]
 
 
 def run(
@@ -62,7 +62,8 @@ def run(
             f"--method {method}": method.startswith("two-step"),
         }
         unusable = [name for name, stated in meant.items() if stated]
-        give_calibration(replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace), results)
+        calibration = replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace)
+        results.present(calibration.summary, calibration=calibration)
         return
     recordings, noise = log.read_unit(logs, gravity, static)
     with progress("calibrating"):
@@ -78,7 +79,8 @@ def run(
             repair=repair,
             **options.effects_of(effect),
         )
-    give_calibration(replace(calibration, trace=trace), results)
+    calibration = replace(calibration, trace=trace)
+    results.present(calibration.summary, calibration=calibration)
 
 
 def _calibrated_means(
@@ -97,19 +99,3 @@ def _calibrated_means(
 
     with progress("calibrating"):
         return calibrate_means(read_means(logs[0], log.reading(gravity)), gravity, loss)
-
-
-def give_calibration(
-    calibration: Calibration, results: options.Results, module: str = "html", name: str = "write_report"
-) -> None:
-    """Print a calibration, and write it and the report of that name where asked."""
-    write = options.drawn(module, name, calibration)
-    results.give(lambda: print_calibration(calibration), write, calibration=calibration)
-
-
-def print_calibration(calibration: Calibration) -> None:
-    """Print what a person wants to see first."""
-    from jaximu.cli.shown import show
-
-    show(calibration.summary())
-    print("Output y = gain·u + bias (+ effects), hence u = inverse(gain)·(y − bias): `jaximu compensate` applies it.")

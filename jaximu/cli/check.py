@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-
-if TYPE_CHECKING:
-    from jaximu.diagnosis import Validity
 
 __all__ = ["run"]
 
@@ -49,44 +46,6 @@ def run(
     recordings, noise = log.alike(old).read_unit(logs, gravity, static)
     with progress("checking"):
         validity = check(old, recordings, gravity, static=noise, segmentation=poses.value())
-    write = options.drawn("validity", "write_validity", validity)
-    results.give(lambda: _print(validity), write, "check.json and report.html", check=validity)
+    results.present(validity.summary, "check.json and report.html", check=validity)
     if fail_on == "invalid" and validity.verdict not in ("valid", "session"):
         raise SystemExit(1)
-
-
-def _print(validity: Validity) -> None:
-    """Print the sentence, what moved, what explains it, and what using the old calibration would cost."""
-    from jaximu.cli.shown import print_all
-    from jaximu.ground.quantities import probability, size, with_interval
-    from jaximu.mistakes.titles import effect_title
-    from jaximu.report.validity import kind_words
-
-    data = validity.data
-    held = f"{data['poses']} poses, {data['turns']} turns" if validity.history is None else f"{data['updates']} updates"
-    print_all(f"{data.get('file', 'recording')}: {held}", f"{validity.verdict}: {validity.headline()}")
-    largest = validity.moved or sorted((s for s in validity.shifts if s.tested), key=lambda s: -abs(s.z))[:3]
-    if largest:
-        headers = ("parameter", "shift ± 95 %", "in the output ± 95 %", "σ")
-        rows = [(shift.words, shift.amount, shift.output, f"{abs(shift.z):.1f}") for shift in largest]
-        title = "moved:" if validity.moved else "largest differences, none beyond what is uncertain:"
-        print_all((headers, rows, title))
-    texts = []
-    statistic, freedom, p_value = validity.difference
-    if freedom:
-        texts.append(f"all {freedom} parameters together: χ² {statistic:.1f}, p {probability(p_value)}")
-    for cause in validity.causes:
-        rivals = f"; or {', '.join(map(effect_title, cause.rivals))}: this recording cannot tell them apart"
-        texts.append(f"explanation: {cause.sentence}{rivals if cause.rivals else ''}")
-    for name, error in validity.output_errors.items():
-        where = "rotation over a turn" if name == "turns" else f"{name} output"
-        texts.append(f"{where}: off by up to {with_interval(error.value, error.sigma, error.unit)}")
-    texts.append(validity.bias_words())
-    if validity.nis is not None:
-        texts.append(f"squared innovations of the filter: {validity.nis:.2f} times what their uncertainty expects")
-    words = kind_words(validity)
-    for name, (before, after, unit) in validity.errors.items():
-        texts.append(
-            f"{words[name]}: rms {size(before, unit)} with this calibration, {size(after, unit)} with a fresh one"
-        )
-    print_all(*texts, notes=validity.notes)

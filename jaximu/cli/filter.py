@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional
 
 from jaximu.cli import options
-from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.cli.reference import read_reference
 from jaximu.ground.errors import InputError
+from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
-    from jaximu.calibration import Calibration, History
+    pass
 
 __all__ = ["run"]
 
@@ -98,18 +98,5 @@ def run(
             noise = None if still is None else fit_noise(still)
             stated = gravity if local != options.LOCAL else None
             calibration, history = followed_in_use(old, recording, noise, stated, attitude, compass)
-    results.give(
-        lambda: _print(calibration, history),
-        options.drawn("filter", "write_filter_report", calibration, history),
-        calibration=calibration,
-    )
-
-
-def _print(calibration: Calibration, history: History) -> None:
-    from jaximu.cli.shown import print_all
-    from jaximu.report.attitude import mounting_words
-    from jaximu.report.filter import statements
-
-    print_calibration(calibration)
-    mounting = mounting_words(calibration) if calibration.reference else []
-    print_all(*mounting, *map(str, statements(calibration, history)))
+    page_of = later("report.filter", "page_of")
+    results.present(lambda: page_of(calibration, history), calibration=calibration)

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import UseAppendAction
 
 from jaximu.cli import options
-from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
+from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
-    from jaximu.calibration import Calibration, FieldStrength, MagneticLog
+    from jaximu.calibration import FieldStrength, MagneticLog
     from jaximu.model.effects import Effect
 
 __all__ = ["run"]
@@ -92,16 +92,9 @@ def run(
         result, trace=trace, diagnosis=diagnosis.document() | ({} if shift is None else {"check": shift.document()})
     )
 
-    def show_all() -> None:
-        _print(result)
-        for part in filter(None, (shift, *diagnosis.causes)):
-            print(part.text())
-
-    results.give(
-        show_all,
-        options.drawn("magnetometer", "write_magnetometer_report", result, measurement, heading),
-        calibration=result,
-    )
+    asked = [part.text() for part in filter(None, (shift, *diagnosis.causes))]
+    page_of = later("report.magnetometer", "page_of")
+    results.present(lambda: page_of(result, measurement, heading, asked), calibration=result)
 
 
 def _strength(
@@ -165,15 +158,3 @@ def _require_overlap(first, second, mag_log: Path, path: Path) -> None:
             f"{mag_log} lies from {first[0]:.6g} to {first[-1]:.6g} s on the clock of {path}, which lies from "
             f"{second[0]:.6g} to {second[-1]:.6g} s: they do not overlap. The stamps must be of one clock."
         )
-
-
-def _print(calibration: Calibration) -> None:
-    from jaximu.cli.shown import print_all
-    from jaximu.report.magnetometer import lead, statements
-
-    names = tuple(name for name in calibration.names if name.owner == "magnetometer")
-    rows = [calibration.names.index(name) for name in names]
-    alone = replace(calibration, names=names, covariance=calibration.covariance[rows][:, rows], rms={}, excess={})
-    print_all(lead(calibration).sentence)
-    print_calibration(alone)
-    print_all(*map(str, statements(calibration)))

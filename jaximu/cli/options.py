@@ -8,6 +8,7 @@ import shlex
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -26,6 +27,7 @@ from jaximu.ground.units import SENSOR_QUANTITIES
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
     from jaximu.ground.document import Document
+    from jaximu.ground.page import Page
     from jaximu.recordings.readers import ReadOptions
     from jaximu.recordings.recording import Recording
     from jaximu.recordings.segmentation import SegmentationOptions
@@ -353,6 +355,29 @@ class Results:
             say(f"Written to {self.output}: {', '.join(path.name for path in written)}")
         elif not self.as_json:
             say(f"Nothing was written: -o DIR writes {names} there.")
+
+    def present(
+        self,
+        page: Callable[[], Page],
+        names: str = "calibration.json and report.html",
+        files: Mapping[str, bytes] = MappingProxyType({}),
+        text: Callable[[], str] | None = None,
+        **documents: Document,
+    ) -> None:
+        """Write the documents, each as NAME.json, `files` and the page as report.html; only then print the page.
+
+        `text` makes the document to print with --json, the first of `documents` if None. A page that cannot be drawn
+        costs nothing else: another says so in its place.
+        """
+        made = cache(page)
+        self.give(
+            lambda: later("report.terminal", "show")(made()),
+            lambda folder: later("report.html", "write_report")(made(), folder),
+            names,
+            files,
+            text,
+            **documents,
+        )
 
     def _write(
         self,

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import UseAppendAction
 
 from jaximu.cli import options
-from jaximu.cli.calibrate import give_calibration
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
@@ -100,7 +99,7 @@ def run(
 
         calibration = calibrate(log.read(path, gravity), gravity)
     calibration = replace(calibration, trace=traced.value((path,)))
-    give_calibration(calibration, results)
+    results.present(calibration.summary, calibration=calibration)
 
 
 def _record(lines: Lines, path: Path, log: options.LogOptions, guide: Guide) -> bool:

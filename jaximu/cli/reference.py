@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional
 
 from jaximu.cli import options
-from jaximu.cli.calibrate import print_calibration
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option
+from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
-    from jaximu.calibration import Calibration
     from jaximu.recordings.attitude import Attitude
     from jaximu.recordings.recording import Recording
 
@@ -62,11 +61,8 @@ def run(
         calibration, measurement = calibrate_against_attitude(
             recording, attitude, gravity, static=noise, loss=loss, repair=repair, **options.effects_of(effect)
         )
-    results.give(
-        lambda: _print(calibration),
-        options.drawn("attitude", "write_attitude_report", calibration, measurement),
-        calibration=calibration,
-    )
+    page_of = later("report.attitude", "page_of")
+    results.present(lambda: page_of(calibration, measurement), calibration=calibration)
 
 
 def read_reference(path: Path, log_path: Path, recording: Recording) -> Attitude:
@@ -76,11 +72,3 @@ def read_reference(path: Path, log_path: Path, recording: Recording) -> Attitude
     with progress("reading the reference"):
         attitude = read_attitude(path)
     return replace(attitude, start=float(recording.start)) if path == log_path and attitude.start == 0 else attitude
-
-
-def _print(calibration: Calibration) -> None:
-    from jaximu.cli.shown import print_all
-    from jaximu.report.attitude import mounting_words, share_words
-
-    print_calibration(replace(calibration, excess={}))
-    print_all(*mounting_words(calibration), f"The misfit is made of: {'; '.join(share_words(calibration))}.")

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import UseAppendAction, arg
 
 from jaximu.cli import options
-from jaximu.cli.calibrate import give_calibration
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
@@ -88,7 +87,8 @@ def run(
             loss=loss,
             repair=repair,
         )
-    give_calibration(replace(calibration, trace=trace), results, "stations", "write_station_report")
+    calibration = replace(calibration, trace=trace)
+    results.present(calibration.summary, calibration=calibration)
 
 
 def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Sequence[Entry]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,8 @@ from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.page import Result
 from jaximu.ground.quantities import probability, size, with_interval
-from jaximu.ground.summary import Block, Described, Summary
 from jaximu.mistakes.titles import effect_title
 
 __all__ = ["Cause", "OutputError", "Shift", "Validity"]
@@ -161,7 +160,7 @@ class OutputError:
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Validity(Described, Document):
+class Validity(Result, Document, page="validity"):
     """Whether a calibration still holds for a recording.
 
     verdict: "valid"; "shifted" (parameters moved); "session" (the parameters hold, and what belongs to the recording
@@ -205,13 +204,6 @@ class Validity(Described, Document):
             f"gyroscope bias: {size(float(np.linalg.norm(shift)), 'rad/s', 2)} off the calibration's; it changes "
             "at power-on; re-zero it at rest."
         )
-
-    def summary(self) -> Summary:
-        """Return the verdict, the parameters that moved, and notes."""
-        rows = [(shift.words, shift.amount, f"{abs(shift.z):.1f}") for shift in self.moved]
-        table = Block(("parameter", "moved by (± 95 %)", "in standard deviations"), tuple(rows)) if rows else None
-        where = Path(str(self.data.get("file", "a recording"))).name
-        return Summary(f"Check against {where}: {self.verdict}", (self.headline(),), table, self.notes)
 
     def headline(self) -> str:
         """Return the one sentence a person wants first."""

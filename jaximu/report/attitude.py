@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.ground.quantities import Z95, number, unit_text
+from jaximu.ground.page import Page, Picture, Statement
+from jaximu.ground.quantities import Z95, unit_text
 from jaximu.ground.summary import sentence
 from jaximu.model.mounting import Mounting
+from jaximu.report.calibration import calibration_page
 from jaximu.report.figures import AFTER, BEFORE, dressed, legend, new_figure, zero_line
-from jaximu.report.html import Folder, write_calibration
-from jaximu.report.words import Lead, Statement, gravity_statement, how_much_smaller, weak_statements
+from jaximu.report.words import gravity_statements, limits
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from jaximu.data.attitude import AgainstAttitude
 
-__all__ = ["mounting_words", "share_words", "write_attitude_report"]
+__all__ = ["mounting_words", "page_of"]
 
 _PANELS = {
     "rotation": "Rate off the reference's, mean of each interval",
@@ -82,31 +82,23 @@ def share_words(calibration: Calibration) -> list[str]:
     ]
 
 
-def write_attitude_report(calibration: Calibration, measurement: AgainstAttitude, folder: Folder) -> Path:
-    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
-    before, after, unit = calibration.rms["rotation"]
-    old, new, force = calibration.rms["specific_force"]
-    first = Lead(
-        f"Against {Path(measurement.attitude.name).name} the gyroscope's error falls from {number(before)} "
-        f"to {number(after, 2)} {unit} (rms), the accelerometer's from {number(old)} to {number(new, 2)} {force}.",
-        f"{number(after, 2)} {unit}",
-        f"rms error of the mean rate between stamps of the reference, {how_much_smaller(before, after)} than before",
-    )
-    parts = "; ".join(share_words(calibration))
+def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
+    """Return the page of a calibration against a measured attitude."""
     trust = [
         Statement("The reference", " ".join(mounting_words(calibration))),
-        Statement("What the misfit is made of", f"{sentence(parts)}. The intervals contain all of it."),
-        gravity_statement(calibration),
+        Statement(
+            "What the misfit is made of",
+            f"{sentence('; '.join(share_words(calibration)))}. The intervals contain all of it.",
+        ),
+        *gravity_statements(calibration),
     ]
-    unknown = weak_statements(
-        calibration.weak, f"All {len(calibration.names)} parameters are determined by this motion."
-    )
-    picture = (
+    picture = Picture(
+        "residuals",
+        partial(_figure, calibration, measurement),
         "Errors against the reference before and after",
         "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
     )
-    drawn = {"residuals": partial(_figure, calibration, measurement)}
-    return write_calibration(calibration, folder, first, trust, unknown, drawn, picture)
+    return calibration_page(calibration, [picture], trust, partial(limits, calibration))
 
 
 def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:

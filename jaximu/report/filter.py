@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,17 +11,20 @@ import numpy as np
 from jaximu.calibration import Calibration, History
 from jaximu.estimation.uncertainty import label
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, number
+from jaximu.ground.summary import sentence
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.effects.magnetic_field import SetupMagneticField
+from jaximu.report.attitude import mounting_words
+from jaximu.report.calibration import calibration_page
 from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, new_figure, zero_line
-from jaximu.report.html import Folder, write_calibration
-from jaximu.report.words import Lead, Statement, gravity_statement, sentence, weak_statements
+from jaximu.report.words import gravity_statements, limits
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["statements", "write_filter_report"]
+__all__ = ["page_of"]
 
 _PANELS = (
     ("gyroscope", "bias", "Gyroscope bias less its last value [°/s]", np.degrees(1.0)),
@@ -108,36 +110,41 @@ def _earth(history: History) -> Statement | None:
     )
 
 
-def write_filter_report(calibration: Calibration, history: History, folder: Folder) -> Path:
-    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
+def page_of(calibration: Calibration, history: History) -> Page:
+    """Return the page of a calibration by the filter."""
     assert calibration.filter is not None
     bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
     scale = np.mean(np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1))
     worst = np.degrees(Z95 * max(bias) / scale)
     minutes = (history.time[-1] - history.time[0]) / 60
-    entries = statements(calibration, history)
     verdict = "diverged" if calibration.filter.get("diverged") else "followed the unit"
-    first = Lead(
-        f"The filter {verdict} through {minutes:.1f} min of rests and motion and determines {len(calibration.names)} "
-        "numbers of the unit.",
-        f"±{number(worst, 2)} °/s",
-        "how well the gyroscope's bias is known at the end (95 %, the worst axis)",
-    )
-    left = calibration.filter["open"] or ["This sequence leaves no number of the unit open."]
-    picture = (
+    picture = Picture(
+        "residuals",
+        partial(_figure, calibration, history),
         "States of the filter over time with 95 % bands",
         "Lines: what the filter knew at each time from the recording so far; bands: 95 %. Grey: rests. Bottom: squared "
         "innovations over what their uncertainty expects; noise gives about 1.",
     )
-    return write_calibration(
+    return calibration_page(
         calibration,
-        folder,
-        first,
-        [*entries, gravity_statement(calibration)],
-        weak_statements(calibration.weak, *left),
-        {"residuals": partial(_figure, calibration, history)},
-        picture,
+        [picture],
+        [*_mounting(calibration), *statements(calibration, history), *gravity_statements(calibration)],
+        partial(_limits, calibration),
+        (f"The filter {verdict} through {minutes:.1f} min of rests and motion.",),
+        (f"±{number(worst, 2)} °/s", "how well the gyroscope's bias is known at the end (95 %, the worst axis)"),
     )
+
+
+def _mounting(calibration: Calibration) -> Iterator[Statement]:
+    if calibration.reference:
+        yield Statement("The reference", " ".join(mounting_words(calibration)))
+
+
+def _limits(calibration: Calibration) -> Iterator[Statement]:
+    assert calibration.filter is not None
+    for text in calibration.filter["open"] or ["This sequence leaves no number of the unit open."]:
+        yield Statement("Left open", text)
+    yield from limits(calibration)
 
 
 _Line = tuple[FloatArray, FloatArray, str, str]

@@ -7,20 +7,20 @@ import hashlib
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, partial
-from html import escape
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaximu.calibration import Calibration
+from markupsafe import Markup, escape
+
 from jaximu.ground.atomic import write_files, write_folder
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import worded
+from jaximu.ground.page import Items, Page, Part, Picture, Result, Section
 from jaximu.ground.quantities import probability
 from jaximu.mistakes.titles import effect_title
-from jaximu.report import figures, tables, vector, words
-from jaximu.report.evidence import evidence
+from jaximu.report import figures, vector, words
 
 if TYPE_CHECKING:
     import jinja2
@@ -34,7 +34,6 @@ __all__ = [
     "Folder",
     "TextRows",
     "page",
-    "write_calibration",
     "write_failure",
     "write_page",
     "write_report",
@@ -45,89 +44,9 @@ Folder = str | os.PathLike[str]
 """Where the files of a report go; made if it is missing."""
 TextRows = list[tuple[str, ...]]
 """The rows of a table, as texts."""
+_LONG_WORD = 40  # letters from which on a cell's word is broken
 MOST_ROWS = 50
 """Rows of a table that may grow with the number of units: what is beyond is counted."""
-
-
-def write_report(calibration: Calibration, folder: Folder, title: str | None = None) -> Path:
-    """Write `report.html` and its pictures as PNGs into `folder`, which is made if it is missing.
-
-    **Arguments:** `title`: the report's heading; the names of the recordings if None. A calibration that was loaded
-    from its file gives a report without the pictures of the recording, because its working is not kept there.
-
-    **Returns:** the path of `report.html`. Everything is drawn before anything is written, and each file is written
-    whole or not at all. Raises `InputError` where the folder cannot be made or written to.
-    """
-    if "poses" not in calibration.data:
-        raise InputError("a calibration of several kinds of data has no page: its summary() says what was found.")
-    errors, drawn = evidence(calibration), {}
-    if errors is not None:
-        drawn["residuals"] = partial(figures.residual_figure, errors)
-        drawn["orientations"] = partial(figures.orientation_figure, errors)
-    if calibration.segmentations:
-        drawn["recording"] = partial(figures.recording_of, calibration)
-    picture = (
-        "Errors of each pose and turn, before and after calibration",
-        "“Before” is where the fit started: the nominal scale and offset, no misalignment. The inner band is what the "
-        "noise, measured while the unit was still, explains; where a wider one surrounds it, the errors scatter more "
-        "than that, and the intervals below count with the wider one.",
-    )
-    return write_calibration(
-        calibration,
-        folder,
-        words.lead(calibration),
-        words.trust(calibration),
-        words.limits(calibration, errors),
-        drawn,
-        picture,
-        title,
-    )
-
-
-def write_calibration(
-    calibration: Calibration,
-    folder: Folder,
-    lead: tuple[str, str, str],
-    trust: Iterable[words.Statement],
-    unknown: Iterable[words.Statement],
-    drawn: Drawn,
-    residuals: tuple[str, str] = ("", ""),
-    title: str | None = None,
-) -> Path:
-    """Write the report of any calibration into a folder; return its path.
-
-    **Arguments:** `lead`: the one sentence, the one number and what it means; `trust`, `unknown`: what to trust, what
-    the data cannot show; `drawn`: its figures by name, `residuals` for one with these alternative text and caption.
-
-    Raises `InputError` where the folder cannot be made or written to; nothing is then left half-written.
-    """
-    sources = [
-        [str(file.get(key, "")) for key in ("file", "rows", "sha256")] for file in calibration.data.get("files", [])
-    ]
-    triads, trust = calibration.triads(), [*trust]
-    return write_page(
-        folder,
-        "calibration",
-        {**drawn, "correlation": partial(figures.correlation_figure, calibration)},
-        title=title or f"Calibration from {', '.join(Path(source[0]).name for source in sources) or 'a recording'}",
-        lead=lead[0],
-        number=lead[1],
-        meaning=lead[2],
-        trust=trust,
-        limits=[*unknown],
-        weak=len(calibration.weak),
-        warnings=[
-            statement.about for statement in trust if statement.caution and not statement.about.startswith("What")
-        ],
-        residuals=residuals,
-        shared_gravity=calibration.gravity.sigma > 0 and "accelerometer" in triads,
-        equations=tables.equations(calibration),
-        snippet=tables.snippet(calibration),
-        tables=[(name, tables.rows(calibration, name, triad)) for name, triad in triads.items()],
-        sources=sources,
-        facts=tables.provenance(calibration),
-        notes=calibration.notes,
-    )
 
 
 def write_page(folder: Folder, template: str, drawn: Drawn, **values: Any) -> Path:
@@ -162,6 +81,71 @@ def page(template: str, drawn: Drawn, *, notes: Sequence[str] = (), **values: An
     )
     text = _TABLE.sub(_labelled, _FOLDERS.sub("", text))
     return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
+
+
+def write_report(result: Result | Page, folder: Folder) -> Path:
+    """Write a result's page as `report.html` and its pictures as PNGs into `folder`, which is made if it is missing.
+
+    **Returns:** the path of `report.html`. Everything is drawn before anything is written, and each file is written
+    whole or not at all. Raises `InputError` where the folder cannot be made or written to.
+    """
+    text, pictures = encoded(result.summary() if isinstance(result, Result) else result)
+    return write_folder(folder, pictures | {"report.html": text})[-1]
+
+
+def encoded(page: Page) -> tuple[bytes, dict[str, bytes]]:
+    """Return a page as HTML, and its pictures by the names of their files.
+
+    The page has no folders of the machine that made it. In place of a figure that cannot be drawn the page says so.
+    """
+    first, rest = [*page.first], [*page.rest()]
+    pictures: dict[str, bytes] = {}
+    drawings: dict[str, vector.Drawing | str] = {}
+    for picture in _pictures([*first, *rest]):
+        try:
+            figure = picture.draw()
+            pictures[f"{picture.name}.png"] = figures.png(figure)
+            drawings[picture.name] = vector.drawing(figure, picture.name)
+        except Exception as error:
+            drawings[picture.name] = _failure(f"The figure “{picture.name}”", error)
+    template = _environment().get_template("page.html.jinja")
+    text = _FOLDERS.sub("", template.render(page=page, first=first, rest=rest, drawings=drawings))
+    return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
+
+
+def _pictures(parts: Iterable[Part]) -> Iterator[Picture]:
+    for part in parts:
+        if isinstance(part, Picture):
+            yield part
+        elif isinstance(part, Section):
+            yield from _pictures(part.parts)
+
+
+def fragment(content: Page | Part) -> str:
+    """Return a page's first screen, or a part of one, as HTML for a notebook, without pictures."""
+    parts = [content]
+    if isinstance(content, Page):
+        number = [f"{content.number}: {content.meaning}"] if content.number else []
+        notes = [Items(content.notes)] if content.notes else []
+        parts = [Section(content.title, (*content.verdict, *number, *content.first, *notes), level=4)]
+    macros: Any = _environment().get_template("page_parts.html.jinja").module
+    return worded(str(macros.all(parts, {})))
+
+
+def _inline(text: str) -> Markup:
+    """Return a text as HTML: what stands between backticks is code."""
+    return Markup(re.sub("`([^`]+)`", r"<code>\1</code>", str(escape(text))).replace("\n", "<br>"))
+
+
+def _anchor(title: str) -> str:
+    return re.sub(r"\W+", "-", title.lower()).strip("-")
+
+
+def _kind_of_cell(text: str) -> Markup:
+    """Return the attribute of a cell that is a number, and stays on one line, or a long word, which is broken."""
+    if max(map(len, text.split()), default=0) > _LONG_WORD:
+        return Markup(' class="long"')
+    return Markup(' class="value"') if re.match("[-+−±]?[0-9]", text) and len(text) < _LONG_WORD else Markup("")
 
 
 def write_failure(path: Path, error: Exception) -> tuple[Path, ...]:
@@ -204,6 +188,7 @@ def _environment() -> jinja2.Environment:
         "script": script,
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     }
+    made.filters |= {"inline": _inline, "kind_of_cell": _kind_of_cell, "anchor": _anchor}
     made.globals |= {"title_of": effect_title, "probability": probability, "sentence": words.sentence}
     return made
 

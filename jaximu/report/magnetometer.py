@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, number
 from jaximu.ground.summary import sentence
+from jaximu.report.calibration import calibration_page
 from jaximu.report.figures import dressed, hemispheres, legend, new_figure
-from jaximu.report.html import Folder, write_calibration
-from jaximu.report.words import Lead, Statement, weak_statements
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from jaximu.calibration import Heading
     from jaximu.data.field import MagneticField
 
-__all__ = ["lead", "next_words", "statements", "write_magnetometer_report"]
+__all__ = ["next_words", "page_of"]
 
 _PAYS = 0.8
 """Share of what is uncertain of a heading that must be left for further directions to be worth a turn."""
@@ -30,8 +29,8 @@ _ENOUGH = 0.6
 """Share of all directions from which on the field counts as seen all round."""
 
 
-def lead(calibration: Calibration) -> Lead:
-    """Say how good a heading becomes, or how much the field's strength still scatters."""
+def _lead(calibration: Calibration) -> tuple[str, str, str]:
+    """Say how good a heading becomes, or how much the field's strength still scatters: sentence, number and meaning."""
     facts = calibration.magnetic
     assert facts is not None
     spread, heading = facts["norm_spread"], facts["heading_error"]
@@ -41,8 +40,8 @@ def lead(calibration: Calibration) -> Lead:
     )
     if heading is None:
         meaning = "scatter of the field's strength on parts of the recording that were left out of the fit"
-        return Lead(f"After calibration {strength}.", f"{100 * spread['after']:.2g} %", meaning)
-    return Lead(
+        return f"After calibration {strength}.", f"{100 * spread['after']:.2g} %", meaning
+    return (
         f"A heading is good to {number(heading['rms'], 2)}° (level, one standard deviation); without calibration it is "
         f"off by {number(heading['before']['rms'], 2)}° (rms). After calibration {strength}.",
         f"{number(heading['rms'], 2)}°",
@@ -120,31 +119,22 @@ def _along(direction: Sequence[float]) -> str:
     )
 
 
-def write_magnetometer_report(
-    calibration: Calibration, measurement: MagneticField, heading: Heading | None, folder: Folder
-) -> Path:
-    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
-    weak = [
-        direction
-        for direction in calibration.weak
-        if any(name.startswith("magnetometer") for name, _ in direction.parameters)
-    ]
-    unknown = weak_statements(weak, "All parameters of the magnetometer are determined by this recording.")
+def page_of(
+    calibration: Calibration, measurement: MagneticField, heading: Heading | None, asked: Sequence[str] = ()
+) -> Page:
+    """Return the page of a magnetometer's calibration; `asked`: what a check and a diagnosis say, in sentences."""
     caption = (
         "Left and middle: the directions that the field had, in the unit's axes, the two halves of the sphere seen "
         "along z; colours show how far the strength is off after calibration."
     )
     if heading is not None:
         caption += " Right: how good a heading is, one standard deviation, by where the unit points."
-    return write_calibration(
-        calibration,
-        folder,
-        lead(calibration),
-        statements(calibration),
-        unknown,
-        {"residuals": partial(_figure, calibration, measurement, heading)},
-        ("Directions and headings", caption),
+    picture = Picture(
+        "residuals", partial(_figure, calibration, measurement, heading), "Directions and headings", caption
     )
+    verdict, number, meaning = _lead(calibration)
+    trust = statements(calibration)
+    return calibration_page(calibration, [picture], trust, tuple, (verdict, *asked), (number, meaning))
 
 
 def _figure(calibration: Calibration, measurement: MagneticField, heading: Heading | None) -> Figure:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from itertools import permutations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,8 +13,10 @@ from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe, label
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.page import Matrices, Part
 from jaximu.ground.quantities import Z95, number, plain, raised, unit_text, with_interval
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
 
 __all__ = ["equations", "provenance", "rows", "short_name", "snippet"]
@@ -71,20 +74,20 @@ def snippet(calibration: Calibration) -> str:
     return "\n".join(lines)
 
 
-def _scaled(values: FloatArray, digits: int = 7) -> tuple[list[list[str]], str]:
-    """Return a matrix's entries as text, all with the decimals of the largest, and a common power of ten if needed."""
+def _scaled(values: FloatArray, digits: int = 7) -> tuple[str, list[list[str]]]:
+    """Return a common power of ten if needed, and a matrix's entries as text with the decimals of the largest."""
     size = int(np.floor(np.log10(np.abs(values).max(initial=1e-300))))
     power = 0 if -2 <= size <= 5 else size
     decimals = max(0, digits - 1 - (size - power))
     scaled = values / 10.0**power
     cells = [[f"{value:.{decimals}f}".replace("-", "−") if value else "0" for value in row] for row in scaled]
-    return cells, f"10{raised(power)} ·" if power else ""
+    return f"10{raised(power)} ·" if power else "", cells
 
 
-def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, str, str, str, bool]]:
-    """Return a triad's scales, misalignments and biases: symbol, words, value ± 95 % in output units, weak or not.
+def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, str, str, str]]:
+    """Return a triad's scales, misalignments and biases: symbol, words, value ± 95 % in output units, in other words.
 
-    Before the last, the same in words that a person compares.
+    A star marks what the data determine weakly.
     """
     (gain, bias), (gain_sigma, bias_sigma) = map(np.asarray, (triad.gain, triad.bias)), calibration.sigma(name)
     fitted = {"gain": (gain, gain_sigma), "bias": (bias, bias_sigma)}
@@ -120,16 +123,16 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
         factor, shown = (_MILLI_G, "mg") if name == "accelerometer" else (1.0, "rad/s")
         return with_interval(bias[i] / factor, bias_sigma[i] / factor, shown, sign=True)
 
-    def row(part: str, axes: tuple[int, ...], meaning: str) -> tuple[str, str, str, str, bool]:
+    def row(part: str, axes: tuple[int, ...], meaning: str) -> tuple[str, str, str, str]:
         parameter = Name(name, part, axes)
         value, sigma = (matrix[axes] for matrix in fitted[part])
         fixed = meaning.startswith("by convention")
         shown = "0" if fixed else with_interval(value, sigma, per) if part == "gain" else with_interval(value, sigma)
         if (not counts or part == "gain") and 0 < abs(value) <= Z95 * sigma:
             meaning = f"{meaning}; not different from zero".removeprefix("; ")
-        words = describe(parameter).removeprefix(f"{name} ")
+        words = describe(parameter).removeprefix(f"{name} ") + " *" * (parameter in weak)
         # a bias as it is put out: what the equation takes
-        return short_name(parameter), words, shown + f" {unit}" * (part == "bias"), meaning, parameter in weak
+        return short_name(parameter), words, shown + f" {unit}" * (part == "bias"), meaning
 
     return [
         *(row("gain", (i, i), scale_words(i)) for i in range(3)),
@@ -156,31 +159,32 @@ def _ratio_sigma(calibration: Calibration, name: str, gain: FloatArray, i: int, 
     return float(np.sqrt(max(slope @ calibration.covariance @ slope, 0.0)))
 
 
-def equations(calibration: Calibration) -> list[dict[str, Any]]:
-    """Return what the equation to apply needs, for each triad: names, units, K, its inverse, b, effects, as text."""
-    made = []
+def equations(calibration: Calibration) -> Iterator[tuple[str, list[Part]]]:
+    """Yield each triad's name and the equation that corrects its output, with K, its inverse, b and effects."""
     for name, triad in calibration.triads().items():
-        gain, known, effects = np.asarray(triad.gain), _INPUTS[name], []
-        for effect in triad.effects:
-            coefficients = [number(coefficient, 6) for coefficient in np.asarray(effect.coefficients)]
-            unit = unit_text(effect.coefficient_unit(triad.output_unit))
-            for inner, parameter in effect.inner.items():  # time constants and the like, after the coefficients
-                unit += f"; {inner.replace('_', ' ')} {number(float(getattr(effect, inner)), 6)} {parameter.unit}"
-            effects.append((effect.title, effect.formula, coefficients, unit))
-        made.append(
-            {
-                "name": name,
-                "input": known.symbol,
-                "quantity": known.words,
-                "si": known.si,
-                "effects": effects,
-                "unit": unit_text(triad.output_unit),
-                "gain": _scaled(gain),
-                "inverse": _scaled(np.linalg.inv(gain)),
-                "bias": _scaled(np.asarray(triad.bias)[:, None]),
-            }
-        )
-    return made
+        known, unit, gain = _INPUTS[name], unit_text(triad.output_unit), np.asarray(triad.gain)
+        factor, inverse = _scaled(np.linalg.inv(gain))
+        bias_factor, bias = _scaled(np.asarray(triad.bias)[:, None])
+        gain_factor, entries = _scaled(gain)
+        per = "(no unit)" if unit == known.si else f"{unit} per {known.si}"
+        parts: list[Part] = [
+            Matrices([f"{known.symbol} = {factor}", inverse, f"· ( y − {bias_factor}", bias, ")"]),
+            f"{known.symbol}: {known.words} in {known.si}; y: output x, y, z in {unit}; the matrix is K⁻¹, the column "
+            "b.",
+            Matrices([f"K = {gain_factor}", entries, per]),
+        ]
+        yield name, parts + [_effect_words(effect, triad.output_unit) for effect in triad.effects]
+
+
+def _effect_words(effect: Effect, output_unit: str) -> str:
+    numbers = ", ".join(number(coefficient, 6) for coefficient in np.asarray(effect.coefficients))
+    unit = unit_text(effect.coefficient_unit(output_unit))
+    for inner, parameter in effect.inner.items():  # time constants and the like, after the coefficients
+        unit += f"; {inner.replace('_', ' ')} {number(float(getattr(effect, inner)), 6)} {parameter.unit}"
+    return (
+        f"Beyond the linear part: {effect.title}, `{effect.formula}`, coefficients {numbers} in {unit}. Then "
+        f"`u = K⁻¹·(y − b − {effect.formula})` is solved by repetition; `jaximu compensate` does it."
+    )
 
 
 _TWO_STEPS = "two steps: the accelerometer by the magnitude of gravity, then the gyroscope by its direction"

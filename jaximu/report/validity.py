@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,82 +11,153 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.diagnosis import Validity
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.validity import Shift
 from jaximu.estimation.rows import TIME
-from jaximu.ground.quantities import change, number, probability, with_interval
+from jaximu.ground.page import Page, Part, Picture, Statement, Table
+from jaximu.ground.quantities import change, listed, number, probability, with_interval
+from jaximu.ground.summary import sentence
+from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
 from jaximu.report.figures import legend, zero_line
-from jaximu.report.html import Folder, write_page
 from jaximu.report.tables import short_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["kind_words", "write_validity"]
+__all__ = ["page_of"]
 
 _OUTPUTS = {
     "accelerometer": "accelerometer's output",
     "gyroscope": "gyroscope's output, its bias re-zeroed",
     "turns": "rotation over a turn",
 }
+_NEXT = {
+    "valid": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
+    "session": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
+    "shifted": "`jaximu calibrate LOG -o RESULTS` calibrates anew.",
+    "effect": "`jaximu diagnose LOG -o RESULTS` finds the effect and writes the extended calibration.",
+    "unexplained": "`jaximu diagnose LOG -o RESULTS` shows what does not fit.",
+}
 
 
-def write_validity(validity: Validity, folder: Folder) -> Path:
-    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
-    name = Path(str(validity.data.get("file", "a recording"))).name
-    moved = [shift.parameter.owner for shift in validity.moved if shift.parameter.owner in validity.output_errors]
-    triad = (*moved, "accelerometer")[0]
-    value = validity.output_errors.get(triad)
-    shown = f"p {probability(validity.p_value)}"
-    meaning = "probability of data at least this unusual if the old calibration is still valid (all tests together)"
-    if value is not None:
-        shown = with_interval(value.value, value.sigma, value.unit)
-        meaning = f"largest error of the {triad} in this recording under the old calibration, 95 % interval"
-    words = kind_words(validity)
-    pictures = {"errors": partial(_errors, validity)}
-    if any(_drawn(shift) for shift in validity.shifts):
-        pictures = {"check": partial(_shifts, validity), **pictures}
-    return write_page(
-        folder,
-        "validity",
-        pictures,
-        title=f"Is the calibration still valid for {name}?",
-        lead=validity.headline(),
-        number=shown,
-        meaning=meaning,
-        validity=validity,
-        shifts=_shift_rows(validity),
-        notes=validity.notes,
-        errors=[(words[name], change(*sizes)) for name, sizes in validity.errors.items()],
-        outputs=[
-            (_OUTPUTS[key], with_interval(error.value, error.sigma, error.unit))
-            for key, error in validity.output_errors.items()
-        ],
+def page_of(validity: Validity) -> Page:
+    """Return what moved, what explains it, what using the old calibration would cost, and the errors under both."""
+    log = str(validity.data.get("file", "LOG"))
+    number, meaning = _number(validity)
+    return Page(
+        f"Is the calibration still valid for {Path(log).name}?",
+        (f"{sentence(validity.verdict)}: {validity.headline()}",),
+        number,
+        meaning,
+        (*_shifts(validity), *_statements(validity), *_errors_table(validity)),
+        rest=lambda: [_picture(validity)],
+        notes=[sentence(note) for note in validity.notes],
+        next=_NEXT[validity.verdict].replace("LOG", shlex.quote(log)),
     )
 
 
-def kind_words(validity: Validity) -> dict[str, str]:
-    """Return what each kind of error is called."""
-    return {} if validity.experiment is None else {kind.name: kind.words for kind in validity.experiment.real.kinds}
+def _number(validity: Validity) -> tuple[str, str]:
+    """Return the error of the output with its interval where it is known, else the probability, and what it is."""
+    moved = [shift.parameter.owner for shift in validity.moved if shift.parameter.owner in validity.output_errors]
+    triad = (*moved, "accelerometer")[0]
+    error = validity.output_errors.get(triad)
+    if error is None:
+        meaning = "probability of data at least this unusual if the old calibration is still valid (all tests together)"
+        return f"p {probability(validity.p_value)}", meaning
+    meaning = f"largest error of the {triad} in this recording under the old calibration, 95 % interval"
+    return with_interval(error.value, error.sigma, error.unit), meaning
 
 
-def _shift_rows(validity: Validity) -> list[tuple]:
-    """Return each parameter in words, its old value, its shift, that in the output, its significance; moved or not."""
-    rows = []
-    for shift in validity.shifts:
-        cells = ("the recording does not determine it", "", "", "")
-        if shift.comparable:
-            p_value = probability(shift.p_value).removeprefix("= ") if shift.tested else "another after every power-on"
-            cells = shift.amount, shift.output, f"{abs(shift.z):.1f}" if shift.tested else "", p_value
-        rows.append((shift.words, number(shift.old, 6), *cells, bool(shift.moved)))
-    return rows
+def _shifts(validity: Validity) -> Iterator[Part]:
+    if any(_drawn(shift) for shift in validity.shifts):
+        yield Picture(
+            "check",
+            partial(_shifts_figure, validity),
+            "Shift of every parameter with its 95 % interval",
+            "Each parameter of a fresh calibration of this recording less the old one's, in the calibrated output "
+            "(gains at 1 g and 1 rad/s), with the 95 % interval of the difference. Coloured: moved, with all "
+            "parameters allowed for.",
+        )
+    if validity.shifts:
+        yield _shifts_table(validity)
+
+
+def _shifts_table(validity: Validity) -> Table:
+    """Return each parameter's old value, its shift, and that in the output, the most significant first."""
+    headers = ("parameter", "old", "shift ± 95 %", "in the output ± 95 %", "σ", "p-value, all allowed for")
+    statistic, freedom, p_value = validity.difference
+    together = f"All {freedom} together: χ² {statistic:.1f}, p {probability(p_value)}." if freedom else ""
+    shifts = sorted(validity.shifts, key=_rank)
+    moved = range(len(validity.moved))
+    return Table(headers, [_shift_row(shift) for shift in shifts], together, moved, brief=max(3, len(moved)))
+
+
+def _rank(shift: Shift) -> tuple[bool, float]:
+    return not shift.moved, -abs(shift.z) if shift.tested else 0.0
+
+
+def _shift_row(shift: Shift) -> tuple[str, ...]:
+    if not shift.comparable:
+        return shift.words, number(shift.old, 6), "not determined here", "", "", ""
+    if not shift.tested:
+        return shift.words, number(shift.old, 6), shift.amount, shift.output, "", "differs after every power-on"
+    p_value = probability(shift.p_value).removeprefix("= ")
+    return shift.words, number(shift.old, 6), shift.amount, shift.output, f"{abs(shift.z):.1f}", p_value
+
+
+def _statements(validity: Validity) -> Iterator[Statement]:
+    for cause in validity.causes:
+        text = f"{cause.sentence}, p {probability(cause.p_value)}."
+        if cause.rivals:
+            text += (
+                f" This recording cannot distinguish it from {listed([effect_title(name) for name in cause.rivals])}."
+            )
+        yield Statement("What explains the difference", text)
+    errors = [
+        f"{_OUTPUTS[name]} {with_interval(error.value, error.sigma, error.unit)}"
+        for name, error in validity.output_errors.items()
+    ]
+    if errors:
+        text = "Largest difference between the outputs under this calibration and under a new one in the recording: "
+        yield Statement("What using it would do", f"{text}{'; '.join(errors)} (95 %).")
+    yield Statement("Gyroscope bias", validity.bias_words())
+    if validity.nis is not None:
+        text = f"Over {validity.data['updates']} updates they are {validity.nis:.2f} times what is expected."
+        yield Statement("Squared innovations of the filter", text)
+
+
+def _errors_table(validity: Validity) -> Iterator[Table]:
+    if validity.experiment is not None:
+        words = {kind.name: kind.words for kind in validity.experiment.real.kinds}
+        rows = [(words[name], change(*sizes)) for name, sizes in validity.errors.items()]
+        counts = f"{validity.data['poses']} poses, {validity.data['turns']} turns"
+        yield Table((f"error, rms ({counts})", "old calibration → fresh calibration"), rows)
+
+
+def _picture(validity: Validity) -> Picture:
+    if validity.experiment is None:
+        return Picture(
+            "errors",
+            partial(_innovations, validity),
+            "Squared innovations of the filter over time",
+            "How far each rest, and the end of each motion, is from what the calibrated unit should have read, squared "
+            "and over what is expected: noise gives about 1.",
+        )
+    return Picture(
+        "errors",
+        partial(_errors, validity, validity.experiment),
+        "Errors of poses and turns under the old calibration and a fresh one",
+        "What the recording should bring to zero, under the old calibration and under a fresh one. Where both scatter "
+        "alike, the old one is as good.",
+    )
 
 
 def _drawn(shift: Shift) -> bool:
     return shift.in_si is not None and shift.tested
 
 
-def _shifts(validity: Validity) -> Figure:
+def _shifts_figure(validity: Validity) -> Figure:
     """Gain and bias of both triads, in mm/s² and mrad/s."""
     figure = figures.new_figure(3.9)
     for panel, triad, unit in zip(
@@ -101,12 +174,10 @@ def _shifts(validity: Validity) -> Figure:
     return figure
 
 
-def _errors(validity: Validity) -> Figure:
+def _errors(validity: Validity, experiment: Experiment) -> Figure:
+    """Conditions of poses and turns under both calibrations."""
     figure = figures.new_figure(3.4)
     panels = figure.subplots(1, 2)
-    experiment = validity.experiment
-    if experiment is None:
-        return _innovations(validity)
     real = experiment.real
     norms, turns = real.of_kind("gravity_norm"), real.of_kind("gravity_direction")
     times = real.covariates[TIME][norms], real.covariates[TIME][turns][::2]

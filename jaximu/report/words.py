@@ -3,49 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import WeakDirection
-from jaximu.ground.quantities import Z95, listed, number, readable, size
+from jaximu.ground.page import Statement
+from jaximu.ground.quantities import Z95, listed, number, size
 from jaximu.ground.summary import sentence
-from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
+from jaximu.report.evidence import evidence, largest_gap
 
 __all__ = [
-    "Lead",
-    "Statement",
-    "gravity_statement",
+    "counts",
+    "gravity_statements",
     "how_much_smaller",
-    "lead",
     "limits",
     "scatter_statements",
     "trust",
     "weak_statements",
-    "without_freedom",
 ]
 
 _BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
-
-
-class Lead(NamedTuple):
-    """What a page begins with: the one sentence, the one number and what the number means."""
-
-    sentence: str
-    number: str
-    meaning: str
-
-
-class Statement(NamedTuple):
-    """One sentence or a few, with what it is about; `caution` where a reader should act on it."""
-
-    about: str
-    text: str
-    caution: bool = False
-
-    def __str__(self) -> str:
-        return f"{self.about}: {self.text}"
 
 
 def counts(calibration: Calibration) -> tuple[int, int]:
@@ -64,39 +43,6 @@ def how_much_smaller(before: float, after: float) -> str:
     ratio = before / after
     digits = 1 - int(np.floor(np.log10(ratio)))
     return f"{round(ratio, digits):,.{max(0, digits)}f} times smaller"
-
-
-def without_freedom(calibration: Calibration) -> Lead:
-    """Say that a fit passes through its conditions by construction."""
-    poses, turns = counts(calibration)
-    return Lead(
-        f"{poses} poses and {turns} turns leave no degrees of freedom: the fit passes through them by construction, "
-        "and nothing is left to check it by. Record more of them.",
-        "not checked",
-        "there are as many parameters as conditions",
-    )
-
-
-def lead(calibration: Calibration) -> Lead:
-    """Say how far the errors against gravity fall."""
-    if calibration.exact:
-        return without_freedom(calibration)
-    poses, turns = counts(calibration)
-    before, after, _ = calibration.rms["gravity_norm"]
-    factor, unit = readable("m/s^2", after)
-    text = (
-        f"At rest, the accelerometer's error against gravity falls from {number(factor * before)} to "
-        f"{number(factor * after, 2)} {unit} (rms over {poses} poses)"
-    )
-    if "gravity_direction" in calibration.rms:
-        old, new, _ = calibration.rms["gravity_direction"]
-        text += (
-            f"; over a turn, the gyroscope loses the direction of gravity by {number(new, 2)}° instead of "
-            f"{number(old)}° (rms over {turns} turns)"
-        )
-    smaller = f", {how_much_smaller(before, after)} than before" if after < before else ""
-    meaning = f"rms error against gravity after calibration{smaller}"
-    return Lead(text + ".", f"{number(factor * after, 2)} {unit}", meaning)
 
 
 _SCATTER = {
@@ -120,8 +66,17 @@ _SCATTER = {
 
 def trust(calibration: Calibration) -> Iterator[Statement]:
     """Say what to trust: where noise explains the errors, where not, and what no interval contains."""
+    by_hand = "gravity_norm" in calibration.rms
     yield from scatter_statements(calibration)
-    yield from [_new_poses(calibration), gravity_statement(calibration)]
+    if by_hand and not calibration.exact:
+        yield new_poses(calibration)
+    yield from gravity_statements(calibration)
+    if not by_hand and "poses" in calibration.data:
+        text = (
+            "What the set-up gets wrong every time (a table that is not level, axes that are not square, a wrong "
+            "angle) shifts the parameters by as much and is in no interval; `jaximu budget` computes how much."
+        )
+        yield Statement("The set-up", text, not calibration.imu.setup)
     if calibration.method.startswith("two-step"):
         text = (
             "The gyroscope was fitted with the accelerometer held fixed: its intervals leave out what the "
@@ -151,13 +106,13 @@ def scatter_statements(calibration: Calibration) -> list[Statement]:
     if any(entry.caution for entry in entries):
         text = (
             "The intervals below include it as if it were random. A cause that repeats may have shifted the parameters "
-            "by more than they say, and will act again when the calibration is used."
+            "by more than they say, and will act again when the calibration is used. Run `jaximu diagnose` to find it."
         )
         entries.append(Statement("What scatter beyond noise means", text, True))
     return entries
 
 
-def _new_poses(calibration: Calibration) -> Statement:
+def new_poses(calibration: Calibration) -> Statement:
     """Say what the errors of the fitted poses tell about others: with n poses and p parameters √((n + p)/(n − p))."""
     poses, _ = counts(calibration)
     fitted = sum(name.owner == "accelerometer" for name in calibration.names)
@@ -176,22 +131,29 @@ def _new_poses(calibration: Calibration) -> Statement:
     return Statement("New poses", text, poses < 2 * fitted)
 
 
-def gravity_statement(calibration: Calibration) -> Statement:
-    gravity = calibration.gravity
+def gravity_statements(calibration: Calibration) -> Iterator[Statement]:
+    """Say how far gravity leaves the scales uncertain; nothing where they are known from other forces."""
+    gravity, triads = calibration.gravity, calibration.triads()
+    if "accelerometer" not in triads:
+        return
     if not gravity.sigma > 0:
         text = (
             f"Gravity was taken as exactly {gravity.value:.5f} m/s². Were it off by 0.001 m/s², all three scales of "
             "the accelerometer would be off by 0.01 %; the intervals do not include that."
         )
-        return Statement("Gravity", text)
+        yield Statement("Gravity", text)
+        return
     share = 100 * Z95 * gravity.sigma / gravity.value
+    sigmas = np.sqrt(np.diag(calibration.covariance_of([Name("accelerometer", "gain", (k, k)) for k in range(3)])))
+    if np.all(100 * Z95 * sigmas < 0.9 * share * np.diag(triads["accelerometer"].gain)):  # what was felt is not gravity
+        return
     text = (
         f"Gravity was taken as {gravity.value:.5f} ± {number(Z95 * gravity.sigma, 2)} m/s² (95 %). This alone leaves "
         f"all three scales of the accelerometer uncertain by ±{number(share, 2)} %, which the intervals include."
     )
     if share > 0.01:
         text += " State the gravity of your place (--gravity, or --latitude and --height) to narrow it."
-    return Statement("Gravity", text, share > 0.1)
+    yield Statement("Gravity", text, share > 0.1)
 
 
 def _temperature(calibration: Calibration) -> str:
@@ -203,20 +165,17 @@ def _temperature(calibration: Calibration) -> str:
     return f"{low:.1f} °C" if high - low < 0.1 else f"{low:.1f} to {high:.1f} °C"
 
 
-def weak_statements(weak: Sequence[WeakDirection], *otherwise: str) -> list[Statement]:
-    """Say which directions are weak, or what is to be said where none is."""
+def weak_statements(weak: Sequence[WeakDirection]) -> list[Statement]:
+    """Say which directions are weak."""
     return [
         Statement("Weakly known" if direction.determined else "Not determined", sentence(direction.text), True)
         for direction in weak
-    ] or [Statement("Parameters", text) for text in otherwise]
+    ]
 
 
-def limits(calibration: Calibration, errors: PoseAndTurnErrors | None) -> Iterator[Statement]:
+def limits(calibration: Calibration) -> Iterator[Statement]:
     """Say what the data cannot tell."""
-    yield from weak_statements(
-        calibration.weak,
-        f"All {len(calibration.names)} parameters are determined by the recording; no combination of them is weak.",
-    )
+    errors, triads = evidence(calibration), calibration.triads()
     if errors is not None:
         gap, where = largest_gap(errors.directions)
         if gap > 60:
@@ -225,19 +184,26 @@ def limits(calibration: Calibration, errors: PoseAndTurnErrors | None) -> Iterat
                 "what the accelerometer does there is extrapolated. Record poses there."
             )
             yield Statement("Orientations", text, True)
-    text = (
-        "The body frame is the accelerometer's own: x along its x axis, y in the plane of its x and y axes. How it is "
-        "turned against the case cannot be seen without a reference; three entries of the accelerometer's gain are "
-        "zero for this reason."
-    )
-    yield Statement("The case", text)
+    if "gravity_norm" in calibration.rms:
+        text = (
+            "The body frame is the accelerometer's: x along its x axis, y in the plane of its x and y axes. How it is "
+            "turned against the case cannot be seen without a reference; three entries of the accelerometer's gain are "
+            "zero for this reason."
+        )
+        yield Statement("The case", text)
+    elif "poses" in calibration.data:
+        text = (
+            "The body frame is the fixture's, in which the reference states its directions; how the fixture is turned "
+            "against the table cannot be distinguished from misalignment."
+        )
+        yield Statement("The fixture", text)
     missing = "temperature, nonlinearity, time lags, ageing"
-    if "gyroscope" not in calibration.triads():
-        yield (Statement("Gyroscope", "It is not part of this calibration: the accelerometer alone was calibrated."))
-    else:
+    if "gyroscope" in triads:
         missing += ", the gyroscope's sensitivity to acceleration"
+    else:
+        yield Statement("Gyroscope", "It is not part of this calibration: the accelerometer alone was calibrated.")
     text = f"Effects beyond scale, misalignment and bias were not tested ({missing})."
-    effects = [effect.title for triad in calibration.triads().values() for effect in triad.effects]
+    effects = [effect.title for triad in triads.values() for effect in triad.effects]
     if effects:
         text = f"Effects other than {', '.join(effects)} were not tested."
     yield Statement("Not modelled", text)

@@ -1,0 +1,148 @@
+"""A result in parts, before anyone has decided how to show it: on the terminal, as an HTML file, in a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from jaximu.ground.reexport import later
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Code", "Items", "Matrices", "Page", "Part", "Picture", "Result", "Section", "Statement", "Table"]
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A sentence or a few, with what it is about; `caution` where a reader should act on it."""
+
+    kind: ClassVar[str] = "statement"
+    about: str
+    text: str
+    caution: bool = False
+
+
+@dataclass(frozen=True)
+class Table:
+    """Texts in rows under headers; without headers the first cell of a row is its name.
+
+    caption: a sentence below it. marked: the rows that a reader should look at. brief: how many of the rows the first
+    screen shows.
+    """
+
+    kind: ClassVar[str] = "table"
+    headers: tuple[str, ...]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    marked: Sequence[int] = ()
+    brief: int | None = None
+
+    def __str__(self) -> str:
+        return later("report.terminal", "text")(self)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return later("report.html", "fragment")(self)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure that is drawn when its turn comes, kept as NAME.png; `alternative`: in words for who cannot see it."""
+
+    kind: ClassVar[str] = "picture"
+    name: str
+    draw: Callable[[], Figure]
+    alternative: str
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Items:
+    """A list of sentences."""
+
+    kind: ClassVar[str] = "items"
+    texts: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Code:
+    """Lines to copy."""
+
+    kind: ClassVar[str] = "code"
+    text: str
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """An equation on one line: texts, and matrices as rows of texts."""
+
+    kind: ClassVar[str] = "matrices"
+    pieces: Sequence[str | Sequence[Sequence[str]]]
+
+
+@dataclass(frozen=True)
+class Section:
+    """Parts under a heading."""
+
+    kind: ClassVar[str] = "section"
+    title: str
+    parts: Sequence[Part]
+    level: int = 2
+
+
+Part = str | Statement | Table | Picture | Items | Code | Matrices | Section
+
+
+@dataclass(frozen=True)
+class Page:
+    """A result in parts. Text between backticks is code.
+
+    verdict: sentences. number, meaning: the one number, with its interval, and what it is of. first: what the first
+    screen shows below them, everywhere (the terminal leaves pictures out). rest: what only the HTML file goes on with,
+    made when it is written. next: what to run next, in a sentence.
+    """
+
+    title: str
+    verdict: Sequence[str]
+    number: str = ""
+    meaning: str = ""
+    first: Sequence[Part] = ()
+    rest: Callable[[], Iterable[Part]] = tuple
+    notes: Sequence[str] = ()
+    next: str = ""
+
+    def __str__(self) -> str:
+        return later("report.terminal", "text")(self)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return later("report.html", "fragment")(self)
+
+
+class Result:
+    """What a verb returns: it has a page, which a module of `report` makes of it when it is asked for.
+
+    A class names the module: `class Validity(Result, page="validity")`.
+    """
+
+    _page: ClassVar[str]
+
+    def __init_subclass__(cls, page: str = "", **more: object):
+        super().__init_subclass__(**more)
+        if page:
+            cls._page = page
+
+    def summary(self) -> Page:
+        """Return what a person wants to know of this: printed it is text, in a notebook HTML."""
+        return later(f"report.{self._page}", "page_of")(self)
+
+    def __repr__(self) -> str:
+        page = self.summary()
+        return f"<{type(self).__name__}: {'. '.join((page.title, *page.verdict[:1]))}>"
+
+    def _repr_html_(self) -> str:
+        return self.summary()._repr_html_()

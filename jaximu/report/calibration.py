@@ -1,0 +1,258 @@
+"""The page of a calibration: errors before and after, what to trust, every parameter, the equation to apply."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaximu.calibration import Calibration
+from jaximu.data.stations import station_errors
+from jaximu.ground.page import Code, Page, Part, Picture, Section, Statement, Table
+from jaximu.ground.quantities import Z95, change, counted, size, with_interval
+from jaximu.ground.summary import Parameter, sentence
+from jaximu.report import figures, tables, words
+from jaximu.report.evidence import evidence
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["calibration_page", "page_of"]
+
+_ERRORS = {
+    "gravity_norm": "Error against gravity at rest",
+    "gravity_direction": "Direction of gravity lost over a turn",
+    "static_gyroscope": "Rate at rest",
+    "specific_force": "Error of the specific force",
+    "rate_at_rest": "Error of the rate in poses",
+    "turn_angle": "Error of the angle of turns",
+    "rotation": "Error of the rate against the reference",
+    "field_strength": "Error of the field's strength",
+    "accelerometer": "Specific force at rest over temperature",
+    "gyroscope": "Rate at rest over temperature",
+}
+
+
+def page_of(calibration: Calibration) -> Page:
+    """Return the page of a calibration from poses, turns or rests."""
+    return calibration_page(
+        calibration, _pictures(calibration), words.trust(calibration), partial(words.limits, calibration)
+    )
+
+
+def _pictures(calibration: Calibration) -> Iterator[Picture]:
+    if calibration.fit is not None and calibration.nominal is not None and calibration.observations is not None:
+        yield Picture(
+            "residuals",
+            partial(figures.residuals_of, calibration),
+            "Errors of each pose and turn, before and after calibration",
+            "“Before” is where the fit started: the nominal scale and offset, no misalignment. The inner band is "
+            "what the noise, measured while the unit was still, explains; where a wider one surrounds it, the errors "
+            "scatter more than that, and the intervals below count with the wider one.",
+        )
+    if calibration.fit is not None and calibration.stations is not None:
+        yield Picture(
+            "stations",
+            partial(_stations_figure, calibration),
+            "Errors of each pose and turn after calibration",
+            "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI.",
+        )
+
+
+def _stations_figure(calibration: Calibration) -> Figure:
+    """Draw each station's errors after calibration, by axis, with the standard deviation of its mean."""
+    fit, stations = calibration.fit, calibration.stations
+    assert fit is not None and stations is not None
+    panels = [panel for panel in station_errors(fit.imu, stations, np.asarray(fit.excess)) if len(panel.station)]
+    figure = figures.new_figure(2.3 * len(panels))
+    grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    for axes, panel in zip(grid, panels, strict=True):
+        for shift, (axis, color), error, sigma in zip(
+            (-0.2, 0.0, 0.2), figures.AXES.items(), panel.error, panel.sigma, strict=True
+        ):
+            axes.errorbar(panel.station + shift, error, Z95 * sigma, fmt="o", ms=3.5, lw=0.8, color=color, label=axis)
+        figures.zero_line(axes)
+        figures.dressed(axes, _error_words(panel.name), ylabel=panel.unit)
+    figures.legend(grid[0], 3, "upper right")
+    grid[-1].set_xlabel("pose or turn, in order of time (bars: 95 % of the noise)")
+    return figure
+
+
+def calibration_page(
+    calibration: Calibration,
+    pictures: Iterable[Picture],
+    trust: Iterable[Statement],
+    limits: Callable[[], Iterable[Statement]],
+    verdict: Sequence[str] = (),
+    number: tuple[str, str] | None = None,
+) -> Page:
+    """Return the page of any calibration.
+
+    **Arguments:** `trust`, `limits`: what to trust, what the data cannot show (only in the file); `verdict`: sentences
+    before those on the errors; `number`: the one number and what it is, the first error after calibration if None.
+    """
+    known, trust = calibration.triads(), [*trust, *words.weak_statements(calibration.weak)]
+    cautions = [statement for statement in trust if statement.caution]
+    settled = [statement for statement in trust if not statement.caution]
+
+    def rest() -> Iterator[Part]:
+        if settled:
+            yield Section("What to trust", settled)
+        yield Section("What the data cannot show", [*limits(), *_orientations(calibration)])
+        yield from _equations(calibration)
+        yield _correlation(calibration)
+        yield from _origin(calibration)
+
+    files = [str(file["file"]) for file in calibration.data.get("files", ())]
+    value, meaning = number or _number(calibration)
+    return Page(
+        _title(calibration, files),
+        (*verdict, *_errors(calibration), *_determined(calibration)),
+        value,
+        meaning,
+        (*pictures, *([Section("Before you rely on it", cautions)] if cautions else []), *_parameters(calibration)),
+        rest,
+        [sentence(note) for note in calibration.notes],
+        f"`jaximu compensate CALIBRATION {shlex.quote(files[0]) if files else 'LOG'} -o CORRECTED.csv` applies it, "
+        "CALIBRATION being the calibration.json in DIR."
+        if "accelerometer" in known
+        else "",
+    )
+
+
+def _title(calibration: Calibration, files: Sequence[str]) -> str:
+    data = calibration.data
+    counts = [
+        counted(data[kind + "s"], kind) for kind in ("pose", "turn", "interval", "window") if data.get(kind + "s")
+    ]
+    names = ", ".join(Path(file).name for file in files) or "a recording"
+    return f"Calibration of {names}: {', '.join([*counts, f'{calibration.method} fit'])}"
+
+
+def _error_words(name: str) -> str:
+    """Return what a kind of residual is called; of several kinds of data it may have a number."""
+    kind, _, number = name.partition(" ")
+    words = _ERRORS.get(kind) or f"Error of the {kind.replace('_', ' ')}"
+    return f"{words} {number}".strip()
+
+
+def _errors(calibration: Calibration) -> Iterator[str]:
+    """Say how large each kind of error was and is."""
+    for name, (before, after, unit) in calibration.rms.items():
+        if name in calibration.exact:
+            yield (
+                f"{_error_words(name)}: {size(before, unit)} before calibration (rms); after it none by construction, "
+                "for there are as many parameters as conditions: no degrees of freedom are left to check it by."
+            )
+        else:
+            yield f"{_error_words(name)}: {change(before, after, unit)} (rms, before → after calibration)."
+
+
+def _number(calibration: Calibration) -> tuple[str, str]:
+    """Return the first kind of error after calibration, and what it is."""
+    if calibration.exact or not calibration.rms:
+        return "not checked", "there are as many parameters as conditions"
+    name, (before, after, unit) = next(iter(calibration.rms.items()))
+    what = _error_words(name)
+    smaller = f", {words.how_much_smaller(before, after)} than before" if after < before else ""
+    return size(after, unit, 2), f"{what[0].lower()}{what[1:]}, rms after calibration{smaller}"
+
+
+def _determined(calibration: Calibration) -> Iterator[str]:
+    """Say what the data determine, and what a diagnosis found."""
+    count, undetermined = len(calibration.names), sum(not direction.determined for direction in calibration.weak)
+    if undetermined:
+        what = f"{counted(undetermined, 'combination')} of the {count} parameters"
+        yield f"The recording does not determine {what} (marked *)."
+    elif calibration.weak:
+        yield "All parameters are determined, those marked * only weakly."
+    else:
+        yield f"All {count} parameters are determined."
+    if calibration.diagnosis:
+        yield f"Diagnosis: {calibration.diagnosis['verdict']}."
+
+
+def _parameters(calibration: Calibration) -> Iterator[Part]:
+    """Return a table of gain and bias for each triad, and one of what else was fitted."""
+    parts: list[Part] = []
+    for name, triad in calibration.triads().items():
+        rows = tables.rows(calibration, name, triad)
+        marked = [index for index, row in enumerate(rows) if "*" in row[1]]
+        parts.append(
+            Section(sentence(name), [Table(("", "parameter", "± 95 %", "in other words"), rows, "", marked)], 3)
+        )
+    others = [one for one in calibration.parameters.values() if "effects" in one.name]
+    if others:
+        parts.append(Section("Effects", [Table(("number", "± 95 %"), [*map(_effect_row, others)])], 3))
+    yield Section("Parameters", [*parts])
+    yield (
+        "Gain K = S·(1 + M): scales S on the diagonal, misalignments M beside it (1 mrad is 0.1 % of the input); "
+        "“misalignment y from x” is how much of the input along x appears on output y."
+        + " Rows marked * take part in a weak combination."
+        * bool(calibration.weak)
+    )
+
+
+def _effect_row(parameter: Parameter) -> tuple[str, str]:
+    return parameter.words + " *" * parameter.weak, with_interval(parameter.value, parameter.sigma, parameter.unit)
+
+
+def _orientations(calibration: Calibration) -> Iterator[Picture]:
+    errors = evidence(calibration)
+    if errors is not None:
+        yield Picture(
+            "orientations",
+            partial(figures.orientation_figure, errors),
+            "Map of the directions that pointed up in each pose",
+            "The two halves of the sphere of orientations, seen along z, areas true. A calibration speaks best for "
+            "orientations near its poses; colours that go with the direction point to a cause that the model lacks.",
+        )
+
+
+def _equations(calibration: Calibration) -> Iterator[Part]:
+    """Return the equation to apply, in numbers and as code."""
+    parts: list[Part] = [
+        "The sensor's output is `y = K·u + b`, with the true input u in SI units. To correct a recording, turn it "
+        "round: `u = K⁻¹·(y − b)`."
+    ]
+    parts += [Section(sentence(name), lines, 3) for name, lines in tables.equations(calibration)]
+    if lines := tables.snippet(calibration):
+        parts += ["In Python, with all digits:", Code(lines)]
+    yield Section("The equation to apply", parts)
+
+
+def _correlation(calibration: Calibration) -> Picture:
+    shared = calibration.gravity.sigma > 0 and "accelerometer" in calibration.triads()
+    caption = (
+        "a: accelerometer, g: gyroscope; s_x: scale of axis x; m_yx: misalignment, input along x seen by output y; "
+        "b_x: bias. Near ±1, the recording determines only the sum or difference of the two, and their single "
+        "intervals are wide."
+    )
+    if shared:
+        caption += " The accelerometer's scales go together as far as they share the uncertainty of gravity."
+    draw = partial(figures.correlation_figure, calibration)
+    return Picture("correlation", draw, "Correlation of the fitted parameters", caption)
+
+
+def _origin(calibration: Calibration) -> Iterator[Part]:
+    """Return the recording, its files and how it was fitted."""
+    parts: list[Part] = []
+    if calibration.segmentations:
+        parts.append(
+            Picture(
+                "recording",
+                partial(figures.recording_of, calibration),
+                "Accelerometer and gyroscope against time, poses shaded",
+                "As recorded, turned into SI units by the nominal scale and offset. Numbers count the poses.",
+            )
+        )
+    sources = [
+        [str(file.get(key, "")) for key in ("file", "rows", "sha256")] for file in calibration.data.get("files", [])
+    ]
+    if sources:
+        parts.append(Table(("file", "rows", "SHA-256"), sources))
+    yield Section("Where it comes from", [*parts, Table((), tables.provenance(calibration))])

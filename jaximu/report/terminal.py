@@ -1,0 +1,112 @@
+"""A page as text: on the terminal with its colours, or as a string; square brackets are units, not markup."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+
+from rich import box
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table as Grid
+
+from jaximu.ground.errors import worded
+from jaximu.ground.page import Code, Items, Page, Part, Section, Statement, Table
+
+__all__ = ["console", "show", "text"]
+
+_WIDTH = 100
+
+
+def console() -> Console:
+    """Return the terminal, or standard output with a hundred columns where it is none."""
+    colors = None if os.environ.get("NO_COLOR") else "auto"  # None: no bold type either
+    terminal = Console(highlight=False, markup=False, color_system=colors)
+    return terminal if terminal.is_terminal else _screen(color_system=colors)
+
+
+def _screen(**options) -> Console:
+    return Console(highlight=False, markup=False, width=_WIDTH, **options)
+
+
+def text(content: Page | Part) -> str:
+    """Return a page, or a part of one, as lines of text."""
+    lines = io.StringIO()
+    show(content, _screen(file=lines, color_system=None))
+    return "\n".join(line.rstrip() for line in lines.getvalue().rstrip().split("\n"))
+
+
+def show(content: Page | Part, screen: Console | None = None) -> None:
+    """Print a page's first screen, or a part of one; pictures and equations are left to the HTML file."""
+    screen = screen or console()
+    match content:
+        case str():
+            screen.print(worded(content))
+        case Statement(about=about, text=words, caution=caution):
+            show(f"{'! ' if caution else ''}{about}: {words}", screen)
+        case Table(rows=rows, brief=brief):
+            _print_table(replace(content, rows=rows[:brief]), screen)
+            if brief is not None and len(rows) > brief:
+                screen.print(f"… and {len(rows) - brief} more in report.html")
+        case Items(texts=texts):
+            _print_items(texts, screen)
+        case Code(text=lines):
+            screen.print(Padding(lines, (0, 0, 0, 2)))
+        case Section(title=title, parts=parts):
+            screen.print(f"\n{title}", style="bold")
+            _print_parts(parts, screen)
+        case Page():
+            screen.print(content.title, style="bold")
+            for sentence in content.verdict:
+                show(sentence, screen)
+            if content.number:
+                screen.print(f"{content.number}  {content.meaning}")
+            _print_parts(content.first, screen)
+            if content.notes:
+                show(Section("Notes", (Items(content.notes),)), screen)
+            if content.next:
+                show(f"\nNext: {content.next}", screen)
+
+
+def _print_parts(parts: Sequence[Part], screen: Console) -> None:
+    for part in parts:
+        show(part, screen)
+
+
+def _print_items(texts: Sequence[str], screen: Console) -> None:
+    """Print a list, its lines indented below their bullets."""
+    grid = Grid.grid(padding=(0, 1, 0, 0))
+    for words in texts:
+        grid.add_row("-", worded(words))
+    screen.print(grid)
+
+
+def _print_table(table: Table, screen: Console) -> None:
+    """Print rows under headers; cells are folded between words, and where even words do not fit rows are stacked."""
+    columns = list(zip(*([table.headers] if table.headers else []), *table.rows, strict=True))
+    words = [max((len(word) for cell in column for word in cell.split()), default=1) for column in columns]
+    widths = [max((len(line) for cell in column for line in cell.split("\n")), default=1) for column in columns]
+    room = screen.width - 2 * len(widths)
+    if sum(words) > room:
+        _print_stacked(table, screen)
+        return
+    while sum(widths) > room:
+        widest = max(range(len(widths)), key=lambda at: widths[at] - words[at])
+        widths[widest] -= 1
+    grid = Grid(box=box.SIMPLE_HEAD if any(table.headers) else None, padding=(0, 1, 0, 0), show_edge=False)
+    for index, width in enumerate(widths):
+        grid.add_column(table.headers[index] if table.headers else "", width=width, overflow="fold")
+    for index, row in enumerate(table.rows):
+        grid.add_row(*row, style="bold" if index in table.marked else None)
+    screen.print(grid)
+    if table.caption:
+        show(table.caption, screen)
+
+
+def _print_stacked(table: Table, screen: Console) -> None:
+    for row in table.rows:
+        for header, cell in zip(table.headers or ("",) * len(row), row, strict=True):
+            if cell:
+                screen.print(f"  {header}: {cell}" if header else f"- {cell}")
