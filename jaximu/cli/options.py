@@ -369,7 +369,15 @@ class Results:
         `text` makes the document to print with --json, the first of `documents` if None. A page that cannot be drawn
         costs nothing else: another says so in its place.
         """
-        made = cache(page)
+
+        @cache
+        def made() -> Page:
+            content = page()
+            if self.output is None or "calibration" not in documents:
+                return content
+            path = shlex.quote(str(self.output / "calibration.json"))
+            return replace(content, next=content.next.replace("CALIBRATION", path))
+
         self.give(
             lambda: later("report.terminal", "show")(made()),
             lambda folder: later("report.html", "write_report")(made(), folder),

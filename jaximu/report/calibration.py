@@ -117,8 +117,7 @@ def calibration_page(
         (*pictures, *([Section("Before you rely on it", cautions)] if cautions else []), *_parameters(calibration)),
         rest,
         [sentence(note) for note in calibration.notes],
-        f"`jaximu compensate CALIBRATION {shlex.quote(files[0]) if files else 'LOG'} -o CORRECTED.csv` applies it, "
-        "CALIBRATION being the calibration.json in DIR."
+        f"`jaximu compensate CALIBRATION {shlex.quote(files[0]) if files else 'LOG'} -o CORRECTED.csv` applies it."
         if "accelerometer" in known
         else "",
     )
