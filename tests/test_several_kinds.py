@@ -96,8 +96,7 @@ def test_data_alone_are_calibrated_and_wrong_ones_refused(tmp_path):
         jaximu.calibrate([half, table], EXACT)
     two = jaximu.calibrate([log, data], EXACT)
     assert "Rate at rest 2" in str(two.summary())
-    with pytest.raises(jaximu.InputError, match="has no page"):
-        write_report(two, tmp_path)
+    assert "Rate at rest 2" in write_report(two, tmp_path).read_text(encoding="utf-8")
     few = jaximu.observe(simulate(draw_imu(0), HandHeld(2, 2.0), consumer_noise(), rate=50.0, seed=0)[0], EXACT)
     with pytest.raises(jaximu.NotPossibleError, match="these data together leave"):
         jaximu.calibrate(few, EXACT)

@@ -249,6 +249,10 @@ def _origin(calibration: Calibration) -> Iterator[Part]:
                 "As recorded, turned into SI units by the nominal scale and offset. Numbers count the poses.",
             )
         )
+    else:
+        parts.append(
+            "This report was made from a stored calibration: errors by pose and the recording are not kept there."
+        )
     sources = [
         [str(file.get(key, "")) for key in ("file", "rows", "sha256")] for file in calibration.data.get("files", [])
     ]
