@@ -11,8 +11,9 @@ from jaximu.calibration import Calibration
 from jaximu.cli.app import main
 from jaximu.estimation.problem import names_of
 from jaximu.model.effects import CATALOGUE
-from jaximu.navigation.consequences import consequences, position, read_sensor_noise
+from jaximu.navigation.consequences import consequences, position
 from jaximu.navigation.trajectory import Place, level_driving
+from jaximu.noise.stated import read_sensor_noise
 from jaximu.simulation import draw_imu
 
 PLACE = Place(45.0, 0.0, LocalGravity(9.80665, 0.0))

@@ -16,9 +16,9 @@ from jaximu.estimation.problem import names_of
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
-from jaximu.navigation.consequences import read_sensor_noise
 from jaximu.navigation.estimator_noise import MeasuredErrors, ModelledErrors, estimator_noise, nees, steady_stamps
 from jaximu.navigation.trajectory import Trajectory, level_driving, of_recording
+from jaximu.noise.stated import read_sensor_noise
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.report.export.noise import TARGETS, noise_files, noise_values

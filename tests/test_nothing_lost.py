@@ -284,7 +284,7 @@ def test_a_page_that_fails_takes_no_result_with_it(verb, folder, tmp_path, monke
 
 
 def test_what_cannot_be_printed_is_written(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("jaximu.cli.calibrate.print_calibration", fails)
+    monkeypatch.setattr("jaximu.report.terminal.show", fails)
     assert run(*WORK[:1], folder / "log.csv", *WORK[2:], "-o", tmp_path)[0] == 1
     assert {"calibration.json", "report.html"} <= set(content(tmp_path))
 

@@ -622,7 +622,7 @@ def test_command(box, schedule, tmp_path, capsys):
     assert loaded.method == "turntable" and within(loaded, truth.imu)
     assert loaded.reading is not None and loaded.reading.units["accelerometer"] == "m/s^2"
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "6 poses and 8 turns" in page and "not square" in page
+    assert "6 poses, 8 turns" in page and "not square" in page
     assert main([*given, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["fit"]["rank"] == 24
     assert main([*given, "--fit", "setup.table_axis"]) == 1

@@ -19,7 +19,7 @@ def run(
     *,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    static: options.StaticLog = None,
+    noise: options.Noise = options.NOISE,
     loss: options.LossChoice = "linear",
     repair: options.RepairFlag = False,
     results: options.Output = options.RESULTS,
@@ -36,11 +36,11 @@ def run(
     """
     gravity = local.value()
     results.prepare()
-    recordings, noise = log.read_unit(logs, gravity, static)
+    recordings, known = log.read_unit(logs, gravity, noise)
     from jaximu.calibration import calibrate_array
 
     with progress("calibrating"):
-        array = calibrate_array(recordings, gravity, static=noise, loss=loss, repair=repair)
+        array = calibrate_array(recordings, gravity, static=known, loss=loss, repair=repair)
     units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(array.units, 1)}
     names = "array.json, report.html and the calibrations"
     write = options.drawn("array", "write_array", array)

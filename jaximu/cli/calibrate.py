@@ -25,7 +25,7 @@ def run(
     *,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    static: options.StaticLog = None,
+    noise: options.Noise = options.NOISE,
     method: Annotated[
         Literal["joint", "two-step", "two-step-rk4", "accelerometer"],
         arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
@@ -54,7 +54,8 @@ def run(
     results.prepare(*options.INERTIAL[: 1 if method == "accelerometer" else 2])
     if means:
         meant = {
-            "--static": static,
+            "--static": noise.static,
+            "--noise": noise.noise,
             "--effect": effect,
             "--threshold": poses.threshold,
             "--repair": repair,
@@ -65,14 +66,14 @@ def run(
         calibration = replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace)
         results.present(calibration.summary, calibration=calibration)
         return
-    recordings, noise = log.read_unit(logs, gravity, static)
+    recordings, known = log.read_unit(logs, gravity, noise)
     with progress("calibrating"):
         from jaximu.calibration import calibrate
 
         calibration = calibrate(
             recordings,
             gravity,
-            static=noise,
+            static=known,
             segmentation=poses.value(),
             method=method,
             loss=loss,

@@ -19,7 +19,7 @@ def run(
     *,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    static: options.StaticLog = None,
+    noise: options.Noise = options.NOISE,
     poses: options.Poses = options.POSES,
     fail_on: Annotated[
         Literal["never", "invalid"],
@@ -43,9 +43,9 @@ def run(
     from jaximu.diagnosis import check
 
     old = load_calibration(calibration).inertial()
-    recordings, noise = log.alike(old).read_unit(logs, gravity, static)
+    recordings, known = log.alike(old).read_unit(logs, gravity, noise)
     with progress("checking"):
-        validity = check(old, recordings, gravity, static=noise, segmentation=poses.value())
+        validity = check(old, recordings, gravity, static=known, segmentation=poses.value())
     results.present(validity.summary, "check.json and report.html", check=validity)
     if fail_on == "invalid" and validity.verdict not in ("valid", "session"):
         raise SystemExit(1)

@@ -25,7 +25,7 @@ def run(
     *,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    static: options.StaticLog = None,
+    noise: options.Noise = options.NOISE,
     heldout: Annotated[Path | None, option("LOG", "Another recording of the unit, to measure the gain on.")] = None,
     reference: Annotated[
         Path | None,
@@ -77,7 +77,7 @@ def run(
     if reference is None and heldout_reference is not None:
         raise InputError("--heldout-reference goes with --reference.")
     results.prepare(*options.INERTIAL)
-    recordings, noise = log.read_unit(logs, gravity, static)
+    recordings, known = log.read_unit(logs, gravity, noise)
     other = None if heldout is None else log.read(heldout, gravity)
     from jaximu.diagnosis import diagnose, diagnose_against_attitude, diagnose_thermal, diagnose_turntable
 
@@ -101,7 +101,7 @@ def run(
             (schedule,) = references_of(others, [heldout_reference])
             held = others[0], schedule
     with progress("diagnosing"):
-        diagnosis = work(static=noise, **({} if held is None else {"heldout": held}))
+        diagnosis = work(static=known, **({} if held is None else {"heldout": held}))
     if not thermal and any(effect.rivals or effect.weak for effect in diagnosis.named):
         from jaximu.planning.separation import advised
 

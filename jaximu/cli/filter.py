@@ -50,7 +50,7 @@ def run(
     ] = None,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    static: options.StaticLog = None,
+    noise: options.Noise = options.NOISE,
     effect: options.EffectNames = (),
     repair: options.RepairFlag = False,
     results: options.Output = options.RESULTS,
@@ -76,11 +76,11 @@ def run(
     options.require_files(online, reference, magnetometer)
     results.prepare(*options.INERTIAL)
     from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
-    from jaximu.noise.at_rest import fit_noise
+    from jaximu.noise.at_rest import noise_of
 
     old = None if online is None else load_calibration(online).inertial()
     compass = None if magnetometer is None else load_calibration(magnetometer)
-    (recording,), still = log.alike(old or compass).read_unit((log_path,), gravity, static)
+    (recording,), known = log.alike(old or compass).read_unit((log_path,), gravity, noise)
     attitude = None if reference is None else read_reference(reference, log_path, recording)
     with progress("filtering" if old is None else "following"):
         if old is None:
@@ -89,14 +89,13 @@ def run(
                 gravity,
                 attitude=attitude,
                 latitude=local.latitude,
-                static=still,
+                static=known,
                 repair=repair,
                 magnetometer=compass,
                 **options.effects_of(effect),
             )
         else:
-            noise = None if still is None else fit_noise(still)
             stated = gravity if local != options.LOCAL else None
-            calibration, history = followed_in_use(old, recording, noise, stated, attitude, compass)
+            calibration, history = followed_in_use(old, recording, noise_of(known), stated, attitude, compass)
     page_of = later("report.filter", "page_of")
     results.present(lambda: page_of(calibration, history), calibration=calibration)

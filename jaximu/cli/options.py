@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from jaximu.calibration import Calibration
     from jaximu.ground.document import Document
     from jaximu.ground.page import Page
+    from jaximu.model.noise_model import NoiseModel
+    from jaximu.noise.stated import SensorNoise
     from jaximu.recordings.readers import ReadOptions
     from jaximu.recordings.recording import Recording
     from jaximu.recordings.segmentation import SegmentationOptions
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = [
     "INERTIAL",
     "LOCAL",
+    "NOISE",
     "POSES",
     "READING",
     "RESULTS",
@@ -48,12 +51,14 @@ __all__ = [
     "LogOptions",
     "Logs",
     "LossChoice",
+    "Noise",
+    "NoiseFile",
+    "NoiseOptions",
     "Output",
     "Poses",
     "Reading",
     "RepairFlag",
     "Results",
-    "StaticLog",
     "Traced",
     "beginning",
     "draw",
@@ -65,6 +70,7 @@ __all__ = [
     "print_json",
     "require_apart",
     "require_files",
+    "stated_noise",
 ]
 
 
@@ -79,7 +85,10 @@ Logs = Annotated[
     option("LOG [LOG ...]", "Recordings of one unit, in any format that jaximu reads.", name="log"),
 ]
 CalibrationFile = Annotated[Path, Positional, option("CALIBRATION", "A calibration.json that jaximu wrote.")]
-StaticLog = Annotated[Path | None, option("LOG", "A recording at rest, to measure noise and bias drift.")]
+NoiseFile = Annotated[
+    Path | None,
+    option("FILE", "Noise that is known: an allan.json, a Kalibr imu.yaml, or a SPEC as `jaximu simulate` takes it."),
+]
 LossChoice = Annotated[Literal["linear", "huber", "cauchy"], arg(help="Least squares, or robust against outliers.")]
 JsonFlag = Annotated[bool, arg(name="json", help="Print one JSON document on stdout, errors too.")]
 ForceFlag = Annotated[bool, arg(help="Replace results that would be lost: a calibration of other sensors in DIR.")]
@@ -200,18 +209,38 @@ class LogOptions:
         return ReadOptions(**stated, gravity=gravity, check=check, alone=alone)
 
     def read_unit(
-        self, paths: tuple[Path, ...], gravity: LocalGravity, static: Path | None = None, alone: bool = False
-    ) -> tuple[list[Recording], Recording | None]:
-        """Read the logs of one unit, and its recording at rest if there is one."""
+        self, paths: tuple[Path, ...], gravity: LocalGravity, noise: NoiseOptions, alone: bool = False
+    ) -> tuple[list[Recording], Recording | NoiseModel | None]:
+        """Read the logs of one unit, and its recording at rest, or the noise that is stated, if there is one."""
         if not paths:
             raise InputError("no log was given: name one or more files.")
         if self.gyro_log is not None and len(paths) > 1:
             raise InputError("--gyro-log goes with one LOG; with several, each must hold its own gyroscope.")
         with progress("reading"):
-            require_files(*paths, static)
+            require_files(*paths, noise.static, noise.noise)
             recordings = [self.read(path, gravity, alone=alone) for path in paths]
-            rest_options = replace(self, gyro_log=None)  # --gyro-log is LOG's
-            return recordings, None if static is None else rest_options.read(static, gravity)
+            return recordings, noise.value(replace(self, gyro_log=None), gravity)  # --gyro-log is LOG's
+
+
+@dataclass(frozen=True)
+class NoiseOptions:
+    """What is known of the noise, by a recording or by a file that states it."""
+
+    title: ClassVar[str] = "Options"
+    static: Annotated[Path | None, option("LOG", "A recording at rest, to measure noise and bias drift.")] = None
+    noise: NoiseFile = None
+
+    def value(self, log: LogOptions, gravity: LocalGravity) -> Recording | NoiseModel | None:
+        """Return the recording at rest, read as `log` says, or the noise that a file states."""
+        if self.static is not None and self.noise is not None:
+            raise InputError("give either --static or --noise, not both.")
+        if self.static is not None:
+            return log.read(self.static, gravity)
+        if self.noise is None:
+            return None
+        from jaximu.noise.stated import model_of
+
+        return model_of(stated_noise(self.noise))
 
 
 @dataclass(frozen=True)
@@ -440,9 +469,11 @@ def effects_of(stated: tuple[str, ...]) -> dict[str, Any]:
 Reading = Annotated[LogOptions, arg(name="")]
 Local = Annotated[GravityOptions, arg(name="")]
 Poses = Annotated[PoseOptions, arg(name="")]
+Noise = Annotated[NoiseOptions, arg(name="")]
 Traced = Annotated[TraceOptions, arg(name="")]
 Output = Annotated[Results, arg(name="")]
-READING, LOCAL, POSES, TRACED, RESULTS = LogOptions(), GravityOptions(), PoseOptions(), TraceOptions(), Results()
+READING, LOCAL, NOISE = LogOptions(), GravityOptions(), NoiseOptions()
+POSES, TRACED, RESULTS = PoseOptions(), TraceOptions(), Results()
 
 
 def require_files(*paths: Path | None) -> None:
@@ -471,6 +502,21 @@ def is_toml(path: Path) -> bool:
         return bool(tomllib.loads(beginning(path).decode("utf-8")))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError):
         return False
+
+
+def stated_noise(path: Path) -> SensorNoise:
+    """Return the figures of noise that a file states, recognised by content. Raises `InputError` for any other file."""
+    from jaximu.noise.stated import read_sensor_noise
+
+    if not is_toml(path):
+        return read_sensor_noise(path)
+    from jaximu.simulation.specification import read_specification
+
+    noise = read_specification(path).case(0).noise
+    return {
+        name: {process.letter: process.size for process in triad.processes if process.letter}
+        for name, triad in noise.items()
+    }
 
 
 def field_strength(text: str | None) -> FieldStrength | None:

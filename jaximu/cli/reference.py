@@ -35,7 +35,7 @@ def run(
     ] = None,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    static: options.StaticLog = None,
+    noise: options.Noise = options.NOISE,
     effect: options.EffectNames = (),
     loss: options.LossChoice = "linear",
     repair: options.RepairFlag = False,
@@ -53,13 +53,13 @@ def run(
     gravity = local.value()
     options.require_files(reference)
     results.prepare(*options.INERTIAL)
-    (recording,), noise = log.read_unit((log_path,), gravity, static)
+    (recording,), known = log.read_unit((log_path,), gravity, noise)
     from jaximu.calibration import calibrate_against_attitude
 
     attitude = read_reference(log_path if reference is None else reference, log_path, recording)
     with progress("calibrating"):
         calibration, measurement = calibrate_against_attitude(
-            recording, attitude, gravity, static=noise, loss=loss, repair=repair, **options.effects_of(effect)
+            recording, attitude, gravity, static=known, loss=loss, repair=repair, **options.effects_of(effect)
         )
     page_of = later("report.attitude", "page_of")
     results.present(lambda: page_of(calibration, measurement), calibration=calibration)

@@ -31,7 +31,7 @@ def run(
     *,
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    static: options.StaticLog = None,
+    noise: options.Noise = options.NOISE,
     calibration: Annotated[
         Path | None, option("CALIBRATION", "Add the thermal part to this calibration of the unit.")
     ] = None,
@@ -72,19 +72,19 @@ def run(
     from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
 
     base = None if calibration is None else load_calibration(calibration).inertial()
-    recordings, noise = log.alike(base).read_unit(logs, gravity, static)
+    recordings, known = log.alike(base).read_unit(logs, gravity, noise)
     recordings = [without_flagged(recording, path) for recording, path in zip(recordings, logs, strict=True)]
     by_hand = [turned_by_hand(recording) for recording in recordings]
     if all(by_hand):
         if base is not None or block is not None or to:
             raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
-        _give_by_hand(recordings, noise, gravity, results)
+        _give_by_hand(recordings, known, gravity, results)
         return
     if any(by_hand):
         first = str(logs[by_hand.index(True)])
         raise InputError(f"{first} is poses by hand and others are a unit at rest: give one kind at a time.")
     with progress("fitting"):
-        thermal = calibrate_thermal(recordings, static=noise, base=base, block=block)
+        thermal = calibrate_thermal(recordings, static=known, base=base, block=block)
         exports = {"px4.params": px4_parameters(thermal, sensor or 0, accel_id, gyro_id)} if "px4" in to else {}
         if "ardupilot" in to:
             exports["ardupilot.param"] = ardupilot_parameters(thermal, 1 if sensor is None else sensor)
@@ -100,13 +100,13 @@ def run(
 
 
 def _give_by_hand(
-    recordings: list[Recording], noise: Recording | None, gravity: LocalGravity, results: options.Results
+    recordings: list[Recording], known: Recording | NoiseModel | None, gravity: LocalGravity, results: options.Results
 ) -> None:
     """Fit poses and turns by hand over temperature, print the result and write it where asked."""
     from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand
 
     with progress("fitting"):
-        thermal = calibrate_thermal_by_hand(recordings, noise, gravity)
+        thermal = calibrate_thermal_by_hand(recordings, known, gravity)
     page = options.drawn("thermal_hand_held", "write_thermal_by_hand", thermal)
     show = partial(_print_by_hand, thermal)
     results.give(show, page, text=thermal.text, calibration=thermal.calibration, thermal=thermal)

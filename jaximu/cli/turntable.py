@@ -36,7 +36,7 @@ def run(
     ] = (),
     log: options.Reading = options.READING,
     local: options.Local = options.LOCAL,
-    static: options.StaticLog = None,
+    noise: options.Noise = options.NOISE,
     fit: Annotated[
         tuple[str, ...],
         UseAppendAction,
@@ -70,7 +70,7 @@ def run(
     if reference and len(reference) != len(logs):
         raise InputError(f"{len(logs)} logs need as many --reference, found {len(reference)}.")
     results.prepare(*options.INERTIAL)
-    recordings, noise = log.read_unit(logs, gravity, static, alone=True)
+    recordings, known = log.read_unit(logs, gravity, noise, alone=True)
     references = references_of(recordings, reference)
     with progress("calibrating"):
         from jaximu.calibration.turntable import calibrate_turntable
@@ -81,7 +81,7 @@ def run(
             recordings,
             references,
             gravity,
-            static=noise,
+            static=known,
             effects=list(dict.fromkeys(wanted)),
             latitude=local.latitude if earth_rotation == "known" else None,
             loss=loss,

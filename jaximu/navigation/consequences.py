@@ -11,7 +11,6 @@ the path; of bias that changes at a power-on it knows nothing, but for a repeata
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,35 +26,30 @@ from jaximu.calibration import Calibration
 from jaximu.data.preintegration import increments
 from jaximu.estimation.problem import Name, names_of
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document, damage
+from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.stored import compiled
 from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
-from jaximu.model.data_sheet import SI_UNITS, convert
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
 from jaximu.navigation import Navigation, deviation, linearised, mechanise, noise_covariance
 from jaximu.navigation.trajectory import Trajectory
-from jaximu.noise.analysis import read_analysis
+from jaximu.noise.stated import SensorNoise
 from jaximu.planning.goals import group_of
 from jaximu.planning.information import root_of
-from jaximu.recordings.readers.kalibr import read_noise
 
 __all__ = [
     "NOISE_WORDS",
     "Consequences",
     "MonteCarlo",
     "Run",
-    "SensorNoise",
     "consequences",
     "kind_of",
     "position",
     "prepared",
-    "read_sensor_noise",
-    "sensor_noise",
 ]
 
 SCHEMA = "jaximu.consequences/1"
@@ -71,58 +65,8 @@ NOISE_WORDS = {
     "K": "rate random walk K",
     "repeatability": "bias repeatability",
 }
-SensorNoise = Mapping[str, Mapping[str, FloatArray]]
-"""By triad and term (N, B, K, repeatability), the figure of each axis (3,), SI, two-sided."""
 _TOGETHER = 25
 """Draws that are mechanised side by side; more do not fit into the caches."""
-
-
-def read_sensor_noise(path: str | os.PathLike[str]) -> dict[str, dict[str, FloatArray]]:
-    """Read N, B, K and repeatability from an `allan.json`, or N and K from Kalibr's `imu.yaml`, whose keys fix units.
-
-    Raises `InputError` for anything else, or without units.
-    """
-    name = os.fspath(path)
-    if name.lower().endswith((".yaml", ".yml")):
-        known = read_noise(path)
-        figures = {
-            triad: {"N": known.get(f"{triad}_noise_density"), "K": known.get(f"{triad}_random_walk")}
-            for triad in INERTIAL_QUANTITIES
-        }
-        return {
-            triad: {term: np.full(3, value) for term, value in terms.items() if value}
-            for triad, terms in figures.items()
-        }
-    return sensor_noise(read_analysis(path), name)
-
-
-def sensor_noise(document: Mapping[str, Any], name: str) -> dict[str, dict[str, FloatArray]]:
-    """Return N, B, K and repeatability of an `allan.json` as a dictionary, called `name`; as `read_sensor_noise`."""
-    figures: dict[str, dict[str, FloatArray]] = {}
-    for triad, quantity in INERTIAL_QUANTITIES.items():
-        axes = document.get(triad)
-        if axes is None:
-            continue
-        units, terms = SI_UNITS[quantity], {}
-        with damage(name):
-            for term in ("N", "B", "K"):
-                entries = [axis["terms"].get(term) for axis in axes]
-                values = [
-                    0.0 if entry is None else _in_si(entry, units[term], f"{name}: {triad} {term}") for entry in entries
-                ]
-                terms[term] = np.array(values, float).reshape(3)
-            spread = (document.get("repeatability") or {}).get(triad)
-            if spread is not None:
-                terms["repeatability"] = np.reshape(_in_si(spread, units["B"], f"{name}: {triad} repeatability"), 3)
-        figures[triad] = {term: values for term, values in terms.items() if np.any(values)}
-    return figures
-
-
-def _in_si(entry: Any, unit: str, what: str) -> Any:
-    stated = entry.get("unit")
-    if not isinstance(stated, str):
-        raise InputError(f"{what} has no unit: state it, such as {unit}.")
-    return convert(entry["value"], stated, unit)
 
 
 def kind_of(name: Name, model: Imu) -> str:
