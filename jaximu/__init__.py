@@ -19,22 +19,36 @@ from jaximu._version import __version__
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
+    from jaximu.acceptance import accept
+    from jaximu.acceptance.verify import verify
     from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
+    from jaximu.calibration import calibrate_against_attitude as reference
+    from jaximu.calibration import calibrate_array as array
+    from jaximu.calibration import calibrate_by_filter as filter
+    from jaximu.calibration import calibrate_magnetometer as magnetometer
+    from jaximu.calibration import calibrate_thermal as thermal
+    from jaximu.calibration import calibrate_turntable as turntable
     from jaximu.data.poses import observe, stack
     from jaximu.diagnosis import check, diagnose
     from jaximu.estimation.fitting import Fit, Prior, fit
     from jaximu.estimation.problem import Parameters, Problem
     from jaximu.estimation.solver import solve
+    from jaximu.fleets import run_fleet as fleet
     from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
     from jaximu.ground.gravity import LocalGravity, parse_gravity, wgs84_gravity
     from jaximu.ground.stored import cache
     from jaximu.model.effects import CATALOGUE, Effect, register
     from jaximu.model.sensor import Imu, Triad
     from jaximu.model.stimulus import Stimulus
+    from jaximu.navigation.consequences import consequences
+    from jaximu.noise.analysis import analyse_noise as allan
+    from jaximu.planning import propose as plan
+    from jaximu.planning.budget import budget
     from jaximu.recordings import write_recording
     from jaximu.recordings.readers import ReadOptions, read_recording
     from jaximu.recordings.recording import Recording, Signal
     from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, segment
+    from jaximu.report.export import export
     from jaximu.simulation import simulate
 
 __all__ = [
@@ -58,21 +72,35 @@ __all__ = [
     "Stimulus",
     "Triad",
     "__version__",
+    "accept",
+    "allan",
+    "array",
+    "budget",
     "cache",
     "calibrate",
     "check",
     "compensate",
+    "consequences",
     "diagnose",
+    "export",
+    "filter",
     "fit",
+    "fleet",
     "load_calibration",
+    "magnetometer",
     "observe",
     "parse_gravity",
+    "plan",
     "read_recording",
+    "reference",
     "register",
     "segment",
     "simulate",
     "solve",
     "stack",
+    "thermal",
+    "turntable",
+    "verify",
     "wgs84_gravity",
     "write_recording",
 ]

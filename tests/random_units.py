@@ -1276,7 +1276,7 @@ def consequences(draw: Draw) -> None:
     line = ["consequences", str(calibration), "--duration", str(draw.pick("seconds", [20, 60]))]
     if draw.chance("noise", 0.5):
         noise = draw.prepared(["allan", str(unit.at_rest(5.0, 25.0)), *draw.reading.options], "noise")
-        line += ["--allan", str(noise / "allan.json")]
+        line += ["--noise", str(noise / "allan.json")]
     more = draw.pick("along", ["driving", "log", "specification", "against", "estimators"])
     if more in ("log", "estimators"):
         line += ["--path", str(unit.another("path", 1)), *draw.reading.options]

@@ -156,7 +156,7 @@ def test_the_command_writes_what_it_prints(unit, tmp_path, capsys):
     (tmp_path / "spec.toml").write_text(SPECIFICATION)
     noise = noise_file(tmp_path / "allan.json")
     line = ["consequences", str(tmp_path / "calibration.json"), "--path", str(tmp_path / "spec.toml"), "--draws", "25",
-            "--duration", "12", "--allan", str(noise)]  # fmt: skip
+            "--duration", "12", "--noise", str(noise)]  # fmt: skip
     assert main([*line, "--json", "-o", str(tmp_path / "out")]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document == json.loads((tmp_path / "out" / "consequences.json").read_text())

@@ -314,7 +314,7 @@ def test_the_command_writes_the_estimators_files(tmp_path, capsys):
     (tmp_path / "imu.yaml").write_text(PUBLISHED)
     assert read_sensor_noise(tmp_path / "imu.yaml")["gyroscope"]["K"] == pytest.approx(2e-5)
     line = ["consequences", str(tmp_path / "calibration.json"), "--draws", "0"]
-    path = [*line, "--path", str(tmp_path / "spec.toml"), "--allan", str(tmp_path / "imu.yaml")]
+    path = [*line, "--path", str(tmp_path / "spec.toml"), "--noise", str(tmp_path / "imu.yaml")]
     assert main([*path, "--noise-for", "vins-fusion,gtsam", "--json", "-o", str(tmp_path / "out")]) == 0
     document = json.loads(capsys.readouterr().out)
     found = document["estimator_noise"]
@@ -325,13 +325,13 @@ def test_the_command_writes_the_estimators_files(tmp_path, capsys):
     assert json.loads((tmp_path / "out" / "estimator_noise.json").read_text())["nees"] == found["nees"]
     assert document["schema"] == "jaximu.consequences/1"
     for wrong, status, said in (
-        ([*line, "--noise-for", "gtsam"], 2, "--allan"),
+        ([*line, "--noise-for", "gtsam"], 2, "--noise"),
         ([*path, "--noise-for", "gtsma"], 2, "did you mean gtsam"),
         ([*path, "--noise-for", " , "], 2, "names no estimator"),
         ([*path, "--noise-for", "px4", "--noise-interval", "20"], 1, "too short|states are 20 s apart"),
         ([*path, "--reference", str(tmp_path / "imu.yaml")], 2, "--reference goes with --path LOG"),
-        ([*line, "--noise-for", "px4", "--allan", str(noise_file(tmp_path / "a.json", ""))], 2, "no unit"),
-        ([*line, "--noise-for", "px4", "--allan", str(noise_file(tmp_path / "b.json"))], 1, "accelerometer_noise"),
+        ([*line, "--noise-for", "px4", "--noise", str(noise_file(tmp_path / "a.json", ""))], 2, "no unit"),
+        ([*line, "--noise-for", "px4", "--noise", str(noise_file(tmp_path / "b.json"))], 1, "accelerometer_noise"),
     ):
         assert main(wrong) == status
         assert re.search(said, capsys.readouterr().err), said
@@ -347,7 +347,7 @@ def test_the_command_takes_a_reference(tmp_path, capsys):
                comments="")  # fmt: skip
     calibration_of(Imu.nominal()).save(tmp_path / "calibration.json")
     (tmp_path / "imu.yaml").write_text(PUBLISHED)
-    line = ["consequences", str(tmp_path / "calibration.json"), "--path", str(log), "--allan",
+    line = ["consequences", str(tmp_path / "calibration.json"), "--path", str(log), "--noise",
             str(tmp_path / "imu.yaml"), "--noise-for", "px4", "--draws", "0", "--duration", "40", "--json"]  # fmt: skip
     assert main([*line, "--reference", str(tracker), "-o", str(tmp_path / "out")]) == 0
     found = json.loads(capsys.readouterr().out)["estimator_noise"]

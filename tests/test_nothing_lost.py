@@ -407,7 +407,7 @@ compensate CALIBRATION X -o OUT; allan X; turntable X; turntable LOG --reference
 reference LOG --reference X; array X X; filter X; filter LOG --online X; filter LOG --magnetometer X; magnetometer X
 magnetometer LOG --mag-log X; magnetometer LOG --calibration X; magnetometer LOG --check X; plan X; budget X; thermal X
 thermal LOG --calibration X; export X --to px4; export CALIBRATION --to kalibr --noise X; consequences X
-consequences CALIBRATION --path X; consequences CALIBRATION --allan X; accept X --limits LIMITS
+consequences CALIBRATION --path X; consequences CALIBRATION --noise X; accept X --limits LIMITS
 accept CALIBRATION --limits X; accept CALIBRATION --limits LIMITS --noise X; verify X; simulate X -o OUT
 record --from X -o OUT; fleet LOG -o X
 """

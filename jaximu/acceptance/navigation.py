@@ -19,8 +19,9 @@ from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
 from jaximu.ground.distributions import normal_isf
 from jaximu.ground.errors import NotPossibleError
-from jaximu.navigation.consequences import consequences, sensor_noise
+from jaximu.navigation.consequences import consequences
 from jaximu.navigation.trajectory import Place, level_driving
+from jaximu.noise.stated import sensor_noise
 from jaximu.planning.information import gravity_sensitivity
 
 __all__ = ["navigation_items"]

@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from jaximu.navigation.consequences import Consequences
     from jaximu.navigation.estimator_noise import EstimatorNoise, MeasuredErrors
     from jaximu.navigation.trajectory import Place, Trajectory
+    from jaximu.noise.stated import SensorNoise
 
 __all__ = ["run"]
 
@@ -30,7 +31,7 @@ def run(
     /,
     *,
     path: Annotated[Path | None, option("SPEC|LOG", "The path (default: ten minutes of level driving).")] = None,
-    allan: Annotated[Path | None, option("ALLAN.JSON", "Noise, as jaximu allan -o DIR writes it.")] = None,
+    noise_file: options.NoiseFile = None,
     against: Annotated[Path | None, option("CALIBRATION", "Compare with another calibration of the unit.")] = None,
     duration: Annotated[
         float | None, option("S", "Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
@@ -70,27 +71,27 @@ def run(
 
     Examples:
       jaximu consequences results/calibration.json
-      jaximu consequences results/calibration.json --allan noise/allan.json --path flight.csv -o consequences
+      jaximu consequences results/calibration.json --noise noise/allan.json --path flight.csv -o consequences
       jaximu consequences results/calibration.json --against old/calibration.json --duration 60
-      jaximu consequences results/calibration.json --path flight.csv --allan noise/allan.json --noise-for vins,gtsam
+      jaximu consequences results/calibration.json --path flight.csv --noise noise/allan.json --noise-for vins,gtsam
 
     """
-    options.require_files(calibration, path, allan, against, reference)
+    options.require_files(calibration, path, noise_file, against, reference)
     if duration is not None and not 0 < duration < math.inf:
         raise InputError(f"--duration: {duration:g} is no number of seconds.")
     if draws < 0 or seed < 0:
         raise InputError("--draws and --seed count from 0 up.")
     if temperature is not None and path is not None:
         raise InputError("--temperature goes with level driving; a SPEC or LOG states the temperature.")
-    targets = _targets(noise_for, allan, reference, path)
+    targets = _targets(noise_for, noise_file, reference, path)
     results.prepare()
     from jaximu.calibration import load_calibration
-    from jaximu.navigation.consequences import consequences, read_sensor_noise
+    from jaximu.navigation.consequences import consequences
     from jaximu.navigation.trajectory import Place
 
     model = load_calibration(calibration)
     other = None if against is None else load_calibration(against)
-    noise = None if allan is None else read_sensor_noise(allan)
+    noise = None if noise_file is None else options.stated_noise(noise_file)
     _require_densities(targets, noise or {})
     gravity = model.gravity if local == options.LOCAL else local.value()
     site = Place(_LATITUDE if local.latitude is None else local.latitude, local.height, gravity)
@@ -140,7 +141,7 @@ def run(
     )
 
 
-def _targets(text: str | None, allan: Path | None, reference: Path | None, path: Path | None) -> list[str]:
+def _targets(text: str | None, noise_file: Path | None, reference: Path | None, path: Path | None) -> list[str]:
     """Return the estimators asked for. Raises `InputError` where what they need is not stated."""
     from jaximu.report.export.noise import target
 
@@ -151,15 +152,15 @@ def _targets(text: str | None, allan: Path | None, reference: Path | None, path:
     targets = list(dict.fromkeys(target(name) for name in text.split(",") if name.strip()))
     if not targets:
         raise InputError("--noise-for names no estimator.")
-    if allan is None:
+    if noise_file is None:
         raise InputError(
-            "--noise-for multiplies known noise: give --allan allan.json, which `jaximu allan LOG -o DIR` writes, or a "
+            "--noise-for multiplies known noise: give --noise allan.json, which `jaximu allan LOG -o DIR` writes, or a "
             "Kalibr imu.yaml with the data sheet's figures."
         )
     return targets
 
 
-def _require_densities(targets: list[str], noise: dict[str, Any]) -> None:
+def _require_densities(targets: list[str], noise: SensorNoise) -> None:
     """Raise `NotPossibleError`, before anything is computed, where an estimator needs noise that is not known."""
     from jaximu.report.export.noise import noise_values
 

@@ -87,7 +87,11 @@ Logs = Annotated[
 CalibrationFile = Annotated[Path, Positional, option("CALIBRATION", "A calibration.json that jaximu wrote.")]
 NoiseFile = Annotated[
     Path | None,
-    option("FILE", "Noise that is known: an allan.json, a Kalibr imu.yaml, or a SPEC as `jaximu simulate` takes it."),
+    option(
+        "FILE",
+        "Noise that is known: an allan.json, a Kalibr imu.yaml, or a SPEC as `jaximu simulate` takes it.",
+        name="noise",
+    ),
 ]
 LossChoice = Annotated[Literal["linear", "huber", "cauchy"], arg(help="Least squares, or robust against outliers.")]
 JsonFlag = Annotated[bool, arg(name="json", help="Print one JSON document on stdout, errors too.")]

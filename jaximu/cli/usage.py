@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from types import UnionType
 
+from jaximu.cli.messages import say
 from jaximu.ground.errors import InputError
 
 __all__ = [
@@ -52,6 +53,8 @@ class OptionHelp:
         return not self.names
 
 
+_RENAMED = {"--allan": "--noise"}
+"""Options by their former names, which go on working until the next version."""
 COMMON = (
     OptionHelp(("--quiet", "-q"), "", "Say nothing on stderr but errors.", "Output"),
     OptionHelp(
@@ -164,7 +167,11 @@ def check_options(name: str, run: Callable[..., None], arguments: Sequence[str])
     valued = [text for option in options if option.metavar for text in option.names if text.startswith("--")]
     line: list[str] = []
     for text in arguments:
-        option = text.partition("=")[0]
+        option, *value = text.split("=", 1)
+        renamed = _RENAMED.get(option)
+        if renamed in known and option not in known:
+            say(f"{option} is called {renamed} now.")
+            option, text = renamed, "=".join([renamed, *value])
         if re.fullmatch(r"--[a-z][\w-]*", option) and option.replace("_", "-") not in known:
             near = difflib.get_close_matches(option, known, 1, 0.5)
             hint = f"; did you mean {near[0]}?" if near else "."

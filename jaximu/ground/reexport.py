@@ -23,15 +23,16 @@ def lazily(package: str) -> Callable[[str], Any]:
     """Return a package's `__getattr__` (PEP 562): its names are those that it imports `if TYPE_CHECKING`."""
 
     @cache
-    def homes() -> dict[str, str]:
+    def homes() -> dict[str, tuple[str, str]]:
         tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8"))
         (guarded,) = (node for node in tree.body if isinstance(node, ast.If))
         imports = [node for node in guarded.body if isinstance(node, ast.ImportFrom)]
-        return {alias.name: str(node.module) for node in imports for alias in node.names}
+        return {alias.asname or alias.name: (str(node.module), alias.name) for node in imports for alias in node.names}
 
     def get(name: str) -> Any:
         if name not in homes():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(homes()[name]), name)
+        module, called = homes()[name]
+        return getattr(import_module(module), called)
 
     return get

@@ -353,7 +353,7 @@ def _identity(name: Name, model: Imu) -> tuple:
 def _notes(calibration: Calibration, noise: SensorNoise | None) -> list[str]:
     notes = []
     if not noise:
-        notes.append("no noise is in the budget: give --allan allan.json, which `jaximu allan LOG -o DIR` writes.")
+        notes.append("no noise is in the budget: give --noise allan.json, which `jaximu allan LOG -o DIR` writes.")
     if calibration.from_data_sheet:
         notes.append(
             f"the calibration has the {listed(calibration.from_data_sheet)} of a data sheet, whose errors are not in "
@@ -404,7 +404,8 @@ def _draw(run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise,
     root = root_of(run.covariance)
     streams = [
         Noise(
-            tuple(_PROCESSES[term](figure) for term, figure in noise.get(triad, {}).items()), INERTIAL_QUANTITIES[triad]
+            tuple(_PROCESSES[term](figure) for term, figure in noise.get(triad, {}).items() if term in _PROCESSES),
+            INERTIAL_QUANTITIES[triad],
         )
         for triad in ("gyroscope", "accelerometer")
     ]

@@ -46,8 +46,9 @@ from jaximu.model import BiasInstability
 from jaximu.model.mounting import Mounting
 from jaximu.model.sensor import Imu
 from jaximu.navigation import noise_covariance
-from jaximu.navigation.consequences import NOISE_WORDS, Run, SensorNoise, kind_of, prepared
+from jaximu.navigation.consequences import NOISE_WORDS, Run, kind_of, prepared
 from jaximu.navigation.trajectory import Trajectory
+from jaximu.noise.stated import SensorNoise
 from jaximu.planning.information import root_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording
