@@ -69,3 +69,13 @@ def test_two_sources_and_files_that_state_none_are_refused(folder, capsys):
     assert "either --static or --noise" in capsys.readouterr().err
     assert main(["calibrate", log, "--noise", log]) == 2
     assert "is not an allan.json" in capsys.readouterr().err
+
+
+def test_the_former_name_of_an_option_works_and_is_said(folder, tmp_path, capsys):
+    assert main(["calibrate", str(folder / "log.parquet"), "-o", str(tmp_path)]) == 0
+    line = ["consequences", str(tmp_path / "calibration.json"), "--draws", "0", "--duration", "10", "--json"]
+    assert main([*line, "--allan", str(folder / "allan.json")]) == 0
+    former = capsys.readouterr()
+    assert "--allan is called --noise now." in former.err
+    assert main([*line, "--noise", str(folder / "allan.json")]) == 0
+    assert capsys.readouterr().out == former.out

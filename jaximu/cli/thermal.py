@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from jaximu.calibration import ThermalCalibration
     from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
     from jaximu.ground.gravity import LocalGravity
+    from jaximu.model.noise_model import NoiseModel
     from jaximu.recordings.recording import Recording
     from jaximu.report.export.thermal_autopilot import AutopilotParameters
 

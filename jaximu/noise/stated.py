@@ -86,7 +86,8 @@ def model_of(figures: SensorNoise) -> NoiseModel:
             raise InputError(f"the {triad}'s white noise N is not stated for each axis: without it no fit has weights.")
     if "accelerometer" not in figures:
         raise InputError("the file states no noise of an accelerometer.")
-    return NoiseModel(**{triad: _axis_noise(terms) for triad, terms in figures.items()})
+    noise = {triad: _axis_noise(terms) for triad, terms in figures.items()}
+    return NoiseModel(noise["accelerometer"], noise.get("gyroscope"))
 
 
 def _axis_noise(terms: Mapping[str, FloatArray]) -> AxisNoise:
