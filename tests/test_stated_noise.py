@@ -73,6 +73,7 @@ def test_two_sources_and_files_that_state_none_are_refused(folder, capsys):
 
 def test_the_former_name_of_an_option_works_and_is_said(folder, tmp_path, capsys):
     assert main(["calibrate", str(folder / "log.parquet"), "-o", str(tmp_path)]) == 0
+    capsys.readouterr()
     line = ["consequences", str(tmp_path / "calibration.json"), "--draws", "0", "--duration", "10", "--json"]
     assert main([*line, "--allan", str(folder / "allan.json")]) == 0
     former = capsys.readouterr()
