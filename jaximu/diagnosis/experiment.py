@@ -74,6 +74,16 @@ class State:
         return self.model.with_effects()
 
     @property
+    def fitted(self) -> NDArray[np.intp]:
+        """The places (p,) among `names` of the numbers that were free, the columns of the evidence's Jacobian."""
+        return np.flatnonzero(np.diag(self.covariance) > 0)
+
+    @property
+    def fitted_sizes(self) -> FloatArray:
+        """The sizes (p,) that the Jacobian's columns are in units of."""
+        return np.asarray(self.linear.sizes, np.float64)[self.fitted]
+
+    @property
     def effects(self) -> tuple[Effect, ...]:
         """The effects that were fitted."""
         return tuple(self.model.all_effects().values())

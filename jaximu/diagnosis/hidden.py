@@ -1,0 +1,70 @@
+"""What could hide in a recording without being noticed, and by how much it would shift what was calibrated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaximu.diagnosis.evidence import EffectBlock
+from jaximu.diagnosis.experiment import State
+from jaximu.ground.array_types import FloatArray
+
+__all__ = ["Hidden", "hidden_causes", "shift_by"]
+
+_NOTHING = 0.05
+"""Standard deviations below which a shift is not listed."""
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A cause as large as its detection limit: `limit` in `unit`, and the shift of each number that it would move.
+
+    shift: by the number's name, in its standard deviations, root mean square over the directions of the coefficients.
+    """
+
+    name: str
+    limit: float
+    unit: str
+    shift: dict[str, float]
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The number that would be shifted most, and by how many standard deviations; ("", 0) where none would."""
+        return max(self.shift.items(), key=lambda item: item[1], default=("", 0.0))
+
+
+def shift_by(state: State, block: EffectBlock) -> FloatArray:
+    """Return the shift (p, q) of each fitted number by each coefficient of an effect that the model lacks.
+
+    Both in their own units. The effect adds its whitened column C to the conditions, and a fit without it makes up for
+    that, to first order by −(JᵀJ)⁻¹JᵀC (the minimal detectable bias carried to the parameters: Baarda 1968; Teunissen
+    2006).
+    """
+    moved = -np.linalg.lstsq(state.evidence.jacobian, block.columns, rcond=None)[0]
+    return np.asarray(moved * state.fitted_sizes[:, None] / block.sizes, np.float64)
+
+
+def hidden_causes(state: State) -> list[Hidden]:
+    """Return each cause at its detection limit and what it would do, the worst first."""
+    causes = [Hidden(name, limit, unit, _shifts(state, name, limit)) for name, (limit, unit) in state.limits.items()]
+    return sorted(causes, key=lambda cause: -cause.worst[1])
+
+
+def _shifts(state: State, name: str, limit: float) -> dict[str, float]:
+    """Return the shifts by a cause, wherever on its grid it does most."""
+    sigmas = np.sqrt(np.maximum(np.diag(state.covariance), 0.0))[state.fitted]
+    largest = np.max([_spread(shift_by(state, block)) for block in _blocks(state, name)], axis=0)
+    sizes = limit * largest / np.where(sigmas > 0, sigmas, np.inf)
+    names = [str(state.names[row]) for row in state.fitted]
+    return {number: float(size) for number, size in zip(names, sizes, strict=True) if size >= _NOTHING}
+
+
+def _spread(shift: FloatArray) -> FloatArray:
+    """Return the root mean square (p,) over coefficient vectors of length one and random direction."""
+    return np.sqrt(np.mean(shift**2, axis=1))
+
+
+def _blocks(state: State, name: str) -> Iterator[EffectBlock]:
+    return (block for block in state.evidence.blocks if block.name == name and block.kind == "effect")
