@@ -421,6 +421,7 @@ def test_command_writes_report_picture_and_json(specification, tmp_path, capsys)
     assert "tilt of the table" in page and "Not reached" in page and "is assumed" in page
     assert main(["budget", specification]) == 0
     text = capsys.readouterr().out
+    assert "its goal is 0.1 mg (0.98 mm/s²)" in text and "--check" not in text
     assert "accelerometer bias z" in text and "instead of 0.03°" in text
 
 

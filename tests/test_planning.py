@@ -489,6 +489,15 @@ def test_plan_writes_a_page_and_a_schedule(specification, tmp_path, capsys):
     assert "gyro.g_sensitivity[8]" in page and ">nan" not in page
 
 
+def test_a_plan_for_one_parameter_names_it_first(specification, capsys):
+    parameter = ("--parameter", "accelerometer.gain[1,0]")
+    assert main(["plan", specification, "--equipment", "table", "--poses", "6", *parameter]) == 0
+    printed = capsys.readouterr().out
+    assert "shrink the uncertainty of the accelerometer misalignment y from x" in printed
+    rows = printed.partition("times smaller")[2].splitlines()
+    assert rows[2].startswith("accelerometer misalignment y from x")
+
+
 def refused(capsys, *arguments) -> str:
     assert main(["plan", *arguments]) == 2
     printed = capsys.readouterr()

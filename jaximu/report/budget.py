@@ -145,9 +145,9 @@ def _verdict(budget: Budget) -> Iterator[str]:
 
 def _number(budget: Budget) -> tuple[str, str]:
     """Return the standard deviation that is farthest from its goal; without goals, the dominant source's mean share."""
-    missing = {goal.worst: goal for goal in budget.goals if budget.determined[budget.names.index(goal.worst)]}
-    if missing:
-        goal = max(missing.values(), key=lambda goal: _total(budget, goal) / goal.size)
+    shown = {goal.worst: goal for goal in budget.goals if budget.determined[budget.names.index(goal.worst)]}
+    if shown:
+        goal = max(shown.values(), key=lambda goal: _total(budget, goal) / goal.size)
         meaning = f"standard deviation (1σ) of the {describe(goal.worst, budget.imu)}; its goal is {_wanted(goal)}"
         return amount(_total(budget, goal), goal.unit), meaning
     known = budget.determined

@@ -41,7 +41,7 @@ def page_of(proposal: Proposal) -> Page:
     poses = f"{len(proposal.poses)} poses {equipment.words}"
     return Page(
         f"{poses} to record next, {equipment.rest:g} s each",
-        (_gain(proposal), _determined(proposal)),
+        tuple(_verdict(proposal)),
         f"{_times(proposal.gain)}×",
         f"smaller uncertainty expected than with {Path(proposal.source).name} alone",
         (
@@ -63,36 +63,33 @@ def _times(ratio: float) -> str:
     return plain(float(f"{ratio:.3g}"))
 
 
-def _gain(proposal: Proposal) -> str:
-    """Say how many times smaller the uncertainties become."""
-    if isinstance(proposal.criterion, Name):
-        what = f"the uncertainty of the {describe(proposal.criterion, proposal.imu)} {_times(proposal.gain)} times"
-    else:
-        what = f"the uncertainties {_times(proposal.gain)} times on average"
-    return f"These {len(proposal.poses)} poses shrink {what}."
+def _verdict(proposal: Proposal) -> Iterator[str]:
+    """Say how many times smaller the uncertainties become, and how many parameters all data together determine."""
+    name = _parameter(proposal)
+    what = "the uncertainties" if name is None else f"the uncertainty of the {describe(name, proposal.imu)}"
+    average = " on average" * (name is None)
+    yield f"These {len(proposal.poses)} poses shrink {what} {_times(proposal.gain)} times{average}."
+    count = len(proposal.names)
+    determined = "all" if proposal.rank == count else f"{proposal.rank} of"
+    yield f"Together with what is known they determine {determined} {count} parameters."
 
 
-def _determined(proposal: Proposal) -> str:
-    """Say how many parameters all data together determine."""
-    count, rank = len(proposal.names), proposal.rank
-    if rank == count:
-        return f"Together with what is known they determine all {count} parameters."
-    return f"Together with what is known they determine {rank} of {count} parameters."
+def _parameter(proposal: Proposal) -> Name | None:
+    """Return the parameter whose uncertainty is the criterion; None where it is that of all."""
+    return next((name for name in proposal.names if name == proposal.criterion), None)
 
 
 def _criterion(proposal: Proposal) -> str:
     """Say what the criterion was, becomes, and what rounding the angles costs."""
-    criterion = proposal.criterion
-    what = (
-        f"the standard deviation of the {describe(criterion, proposal.imu)}"
-        if isinstance(criterion, Name)
-        else _CRITERIA[criterion]
-    )
-    loss = 100 * proposal.rounding_loss
-    cost = f"makes it larger by {loss:.2g} %" if loss > 0.005 else "costs nothing"
-    rounding = "" if proposal.equipment.in_sequence else f" Rounding the angles {cost}."
     before, after = number(proposal.criterion_before), number(proposal.criterion_after)
-    return f"The poses minimise {what}, which falls from {before} to {after}.{rounding}"
+    if _parameter(proposal) is None:
+        text = f"The poses minimise {_CRITERIA[proposal.criterion]}, which falls from {before} to {after}."
+    else:
+        text = "The poses minimise the standard deviation in the first row."
+    if proposal.equipment.in_sequence:
+        return text
+    loss = 100 * proposal.rounding_loss
+    return f"{text} Rounding the angles {f'makes it larger by {loss:.2g} %' if loss > 0.005 else 'costs nothing'}."
 
 
 def _instructions(proposal: Proposal) -> Iterator[str]:
@@ -166,15 +163,15 @@ def _parameters(proposal: Proposal) -> Table:
     def interval(name: Name, sigma: float) -> str:
         return f"± {spoken_amount(name, Z95 * sigma, proposal.imu)}"
 
+    first = _parameter(proposal)
     sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
     rows = [
         (describe(name, proposal.imu), interval(name, before), interval(name, after), f"{_times(before / after)}×")
-        for name, before, after in sorted(sigmas, key=lambda row: -row[1] / row[2])
+        for name, before, after in sorted(sigmas, key=lambda row: (row[0] != first, -row[1] / row[2]))
     ]
-    caption = (
-        f"{_criterion(proposal)} A prediction from the noise, to first order, without errors of the set-up; ± is 95 %."
-    )
-    return Table(("parameter", "known", "after these poses", "times smaller"), rows, caption, brief=8)
+    headers = ("parameter", "known", "after these poses", "times smaller")
+    caption = "A prediction from the noise, to first order, without errors of the set-up; ± is 95 %."
+    return Table(headers, rows, f"{_criterion(proposal)} {caption}", [0] if first else [], brief=8)
 
 
 def _open(proposal: Proposal) -> Iterator[Section]:
