@@ -140,7 +140,7 @@ def _verdict(budget: Budget) -> Iterator[str]:
     parts[0] = f"{parts[0]} of {counted(len(known), 'parameter')}"
     yield f"Largest source of uncertainty: {listed(parts)}."
     if lost := len(budget.names) - len(known):
-        yield f"This scheme does not determine {counted(lost, 'parameter')} more."
+        yield f"This scheme does not determine {counted(lost, 'other parameter')}."
 
 
 def _number(budget: Budget) -> tuple[str, str]:
@@ -167,7 +167,8 @@ def _total(budget: Budget, goal: Goal) -> float:
 def _wanted(goal: Goal) -> str:
     """Return a goal as it was stated, and in the unit of the page where that is another."""
     stated, shown = _stated(goal.text), amount(goal.size, goal.unit)
-    return stated if stated == shown else f"{stated} ({shown})"
+    same = re.sub(r"^[\d.]+", "", stated) == re.sub(r"^[\d.]+", "", shown)
+    return stated if same else f"{stated} ({shown})"
 
 
 def _stated(size: str) -> str:
@@ -179,7 +180,7 @@ def _next(budget: Budget) -> str:
     """Say what to run: again with better sources, with simulated sessions, or the calibration."""
     source = shlex.quote(budget.source)
     if not all(goal.reached for goal in budget.goals):
-        return f"make a source smaller in the specification and run `jaximu budget {source}` once more."
+        return f"improve the set-up in the specification and run `jaximu budget {source}` once more."
     if budget.check is None:
         return f"`jaximu budget {source} --check 2000` compares the budget with simulated sessions."
     return "`jaximu turntable LOG --reference schedule.csv -o RESULTS` calibrates a session on this set-up."
