@@ -83,7 +83,7 @@ def main() -> None:
             f"{draws} sessions, {found.check.failed} not converged, {seconds:.0f} s in all. Ratio on average "
             f"{ratio.mean():.4f}, farthest from one by {100 * worst:.1f} %; chance alone is "
             f"{100 / np.sqrt(2 * draws):.1f} % (1σ) for each. "
-            + " ".join(goal_words(found, goal) for goal in found.goals)
+            + " ".join(f"{goal.name} to {goal.text}: {goal_words(found, goal)}" for goal in found.goals)
         )
         compared = Table(
             f"{name}: budget and Monte Carlo, 1σ", ["parameter", "budget", "Monte Carlo", "ratio", "of"], note

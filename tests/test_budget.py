@@ -418,10 +418,11 @@ def test_command_writes_report_picture_and_json(specification, tmp_path, capsys)
     assert json.loads((out / "budget.json").read_text()) == printed
     assert [goal["reached"] for goal in printed["goals"]] == [False, True]
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert "tilt of the table" in page and "not reached" in page and "is assumed" in page
+    assert "tilt of the table" in page and "Not reached" in page and "is assumed" in page
     assert main(["budget", specification]) == 0
     text = capsys.readouterr().out
-    assert "accelerometer bias z" in text and "instead of 0.03 deg" in text
+    assert "its goal is 0.1 mg (0.98 mm/s²)" in text and "--check" not in text
+    assert "accelerometer bias z" in text and "instead of 0.03°" in text
 
 
 def test_command_refuses(specification, tmp_path, capsys):

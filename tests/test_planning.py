@@ -1,6 +1,7 @@
 """Planning: the information against the real problem, optima against theory, predictions against estimates."""
 
 import json
+import re
 from dataclasses import replace
 
 import jax
@@ -314,16 +315,86 @@ def test_coarser_angles_cost_more():
     assert coarse.rounding_loss > 10 * abs(fine.rounding_loss) and abs(fine.rounding_loss) < 1e-3
 
 
+def decoded(words: str) -> np.ndarray:
+    """The body direction that points up, from the words alone."""
+    match = re.fullmatch(
+        r"on its (top|bottom|[+−][xyz] side) \(([xyz]) (up|down)\)(?:, (.*) lifted by ([\d.]+)°)?", words
+    )
+    assert match is not None, words
+    lies_on, axis, way, lifted, tilt = match.groups()
+    below = {"top": "+z", "bottom": "−z"}.get(lies_on, lies_on.removesuffix(" side"))
+    assert below == ("−" if way == "up" else "+") + axis  # both say the same
+
+    def along(name: str) -> np.ndarray:
+        return (1.0 if name[0] == "+" else -1.0) * np.eye(3)["xyz".index(name[1])]
+
+    if lifted is None:
+        return -along(below)
+    if edge := re.fullmatch(r"edge ([\d.]+)° from (..) towards (..)", lifted):
+        first, second, angle = along(edge[2]), along(edge[3]), np.radians(float(edge[1]))
+    elif corner := re.fullmatch(r"(..)/(..) corner", lifted):
+        first, second, angle = along(corner[1]), along(corner[2]), np.pi / 4
+    else:
+        first, second, angle = along(lifted.removesuffix(" side")), np.zeros(3), 0.0
+    raised = np.cos(angle) * first + np.sin(angle) * second
+    assert np.linalg.norm(raised) == pytest.approx(1) and abs(raised @ along(below)) < 1e-12
+    return np.cos(np.radians(float(tilt))) * -along(below) + np.sin(np.radians(float(tilt))) * raised
+
+
+SIDES = {
+    "away from you": 0.0,
+    "to your left": 90.0,
+    "towards you": 180.0,
+    "to your right": -90.0,
+}
+
+
+def decoded_attitude(words: str) -> Rotation:
+    """The attitude in the frame of the person, x to the right and y away, from the words alone."""
+    lying, pointing = words.split("; ")
+    up = decoded(lying)
+    match = re.fullmatch(r"\+([xyz]) points (.*?)(?:, ([\d.]+)° to the (left|right))?", pointing)
+    assert match is not None, words
+    heading = SIDES[match[2]]
+    if match[3]:
+        towards = {"left": 1, "right": -1}[match[4]] * float(match[3])
+        heading = towards if heading == 0 else 180.0 - towards
+    level = np.eye(3)["xyz".index(match[1])] - up["xyz".index(match[1])] * up
+    ahead = np.array([-np.sin(np.radians(heading)), np.cos(np.radians(heading)), 0.0])
+    return Rotation.align_vectors([[0.0, 0, 1], ahead], [up, level / np.linalg.norm(level)], weights=[np.inf, 1])[0]
+
+
 def test_words():
-    assert pose_words(np.array([0, 0, 1.0])) == "z up"
-    assert pose_words(np.array([0, -1.0, 0])) == "y down"
+    assert pose_words(np.array([0, 0, 1.0])) == "on its bottom (z up)"
+    assert pose_words(np.array([0, -1.0, 0])) == "on its +y side (y down)"
+    half = np.sqrt(0.5)
+    assert pose_words(np.array([half / np.sqrt(2), -half / np.sqrt(2), -half - 1e-9])) == (
+        "on its top (z down), −y/+x corner lifted by 45°"
+    )
     tilted = np.array([np.sin(np.radians(35)), 0, np.cos(np.radians(35))])
-    assert pose_words(tilted) == "z up, tilted by 35° so that +x rises"
+    assert pose_words(tilted) == "on its bottom (z up), +x side lifted by 35°"
     # x up, z away: y to the right, since y = z × x
     matrix = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
     q = Rotation.from_matrix(matrix).as_quat(scalar_first=True)
     np.testing.assert_allclose(up_of(q), [1, 0, 0], atol=1e-12)
-    assert attitude_words(q) == "x up; +y points to your right"
+    assert attitude_words(q) == "on its −x side (x up); +y points to your right"
+
+
+def test_words_are_decoded_to_their_pose():
+    rng = np.random.default_rng(12)
+    wordings = set()
+    for step in np.radians([5.0, 15.0, 45.0]):
+        for up in rng.standard_normal((400, 3)):
+            up = round_direction(up / np.linalg.norm(up), step)
+            words = pose_words(up)
+            np.testing.assert_allclose(decoded(words), up, atol=1e-5, err_msg=words)
+            wordings.add(words)
+    assert all(any(kind in words for words in wordings) for kind in ("side lifted", "corner lifted", "edge"))
+    for q in attitudes(300, 13):
+        q = round_attitude(q, np.radians(15.0))
+        words = attitude_words(q)
+        off = decoded_attitude(words).inv() * Rotation.from_quat(q, scalar_first=True)
+        assert off.magnitude() < 1e-4, words
 
 
 def test_short_order_turns_little():
@@ -416,6 +487,15 @@ def test_plan_writes_a_page_and_a_schedule(specification, tmp_path, capsys):
     assert any("accel.temperature" in note for note in document["notes"])
     page = (out / "report.html").read_text()
     assert "gyro.g_sensitivity[8]" in page and ">nan" not in page
+
+
+def test_a_plan_for_one_parameter_names_it_first(specification, capsys):
+    parameter = ("--parameter", "accelerometer.gain[1,0]")
+    assert main(["plan", specification, "--equipment", "table", "--poses", "6", *parameter]) == 0
+    printed = capsys.readouterr().out
+    assert "shrink the uncertainty of the accelerometer misalignment y from x" in printed
+    rows = printed.partition("times smaller")[2].splitlines()
+    assert rows[2].startswith("accelerometer misalignment y from x")
 
 
 def refused(capsys, *arguments) -> str:

@@ -18,7 +18,7 @@ from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.planning import FILTERED, Filter, Known, propose_sequence
 from jaximu.planning.sequences import filter_of
-from jaximu.report.plan import write_plan
+from jaximu.report.html import write_report
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu, simulate
 from jaximu.simulation.protocols import Rotations
 from jaximu.simulation.protocols.course import attitude_of
@@ -103,7 +103,7 @@ def test_what_a_short_sequence_leaves_open_is_said_with_what_opens_it(tmp_path):
     found = propose_sequence(known(), TABLE, 2, noise=WHITE)
     assert found.rank < len(found.names) and found.open
     assert all("What to record" in each.text for each in found.open)
-    write_plan(found, tmp_path / "out")
+    write_report(found, tmp_path / "out")
     document = json.loads(found.text())
     assert len(document["turns"]) == 1 and document["open"]
     page = (tmp_path / "out" / "report.html").read_text()

@@ -20,7 +20,7 @@ from jaximu.planning.optimisation import covariance, score
 from jaximu.planning.plan import question_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Signal
-from jaximu.report.plan import write_plan
+from jaximu.report.html import write_report
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, draw_imu
 from jaximu.simulation.protocols.course import attitude_of
 
@@ -153,7 +153,7 @@ def test_a_better_attitude_and_longer_rests_tell_more(proposal):
 
 
 def test_page_document_and_refusals(proposal, tmp_path, capsys):
-    write_plan(proposal, tmp_path / "out")
+    write_report(proposal, tmp_path / "out")
     document = json.loads(proposal.text())
     assert document["equipment"] == "robot" and document["accuracy"] == {"value": 0.05, "unit": "deg"}
     page = (tmp_path / "out" / "report.html").read_text()

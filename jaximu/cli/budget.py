@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import arg
 
@@ -13,9 +13,6 @@ from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
-
-if TYPE_CHECKING:
-    from jaximu.planning.budget import Budget
 
 __all__ = ["run"]
 
@@ -59,26 +56,4 @@ def run(
     results.prepare()
     with progress("propagating errors"):
         budget = planning.budget(task, check, seed)
-    write = options.drawn("budget", "write_budget", budget)
-    results.give(lambda: _print(budget), write, "budget.json, report.html and budget.png", budget=budget)
-
-
-def _print(budget: Budget) -> None:
-    from jaximu.cli.shown import print_all
-    from jaximu.report.budget import check_words, goal_words, headline, nonlinear_words, parameter_rows, source_rows
-
-    drawn = ["by Monte Carlo"] if budget.check else []
-    rows = [
-        (words, sigma, *([simulated] if drawn else []), made)
-        for words, sigma, made, simulated in parameter_rows(budget)
-    ]
-    print_all(
-        (("source", "size (1σ)", "mean share", "most of"), source_rows(budget), "Sources, dominant first"),
-        (("parameter", "1σ", *drawn, "made of"), rows, "Parameters"),
-        headline(budget),
-        *(goal_words(budget, goal) for goal in budget.goals),
-        *(f"not linear: {text}" for text in nonlinear_words(budget)),
-        *filter(None, [check_words(budget)]),
-        *(f"stays open: {text}" for text in budget.open),
-        notes=budget.notes,
-    )
+    results.present(budget.summary, "budget.json, report.html and budget.png", budget=budget)

@@ -15,7 +15,7 @@ from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
-    from jaximu.planning import Known, Proposal
+    from jaximu.planning import Known
 
 __all__ = ["run"]
 
@@ -103,9 +103,8 @@ def run(
             proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
     if magnetometer is not None:
         proposal = replace(proposal, notes=(*proposal.notes, magnetometer))
-    write, names = options.drawn("plan", "write_plan", proposal), "plan.json, report.html and the poses drawn"
     files = {} if chosen.by_hand else {"schedule.csv": proposal.schedule.encode()}
-    results.give(lambda: _print(proposal), write, names, files, plan=proposal)
+    results.present(proposal.summary, "plan.json, report.html and the poses drawn", files, plan=proposal)
 
 
 def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[Known | None, str | None]:
@@ -140,19 +139,3 @@ def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[K
         raise InputError(f"{path} is neither a calibration nor a specification, and as a log: {error}") from error
     with progress("calibrating"):
         return Known.from_calibration(calibrate(recordings, gravity), str(path)), None
-
-
-def _print(proposal: Proposal) -> None:
-    from jaximu.cli.shown import print_all
-    from jaximu.report.plan import gain_words, pose_rows, sigma_rows, turn_rows
-
-    equipment, turns = proposal.equipment, turn_rows(proposal)
-    title = f"{len(proposal.poses)} poses {equipment.words}, {equipment.rest:g} s each"
-    print_all(
-        (("", "pose", *(["turn to it"] if equipment.chained else [])), pose_rows(proposal), title),
-        *([(("", "axis up, rate, angle and sense"), turns, f"{len(turns)} turns")] if turns else []),
-        (("± is 95 %", "known", "after these", "times smaller"), sigma_rows(proposal)),
-        gain_words(proposal),
-        *(f"stays open: {weak.text}" for weak in proposal.open),
-        notes=proposal.notes,
-    )

@@ -66,6 +66,7 @@ from jaximu.estimation.uncertainty import UNDETERMINED, weak_directions
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
@@ -128,8 +129,8 @@ class Trials:
     failed: int
 
 
-@dataclass(frozen=True, eq=False)
-class Budget(Document):
+@dataclass(frozen=True, repr=False, eq=False)
+class Budget(Result, Document, page="budget"):
     """How each of s sources reaches each of p parameters.
 
     names: of the parameters, `accelerometer.gain[1,0]`; units: of their standard deviations, gains being relative to

@@ -18,6 +18,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
+from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
@@ -221,8 +222,8 @@ class Turn:
     words: str
 
 
-@dataclass(frozen=True, eq=False)
-class Proposal(Document):
+@dataclass(frozen=True, repr=False, eq=False)
+class Proposal(Result, Document, page="plan"):
     """The next poses and turns, and what they are expected to do to the uncertainty.
 
     By hand and on a robot, turn k leads from pose k to the next. before, after: standard deviations of the parameters

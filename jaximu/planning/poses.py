@@ -111,22 +111,34 @@ def _degrees(angle: float) -> str:
     return f"{np.degrees(angle):.4g}°"
 
 
-def _between(azimuth: float, j: str, k: str) -> str:
-    """Name a direction by its angle from axis j towards axis k."""
+def _lifted(azimuth: float, j: str, k: str) -> str:
+    """Name the side, corner or edge of a level box that lies in a direction, counted from axis j towards axis k."""
     quarter, rest = divmod(azimuth, np.pi / 2)
-    names = [f"+{j}", f"+{k}", f"−{j}", f"−{k}"]
-    name, following = names[int(quarter) % 4], names[int(quarter + 1) % 4]
     if np.pi / 2 - rest < 1e-9:
-        return following
-    return name if rest < 1e-9 else f"the direction {_degrees(rest)} from {name} towards {following}"
+        quarter, rest = quarter + 1, 0.0
+    names = [f"+{j}", f"+{k}", f"−{j}", f"−{k}"]
+    side, following = names[int(quarter) % 4], names[int(quarter + 1) % 4]
+    if rest < 1e-9:
+        return f"{side} side"
+    if abs(rest - np.pi / 4) < 1e-9:
+        return f"{side}/{following} corner"
+    return f"edge {_degrees(rest)} from {side} towards {following}"
+
+
+_LYING = {"z up": "on its bottom", "z down": "on its top"}
 
 
 def pose_words(up: FloatArray) -> str:
-    """Say which way a body direction (3,) that points up is, such as "z up, tilted by 35° so that +x rises"."""
+    """Say how a box lies whose body direction (3,) points up: "on its bottom (z up), +x side lifted by 35°".
+
+    Its top is the face that +z leaves. A corner is halfway between two sides.
+    """
     axis, sign, tilt, azimuth = _polar(up)
     name, j, k = ("xyz"[(axis + step) % 3] for step in range(3))
-    base = f"{name} {'up' if sign > 0 else 'down'}"
-    return base if tilt < 1e-6 else f"{base}, tilted by {_degrees(tilt)} so that {_between(azimuth, j, k)} rises"
+    upward = f"{name} {'up' if sign > 0 else 'down'}"
+    lying = _LYING.get(upward, f"on its {'−' if sign > 0 else '+'}{name} side")
+    lifted = f", {_lifted(azimuth, j, k)} lifted by {_degrees(tilt)}" if tilt >= 1e-6 else ""
+    return f"{lying} ({upward}){lifted}"
 
 
 def box_words(up: FloatArray) -> str:

@@ -1,8 +1,9 @@
-"""The report of an error budget: what each parameter's uncertainty is made of, and what to mend."""
+"""The page of an error budget: what each parameter's uncertainty is made of, and what to improve."""
 
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -12,54 +13,87 @@ import numpy as np
 
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.quantities import Z95, number, size
-from jaximu.planning.budget import Budget, Goal
+from jaximu.ground.page import Page, Part, Picture, Section, Statement, Table
+from jaximu.ground.quantities import Z95, counted, listed, number, size, unit_text
+from jaximu.ground.summary import sentence
+from jaximu.planning.budget import Budget, Goal, Trials
 from jaximu.planning.setup_errors import ErrorSource
 from jaximu.report import figures
 from jaximu.report.figures import LEAST_SHARE, OTHERS, PALETTE, dressed, legend_below
-from jaximu.report.html import Folder, TextRows, write_page
+from jaximu.report.html import TextRows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "amount",
-    "check_words",
-    "goal_words",
-    "headline",
-    "nonlinear_words",
-    "parameter_rows",
-    "source_rows",
-    "write_budget",
-]
+__all__ = ["amount", "goal_words", "page_of", "parameter_rows", "source_rows"]
 
 _GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": "Set-up"}
 
 
-def write_budget(budget: Budget, folder: Folder) -> Path:
-    """Write `report.html`, whose path is returned, and `budget.png`. Raises `InputError` where they cannot be."""
-    goals = [
-        ("Reached" if goal.reached else "Not reached", goal_words(budget, goal), not goal.reached)
+def page_of(budget: Budget) -> Page:
+    """Return which goals are reached, which source dominates, and what each parameter's uncertainty is made of."""
+    number, meaning = _number(budget)
+    return Page(
+        f"Error budget of {Path(budget.source).name}",
+        tuple(_verdict(budget)),
+        number,
+        meaning,
+        (_picture(budget), *_goals(budget), _sources(budget), _parameters(budget), *_limits(budget)),
+        notes=[sentence(note) for note in budget.notes],
+        next=_next(budget),
+    )
+
+
+def _picture(budget: Budget) -> Picture:
+    return Picture(
+        "budget",
+        partial(_figure, budget),
+        "Shares of each source in each parameter's variance",
+        "A bar is the variance of one parameter, divided among its sources; the figure beside it is its standard "
+        "deviation (1σ). Independent errors add by their squares, so halving a source removes three quarters of its "
+        "part.",
+    )
+
+
+def _goals(budget: Budget) -> Iterator[Section]:
+    """Return each goal with the sizes that would reach it."""
+    statements = [
+        Statement(f"{goal.name} to {_wanted(goal)}", sentence(goal_words(budget, goal)), not goal.reached)
         for goal in budget.goals
     ]
-    return write_page(
-        folder,
-        "budget",
-        {"budget": partial(_figure, budget)},
-        title=f"Error budget of {Path(budget.source).name}",
-        lead=headline(budget),
-        goals=goals,
-        sources=source_rows(budget),
-        check=check_words(budget),
-        rows=[
-            (words, sigma, *([drawn] if budget.check else []), made, not made)
-            for words, sigma, made, drawn in parameter_rows(budget)
-        ],
-        nonlinear=[("Not linear", text) for text in nonlinear_words(budget)],
-        open=[("Weak or open", text) for text in budget.open],
-        notes=budget.notes,
+    if statements:
+        yield Section("Goals", statements)
+
+
+def _sources(budget: Budget) -> Section:
+    headers = ("source", "size (1σ)", "mean share of the variances", "most of")
+    return Section("Sources, dominant first", [Table(headers, source_rows(budget))])
+
+
+def _parameters(budget: Budget) -> Section:
+    """Return each parameter's standard deviation and what it is made of; those that are not determined are marked."""
+    drawn = ("by Monte Carlo",) * (budget.check is not None)
+    rows = [
+        (words, sigma, *([simulated] if drawn else []), made)
+        for words, sigma, made, simulated in parameter_rows(budget)
+    ]
+    caption = (
+        "Standard deviations; scale and misalignment relative to the scale of their axis. To first order, through the "
+        "whole fit."
     )
+    marked = [index for index, row in enumerate(rows) if not row[-1]]
+    return Section("Parameters", [Table(("parameter", "1σ", *drawn, "made of"), rows, caption, marked)])
+
+
+def _limits(budget: Budget) -> Iterator[Section]:
+    """Return where the first order is not enough, how it compares with simulated sessions, and what stays open."""
+    parts: list[Part] = [Statement("Not linear", text, caution=True) for text in nonlinear_words(budget)]
+    if budget.check is not None:
+        parts.append(Statement("Against simulated sessions", check_words(budget, budget.check)))
+    parts += [Statement("Weak or open", text, caution=True) for text in budget.open]
+    if parts:
+        yield Section("How far it holds", parts)
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -87,18 +121,69 @@ def shares(budget: Budget) -> FloatArray:
     return budget.sigma**2 / np.maximum(np.sum(budget.sigma**2, axis=0), 1e-300)
 
 
-def headline(budget: Budget) -> str:
-    """Say which source dominates most parameters, and how many it dominates."""
+def _verdict(budget: Budget) -> Iterator[str]:
+    """Say whether the goals are reached, and which sources dominate how many parameters."""
+    if budget.goals:
+        reached, count = sum(goal.reached for goal in budget.goals), len(budget.goals)
+        if count == 1:
+            yield f"The goal is {'' if reached else 'not '}reached."
+        else:
+            yield f"{reached} of {count} goals are reached."
     known = np.flatnonzero(budget.determined)
     if not len(known):
-        return "The scheme determines no parameter."
+        yield "The scheme determines no parameter."
+        return
     largest = np.argmax(shares(budget)[:, known], axis=0)
     count = np.bincount(largest, minlength=len(budget.sources))
     order = [int(row) for row in np.argsort(-count, kind="stable") if count[row]]
-    parts = [f"{budget.sources[row].words} ({count[row]})" for row in order]
-    text = f"The largest source of {len(known)} parameters: {', '.join(parts)}."
-    lost = len(budget.names) - len(known)
-    return text + (f" {lost} more are not determined by this scheme." if lost else "")
+    parts = [f"{budget.sources[row].words} for {count[row]}" for row in order]
+    parts[0] = f"{parts[0]} of {counted(len(known), 'parameter')}"
+    yield f"Largest source of uncertainty: {listed(parts)}."
+    if lost := len(budget.names) - len(known):
+        yield f"This scheme does not determine {counted(lost, 'other parameter')}."
+
+
+def _number(budget: Budget) -> tuple[str, str]:
+    """Return the standard deviation that is farthest from its goal; without goals, the dominant source's mean share."""
+    shown = {goal.worst: goal for goal in budget.goals if budget.determined[budget.names.index(goal.worst)]}
+    if shown:
+        goal = max(shown.values(), key=lambda goal: _total(budget, goal) / goal.size)
+        meaning = f"standard deviation (1σ) of the {describe(goal.worst, budget.imu)}; its goal is {_wanted(goal)}"
+        return amount(_total(budget, goal), goal.unit), meaning
+    known = budget.determined
+    if not budget.sources or not known.any():
+        return "not determined", "the scheme determines no parameter"
+    row = budget.order()[0]
+    return _percent(float(np.mean(shares(budget)[row, known]))), (
+        f"of the parameters' variances, on average, come from the {budget.sources[row].words}"
+    )
+
+
+def _total(budget: Budget, goal: Goal) -> float:
+    """Return the standard deviation of a goal's worst parameter."""
+    return float(budget.total[budget.names.index(goal.worst)])
+
+
+def _wanted(goal: Goal) -> str:
+    """Return a goal as it was stated, and in the unit of the page where that is another."""
+    stated, shown = _stated(goal.text), amount(goal.size, goal.unit)
+    same = re.sub(r"^[\d.]+", "", stated) == re.sub(r"^[\d.]+", "", shown)
+    return stated if same else f"{stated} ({shown})"
+
+
+def _stated(size: str) -> str:
+    """Return a size as it was stated, its unit as it is printed."""
+    return re.sub(r" °(?!/)", "°", unit_text(re.sub("degrees?", "deg", size.strip())))
+
+
+def _next(budget: Budget) -> str:
+    """Say what to run: again with better sources, with simulated sessions, or the calibration."""
+    source = shlex.quote(budget.source)
+    if not all(goal.reached for goal in budget.goals):
+        return f"improve the set-up in the specification and run `jaximu budget {source}` once more."
+    if budget.check is None:
+        return f"`jaximu budget {source} --check 2000` compares the budget with simulated sessions."
+    return "`jaximu turntable LOG --reference schedule.csv -o RESULTS` calibrates a session on this set-up."
 
 
 def parameter_rows(budget: Budget) -> TextRows:
@@ -128,7 +213,9 @@ def source_rows(budget: Budget) -> TextRows:
         most = int(known[np.argmax(part[row, known])]) if len(known) else 0
         mean = np.mean(part[row, known]) if len(known) else 0.0
         where = f"{describe(budget.names[most], budget.imu)}: {_percent(part[row, most])}"
-        rows.append((source.words, source.size, _percent(mean), where if part[row, most] >= 1e-3 else "nowhere"))
+        rows.append(
+            (source.words, _stated(source.size), _percent(mean), where if part[row, most] >= 1e-3 else "nowhere")
+        )
     return rows
 
 
@@ -159,16 +246,15 @@ def goal_words(budget: Budget, goal: Goal) -> str:
     """Say whether a goal is reached, and if not, how good each source must become."""
     index = budget.names.index(goal.worst)
     worst = describe(goal.worst, budget.imu)
-    wanted = f"{goal.name} to {goal.text}"
     if not budget.determined[index]:
-        return f"{wanted}: out of reach, because the scheme does not determine the {worst}."
-    reached = f"the {worst} is known to {amount(budget.total[index], goal.unit)}"
+        return f"out of reach, because the scheme does not determine the {worst}."
+    known = f"the {worst} is known to {amount(budget.total[index], goal.unit)}"
     if goal.reached:
-        return f"{wanted}: reached, {reached}."
+        return f"reached: {known}."
     sources = {source.name: source for source in budget.sources}
     able = [_smaller(sources[need.sources[0]], need.times) for need in goal.alone if need.times is not None]
     unable = [sources[need.sources[0]].words for need in goal.alone if need.times is None]
-    text = f"{wanted}: not reached, {reached}. "
+    text = f"not reached: {known}. "
     if able:
         text += f"{'One of these alone would do' if len(able) > 1 else 'One source alone would do'}: {'; '.join(able)}."
         return text + (f" Not enough by themselves: {', '.join(unable)}." if unable else "")
@@ -183,16 +269,12 @@ def _smaller(source: ErrorSource, times: float) -> str:
     stated = re.fullmatch(r"\s*([+\d.eE-]+)(.*)", source.size)
     if source.value is None or stated is None:
         return f"{source.words} {number(times, 3)} times smaller"
-    unit = stated[2].strip() or source.unit.replace("1", "")
-    size = float(stated[1]) / times
-    return f"{source.words} {number(size, 2)} {unit}".rstrip() + f" instead of {source.size.strip()}"
+    smaller = f"{number(float(stated[1]) / times, 2)} {stated[2].strip() or source.unit.replace('1', '')}"
+    return f"{source.words} {_stated(smaller)} instead of {_stated(source.size)}"
 
 
-def check_words(budget: Budget) -> str:
-    """Compare the budget with sessions put through the whole estimator; empty where there were none."""
-    check = budget.check
-    if check is None:
-        return ""
+def check_words(budget: Budget, check: Trials) -> str:
+    """Compare the budget with sessions put through the whole estimator."""
     known = np.flatnonzero(budget.determined)
     ratio = check.rms[known] / budget.total[known]
     worst = int(np.argmax(np.abs(ratio - 1)))

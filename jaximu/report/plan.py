@@ -1,8 +1,9 @@
-"""The report of a plan: the poses drawn, the turns, and what they are expected to gain."""
+"""The page of a plan: the poses drawn, how to record them, the turns, and what they are expected to gain."""
 
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,16 +14,17 @@ from scipy.spatial.transform import Rotation
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe, spoken_amount
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.quantities import Z95
+from jaximu.ground.page import Page, Picture, Section, Statement, Table
+from jaximu.ground.quantities import Z95, number, plain
+from jaximu.ground.summary import sentence
 from jaximu.planning import Proposal
 from jaximu.report import figures
-from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["gain_words", "pose_rows", "sigma_rows", "turn_rows", "write_plan"]
+__all__ = ["page_of"]
 
 _COLUMNS = 3
 _ABOVE = 0.08  # inches between the figure's edge and its title, for which the layout keeps a line
@@ -33,69 +35,170 @@ _CRITERIA = {
 }
 
 
-def write_plan(proposal: Proposal, folder: Folder) -> Path:
-    """Write `report.html`, whose path is returned, and `poses.png`. Raises `InputError` where they cannot be."""
-    return write_page(
-        folder,
-        "plan",
-        {"poses": partial(_poses_figure, proposal)},
-        title=f"{len(proposal.poses)} poses to record next",
-        lead=gain_words(proposal),
-        number=f"{proposal.gain:.3g}×",
-        meaning=f"smaller uncertainty than with {Path(proposal.source).name} alone",
-        proposal=proposal,
-        poses=pose_rows(proposal),
-        turns=turn_rows(proposal),
-        rows=sigma_rows(proposal),
-        notes=proposal.notes,
-        open=[("Weak" if weak.determined else "Not determined", weak.text) for weak in proposal.open],
+def page_of(proposal: Proposal) -> Page:
+    """Return the poses, how to record them, and what they are expected to gain."""
+    equipment = proposal.equipment
+    poses = f"{len(proposal.poses)} poses {equipment.words}"
+    return Page(
+        f"{poses} to record next, {equipment.rest:g} s each",
+        tuple(_verdict(proposal)),
+        f"{_times(proposal.gain)}×",
+        f"smaller uncertainty expected than with {Path(proposal.source).name} alone",
+        (
+            Section("The poses", [_picture(proposal), *_instructions(proposal), _poses(proposal)]),
+            *_turns(proposal),
+            Section("What they are expected to gain", [_parameters(proposal)]),
+            *_open(proposal),
+        ),
+        notes=[sentence(note) for note in proposal.notes],
+        next=_next(proposal),
     )
 
 
-def pose_rows(proposal: Proposal) -> TextRows:
-    """Return each pose's number, words and, by hand and on a robot, the turn to it."""
-    turns = ["", *(turn.words for turn in proposal.turns)]
-    return [
-        (str(row + 1), pose.words, *([turns[row] if proposal.turns else ""] if proposal.equipment.chained else []))
-        for row, pose in enumerate(proposal.poses)
+# --- words ------------------------------------------------------------------------------------------------------------
+
+
+def _times(ratio: float) -> str:
+    """Return a ratio with three digits, without a power of ten where a person would use none."""
+    return plain(float(f"{ratio:.3g}"))
+
+
+def _verdict(proposal: Proposal) -> Iterator[str]:
+    """Say how many times smaller the uncertainties become, and how many parameters all data together determine."""
+    name = _parameter(proposal)
+    what = "the uncertainties" if name is None else f"the uncertainty of the {describe(name, proposal.imu)}"
+    average = " on average" * (name is None)
+    yield f"These {len(proposal.poses)} poses shrink {what} {_times(proposal.gain)} times{average}."
+    count = len(proposal.names)
+    determined = "all" if proposal.rank == count else f"{proposal.rank} of"
+    yield f"Together with what is known they determine {determined} {count} parameters."
+
+
+def _parameter(proposal: Proposal) -> Name | None:
+    """Return the parameter whose uncertainty is the criterion; None where it is that of all."""
+    return next((name for name in proposal.names if name == proposal.criterion), None)
+
+
+def _criterion(proposal: Proposal) -> str:
+    """Say what the criterion was, becomes, and what rounding the angles costs."""
+    before, after = number(proposal.criterion_before), number(proposal.criterion_after)
+    if _parameter(proposal) is None:
+        text = f"The poses minimise {_CRITERIA[proposal.criterion]}, which falls from {before} to {after}."
+    else:
+        text = "The poses minimise the standard deviation in the first row."
+    if proposal.equipment.in_sequence:
+        return text
+    loss = 100 * proposal.rounding_loss
+    return f"{text} Rounding the angles {f'makes it larger by {loss:.2g} %' if loss > 0.005 else 'costs nothing'}."
+
+
+def _instructions(proposal: Proposal) -> Iterator[str]:
+    """Say how to hold the poses, and how to get from one to the next."""
+    equipment = proposal.equipment
+    yield f"Hold each pose for {equipment.rest:g} s, perfectly still."
+    if equipment.by_hand:
+        yield (
+            f"From one to the next, turn the direct way in about {equipment.turn:g} s, and record without a break. "
+            "A pose that is missed by some ten degrees costs little: the recording shows its true orientation."
+        )
+    elif equipment.accuracy is not None:
+        yield (
+            f"From one to the next, turn about the stated axis in {equipment.turn:g} s, the rate rising in the first "
+            "fifth of it and falling in the last. Record without a break, and log the robot's attitude throughout: its "
+            f"noise is taken as {equipment.accuracy:g}° (1 σ, each axis) at each stamp, independent of the others. "
+            "schedule.csv holds rests and turns in this order."
+        )
+    elif equipment.in_sequence:
+        yield (
+            "Start at rest in the first pose, and record all of it without a break. Each rotation takes "
+            f"{equipment.turn:g} s and goes about the named axis of the unit, by the right-hand rule. schedule.csv "
+            "holds positions and rotations in this order."
+        )
+
+
+def _next(proposal: Proposal) -> str:
+    """Say what to run on the recording."""
+    equipment = proposal.equipment
+    if equipment.by_hand:
+        command = "jaximu calibrate LOG -o RESULTS"
+    elif equipment.accuracy is not None:
+        command = "jaximu reference LOG --reference REF -o RESULTS"
+    elif equipment.in_sequence:
+        command = "jaximu filter LOG -o RESULTS"
+    else:
+        command = "jaximu turntable LOG --reference schedule.csv -o RESULTS"
+    return f"record the poses, then run `{command}`."
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def _poses(proposal: Proposal) -> Table:
+    """Return each pose's number, words and, where each turn leads from one pose to the next, the turn to it."""
+    chained = proposal.equipment.chained
+    turns = ["", *(turn.words for turn in proposal.turns)] if proposal.turns else [""] * len(proposal.poses)
+    rows = [
+        (str(index + 1), pose.words, *([turns[index]] if chained else [])) for index, pose in enumerate(proposal.poses)
     ]
+    legend = "The top is the face that +z leaves, the bottom the one opposite."
+    if any(" corner " in pose.words for pose in proposal.poses):
+        legend += " A corner lies halfway, at 45°, between the two sides."
+    return Table(("", "pose", *(["turn to it"] if chained else [])), rows, legend)
 
 
-def turn_rows(proposal: Proposal) -> TextRows:
-    """Return each turn of a table, its number and words; else they stand beside the poses."""
-    turns = () if proposal.equipment.chained else proposal.turns
-    return [(str(row), turn.words) for row, turn in enumerate(turns, 1)]
+def _turns(proposal: Proposal) -> Iterator[Section]:
+    """Return the turns of a table; by hand, on a robot and in a sequence they stand beside the poses."""
+    if proposal.turns and not proposal.equipment.chained:
+        rows = [(str(index), turn.words) for index, turn in enumerate(proposal.turns, 1)]
+        words = (
+            "About the vertical axis of the table, the unit mounted as the turn says. schedule.csv holds poses and "
+            "turns in this order; correct its times once they are done."
+        )
+        yield Section(f"{len(rows)} turns", [words, Table(("", "turn"), rows)])
 
 
-def sigma_rows(proposal: Proposal) -> TextRows:
-    """Return each parameter in words, its 95 % interval before and after, and how many times smaller it becomes."""
-    sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
+def _parameters(proposal: Proposal) -> Table:
+    """Return each parameter's 95 % interval before and after, and how many times smaller it becomes, best first."""
 
     def interval(name: Name, sigma: float) -> str:
         return f"± {spoken_amount(name, Z95 * sigma, proposal.imu)}"
 
-    return [
-        (describe(name, proposal.imu), interval(name, before), interval(name, after), f"{before / after:.3g}")
-        for name, before, after in sigmas
+    first = _parameter(proposal)
+    sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
+    rows = [
+        (describe(name, proposal.imu), interval(name, before), interval(name, after), f"{_times(before / after)}×")
+        for name, before, after in sorted(sigmas, key=lambda row: (row[0] != first, -row[1] / row[2]))
     ]
+    headers = ("parameter", "known", "after these poses", "times smaller")
+    caption = "A prediction from the noise, to first order, without errors of the set-up; ± is 95 %."
+    return Table(headers, rows, f"{_criterion(proposal)} {caption}", [0] if first else [], brief=8)
 
 
-def gain_words(proposal: Proposal) -> str:
-    """Say what the criterion was, becomes, and what rounding the angles costs."""
-    criterion = proposal.criterion
-    what = (
-        f"the standard deviation of the {describe(criterion, proposal.imu)}"
-        if isinstance(criterion, Name)
-        else _CRITERIA[criterion]
-    )
-    loss = 100 * proposal.rounding_loss
-    cost = f"makes it larger by {loss:.2g} %" if loss > 0.005 else "costs nothing"
-    rounding = "" if proposal.equipment.in_sequence else f"Rounding the angles {cost}. "
-    return (
-        f"Expected: {what} falls from {proposal.criterion_before:.3g} to {proposal.criterion_after:.3g}, "
-        f"{proposal.gain:.3g} times. {rounding}All together determine "
-        f"{proposal.rank} of {len(proposal.names)} parameters."
-    )
+def _open(proposal: Proposal) -> Iterator[Section]:
+    """Return what stays open, in words."""
+    if proposal.open:
+        statements = [
+            Statement("Weak" if weak.determined else "Not determined", weak.text, caution=True)
+            for weak in proposal.open
+        ]
+        yield Section("What stays open", statements)
+
+
+# --- the picture ------------------------------------------------------------------------------------------------------
+
+
+def _picture(proposal: Proposal) -> Picture:
+    """Return the unit drawn in each pose."""
+    equipment = proposal.equipment
+    caption = "Arrows are its axes, coloured faces their positive ends; dashed arrows point away from you."
+    if equipment.by_hand:
+        view = "The unit as the person who holds it sees it, a little from above."
+        caption = f"{view} {caption} A minus marks the negative ends."
+    elif equipment.chained:
+        caption = f"Seen a little from above; headings are counted from an arbitrary zero. {caption}"
+    else:
+        caption = f"Seen a little from above; the heading on the table does not matter. {caption}"
+    return Picture("poses", partial(_poses_figure, proposal), "The unit drawn in each pose", caption)
 
 
 def _poses_figure(proposal: Proposal) -> Figure:
@@ -106,10 +209,10 @@ def _poses_figure(proposal: Proposal) -> Figure:
     for axes in grid:
         axes.set_axis_off()
         axes.set_aspect("equal")
-    for number, (axes, pose) in enumerate(zip(grid, proposal.poses, strict=False)):
+    for index, (axes, pose) in enumerate(zip(grid, proposal.poses, strict=False), 1):
         _draw_floor(axes, proposal.equipment.by_hand)
         _draw_unit(axes, Rotation.from_quat(pose.attitude, scalar_first=True).as_matrix())
-        axes.set_title(f"{number + 1}", loc="left", fontsize=12, fontweight="bold")
+        axes.set_title(f"{index}", loc="left", fontsize=12, fontweight="bold")
         axes.text(0.0, -1.75, _folded(pose.words), ha="center", va="top", fontsize=9.5)
     figure.suptitle(
         f"{count} poses {proposal.equipment.words}: {proposal.equipment.rest:g} s at rest in each",
