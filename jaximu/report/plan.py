@@ -127,7 +127,8 @@ def _next(proposal: Proposal) -> str:
         command = "jaximu filter LOG -o RESULTS"
     else:
         command = "jaximu turntable LOG --reference schedule.csv -o RESULTS"
-    return f"record the poses, then run `{command}`."
+    earlier = " with earlier recordings beside LOG" * equipment.by_hand
+    return f"record the poses, then run `{command}`{earlier}."
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
