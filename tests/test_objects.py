@@ -70,7 +70,7 @@ def test_a_summary_says_the_verdict_the_numbers_and_what_is_open(calibration):
     text = str(calibration.summary())
     before, after, _ = calibration.rms["gravity_norm"]
     assert f"Error against gravity at rest: {1e3 * before:.0f} → {1e3 * after:.3f} mm/s²" in text
-    assert "All 21 parameters are determined." in text and text.count("accelerometer scale") == 3
+    assert "All 21 parameters are determined." in text and text.count("scale x ") == 2
     said = " ".join(text.split())
     assert "jaximu.wgs84_gravity(latitude, height)" in said and "--" not in said  # Python's words
     with command_line():
@@ -98,7 +98,7 @@ def test_reprs_are_short_and_pages_hold_the_summary(recording, calibration):
         assert len(repr(each)) < 300 and type(each).__name__ in repr(each)
         page = each._repr_html_()
         assert each.summary().verdict[0][:20] in page.replace("&#x27;", "'")
-        assert page.count("<table>") == page.count("</table>") <= 1
+        assert page.count("<table") == page.count("</table>")
     assert "&lt;b&gt;" in jaximu.Recording(recording.accelerometer, notes=("<b>",))._repr_html_()
     assert "0.00100 m/s²/√Hz" in str(stated.summary()) or "1.00 mm/s²/√Hz" in str(stated.summary())
 
