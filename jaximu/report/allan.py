@@ -1,19 +1,22 @@
-"""What a noise analysis tells a person: tables in both units, sentences, the picture, one HTML page, Kalibr's file."""
+"""The page of a noise analysis: the curve, every axis's terms, the numbers that a filter takes, Kalibr's file."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaximu._version import __version__
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.page import Code, Page, Part, Picture, Section, Statement, Table
 from jaximu.ground.quantities import listed, number, unit_text
+from jaximu.ground.summary import sentence
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
 from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.analysis import NoiseAnalysis
@@ -30,7 +33,6 @@ from jaximu.noise.identification import Identified, Term
 from jaximu.recordings.readers.kalibr import kalibr_yaml
 from jaximu.recordings.recording import Source
 from jaximu.report.figures import AXES, dressed, new_figure
-from jaximu.report.html import page
 from jaximu.report.tables import written_now
 
 if TYPE_CHECKING:
@@ -43,8 +45,7 @@ __all__ = [
     "filter_rows",
     "hours",
     "kalibr_text",
-    "lead",
-    "noise_report",
+    "page_of",
     "repeatability_rows",
     "term_rows",
     "unresolved",
@@ -56,6 +57,11 @@ _DISCRETE_UNITS = {
     "specific_force": ("mg", "m/s^2"),
     "magnetic_field": ("nT", "uT"),
 }
+_ORDER = ("gyroscope", "accelerometer", "magnetometer")
+"""Whose noise matters most."""
+_AXES = ("x", "y", "z", "mean")
+_TERM_HEADERS = ("term", "unit", *_AXES)
+_NONE = "The data supports none of N, B and K."
 Cell = tuple[float, float, float] | float
 
 
@@ -72,14 +78,19 @@ class TermRow:
     cells: tuple[Cell, ...]
     first: bool
 
-    def texts(self) -> list[tuple[str, str]]:
-        """Return value and interval as a person reads them."""
-        return [
+    def texts(self, intervals: bool = True) -> list[str]:
+        """Return each value as a person reads it, with its interval on a line below."""
+        pairs = [
             (number(cell[0], 4), f"{number(cell[1])} … {number(cell[2])}")
             if isinstance(cell, tuple)
             else ("not seen", f"up to {number(cell)}")
             for cell in self.cells
         ]
+        return ["\n".join(pair) if intervals else pair[0] for pair in pairs]
+
+    def row(self, name: str, intervals: bool = True) -> tuple[str, ...]:
+        """Return the row of a table: its name where it is the first of its term, the unit, and the texts."""
+        return name if self.first else "", unit_text(self.unit), *self.texts(intervals)
 
 
 def _factor(quantity: str, term: str, unit: str) -> float:
@@ -153,20 +164,30 @@ def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
     return made
 
 
-def lead(analysis: NoiseAnalysis) -> str:
-    """Return the one sentence that a person should keep."""
-    parts = []
-    for name in ("gyroscope", "accelerometer", "magnetometer"):
-        if name in analysis.axes:
-            quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
-            sizes = [
-                f"{TERM_NAMES[term]} of {_in_unit(estimate.value, quantity, term)}"
-                for term in "NBK"
-                if (estimate := mean.get(term)) is not None
-            ]
-            parts.append(f"the {name} has {listed(sizes) if sizes else 'none of N, B and K'}")
-    axes = next(iter(analysis.axes.values()))
-    return f"In {hours(recorded_seconds(axes[0]))} at rest, {'; '.join(parts)} (mean of the axes)."
+def _verdict(analysis: NoiseAnalysis) -> Iterator[str]:
+    """Say of each triad what a person should keep."""
+    start = f"In {hours(recorded_seconds(next(iter(analysis.axes.values()))[0]))} at rest, the"
+    for name in [name for name in _ORDER if name in analysis.axes]:
+        quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
+        sizes = [
+            f"{TERM_NAMES[term]} of {_in_unit(estimate.value, quantity, term)}"
+            for term in "NBK"
+            if (estimate := mean.get(term)) is not None
+        ]
+        yield f"{start} {name} has {listed(sizes) if sizes else 'none of N, B and K'} (mean of the axes)."
+        start = "The"
+
+
+def _number(analysis: NoiseAnalysis) -> tuple[str, str]:
+    """Return the first term of the most important triad that shows one, and what it is."""
+    for name in [name for name in _ORDER if name in analysis.axes]:
+        quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
+        for term, estimate in [(term, mean.get(term)) for term in "NBK"]:
+            if estimate is not None:
+                low, high = (_in_unit(end, quantity, term) for end in (estimate.low, estimate.high))
+                meaning = f"{TERM_NAMES[term]} of the {name} (mean of the axes), 95 % interval {low} … {high}"
+                return _in_unit(estimate.value, quantity, term), meaning
+    return "", ""
 
 
 def _lowest(axes: Sequence[Identified]) -> tuple[float, float]:
@@ -346,81 +367,186 @@ def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
     return kalibr_yaml(numbers, float(f"{min(rates):.6g}"), topic, header)
 
 
-def noise_report(
-    analysis: NoiseAnalysis, sources: Sequence[Source] = (), title: str | None = None
-) -> tuple[bytes, dict[str, bytes]]:
-    """Return the report, one HTML page that works offline, and its picture by the name of its file.
-
-    **Arguments:** `sources`: the files with their SHA-256 and rows. `title`: the heading; the names of the files if
-    None.
-    """
+def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
+    """Return the page of a noise analysis; `sources`: the files with their SHA-256 and rows, where they are known."""
     names = ", ".join(Path(path).name for path in analysis.files) or "a recording"
-    return page(
-        "allan",
-        {"allan": partial(allan_figure, analysis)},
-        title=title or f"Noise at rest: {names}",
-        lead=lead(analysis),
-        alternative="Allan deviation against averaging time for " + " and ".join(analysis.axes),
-        triads=[_triad(analysis, name) for name in analysis.axes],
-        caution=[name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)],
-        missing=[name for name in INERTIAL_QUANTITIES if name not in analysis.axes],
-        unresolved=[(name.capitalize(), text) for name, text in unresolved(analysis).items()],
-        yaml=kalibr_text(analysis),
-        recordings=len(analysis.files),
-        notes=[note for note in analysis.notes if note],
-        repeatability=[(row.meaning, unit_text(row.unit), row.texts()) for row in repeatability_rows(analysis)],
-        sources=[
-            (source.path, str(source.rows or ""), source.sha256)
-            for source in sources or [Source(path, "", 0) for path in analysis.files]
-        ],
-        facts=[
-            ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
-            (
-                "Method",
-                "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data supports "
-                "(jaximu.noise.identify); picture: overlapping Allan deviation at octaves",
-            ),
-            ("Software", f"jaximu {__version__}"),
-            ("Report written", written_now()),
-        ],
+    log = shlex.quote(analysis.files[0]) if analysis.files else "REST"
+    number, meaning = _number(analysis)
+    return Page(
+        f"Noise at rest: {names}",
+        [*_verdict(analysis)],
+        number,
+        meaning,
+        (_picture(analysis), *_cautions(analysis), _terms(analysis), _filter(analysis), *_limits(analysis)),
+        partial(_details, analysis, sources or [Source(path, "", 0) for path in analysis.files]),
+        [*map(sentence, filter(None, analysis.notes))],
+        f"`jaximu calibrate LOG --static {log} -o RESULTS` calibrates the unit with this noise."
+        if "accelerometer" in analysis.axes
+        else "",
     )
 
 
-def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
-    """Return what the page says of one triad, as text."""
-    axes, quantity, rate = analysis.axes[name], SENSOR_QUANTITIES[name], analysis.rates[name]
-    terms = []
-    for row in term_rows(axes, quantity):
-        kinds = ["SI"] * (row.unit == SI_UNITS[quantity][row.term]) + ["data sheets"] * row.first
-        terms.append((row, unit_text(row.unit), " and ".join(kinds)))
-    columns: list[dict[str, Any]] = [*(dict(axis.terms) for axis in axes), dict(mean_terms(axes))]
-    discrete = []
-    for term, words in (("N", "white noise of one sample, σ = N √rate"), ("K", "step of the bias walk, σ = K/√rate")):
-        sizes = [
-            None if column.get(term) is None else float(to_discrete(term, column[term].value, rate))
-            for column in columns
+def _picture(analysis: NoiseAnalysis) -> Picture:
+    return Picture(
+        "allan",
+        partial(allan_figure, analysis),
+        "Allan deviation against averaging time for " + " and ".join(analysis.axes),
+        "How to read it: average the output over τ seconds, and the difference between one average and the next is "
+        "typically √2 times the height of the curve. On the left, averaging helps: white noise falls by √10 for ten "
+        "times the time. Where the curve is flat (bias instability) or rises (random walk, ramp), the bias itself "
+        "wanders and longer averages no longer help. The squares of the dashed lines add up to that of a solid one.",
+    )
+
+
+def _cautions(analysis: NoiseAnalysis) -> Iterator[Section]:
+    """Say where the terms are not the whole noise, and which sensor is missing."""
+    poor = [name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)]
+    missing = [name for name in INERTIAL_QUANTITIES if name not in analysis.axes]
+    cautions = []
+    if poor:
+        text = f"The five terms do not describe the {listed(poor)} completely; the intervals are widened for it, see "
+        cautions.append(Statement("More than the five terms", f"{text}the notes.", True))
+    if missing:
+        cautions.append(Statement("Not recorded", f"The recording has no {listed(missing, 'and no')}.", True))
+    if cautions:
+        yield Section("Before you rely on it", cautions)
+
+
+def _terms(analysis: NoiseAnalysis) -> Section:
+    """Return each triad's terms with their intervals, in both units."""
+    parts: list[Part] = [
+        "Continuous, two-sided densities with 95 % intervals below them; they belong to the sensor, whatever its "
+        "sample rate. “Mean” is the root mean square of the axes, for a filter that takes one number per triad. Many "
+        "data sheets call the lowest point of the curve bias instability; B is the height of its flat part over 0.664."
+    ]
+    for name, axes in analysis.axes.items():
+        quantity = SENSOR_QUANTITIES[name]
+        at, size = _lowest(axes)
+        lowest = f"Lowest point of the mean's curve: {_in_unit(size, quantity, 'B', 2)} at {hours(at)}."
+        rows = [row.row(f"{row.term} {row.meaning}", row.first) for row in term_rows(axes, quantity)]
+        tables = [Table(_TERM_HEADERS, rows)] if rows else []
+        title = f"{sentence(name)}, {analysis.rates[name]:.5g} Hz"
+        parts.append(Section(title, [*tables, *unseen_notes(axes, quantity), lowest], 3))
+    return Section("The terms: continuous", parts)
+
+
+def _terms_in_si(analysis: NoiseAnalysis) -> Iterator[Section]:
+    """Yield each triad's terms in SI with their intervals, which the first screen has no room for."""
+    for name, axes in analysis.axes.items():
+        quantity = SENSOR_QUANTITIES[name]
+        rows = [
+            replace(row, first=True) for row in term_rows(axes, quantity) if row.unit == SI_UNITS[quantity][row.term]
         ]
-        for unit in _DISCRETE_UNITS[quantity] if any(size is not None for size in sizes) else ():
+        if rows:
+            table = Table(_TERM_HEADERS, [row.row(f"{row.term} {row.meaning}") for row in rows])
+            yield Section(sentence(name), [table], 3)
+
+
+def _filter(analysis: NoiseAnalysis) -> Section:
+    """Return the numbers that a filter takes of the mean of each triad's axes."""
+    parts: list[Part] = ["Of the mean of the axes, in SI."]
+    for name in analysis.axes:
+        mean = filter_numbers(analysis, name)[1]
+        rows = [(formula, words, value, unit) for formula, words, value, unit in filter_rows(mean) if value is not None]
+        content = Table(("formula", "number", "value", "unit"), rows) if rows else _NONE
+        parts.append(Section(f"{sentence(name)}, Δt = 1/({mean.rate:.6g} Hz)", [content], 3))
+    return Section("For a Kalman filter", parts)
+
+
+def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
+    """Say what the length of the recording does not resolve, and how the bias differs between recordings."""
+    triads: dict[str, list[str]] = {}
+    for name, text in unresolved(analysis).items():
+        triads.setdefault(text, []).append(name)
+    yield Section(
+        "What the length cannot resolve", [Statement(sentence(listed(names)), text) for text, names in triads.items()]
+    )
+    if analysis.repeatability:
+        text = (
+            f"Standard deviation of the bias over {len(analysis.files)} recordings, with its 95 % interval. No Allan "
+            "deviation sees it, and a filter needs it as the bias's standard deviation at the start."
+        )
+        rows = [row.row(row.meaning) for row in repeatability_rows(analysis)]
+        yield Section("Repeatability", [text, Table(("sensor", "unit", *_AXES[:3]), rows)])
+    else:
+        text = (
+            "One recording does not show how the bias changes from power-on to power-on, and the Allan deviation "
+            "cannot see it. Give several recordings of the unit, lying alike: `jaximu allan LOG1 LOG2 LOG3 …`"
+        )
+        yield Section("Repeatability", [text])
+
+
+def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Part]:
+    """Return what a program needs: numbers at the sample rate and by axis, Kalibr's file; and where it comes from."""
+    yield Section("The terms in SI, with intervals", [*_terms_in_si(analysis)])
+    yield Section(
+        "At the sample rate: discrete",
+        [
+            "These belong to the sensor at one sample rate: standard deviations of a sample or a step. They are not "
+            "the numbers above, and change with the rate. A program that asks for a unit with √Hz or √h wants the "
+            "continuous terms; one that asks for rad/s or m/s² a sample wants this.",
+            *(_discrete(analysis, name) for name in analysis.axes),
+        ],
+    )
+    yield Section(
+        "For a Kalman filter, by axis",
+        [
+            "The bias is a random walk of density K² (if there is K) plus a first-order Gauss–Markov process of "
+            "standard deviation B (if there is B). Flicker noise has no correlation time; T is chosen so that the "
+            "process peaks (at 1.89 T) in the middle of the part where B rules. A filter that takes a sample as a "
+            "measurement needs R; one that integrates samples, as navigation does, needs N²Δt.",
+            *(_filter_by_axis(analysis, name) for name in analysis.axes),
+        ],
+    )
+    yield Section("For Kalibr", ["The same, as `imu.yaml`:", Code(kalibr_text(analysis))])
+    files = [(source.path, str(source.rows or ""), source.sha256) for source in sources]
+    facts = [
+        ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
+        (
+            "Method",
+            "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data supports "
+            "(jaximu.noise.identify); picture: overlapping Allan deviation at octaves",
+        ),
+        ("Software", f"jaximu {__version__}"),
+        ("Report written", written_now()),
+    ]
+    tables = [Table(("file", "rows", "SHA-256"), files)] if files else []
+    yield Section("Where it comes from", [*tables, Table((), facts)])
+
+
+def _discrete(analysis: NoiseAnalysis, name: str) -> Section:
+    """Return the standard deviations of a triad's samples and steps, in two units."""
+    axes, quantity, rate = analysis.axes[name], SENSOR_QUANTITIES[name], analysis.rates[name]
+    rows: list[tuple[str, ...]] = []
+    for term, words in (("N", "white noise of one sample, σ = N √rate"), ("K", "step of the bias walk, σ = K/√rate")):
+        estimates = [*(axis.terms.get(term) for axis in axes), mean_terms(axes).get(term)]
+        for unit in _DISCRETE_UNITS[quantity] if any(estimates) else ():
             factor = _factor(quantity, "B", unit)
-            cells = [None if size is None else number(factor * size, 4) for size in sizes]
-            discrete.append((words, unit_text(unit), cells))
+            sizes = [
+                "–" if one is None else number(factor * float(to_discrete(term, one.value, rate)), 4)
+                for one in estimates
+            ]
+            rows.append((words, unit_text(unit), *sizes))
+            words = ""
+    content = Table(("", "unit", *_AXES), rows) if rows else "The data supports neither N nor K."
+    return Section(f"{sentence(name)}, {rate:.6g} Hz", [content], 3)
+
+
+def _filter_by_axis(analysis: NoiseAnalysis, name: str) -> Section:
+    """Return the numbers that a filter takes of each axis of a triad, and where B rules."""
     per_axis, mean = filter_numbers(analysis, name)
-    numbers = [
-        (*row[0][:2], row[0][3], [text for _, _, text, _ in row])
-        for row in zip(*map(filter_rows, (*per_axis, mean)), strict=True)
+    rows = [
+        (row[0][0], row[0][3], *("–" if text is None else text for _, _, text, _ in row))
+        for row in zip(*map(filter_rows, per_axis), strict=True)
         if any(text for _, _, text, _ in row)
     ]
-    at, size = _lowest(axes)
-    return {
-        "name": name,
-        "rate": f"{rate:.6g}",
-        "terms": terms,
-        "discrete": discrete,
-        "numbers": numbers,
-        "notes": unseen_notes(axes, quantity),
-        "lowest": f"{_in_unit(size, quantity, 'B', 2)} at {hours(at)}",
-        "flat": None if mean.flat is None else [hours(end) for end in sorted(mean.flat)],
-    }
+    parts: list[Part] = [Table(("formula", "unit", *_AXES[:3]), rows) if rows else _NONE]
+    if mean.flat is not None:
+        left, right = (hours(end) for end in sorted(mean.flat))
+        parts.append(
+            f"In the mean, B rules between averaging times of {left} and {right}; T is their geometric mean over 1.89."
+        )
+    return Section(f"{sentence(name)}, Δt = 1/({mean.rate:.6g} Hz)", parts, 3)
 
 
 def filter_rows(numbers: FilterNumbers) -> list[tuple[str, str, str | None, str]]:
