@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -40,15 +40,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "TermRow",
     "allan_figure",
-    "filter_rows",
-    "hours",
     "kalibr_text",
     "page_of",
-    "repeatability_rows",
     "term_rows",
-    "unresolved",
     "unseen_notes",
 ]
 
@@ -61,6 +56,7 @@ _ORDER = ("gyroscope", "accelerometer", "magnetometer")
 """Whose noise matters most."""
 _AXES = ("x", "y", "z", "mean")
 _TERM_HEADERS = ("term", "unit", *_AXES)
+_Content = Callable[[NoiseAnalysis, str], Iterable[Part]]
 _NONE = "The data supports none of N, B and K."
 Cell = tuple[float, float, float] | float
 
@@ -144,29 +140,16 @@ def unseen_notes(axes: Sequence[Identified], quantity: str) -> list[str]:
     return [*notes, f"Not seen on any axis: {listed(missing)}."] if missing else notes
 
 
-def hours(seconds: float) -> str:
+def _hours(seconds: float) -> str:
     """Return a duration as a person says it."""
     if seconds < 120:
         return f"{seconds:.3g} s"
     return f"{seconds / 60:.3g} min" if seconds < 7200 else f"{seconds / 3600:.3g} h"
 
 
-def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
-    """Return by triad what the length of the recording cannot resolve."""
-    made = {}
-    for name, axes in analysis.axes.items():
-        length, longest = recorded_seconds(axes[0]), axes[0].deviation.tau[-1]
-        text = (
-            f"{hours(length)} at rest resolve averages up to {hours(longest)}; what the bias does more slowly, and "
-            "from one power-on to the next, does not show."
-        )
-        made[name] = f"{text} Four times the recording resolves four times as long averages."
-    return made
-
-
 def _verdict(analysis: NoiseAnalysis) -> Iterator[str]:
     """Say of each triad what a person should keep."""
-    start = f"In {hours(recorded_seconds(next(iter(analysis.axes.values()))[0]))} at rest, the"
+    start = f"In {_hours(recorded_seconds(next(iter(analysis.axes.values()))[0]))} at rest, the"
     for name in [name for name in _ORDER if name in analysis.axes]:
         quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
         sizes = [
@@ -283,7 +266,7 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
     panel.text(
         math.sqrt(longest * right),
         top / 1.15,
-        f"not resolved\nby {hours(recorded_seconds(axes[0]))}",
+        f"not resolved\nby {_hours(recorded_seconds(axes[0]))}",
         ha="center",
         va="top",
         fontsize=8.5,
@@ -371,13 +354,22 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
     """Return the page of a noise analysis; `sources`: the files with their SHA-256 and rows, where they are known."""
     names = ", ".join(Path(path).name for path in analysis.files) or "a recording"
     log = shlex.quote(analysis.files[0]) if analysis.files else "REST"
-    number, meaning = _number(analysis)
+    terms = _by_triad(
+        analysis,
+        "The terms: continuous",
+        "Continuous, two-sided densities with 95 % intervals below them; they belong to the sensor, whatever its "
+        "sample rate. “Mean” is the root mean square of the axes, for a filter that takes one number per triad. Many "
+        "data sheets call the lowest point of the curve bias instability; B is the height of its flat part over 0.664.",
+        _terms,
+    )
+    numbers = _by_triad(
+        analysis, "For a Kalman filter", "Of the mean of the axes, in SI; Δt is one over the sample rate.", _filter
+    )
     return Page(
         f"Noise at rest: {names}",
         [*_verdict(analysis)],
-        number,
-        meaning,
-        (_picture(analysis), *_cautions(analysis), _terms(analysis), _filter(analysis), *_limits(analysis)),
+        *_number(analysis),
+        (_picture(analysis), *_cautions(analysis), terms, numbers, *_limits(analysis)),
         partial(_details, analysis, sources or [Source(path, "", 0) for path in analysis.files]),
         [*map(sentence, filter(None, analysis.notes))],
         f"`jaximu calibrate LOG --static {log} -o RESULTS` calibrates the unit with this noise."
@@ -412,91 +404,83 @@ def _cautions(analysis: NoiseAnalysis) -> Iterator[Section]:
         yield Section("Before you rely on it", cautions)
 
 
-def _terms(analysis: NoiseAnalysis) -> Section:
-    """Return each triad's terms with their intervals, in both units."""
-    parts: list[Part] = [
-        "Continuous, two-sided densities with 95 % intervals below them; they belong to the sensor, whatever its "
-        "sample rate. “Mean” is the root mean square of the axes, for a filter that takes one number per triad. Many "
-        "data sheets call the lowest point of the curve bias instability; B is the height of its flat part over 0.664."
-    ]
-    for name, axes in analysis.axes.items():
-        quantity = SENSOR_QUANTITIES[name]
-        at, size = _lowest(axes)
-        lowest = f"Lowest point of the mean's curve: {_in_unit(size, quantity, 'B', 2)} at {hours(at)}."
-        rows = [row.row(f"{row.term} {row.meaning}", row.first) for row in term_rows(axes, quantity)]
-        tables = [Table(_TERM_HEADERS, rows)] if rows else []
-        title = f"{sentence(name)}, {analysis.rates[name]:.5g} Hz"
-        parts.append(Section(title, [*tables, *unseen_notes(axes, quantity), lowest], 3))
-    return Section("The terms: continuous", parts)
-
-
-def _terms_in_si(analysis: NoiseAnalysis) -> Iterator[Section]:
-    """Yield each triad's terms in SI with their intervals, which the first screen has no room for."""
-    for name, axes in analysis.axes.items():
-        quantity = SENSOR_QUANTITIES[name]
-        rows = [
-            replace(row, first=True) for row in term_rows(axes, quantity) if row.unit == SI_UNITS[quantity][row.term]
-        ]
-        if rows:
-            table = Table(_TERM_HEADERS, [row.row(f"{row.term} {row.meaning}") for row in rows])
-            yield Section(sentence(name), [table], 3)
-
-
-def _filter(analysis: NoiseAnalysis) -> Section:
-    """Return the numbers that a filter takes of the mean of each triad's axes."""
-    parts: list[Part] = ["Of the mean of the axes, in SI."]
+def _by_triad(analysis: NoiseAnalysis, title: str, text: str, content: _Content) -> Section:
+    """Return a section with a part for each triad."""
+    parts: list[Part] = [text] if text else []
     for name in analysis.axes:
-        mean = filter_numbers(analysis, name)[1]
-        rows = [(formula, words, value, unit) for formula, words, value, unit in filter_rows(mean) if value is not None]
-        content = Table(("formula", "number", "value", "unit"), rows) if rows else _NONE
-        parts.append(Section(f"{sentence(name)}, Δt = 1/({mean.rate:.6g} Hz)", [content], 3))
-    return Section("For a Kalman filter", parts)
+        parts.append(Section(f"{sentence(name)}, {analysis.rates[name]:.6g} Hz", [*content(analysis, name)], 3))
+    return Section(title, parts)
+
+
+def _terms(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
+    """Yield a triad's terms with their intervals, in both units, what is not seen, and the lowest point."""
+    axes, quantity = analysis.axes[name], SENSOR_QUANTITIES[name]
+    if rows := [row.row(f"{row.term} {row.meaning}", row.first) for row in term_rows(axes, quantity)]:
+        yield Table(_TERM_HEADERS, rows)
+    yield from unseen_notes(axes, quantity)
+    at, size = _lowest(axes)
+    yield f"Lowest point of the mean's curve: {_in_unit(size, quantity, 'B', 2)} at {_hours(at)}."
+
+
+def _terms_in_si(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
+    """Yield a triad's terms in SI with their intervals, which the first screen has no room for."""
+    quantity = SENSOR_QUANTITIES[name]
+    rows = [row for row in term_rows(analysis.axes[name], quantity) if row.unit == SI_UNITS[quantity][row.term]]
+    named = [replace(row, first=True).row(f"{row.term} {row.meaning}") for row in rows]
+    yield Table(_TERM_HEADERS, named) if named else _NONE
+
+
+def _filter(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
+    """Yield the numbers that a filter takes of the mean of a triad's axes."""
+    rows = [row for row in _filter_rows(filter_numbers(analysis, name)[1]) if row[2]]
+    yield Table(("formula", "number", "value", "unit"), rows) if rows else _NONE
 
 
 def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
     """Say what the length of the recording does not resolve, and how the bias differs between recordings."""
     triads: dict[str, list[str]] = {}
-    for name, text in unresolved(analysis).items():
+    for name, axes in analysis.axes.items():
+        text = (
+            f"{_hours(recorded_seconds(axes[0]))} at rest resolve averages up to {_hours(axes[0].deviation.tau[-1])}; "
+            "what the bias does more slowly, and from one power-on to the next, does not show. Four times the "
+            "recording resolves four times as long averages."
+        )
         triads.setdefault(text, []).append(name)
-    yield Section(
-        "What the length cannot resolve", [Statement(sentence(listed(names)), text) for text, names in triads.items()]
-    )
+    statements = [Statement(sentence(listed(names)), text) for text, names in triads.items()]
+    yield Section("What the length cannot resolve", statements)
+    parts: list[Part] = [
+        "One recording does not show how the bias changes from power-on to power-on, and the Allan deviation cannot "
+        "see it. Give several recordings of the unit, lying alike: `jaximu allan LOG1 LOG2 LOG3 …`"
+    ]
     if analysis.repeatability:
         text = (
             f"Standard deviation of the bias over {len(analysis.files)} recordings, with its 95 % interval. No Allan "
             "deviation sees it, and a filter needs it as the bias's standard deviation at the start."
         )
-        rows = [row.row(row.meaning) for row in repeatability_rows(analysis)]
-        yield Section("Repeatability", [text, Table(("sensor", "unit", *_AXES[:3]), rows)])
-    else:
-        text = (
-            "One recording does not show how the bias changes from power-on to power-on, and the Allan deviation "
-            "cannot see it. Give several recordings of the unit, lying alike: `jaximu allan LOG1 LOG2 LOG3 …`"
-        )
-        yield Section("Repeatability", [text])
+        rows = [row.row(row.meaning) for row in _repeatability_rows(analysis)]
+        parts = [text, Table(("sensor", "unit", *_AXES[:3]), rows)]
+    yield Section("Repeatability", parts)
 
 
 def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Part]:
-    """Return what a program needs: numbers at the sample rate and by axis, Kalibr's file; and where it comes from."""
-    yield Section("The terms in SI, with intervals", [*_terms_in_si(analysis)])
-    yield Section(
+    """Yield what a program needs: numbers at the sample rate and by axis, Kalibr's file; and where it comes from."""
+    yield _by_triad(analysis, "The terms in SI, with intervals", "", _terms_in_si)
+    yield _by_triad(
+        analysis,
         "At the sample rate: discrete",
-        [
-            "These belong to the sensor at one sample rate: standard deviations of a sample or a step. They are not "
-            "the numbers above, and change with the rate. A program that asks for a unit with √Hz or √h wants the "
-            "continuous terms; one that asks for rad/s or m/s² a sample wants this.",
-            *(_discrete(analysis, name) for name in analysis.axes),
-        ],
+        "These belong to the sensor at one sample rate: standard deviations of a sample or a step. They are not the "
+        "numbers above, and change with the rate. A program that asks for a unit with √Hz or √h wants the continuous "
+        "terms; one that asks for rad/s or m/s² a sample wants this.",
+        _discrete,
     )
-    yield Section(
+    yield _by_triad(
+        analysis,
         "For a Kalman filter, by axis",
-        [
-            "The bias is a random walk of density K² (if there is K) plus a first-order Gauss–Markov process of "
-            "standard deviation B (if there is B). Flicker noise has no correlation time; T is chosen so that the "
-            "process peaks (at 1.89 T) in the middle of the part where B rules. A filter that takes a sample as a "
-            "measurement needs R; one that integrates samples, as navigation does, needs N²Δt.",
-            *(_filter_by_axis(analysis, name) for name in analysis.axes),
-        ],
+        "The bias is a random walk of density K² (if there is K) plus a first-order Gauss–Markov process of standard "
+        "deviation B (if there is B). Flicker noise has no correlation time; T is chosen so that the process peaks "
+        "(at 1.89 T) in the middle of the part where B rules. A filter that takes a sample as a measurement needs R; "
+        "one that integrates samples, as navigation does, needs N²Δt.",
+        _filter_by_axis,
     )
     yield Section("For Kalibr", ["The same, as `imu.yaml`:", Code(kalibr_text(analysis))])
     files = [(source.path, str(source.rows or ""), source.sha256) for source in sources]
@@ -514,50 +498,46 @@ def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Par
     yield Section("Where it comes from", [*tables, Table((), facts)])
 
 
-def _discrete(analysis: NoiseAnalysis, name: str) -> Section:
-    """Return the standard deviations of a triad's samples and steps, in two units."""
+def _discrete(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
+    """Yield the standard deviations of a triad's samples and steps, in two units."""
     axes, quantity, rate = analysis.axes[name], SENSOR_QUANTITIES[name], analysis.rates[name]
     rows: list[tuple[str, ...]] = []
     for term, words in (("N", "white noise of one sample, σ = N √rate"), ("K", "step of the bias walk, σ = K/√rate")):
         estimates = [*(axis.terms.get(term) for axis in axes), mean_terms(axes).get(term)]
-        for unit in _DISCRETE_UNITS[quantity] if any(estimates) else ():
+        sizes = [None if one is None else float(to_discrete(term, one.value, rate)) for one in estimates]
+        for unit in _DISCRETE_UNITS[quantity] if any(sizes) else ():
             factor = _factor(quantity, "B", unit)
-            sizes = [
-                "–" if one is None else number(factor * float(to_discrete(term, one.value, rate)), 4)
-                for one in estimates
-            ]
-            rows.append((words, unit_text(unit), *sizes))
+            cells = ["–" if one is None else number(factor * one, 4) for one in sizes]
+            rows.append((words, unit_text(unit), *cells))
             words = ""
-    content = Table(("", "unit", *_AXES), rows) if rows else "The data supports neither N nor K."
-    return Section(f"{sentence(name)}, {rate:.6g} Hz", [content], 3)
+    yield Table(("", "unit", *_AXES), rows) if rows else "The data supports neither N nor K."
 
 
-def _filter_by_axis(analysis: NoiseAnalysis, name: str) -> Section:
-    """Return the numbers that a filter takes of each axis of a triad, and where B rules."""
+def _filter_by_axis(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
+    """Yield the numbers that a filter takes of each axis of a triad, and where B rules."""
     per_axis, mean = filter_numbers(analysis, name)
     rows = [
-        (row[0][0], row[0][3], *("–" if text is None else text for _, _, text, _ in row))
-        for row in zip(*map(filter_rows, per_axis), strict=True)
+        (row[0][0], row[0][3], *(text or "–" for _, _, text, _ in row))
+        for row in zip(*map(_filter_rows, per_axis), strict=True)
         if any(text for _, _, text, _ in row)
     ]
-    parts: list[Part] = [Table(("formula", "unit", *_AXES[:3]), rows) if rows else _NONE]
+    yield Table(("formula", "unit", *_AXES[:3]), rows) if rows else _NONE
     if mean.flat is not None:
-        left, right = (hours(end) for end in sorted(mean.flat))
-        parts.append(
+        left, right = (_hours(end) for end in sorted(mean.flat))
+        yield (
             f"In the mean, B rules between averaging times of {left} and {right}; T is their geometric mean over 1.89."
         )
-    return Section(f"{sentence(name)}, Δt = 1/({mean.rate:.6g} Hz)", parts, 3)
 
 
-def filter_rows(numbers: FilterNumbers) -> list[tuple[str, str, str | None, str]]:
-    """Return formula, words, value as text and unit of each number that a filter takes; None where there is none."""
+def _filter_rows(numbers: FilterNumbers) -> list[tuple[str, str, str, str]]:
+    """Return formula, words, value as text and unit of each number that a filter takes; no text where there is none."""
     return [
-        (formula, words, None if value is None else number(value, 8 if key == "decay" else 4), unit_text(unit))
+        (formula, words, "" if value is None else number(value, 8 if key == "decay" else 4), unit_text(unit))
         for key, formula, words, value, unit in numbers.rows()
     ]
 
 
-def repeatability_rows(analysis: NoiseAnalysis) -> list[TermRow]:
+def _repeatability_rows(analysis: NoiseAnalysis) -> list[TermRow]:
     """Return how the bias scatters over recordings, by triad: a row in the unit of data sheets, then one in SI."""
     rows = []
     for name, table in analysis.repeatability.items():
