@@ -379,6 +379,7 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
 
 
 def _picture(analysis: NoiseAnalysis) -> Picture:
+    """Return the Allan deviation of all sensors with how to read it."""
     return Picture(
         "allan",
         partial(allan_figure, analysis),

@@ -122,5 +122,5 @@ def _guess(guess: Mapping[str, Any] | None) -> Iterator[Part]:
     ]
     if guess["rows"]:
         columns = list(zip(*guess["rows"], strict=True))
-        parts.append(Table(("column", *(f"row {place}" for place in range(1, len(columns[0])))), columns))
+        parts.append(Table(("column", *(f"row {row}" for row in range(1, len(columns[0])))), columns))
     yield Section("How the columns were understood", parts)
