@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,8 +52,11 @@ def run(
     if as_json:
         options.print_json(documents[0] if len(documents) == 1 else documents)
         return
+    from jaximu.report.recording import log_page
+    from jaximu.report.terminal import show
+
     for path, document, reading in zip(logs, documents, stated, strict=True):
-        _print(document, path, reading.line())
+        show(log_page(document, [*_lines(document, path, reading.line())]))
 
 
 def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
@@ -104,10 +108,11 @@ def _shown(advice: Advice) -> str:
 def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -> dict[str, Any]:
     """Return what the log holds, what was noticed, and what it can be used for: as `--json` prints it."""
     from jaximu.mistakes import prepare
+    from jaximu.report.recording import signal_facts
 
     ready = prepare(recording)
     used = ready.recording.signals
-    signals = {name: _signal(signal, used[name]) for name, signal in recording.signals.items()}
+    signals = {name: signal_facts(signal, used[name]) for name, signal in recording.signals.items()}
     guessing = guessed or advice is not None
     notes = [note for note in recording.remarks if not guessing or "--" not in note]  # options that only this verb gave
     findings = [*guessed, *notes, *ready.notes]
@@ -135,6 +140,7 @@ def _uses(recording: Recording, repaired: Recording, findings: list[str], physic
     import numpy as np
 
     from jaximu.recordings.recording import plausibility
+    from jaximu.report.recording import signal_facts
 
     uses, signals, poses = {}, recording.signals, 0
     force = np.linalg.norm(recording.accelerometer.si(), axis=1)
@@ -148,7 +154,7 @@ def _uses(recording: Recording, repaired: Recording, findings: list[str], physic
         if not means:
             findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
     rest, longest, begin = _rest(repaired) if physical else (0.0, 0.0, 0.0)
-    length = _signal(recording.accelerometer, repaired.accelerometer)["duration"]
+    length = signal_facts(recording.accelerometer, repaired.accelerometer)["duration"]
     if rest:
         findings.append(
             f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
@@ -204,25 +210,6 @@ def _poses(recording: Recording, findings: list[str]) -> int:
     return poses
 
 
-def _signal(signal: Signal, used: Signal) -> dict[str, Any]:
-    """What a signal holds; where its stamps were put right, as every other verb does, those."""
-    import numpy as np
-
-    used = used if len(used) == len(signal) else signal  # rows that are left out are no gap of the log
-    interval = np.diff(used.time)
-    several = len(interval) > 0
-    return {
-        "unit": signal.unit,
-        "samples": len(signal),
-        "rate": float(used.rate) if several else 0.0,
-        "jitter": float(np.std(interval)) if several else 0.0,
-        "longest_gap": float(interval.max()) if several else 0.0,
-        "duration": float(used.time[-1] - used.time[0]),
-        "minimum": signal.values.min(axis=0).tolist(),
-        "maximum": signal.values.max(axis=0).tolist(),
-    }
-
-
 def _tilt(signal: Signal, intervals: FloatArray) -> float:
     """Return the largest angle, degrees, of the force in a pose from its mean over all poses."""
     import numpy as np
@@ -269,54 +256,11 @@ _MORE = {
 """What the line to paste needs beside the log, and where results go."""
 
 
-def _print(document: dict[str, Any], path: Path, stated: str) -> None:
-    from jaximu.cli.shown import console, table
-    from jaximu.ground.quantities import number, unit_text
-    from jaximu.ground.summary import sentence
-
-    screen = console(150)
-    headers = (
-        "signal",
-        "unit",
-        "samples",
-        "rate [Hz]",
-        "jitter [ms]",
-        "longest gap [s]",
-        "duration [s]",
-        "minimum",
-        "maximum",
-    )
-    rows = [
-        (
-            name,
-            unit_text(signal["unit"]),
-            str(signal["samples"]),
-            f"{signal['rate']:.5g}",
-            number(round(1e3 * signal["jitter"], 6)),
-            f"{signal['longest_gap']:.3g}",
-            f"{signal['duration']:.5g}",
-            *(" ".join(f"{value:.4g}" for value in signal[key]).replace("-", "−") for key in ("minimum", "maximum")),
-        )
-        for name, signal in document["signals"].items()
-    ]
-    table(screen, headers, rows, document["file"])
+def _lines(document: dict[str, Any], path: Path, stated: str) -> Iterator[str]:
+    """Yield the line to paste for each use; `stated`: the options with which the log was read."""
     if guess := document.get("guess"):
-        blanks = ", fill in the ?" if "?" in guess["line"] else ""
-        screen.print(f"The file does not say all of this. Check it{blanks}, then paste:")
-        screen.print(f"  {guess['line']}", soft_wrap=True)
-        for text in (*guess["reasons"], *guess["questions"]):
-            screen.print(f"  - {sentence(text)}")
-        if guess["rows"]:
-            table(screen, guess["rows"][0], guess["rows"][1:], "First rows:")
-    for finding in document["findings"]:
-        screen.print(f"- {sentence(finding)}")
-    if guess:
         stated = f" {guess['line']}"
-    screen.print("Can be used for:")
     for use in document["uses"]:
         needs, results = _MORE.get(use["verb"], ("", " -o results"))
         first = " results/calibration.json" if use["verb"] in ("check", "compensate") else ""
-        screen.print(f"  {sentence(use['why'])}:")
-        screen.print(
-            f"    jaximu {use['verb']}{first} {shlex.quote(str(path))}{stated}{needs}{results}", soft_wrap=True
-        )
+        yield f"jaximu {use['verb']}{first} {shlex.quote(str(path))}{stated}{needs}{results}"

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.ground.errors import InputError, worded
+from jaximu.ground.page import Table
 from jaximu.ground.quantities import Z95, readable, with_interval
 
 if TYPE_CHECKING:
@@ -163,7 +164,7 @@ class ParameterTable(Mapping[str, Parameter]):
     def __len__(self) -> int:
         return len(self._parameters)
 
-    def block(self) -> Block:
+    def block(self) -> Table:
         """Return the table as texts; a star marks what is weakly determined."""
         largest: dict[tuple[str, str], float] = {}
         for one in self.values():
@@ -172,13 +173,13 @@ class ParameterTable(Mapping[str, Parameter]):
         for one in self.values():
             words, *numbers = one.cells(largest[one.group])
             rows.append((words + " *" * one.weak, *numbers))
-        return Block(("parameter", "value", "standard uncertainty", "unit"), tuple(rows))
+        return Table(("parameter", "value", "standard uncertainty", "unit"), tuple(rows))
 
     def __repr__(self) -> str:
-        return self.block().text()
+        return str(self.block())
 
     def _repr_html_(self) -> str:
-        return self.block().html()
+        return self.block()._repr_html_()
 
     def to_arrow(self) -> pa.Table:
         """Return name, words, value, sigma, unit and weak as an Arrow table, which polars and DuckDB read, too."""

@@ -21,9 +21,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.quantities import number, readable, size
-from jaximu.ground.summary import Block, Described, Summary
-from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_UNITS
+from jaximu.ground.page import Result
 from jaximu.model.processes import RATIO
 
 __all__ = ["AxisNoise", "NoiseModel"]
@@ -98,29 +96,12 @@ class AxisNoise:
 
 
 @dataclass(frozen=True, repr=False)
-class NoiseModel(Described):
+class NoiseModel(Result, page="noise_model"):
     """The noise of a unit: accelerometer (m/s²) and, unless None, gyroscope (rad/s)."""
 
     accelerometer: AxisNoise
     gyroscope: AxisNoise | None = None
     notes: tuple[str, ...] = ()
-
-    def summary(self) -> Summary:
-        """Return each axis's white noise and the spread of its slow bias, and the notes."""
-        rows = []
-        for name in INERTIAL_QUANTITIES:
-            noise: AxisNoise | None = getattr(self, name)
-            if noise is None:
-                continue
-            unit = SENSOR_UNITS[name]
-            for axis, *densities in zip("xyz", noise.white, noise.variance.sum(axis=1), strict=True):
-                white, slow = map(float, np.sqrt(densities))
-                factor, printed = readable(unit, white)
-                rows.append((f"{name} {axis}", f"{number(factor * white)} {printed}/√Hz", size(slow, unit)))
-        duration = self.accelerometer.duration
-        origin = f"Fitted to {duration:.0f} s at rest." if duration else "Stated, not fitted."
-        headers = ("axis", "white noise", "slow bias (standard deviation)")
-        return Summary("Noise model", (origin,), Block(headers, tuple(rows)), self.notes)
 
 
 def fit_bank(values: FloatArray, rate: float) -> AxisNoise:

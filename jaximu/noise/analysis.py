@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,11 +14,11 @@ from jaximu.ground.distributions import chi2_isf
 from jaximu.ground.document import SOFTWARE, read_document
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.ground.quantities import number, size, unit_text
-from jaximu.ground.summary import Block, Described, Summary
+from jaximu.ground.page import Result
+from jaximu.ground.quantities import size
 from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.mistakes import Prepared, prepared
-from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert
+from jaximu.model.data_sheet import SI_UNITS
 from jaximu.noise.cleaning import PeriodicLine, without_outliers
 from jaximu.noise.identification import Identified, identify
 from jaximu.recordings.recording import Recording, Signal, recordings_of
@@ -41,7 +40,7 @@ def read_analysis(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class NoiseAnalysis(Described, Comparable):
+class NoiseAnalysis(Result, Comparable, page="allan"):
     """Identified noise by triad (three axes each), its sample rate, and the spread of the bias over several logs.
 
     repeatability: by triad, standard deviation of the recordings' means with its 95 % interval, (3, 3) value, low, high
@@ -58,25 +57,6 @@ class NoiseAnalysis(Described, Comparable):
     def lines(self) -> dict[str, list[tuple[PeriodicLine, ...]]]:
         """The periodic lines found, by triad and axis: frequency (Hz) and amplitude (SI)."""
         return {name: [axis.lines for axis in axes] for name, axes in self.axes.items()}
-
-    def summary(self) -> Summary:
-        """Return the terms of each axis with their 95 % intervals in data-sheet units, and the notes."""
-        rows = []
-        for name, axes in self.axes.items():
-            units, printed = SI_UNITS[SENSOR_QUANTITIES[name]], DATASHEET_UNITS[SENSOR_QUANTITIES[name]]
-            for axis, identified in zip("xyz", axes, strict=True):
-                for letter, term in identified.terms.items():
-                    if term is None:
-                        continue
-                    what, unit = f"{name} {axis}: {TERM_NAMES[letter]} ({letter})", printed[letter]
-                    sizes = (term.value, term.low, term.high)
-                    value, low, high = (float(convert(size, units[letter], unit)) for size in sizes)
-                    rows.append((what, number(value), f"{number(low, 2)} to {number(high, 2)}", unit_text(unit)))
-        rates = ", ".join(f"{name} {rate:.5g} Hz" for name, rate in self.rates.items())
-        files = ", ".join(Path(file).name for file in self.files) or "a recording"
-        table = Block(("noise term", "value", "95 % interval", "unit"), tuple(rows))
-        verdict = f"{len(rows)} noise terms are supported by the data ({rates})."
-        return Summary(f"Noise of {files}", (verdict,), table, self.notes)
 
     def document(self) -> dict[str, Any]:
         """Return the analysis as the JSON document of schema `jaximu.allan/1`: SI, continuous, two-sided, 95 %."""

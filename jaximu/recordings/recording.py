@@ -9,7 +9,6 @@ from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,9 +18,9 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
-from jaximu.ground.quantities import unit_text
+from jaximu.ground.page import Result
 from jaximu.ground.reexport import later
-from jaximu.ground.summary import Block, Described, Summary, data_frame, sentence
+from jaximu.ground.summary import data_frame
 from jaximu.ground.tracing import is_traced
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, STANDARD_GRAVITY
 from jaximu.recordings.alignment import CORRELATED, Turning, turning, turns_backwards
@@ -264,7 +263,7 @@ def _axes_words(axes: str | None) -> str:
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Recording(Described, Comparable):
+class Recording(Result, Comparable, page="recording"):
     """One recording of one unit. Sensors carry their own stamps, which may differ; absent ones are None.
 
     Of a gyroscope alone (`ReadOptions.alone`) the accelerometer has no samples.
@@ -344,30 +343,6 @@ class Recording(Described, Comparable):
     def plot(self) -> "Figure":
         """Return a figure of all signals against time, in SI units; it shows itself in a notebook."""
         return later("report.figures", "signals_figure")(self)
-
-    def summary(self) -> Summary:
-        """Return which sensors are in it, their units, rates and durations, and what reading it had to assume."""
-        rows = [
-            (
-                name.replace("_", " "),
-                str(len(signal)),
-                f"{signal.rate:.5g}" if len(signal) > 1 else "",
-                f"{signal.time[-1] - signal.time[0]:.5g}" if len(signal) else "",
-                unit_text(signal.unit),
-            )
-            for name, signal in self.signals.items()
-        ]
-        names = ", ".join(Path(source.path).name for source in self.sources)
-        longest = max(self.signals.values(), key=len)
-        lasting = (
-            f"{longest.time[-1] - longest.time[0]:.5g} s at {longest.rate:.5g} Hz" if len(longest) > 1 else "one sample"
-        )
-        sensors = " and ".join(name for name in self.signals if name in SENSORS.values())
-        headers = ("signal", "samples", "rate [Hz]", "duration [s]", "unit")
-        table = Block(headers, tuple(rows))
-        return Summary(
-            names or "recording", (sentence(f"{sensors}, {lasting}."),), table, tuple(map(sentence, self.notes))
-        )
 
 
 def recordings_of(recordings: "Recording | Sequence[Any]") -> list[Recording]:

@@ -1,19 +1,22 @@
-"""What a noise analysis tells a person: tables in both units, sentences, the picture, one HTML page, Kalibr's file."""
+"""The page of a noise analysis: the curve, every axis's terms, the numbers that a filter takes, Kalibr's file."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+import shlex
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaximu._version import __version__
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.page import Code, Page, Part, Picture, Section, Statement, Table
 from jaximu.ground.quantities import listed, number, unit_text
+from jaximu.ground.summary import sentence
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
 from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.analysis import NoiseAnalysis
@@ -30,7 +33,6 @@ from jaximu.noise.identification import Identified, Term
 from jaximu.recordings.readers.kalibr import kalibr_yaml
 from jaximu.recordings.recording import Source
 from jaximu.report.figures import AXES, dressed, new_figure
-from jaximu.report.html import page
 from jaximu.report.tables import written_now
 
 if TYPE_CHECKING:
@@ -38,16 +40,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "TermRow",
     "allan_figure",
-    "filter_rows",
-    "hours",
     "kalibr_text",
-    "lead",
-    "noise_report",
-    "repeatability_rows",
+    "page_of",
     "term_rows",
-    "unresolved",
     "unseen_notes",
 ]
 
@@ -56,6 +52,12 @@ _DISCRETE_UNITS = {
     "specific_force": ("mg", "m/s^2"),
     "magnetic_field": ("nT", "uT"),
 }
+_ORDER = ("gyroscope", "accelerometer", "magnetometer")
+"""Whose noise matters most."""
+_AXES = ("x", "y", "z", "mean")
+_TERM_HEADERS = ("term", "unit", *_AXES)
+_Content = Callable[[NoiseAnalysis, str], Iterable[Part]]
+_NONE = "The data supports none of N, B and K."
 Cell = tuple[float, float, float] | float
 
 
@@ -72,14 +74,19 @@ class TermRow:
     cells: tuple[Cell, ...]
     first: bool
 
-    def texts(self) -> list[tuple[str, str]]:
-        """Return value and interval as a person reads them."""
-        return [
+    def texts(self, intervals: bool = True) -> list[str]:
+        """Return each value as a person reads it, with its interval on a line below."""
+        pairs = [
             (number(cell[0], 4), f"{number(cell[1])} … {number(cell[2])}")
             if isinstance(cell, tuple)
             else ("not seen", f"up to {number(cell)}")
             for cell in self.cells
         ]
+        return ["\n".join(pair) if intervals else pair[0] for pair in pairs]
+
+    def row(self, name: str, intervals: bool = True) -> tuple[str, ...]:
+        """Return the row of a table: its name where it is the first of its term, the unit, and the texts."""
+        return name if self.first else "", unit_text(self.unit), *self.texts(intervals)
 
 
 def _factor(quantity: str, term: str, unit: str) -> float:
@@ -133,40 +140,37 @@ def unseen_notes(axes: Sequence[Identified], quantity: str) -> list[str]:
     return [*notes, f"Not seen on any axis: {listed(missing)}."] if missing else notes
 
 
-def hours(seconds: float) -> str:
+def _hours(seconds: float) -> str:
     """Return a duration as a person says it."""
     if seconds < 120:
         return f"{seconds:.3g} s"
     return f"{seconds / 60:.3g} min" if seconds < 7200 else f"{seconds / 3600:.3g} h"
 
 
-def unresolved(analysis: NoiseAnalysis) -> dict[str, str]:
-    """Return by triad what the length of the recording cannot resolve."""
-    made = {}
-    for name, axes in analysis.axes.items():
-        length, longest = recorded_seconds(axes[0]), axes[0].deviation.tau[-1]
-        text = (
-            f"{hours(length)} at rest resolve averages up to {hours(longest)}; what the bias does more slowly, and "
-            "from one power-on to the next, does not show."
-        )
-        made[name] = f"{text} Four times the recording resolves four times as long averages."
-    return made
+def _verdict(analysis: NoiseAnalysis) -> Iterator[str]:
+    """Say of each triad what a person should keep."""
+    start = f"In {_hours(recorded_seconds(next(iter(analysis.axes.values()))[0]))} at rest, the"
+    for name in [name for name in _ORDER if name in analysis.axes]:
+        quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
+        sizes = [
+            f"{TERM_NAMES[term]} of {_in_unit(estimate.value, quantity, term)}"
+            for term in "NBK"
+            if (estimate := mean.get(term)) is not None
+        ]
+        yield f"{start} {name} has {listed(sizes) if sizes else 'none of N, B and K'} (mean of the axes)."
+        start = "The"
 
 
-def lead(analysis: NoiseAnalysis) -> str:
-    """Return the one sentence that a person should keep."""
-    parts = []
-    for name in ("gyroscope", "accelerometer", "magnetometer"):
-        if name in analysis.axes:
-            quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
-            sizes = [
-                f"{TERM_NAMES[term]} of {_in_unit(estimate.value, quantity, term)}"
-                for term in "NBK"
-                if (estimate := mean.get(term)) is not None
-            ]
-            parts.append(f"the {name} has {listed(sizes) if sizes else 'none of N, B and K'}")
-    axes = next(iter(analysis.axes.values()))
-    return f"In {hours(recorded_seconds(axes[0]))} at rest, {'; '.join(parts)} (mean of the axes)."
+def _number(analysis: NoiseAnalysis) -> tuple[str, str]:
+    """Return the first term of the most important triad that shows one, and what it is."""
+    for name in [name for name in _ORDER if name in analysis.axes]:
+        quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
+        for term, estimate in [(term, mean.get(term)) for term in "NBK"]:
+            if estimate is not None:
+                low, high = (_in_unit(end, quantity, term) for end in (estimate.low, estimate.high))
+                meaning = f"{TERM_NAMES[term]} of the {name} (mean of the axes), 95 % interval {low} … {high}"
+                return _in_unit(estimate.value, quantity, term), meaning
+    return "", ""
 
 
 def _lowest(axes: Sequence[Identified]) -> tuple[float, float]:
@@ -262,7 +266,7 @@ def _panel(panel: Axes, name: str, axes: Sequence[Identified], unit: str) -> Non
     panel.text(
         math.sqrt(longest * right),
         top / 1.15,
-        f"not resolved\nby {hours(recorded_seconds(axes[0]))}",
+        f"not resolved\nby {_hours(recorded_seconds(axes[0]))}",
         ha="center",
         va="top",
         fontsize=8.5,
@@ -346,92 +350,195 @@ def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
     return kalibr_yaml(numbers, float(f"{min(rates):.6g}"), topic, header)
 
 
-def noise_report(
-    analysis: NoiseAnalysis, sources: Sequence[Source] = (), title: str | None = None
-) -> tuple[bytes, dict[str, bytes]]:
-    """Return the report, one HTML page that works offline, and its picture by the name of its file.
-
-    **Arguments:** `sources`: the files with their SHA-256 and rows. `title`: the heading; the names of the files if
-    None.
-    """
+def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
+    """Return the page of a noise analysis; `sources`: the files with their SHA-256 and rows, where they are known."""
     names = ", ".join(Path(path).name for path in analysis.files) or "a recording"
-    return page(
-        "allan",
-        {"allan": partial(allan_figure, analysis)},
-        title=title or f"Noise at rest: {names}",
-        lead=lead(analysis),
-        alternative="Allan deviation against averaging time for " + " and ".join(analysis.axes),
-        triads=[_triad(analysis, name) for name in analysis.axes],
-        caution=[name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)],
-        missing=[name for name in INERTIAL_QUANTITIES if name not in analysis.axes],
-        unresolved=[(name.capitalize(), text) for name, text in unresolved(analysis).items()],
-        yaml=kalibr_text(analysis),
-        recordings=len(analysis.files),
-        notes=[note for note in analysis.notes if note],
-        repeatability=[(row.meaning, unit_text(row.unit), row.texts()) for row in repeatability_rows(analysis)],
-        sources=[
-            (source.path, str(source.rows or ""), source.sha256)
-            for source in sources or [Source(path, "", 0) for path in analysis.files]
-        ],
-        facts=[
-            ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
-            (
-                "Method",
-                "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data supports "
-                "(jaximu.noise.identify); picture: overlapping Allan deviation at octaves",
-            ),
-            ("Software", f"jaximu {__version__}"),
-            ("Report written", written_now()),
-        ],
+    log = shlex.quote(analysis.files[0]) if analysis.files else "REST"
+    terms = _by_triad(
+        analysis,
+        "The terms: continuous",
+        "Continuous, two-sided densities with 95 % intervals below them; they belong to the sensor, whatever its "
+        "sample rate. “Mean” is the root mean square of the axes, for a filter that takes one number per triad. Many "
+        "data sheets call the lowest point of the curve bias instability; B is the height of its flat part over 0.664.",
+        _terms,
+    )
+    numbers = _by_triad(
+        analysis, "For a Kalman filter", "Of the mean of the axes, in SI; Δt is one over the sample rate.", _filter
+    )
+    return Page(
+        f"Noise at rest: {names}",
+        [*_verdict(analysis)],
+        *_number(analysis),
+        (_picture(analysis), *_cautions(analysis), terms, numbers, *_limits(analysis)),
+        partial(_details, analysis, sources or [Source(path, "", 0) for path in analysis.files]),
+        [*map(sentence, filter(None, analysis.notes))],
+        f"`jaximu calibrate LOG --static {log} -o RESULTS` calibrates the unit with this noise."
+        if "accelerometer" in analysis.axes
+        else "",
     )
 
 
-def _triad(analysis: NoiseAnalysis, name: str) -> dict[str, Any]:
-    """Return what the page says of one triad, as text."""
+def _picture(analysis: NoiseAnalysis) -> Picture:
+    """Return the Allan deviation of all sensors with how to read it."""
+    return Picture(
+        "allan",
+        partial(allan_figure, analysis),
+        "Allan deviation against averaging time for " + " and ".join(analysis.axes),
+        "How to read it: average the output over τ seconds, and the difference between one average and the next is "
+        "typically √2 times the height of the curve. On the left, averaging helps: white noise falls by √10 for ten "
+        "times the time. Where the curve is flat (bias instability) or rises (random walk, ramp), the bias itself "
+        "wanders and longer averages no longer help. The squares of the dashed lines add up to that of a solid one.",
+    )
+
+
+def _cautions(analysis: NoiseAnalysis) -> Iterator[Section]:
+    """Say where the terms are not the whole noise, and which sensor is missing."""
+    poor = [name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)]
+    missing = [name for name in INERTIAL_QUANTITIES if name not in analysis.axes]
+    cautions = []
+    if poor:
+        text = f"The five terms do not describe the {listed(poor)} completely; the intervals are widened for it, see "
+        cautions.append(Statement("More than the five terms", f"{text}the notes.", True))
+    if missing:
+        cautions.append(Statement("Not recorded", f"The recording has no {listed(missing, 'and no')}.", True))
+    if cautions:
+        yield Section("Before you rely on it", cautions)
+
+
+def _by_triad(analysis: NoiseAnalysis, title: str, text: str, content: _Content) -> Section:
+    """Return a section with a part for each triad."""
+    parts: list[Part] = [text] if text else []
+    for name in analysis.axes:
+        parts.append(Section(f"{sentence(name)}, {analysis.rates[name]:.6g} Hz", [*content(analysis, name)], 3))
+    return Section(title, parts)
+
+
+def _terms(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
+    """Yield a triad's terms with their intervals, in both units, what is not seen, and the lowest point."""
+    axes, quantity = analysis.axes[name], SENSOR_QUANTITIES[name]
+    if rows := [row.row(f"{row.term} {row.meaning}", row.first) for row in term_rows(axes, quantity)]:
+        yield Table(_TERM_HEADERS, rows)
+    yield from unseen_notes(axes, quantity)
+    at, size = _lowest(axes)
+    yield f"Lowest point of the mean's curve: {_in_unit(size, quantity, 'B', 2)} at {_hours(at)}."
+
+
+def _terms_in_si(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
+    """Yield a triad's terms in SI with their intervals, which the first screen has no room for."""
+    quantity = SENSOR_QUANTITIES[name]
+    rows = [row for row in term_rows(analysis.axes[name], quantity) if row.unit == SI_UNITS[quantity][row.term]]
+    named = [replace(row, first=True).row(f"{row.term} {row.meaning}") for row in rows]
+    yield Table(_TERM_HEADERS, named) if named else _NONE
+
+
+def _filter(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
+    """Yield the numbers that a filter takes of the mean of a triad's axes."""
+    rows = [row for row in _filter_rows(filter_numbers(analysis, name)[1]) if row[2]]
+    yield Table(("formula", "number", "value", "unit"), rows) if rows else _NONE
+
+
+def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
+    """Say what the length of the recording does not resolve, and how the bias differs between recordings."""
+    triads: dict[str, list[str]] = {}
+    for name, axes in analysis.axes.items():
+        text = (
+            f"{_hours(recorded_seconds(axes[0]))} at rest resolve averages up to {_hours(axes[0].deviation.tau[-1])}; "
+            "what the bias does more slowly, and from one power-on to the next, does not show. Four times the "
+            "recording resolves four times as long averages."
+        )
+        triads.setdefault(text, []).append(name)
+    statements = [Statement(sentence(listed(names)), text) for text, names in triads.items()]
+    yield Section("What the length cannot resolve", statements)
+    parts: list[Part] = [
+        "One recording does not show how the bias changes from power-on to power-on, and the Allan deviation cannot "
+        "see it. Give several recordings of the unit, lying alike: `jaximu allan LOG1 LOG2 LOG3 …`"
+    ]
+    if analysis.repeatability:
+        text = (
+            f"Standard deviation of the bias over {len(analysis.files)} recordings, with its 95 % interval. No Allan "
+            "deviation sees it, and a filter needs it as the bias's standard deviation at the start."
+        )
+        rows = [row.row(row.meaning) for row in _repeatability_rows(analysis)]
+        parts = [text, Table(("sensor", "unit", *_AXES[:3]), rows)]
+    yield Section("Repeatability", parts)
+
+
+def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Part]:
+    """Yield what a program needs: numbers at the sample rate and by axis, Kalibr's file; and where it comes from."""
+    yield _by_triad(analysis, "The terms in SI, with intervals", "", _terms_in_si)
+    yield _by_triad(
+        analysis,
+        "At the sample rate: discrete",
+        "These belong to the sensor at one sample rate: standard deviations of a sample or a step. They are not the "
+        "numbers above, and change with the rate. A program that asks for a unit with √Hz or √h wants the continuous "
+        "terms; one that asks for rad/s or m/s² a sample wants this.",
+        _discrete,
+    )
+    yield _by_triad(
+        analysis,
+        "For a Kalman filter, by axis",
+        "The bias is a random walk of density K² (if there is K) plus a first-order Gauss–Markov process of standard "
+        "deviation B (if there is B). Flicker noise has no correlation time; T is chosen so that the process peaks "
+        "(at 1.89 T) in the middle of the part where B rules. A filter that takes a sample as a measurement needs R; "
+        "one that integrates samples, as navigation does, needs N²Δt.",
+        _filter_by_axis,
+    )
+    yield Section("For Kalibr", ["The same, as `imu.yaml`:", Code(kalibr_text(analysis))])
+    files = [(source.path, str(source.rows or ""), source.sha256) for source in sources]
+    facts = [
+        ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
+        (
+            "Method",
+            "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data supports "
+            "(jaximu.noise.identify); picture: overlapping Allan deviation at octaves",
+        ),
+        ("Software", f"jaximu {__version__}"),
+        ("Report written", written_now()),
+    ]
+    tables = [Table(("file", "rows", "SHA-256"), files)] if files else []
+    yield Section("Where it comes from", [*tables, Table((), facts)])
+
+
+def _discrete(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
+    """Yield the standard deviations of a triad's samples and steps, in two units."""
     axes, quantity, rate = analysis.axes[name], SENSOR_QUANTITIES[name], analysis.rates[name]
-    terms = []
-    for row in term_rows(axes, quantity):
-        kinds = ["SI"] * (row.unit == SI_UNITS[quantity][row.term]) + ["data sheets"] * row.first
-        terms.append((row, unit_text(row.unit), " and ".join(kinds)))
-    columns: list[dict[str, Any]] = [*(dict(axis.terms) for axis in axes), dict(mean_terms(axes))]
-    discrete = []
+    rows: list[tuple[str, ...]] = []
     for term, words in (("N", "white noise of one sample, σ = N √rate"), ("K", "step of the bias walk, σ = K/√rate")):
-        sizes = [
-            None if column.get(term) is None else float(to_discrete(term, column[term].value, rate))
-            for column in columns
-        ]
-        for unit in _DISCRETE_UNITS[quantity] if any(size is not None for size in sizes) else ():
+        estimates = [*(axis.terms.get(term) for axis in axes), mean_terms(axes).get(term)]
+        sizes = [None if one is None else float(to_discrete(term, one.value, rate)) for one in estimates]
+        for unit in _DISCRETE_UNITS[quantity] if any(sizes) else ():
             factor = _factor(quantity, "B", unit)
-            cells = [None if size is None else number(factor * size, 4) for size in sizes]
-            discrete.append((words, unit_text(unit), cells))
+            cells = ["–" if one is None else number(factor * one, 4) for one in sizes]
+            rows.append((words, unit_text(unit), *cells))
+            words = ""
+    yield Table(("", "unit", *_AXES), rows) if rows else "The data supports neither N nor K."
+
+
+def _filter_by_axis(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
+    """Yield the numbers that a filter takes of each axis of a triad, and where B rules."""
     per_axis, mean = filter_numbers(analysis, name)
-    numbers = [
-        (*row[0][:2], row[0][3], [text for _, _, text, _ in row])
-        for row in zip(*map(filter_rows, (*per_axis, mean)), strict=True)
+    rows = [
+        (row[0][0], row[0][3], *(text or "–" for _, _, text, _ in row))
+        for row in zip(*map(_filter_rows, per_axis), strict=True)
         if any(text for _, _, text, _ in row)
     ]
-    at, size = _lowest(axes)
-    return {
-        "name": name,
-        "rate": f"{rate:.6g}",
-        "terms": terms,
-        "discrete": discrete,
-        "numbers": numbers,
-        "notes": unseen_notes(axes, quantity),
-        "lowest": f"{_in_unit(size, quantity, 'B', 2)} at {hours(at)}",
-        "flat": None if mean.flat is None else [hours(end) for end in sorted(mean.flat)],
-    }
+    yield Table(("formula", "unit", *_AXES[:3]), rows) if rows else _NONE
+    if mean.flat is not None:
+        left, right = (_hours(end) for end in sorted(mean.flat))
+        yield (
+            f"In the mean, B rules between averaging times of {left} and {right}; T is their geometric mean over 1.89."
+        )
 
 
-def filter_rows(numbers: FilterNumbers) -> list[tuple[str, str, str | None, str]]:
-    """Return formula, words, value as text and unit of each number that a filter takes; None where there is none."""
+def _filter_rows(numbers: FilterNumbers) -> list[tuple[str, str, str, str]]:
+    """Return formula, words, value as text and unit of each number that a filter takes; no text where there is none."""
     return [
-        (formula, words, None if value is None else number(value, 8 if key == "decay" else 4), unit_text(unit))
+        (formula, words, "" if value is None else number(value, 8 if key == "decay" else 4), unit_text(unit))
         for key, formula, words, value, unit in numbers.rows()
     ]
 
 
-def repeatability_rows(analysis: NoiseAnalysis) -> list[TermRow]:
+def _repeatability_rows(analysis: NoiseAnalysis) -> list[TermRow]:
     """Return how the bias scatters over recordings, by triad: a row in the unit of data sheets, then one in SI."""
     rows = []
     for name, table in analysis.repeatability.items():

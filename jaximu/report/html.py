@@ -19,12 +19,14 @@ from jaximu.ground.atomic import write_files, write_folder
 from jaximu.ground.errors import worded
 from jaximu.ground.page import Items, Page, Part, Picture, Result, Section
 from jaximu.ground.quantities import probability
-from jaximu.mistakes.titles import effect_title
-from jaximu.report import figures, vector, words
+from jaximu.ground.reexport import later
+from jaximu.ground.summary import sentence
 
 if TYPE_CHECKING:
     import jinja2
     from matplotlib.figure import Figure
+
+    from jaximu.report.vector import Drawing
 
     Drawn = Mapping[str, Callable[[], Figure]]
     """Figures by name, each drawn when its turn comes: one that fails takes nothing else with it."""
@@ -66,18 +68,16 @@ def page(template: str, drawn: Drawn, *, notes: Sequence[str] = (), **values: An
     In place of a figure that cannot be drawn the page says so.
     """
     pictures: dict[str, bytes] = {}
-    sources: dict[str, vector.Drawing | str] = {}
+    sources: dict[str, Drawing | str] = {}
     for name, draw in drawn.items():
         try:
-            figure = draw()
-            pictures[f"{name}.png"] = figures.png(figure)
-            sources[name] = vector.drawing(figure, name)
+            sources[name], pictures[f"{name}.png"] = _drawn(draw(), name)
         except Exception as error:
             sources[name] = _failure(f"The figure “{name}”", error)
     text = (
         _environment()
         .get_template(f"{template}.html.jinja")
-        .render(pictures=sources, notes=[words.sentence(note) for note in notes], **values)
+        .render(pictures=sources, notes=[sentence(note) for note in notes], **values)
     )
     text = _TABLE.sub(_labelled, _FOLDERS.sub("", text))
     return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
@@ -100,17 +100,23 @@ def encoded(page: Page) -> tuple[bytes, dict[str, bytes]]:
     """
     first, rest = [*page.first], [*page.rest()]
     pictures: dict[str, bytes] = {}
-    drawings: dict[str, vector.Drawing | str] = {}
+    drawings: dict[str, Drawing | str] = {}
     for picture in _pictures([*first, *rest]):
         try:
-            figure = picture.draw()
-            pictures[f"{picture.name}.png"] = figures.png(figure)
-            drawings[picture.name] = vector.drawing(figure, picture.name)
+            drawings[picture.name], pictures[f"{picture.name}.png"] = _drawn(picture.draw(), picture.name)
         except Exception as error:
             drawings[picture.name] = _failure(f"The figure “{picture.name}”", error)
     template = _environment().get_template("page.html.jinja")
     text = _FOLDERS.sub("", template.render(page=page, first=first, rest=rest, drawings=drawings))
     return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
+
+
+def _drawn(figure: Figure, name: str) -> tuple[Drawing, bytes]:
+    """Return a figure as a drawing and as a PNG; a fragment without pictures need not load what draws."""
+    from jaximu.report import figures, vector
+
+    png = figures.png(figure)
+    return vector.drawing(figure, name), png
 
 
 def _pictures(parts: Iterable[Part]) -> Iterator[Picture]:
@@ -189,7 +195,11 @@ def _environment() -> jinja2.Environment:
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     }
     made.filters |= {"inline": _inline, "kind_of_cell": _kind_of_cell, "anchor": _anchor}
-    made.globals |= {"title_of": effect_title, "probability": probability, "sentence": words.sentence}
+    made.globals |= {
+        "title_of": lambda name: later("mistakes.titles", "effect_title")(name),
+        "probability": probability,
+        "sentence": sentence,
+    }
     return made
 
 

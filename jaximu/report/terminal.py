@@ -9,7 +9,6 @@ from dataclasses import replace
 
 from rich import box
 from rich.console import Console
-from rich.padding import Padding
 from rich.table import Table as Grid
 
 from jaximu.ground.errors import worded
@@ -53,7 +52,8 @@ def show(content: Page | Part, screen: Console | None = None) -> None:
         case Items(texts=texts):
             _print_items(texts, screen)
         case Code(text=lines):
-            screen.print(Padding(lines, (0, 0, 0, 2)))
+            for line in lines.split("\n"):
+                screen.print(f"  {line}", soft_wrap=True)  # what is cut into lines cannot be pasted
         case Section(title=title, parts=parts):
             screen.print(f"\n{title}", style="bold")
             _print_parts(parts, screen)

@@ -1,0 +1,126 @@
+"""The page of a recording: which signals it holds, how they were sampled, and what was noticed."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaximu.ground.page import Code, Items, Page, Part, Picture, Section, Table
+from jaximu.ground.quantities import listed, number, unit_text
+from jaximu.ground.summary import sentence
+from jaximu.ground.units import SENSORS
+from jaximu.recordings.recording import Recording, Signal
+
+__all__ = ["log_page", "page_of", "signal_facts"]
+
+_HEADERS = (
+    "signal",
+    "unit",
+    "samples",
+    "rate [Hz]",
+    "jitter [ms]",
+    "longest gap [s]",
+    "duration [s]",
+    "minimum",
+    "maximum",
+)
+
+
+def page_of(recording: Recording) -> Page:
+    """Return which sensors are in a recording, how they were sampled, and what reading it had to assume."""
+    names = [source.path for source in recording.sources]
+    signals = {name: signal_facts(signal) for name, signal in recording.signals.items()}
+    picture = Picture("signals", recording.plot, "All signals against time", "As recorded, in SI units.")
+    after = f"`jaximu info {shlex.quote(names[0])}` shows what it can be used for." if names else ""
+    title = ", ".join(Path(name).name for name in names) or "recording"
+    return _page(title, signals, (picture, _table(signals)), recording.notes, after)
+
+
+def log_page(document: Mapping[str, Any], commands: Sequence[str]) -> Page:
+    """Return the page of a log that `jaximu info` described; `commands`: a line to paste for each of its uses."""
+    uses: list[Part] = []
+    for use, command in zip(document["uses"], commands, strict=True):
+        uses += [f"{sentence(use['why'])}:", Code(command)]
+    parts = [
+        _table(document["signals"]),
+        *_guess(document.get("guess")),
+        Section("What was noticed", [Items([*map(sentence, document["findings"])])]),
+        Section("What it can be used for", uses),
+    ]
+    return _page(document["file"], document["signals"], parts)
+
+
+def signal_facts(signal: Signal, used: Signal | None = None) -> dict[str, Any]:
+    """Return how a signal was sampled and between which values it lies.
+
+    **Arguments:** `used`: the signal as every other verb takes it; where its stamps were put right, those count.
+    """
+    used = used if used is not None and len(used) == len(signal) else signal  # rows left out are no gap of the log
+    interval = np.diff(used.time)
+    several = len(interval) > 0
+    return {
+        "unit": signal.unit,
+        "samples": len(signal),
+        "rate": float(used.rate) if several else 0.0,
+        "jitter": float(np.std(interval)) if several else 0.0,
+        "longest_gap": float(interval.max()) if several else 0.0,
+        "duration": float(used.time[-1] - used.time[0]) if several else 0.0,
+        "minimum": signal.values.min(axis=0).tolist() if len(signal) else [],
+        "maximum": signal.values.max(axis=0).tolist() if len(signal) else [],
+    }
+
+
+def _page(
+    title: str,
+    signals: Mapping[str, Mapping[str, Any]],
+    parts: Sequence[Part],
+    notes: Iterable[str] = (),
+    after: str = "",
+) -> Page:
+    """Return the page of signals that are described by their facts: which sensors, at what rate, and for how long."""
+    sensors = [name for name in signals if name in SENSORS.values()] or [*signals] or ["no signal"]
+    longest = max(signals.values(), key=lambda facts: facts["samples"], default={"samples": 0})
+    rate = duration = meaning = ""
+    if longest["samples"] > 1:
+        rate, duration = f" at {longest['rate']:.5g} Hz", f"{longest['duration']:.5g} s"
+        meaning = f"from the first to the last of {longest['samples']} samples"
+    text = sentence(f"{listed(sensors)}{rate}.")
+    return Page(title, (text,), duration, meaning, parts, notes=[*map(sentence, notes)], next=after)
+
+
+def _table(signals: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return a row a signal: how it was sampled, and between which values it lies."""
+    rows = [
+        (
+            name.replace("_", " "),
+            unit_text(facts["unit"]),
+            str(facts["samples"]),
+            f"{facts['rate']:.5g}",
+            number(round(1e3 * facts["jitter"], 6)),
+            f"{facts['longest_gap']:.3g}",
+            f"{facts['duration']:.5g}",
+            *(" ".join(f"{value:.4g}" for value in facts[key]).replace("-", "−") for key in ("minimum", "maximum")),
+        )
+        for name, facts in signals.items()
+    ]
+    return Table(_HEADERS, rows)
+
+
+def _guess(guess: Mapping[str, Any] | None) -> Iterator[Part]:
+    """Return how the columns of a file that does not name them were understood, and the options that say it."""
+    if guess is None:
+        return
+    blanks = ", fill in the ?" if "?" in guess["line"] else ""
+    parts: list[Part] = [
+        f"The file does not say all of this. Check it{blanks}, then paste:",
+        Code(guess["line"]),
+        Items([sentence(text) for text in (*guess["reasons"], *guess["questions"])]),
+    ]
+    if guess["rows"]:
+        columns = list(zip(*guess["rows"], strict=True))
+        parts.append(Table(("column", *(f"row {row}" for row in range(1, len(columns[0])))), columns))
+    yield Section("How the columns were understood", parts)
