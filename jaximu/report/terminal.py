@@ -6,10 +6,10 @@ import io
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from textwrap import indent
 
 from rich import box
 from rich.console import Console
-from rich.padding import Padding
 from rich.table import Table as Grid
 
 from jaximu.ground.errors import worded
@@ -53,7 +53,7 @@ def show(content: Page | Part, screen: Console | None = None) -> None:
         case Items(texts=texts):
             _print_items(texts, screen)
         case Code(text=lines):
-            screen.print(Padding(lines, (0, 0, 0, 2)))
+            screen.print(indent(lines, "  "), soft_wrap=True)  # a folded line is no longer what is to be copied
         case Section(title=title, parts=parts):
             screen.print(f"\n{title}", style="bold")
             _print_parts(parts, screen)
