@@ -37,4 +37,5 @@ def run(
     with progress("calibrating"):
         array = calibrate_array(recordings, gravity, static=noise, loss=loss, repair=repair)
     units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(array.units, 1)}
-    results.present(array.summary, "array.json, report.html and the calibrations", array=array, **units)
+    names = "array.json, report.html and the calibrations"
+    results.present(array.summary, names, {}, array.text, array=array, **units)

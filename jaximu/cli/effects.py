@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from jaximu.cli import options
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
-from jaximu.ground.page import Page, Table
+from jaximu.ground.page import Page, Section, Table
 from jaximu.ground.quantities import joined, plain, unit_text
 from jaximu.ground.reexport import later
 
@@ -75,14 +75,13 @@ def _entry(kind: type[Effect]) -> dict[str, Any]:
 
 def _catalogue(kinds: list[type[Effect]]) -> Page:
     """Return the page of all effects."""
-    rows = []
+    parts = []
     for kind in kinds:
         inner = "".join(f" + {name.replace('_', ' ')}" for name in kind.inner)
         alike = f"; easily taken for {', '.join(kind.look_alikes)}" if kind.look_alikes else ""
         text = f"{kind.size}{inner}, {unit_text(kind.unit)}; {kind.scope}; excited by {kind.excited_by}{alike}"
-        rows.append((f"{kind.title}\n{kind.formula}", text))
-    table = Table(("effect and formula", "numbers, unit; scope; what excites it; what it is mistaken for"), rows)
-    return Page(f"{len(kinds)} effects", ("`jaximu effects NAME` shows one in full.",), first=(table,))
+        parts.append(Section(kind.title, (kind.formula, text)))
+    return Page(f"{len(kinds)} effects", ("`jaximu effects NAME` shows one in full.",), first=parts)
 
 
 def _page(kind: type[Effect]) -> Page:
