@@ -324,6 +324,8 @@ def test_the_command_writes_the_estimators_files(tmp_path, capsys):
     for name, text in found["files"].items():
         assert (tmp_path / "out" / name).read_text() == text
     assert json.loads((tmp_path / "out" / "estimator_noise.json").read_text())["nees"] == found["nees"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "multiply the gyroscope&#39;s white noise by" in page and "vins.yaml" in page
     assert document["schema"] == "jaximu.consequences/1"
     for wrong, status, said in (
         ([*line, "--noise-for", "gtsam"], 2, "--allan"),

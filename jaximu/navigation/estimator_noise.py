@@ -392,7 +392,7 @@ class EstimatorNoise(Result, Document, page="estimator_noise"):
         at = f"{self.lengths[self.chosen]:g} s"
         parts = [
             f"the {name}'s white noise by {number(triad.applied[self.chosen])} "
-            f"({number(triad.low[self.chosen], 2)} to {number(triad.high[self.chosen], 2)})"
+            f"({number(triad.low[self.chosen])} to {number(triad.high[self.chosen])})"
             for name, triad in self.triads.items()
         ]
         return f"For an estimator whose states are {at} apart, multiply {' and '.join(parts)}; {self.words}."

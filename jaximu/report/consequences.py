@@ -69,7 +69,8 @@ def _next(consequences: Consequences) -> str:
     """Say which command makes the error smaller, where a better calibration would."""
     if _at_end(consequences.calibration) < _at_end(consequences.noise):
         return ""
-    file = shlex.quote(consequences.calibration_file)
+    file = consequences.calibration_file
+    file = shlex.quote(file) if Path(file).suffix else "CALIBRATION"
     return f"`jaximu plan {file} -o plan` plans the poses and turns that improve the calibration most."
 
 

@@ -28,7 +28,7 @@ def page_of(noise: EstimatorNoise) -> Page:
     return Page(
         f"Noise for an estimator whose states are {_length(noise)} apart",
         (noise.headline(),),
-        f"{number(triad.applied[at])} (95 %: {number(triad.low[at], 2)} to {number(triad.high[at], 2)})",
+        f"{number(triad.applied[at])} (95 %: {number(triad.low[at])} to {number(triad.high[at])})",
         f"times the {name}'s white noise N",
         (*statements(noise), _table(noise)),
         notes=[sentence(note) for note in noise.notes],
@@ -77,11 +77,15 @@ def _table(noise: EstimatorNoise) -> Table:
         rows.append((f"NEES of {name}, as stated", *(number(value, 2) for value in values[:, 0])))
         rows.append((f"NEES of {name}, multiplied", *(number(value, 2) for value in values[:, 1])))
     headers = ("", *(f"over {length:g} s" for length in noise.lengths))
-    return Table(headers, rows, "Terms after a dash: what each would make by itself, as a multiple of N.")
+    caption = (
+        "Terms after a dash: what each would make by itself, as a multiple of N. NEES: squared error over what the "
+        "estimator expects; it should be one."
+    )
+    return Table(headers, rows, caption)
 
 
 def _multipliers(triad: TriadNoise) -> list[str]:
     return [
-        f"{number(middle)} ({number(low, 2)} to {number(high, 2)})"
+        f"{number(middle)} ({number(low)} to {number(high)})"
         for middle, low, high in zip(triad.multiplier, triad.low, triad.high, strict=True)
     ]
