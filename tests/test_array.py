@@ -182,6 +182,7 @@ def test_the_command(tmp_path, capsys):
     assert document["units"][1]["scatter"] == {"rate": None, "force": None}  # of two nobody can tell
     written = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"array.json", "report.html", "array.png", "calibration_1.json", "calibration_2.json"} == written
+    assert "compensate calibration_1.json unit1.csv" in (tmp_path / "out" / "report.html").read_text()
     assert main(["array", files[0]]) == 2
     assert "two units or more" in capsys.readouterr().err
 

@@ -21,6 +21,7 @@ from jaximu.navigation.trajectory import Trajectory, level_driving, of_recording
 from jaximu.noise.stated import read_sensor_noise
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
+from jaximu.report.estimator_noise import statements
 from jaximu.report.export.noise import TARGETS, noise_files, noise_values
 from jaximu.simulation import consumer_noise, simulate
 from jaximu.simulation.protocols import HandHeld
@@ -58,7 +59,7 @@ def test_a_perfect_calibration_needs_no_multiplier():
     for values in found.nees.values():
         np.testing.assert_allclose(values, 1.0, rtol=1e-6)
     assert found.densities()["gyroscope_random_walk"] == pytest.approx(1e-5)
-    assert not found.statements()
+    assert not list(statements(found))
 
 
 def test_an_unknown_scale_adds_up_as_the_angle_does():
@@ -74,7 +75,7 @@ def test_an_unknown_scale_adds_up_as_the_angle_does():
     np.testing.assert_allclose(found.triads["accelerometer"].multiplier, 1.0, rtol=1e-6)  # gravity lies along z
     chosen = found.nees["rotation"][:, 1]
     assert chosen[1] == pytest.approx(1.0, rel=1e-6) and chosen[0] < 0.8 and chosen[2] > 1.25
-    assert "No white noise makes the NEES of rotation one" in found.statements()[0]
+    assert "No white noise makes the NEES of rotation one" in next(statements(found)).text
 
 
 def test_a_bias_is_a_state_of_the_estimator():
@@ -183,7 +184,7 @@ def test_the_gyroscopes_errors_are_not_the_accelerometers():
 
 def test_noise_never_falls_below_that_at_rest():
     quiet = estimator_noise(flown(2, gyroscope=0.3), WHITE, lengths=(1.0,))
-    assert quiet.triads["gyroscope"].multiplier[0] < 0.5 and "no quieter than at rest" in quiet.statements()[0]
+    assert quiet.triads["gyroscope"].multiplier[0] < 0.5 and "no quieter than at rest" in next(statements(quiet)).text
     assert quiet.densities()["gyroscope_noise_density"] == pytest.approx(2e-4)
     found = estimator_noise(replace(flown(2), velocity=None), WHITE, lengths=(1.0,))
     assert found.triads["accelerometer"].multiplier[0] == 1.0 and set(found.nees) == {"rotation"}
@@ -323,6 +324,8 @@ def test_the_command_writes_the_estimators_files(tmp_path, capsys):
     for name, text in found["files"].items():
         assert (tmp_path / "out" / name).read_text() == text
     assert json.loads((tmp_path / "out" / "estimator_noise.json").read_text())["nees"] == found["nees"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "multiply the gyroscope&#39;s white noise by" in page and "vins.yaml" in page
     assert document["schema"] == "jaximu.consequences/1"
     for wrong, status, said in (
         ([*line, "--noise-for", "gtsam"], 2, "--noise"),

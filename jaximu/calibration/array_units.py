@@ -11,6 +11,7 @@ from jaximu.calibration.calibration import Calibration
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Document
 from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.page import Result
 
 __all__ = ["Array", "ArrayUnit", "Averaged"]
 
@@ -77,9 +78,9 @@ class Averaged:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Array(Document):
-    """Several units on one rigid body; the first is the one that the others are told against."""
+@dataclass(frozen=True, repr=False, eq=False)
+class Array(Result, Document, page="array"):
+    """Several units on one rigid body; the first is the one that the others are measured against."""
 
     units: tuple[ArrayUnit, ...]
     averaged: Averaged

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-
-if TYPE_CHECKING:
-    from jaximu.calibration.array_units import Array
 
 __all__ = ["run"]
 
@@ -43,13 +38,4 @@ def run(
         array = calibrate_array(recordings, gravity, static=known, loss=loss, repair=repair)
     units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(array.units, 1)}
     names = "array.json, report.html and the calibrations"
-    write = options.drawn("array", "write_array", array)
-    results.give(lambda: _print(array), write, names, {}, array.text, array=array, **units)
-
-
-def _print(array: Array) -> None:
-    from jaximu.cli.shown import print_all
-    from jaximu.report.array import HEADERS, headline, statements, unit_rows
-
-    units = (HEADERS, unit_rows(array), "± is 95 %; positions in the first unit's axes")
-    print_all(headline(array), units, *statements(array))
+    results.present(array.summary, names, {}, array.text, array=array, **units)

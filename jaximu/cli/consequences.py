@@ -12,10 +12,10 @@ from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
+from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
-    from jaximu.navigation.consequences import Consequences
     from jaximu.navigation.estimator_noise import EstimatorNoise, MeasuredErrors
     from jaximu.navigation.trajectory import Place, Trajectory
     from jaximu.noise.stated import SensorNoise
@@ -105,39 +105,35 @@ def run(
         result = consequences(
             model, trajectory, noise, draws=draws, seed=seed, against=other, files=(str(calibration), str(against))
         )
-    write = options.drawn("consequences", "write_consequences", result)
     names = "consequences.json, report.html and pictures"
     if not targets:
-        results.give(lambda: _print(result), write, names, consequences=result)
+        results.present(result.summary, names, consequences=result)
         return
     assert noise is not None
     from jaximu.navigation.estimator_noise import ModelledErrors, estimator_noise
 
     with progress("finding the estimator's noise"):
-        sources = [ModelledErrors(model, trajectory, str(calibration)), *([] if measured is None else [measured])]
-        estimated = [estimator_noise(source, noise, interval=noise_interval, seed=seed) for source in sources]
-    files = _files(targets, estimated[-1], site.gravity.value)
+        sources = {"expected": ModelledErrors(model, trajectory, str(calibration))}
+        sources |= {} if measured is None else {"measured": measured}
+        estimated = {
+            origin: estimator_noise(source, noise, interval=noise_interval, seed=seed)
+            for origin, source in sources.items()
+        }
+    final = estimated["expected" if measured is None else "measured"]
+    files = _files(targets, final, site.gravity.value)
 
     def document() -> str:
-        added = estimated[-1].document() | {"files": {name: text.decode() for name, text in files.items()}}
-        added |= {} if measured is None else {"expected": estimated[0].document()}
+        added = final.document() | {"files": {name: text.decode() for name, text in files.items()}}
+        added |= {} if measured is None else {"expected": estimated["expected"].document()}
         return json.dumps(result.document() | {"estimator_noise": added}, indent=1, allow_nan=False)
 
-    def show() -> None:
-        _print(result)
-        for estimate in estimated:
-            _print_noise(estimate)
-        for name, text in files.items():
-            print(f"\n{name}:\n{text.decode()}", end="")
-
-    results.give(
-        show,
-        write,
+    results.present(
+        lambda: later("report.consequences", "page_of")(result, estimated, files),
         f"{names}, {', '.join(files)}",
         files,
         document,
         consequences=result,
-        estimator_noise=estimated[-1],
+        estimator_noise=final,
     )
 
 
@@ -236,27 +232,3 @@ def _trajectory(
         if measured is not None and recording.attitude is None:
             recording = replace(recording, attitude=Signal(measured.stamp, measured.rotation, ""))
         return of_recording(recording, model, site, duration or 60.0), {}
-
-
-def _print(consequences: Consequences) -> None:
-    from jaximu.cli.shown import print_all
-    from jaximu.report.consequences import budget_rows, headers, headline, statements, total_rows
-
-    times = headers(consequences)
-    print_all(
-        headline(consequences),
-        f"Path: {consequences.trajectory.words}. Its start is taken as known exactly.\n",
-        (("position error, 1σ", *times), budget_rows(consequences)),
-        "",
-        (("everything, 1σ", *times), total_rows(consequences)),
-        "",
-        *map(str, statements(consequences)),
-        notes=consequences.notes,
-    )
-
-
-def _print_noise(noise: EstimatorNoise) -> None:
-    from jaximu.cli.shown import print_all
-
-    multiples = (("multiples of N", *(f"over {length:g} s" for length in noise.lengths)), noise.rows())
-    print_all(f"\n{noise.headline()}", multiples, *noise.statements(), notes=noise.notes)

@@ -9,12 +9,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 from jaximu.cli import options
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
+from jaximu.ground.page import Page, Section, Table
 from jaximu.ground.quantities import joined, plain, unit_text
+from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.model.effects import Effect
 
 __all__ = ["run"]
+
+_SCOPES = {
+    "device": "device: belongs to the unit and holds in other recordings",
+    "session": "session: belongs to this recording",
+    "fixture": "fixture: belongs to the set-up",
+}
+_ACTS_ON = {"input": "what the axes sense, before the gain", "output": "what the axes put out"}
+_SETUP = "what the sensors go through, as against what the set-up says"
 
 
 def run(
@@ -40,10 +50,8 @@ def run(
     if as_json:
         entries = [_entry(kind) for kind in kinds]
         options.print_json(entries if name is None else entries[0])
-    elif name is None:
-        _print_table(kinds)
     else:
-        _print_entry(kinds[0])
+        later("report.terminal", "show")(_catalogue(kinds) if name is None else _page(kinds[0]))
 
 
 def _entry(kind: type[Effect]) -> dict[str, Any]:
@@ -65,59 +73,38 @@ def _entry(kind: type[Effect]) -> dict[str, Any]:
     }
 
 
-def _print_table(kinds: list[type[Effect]]) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.padding import Padding
-
-    console = Console(highlight=False)
-    console.print(f"{len(kinds)} effects; `jaximu effects NAME` shows one in full.\n", markup=False)
+def _catalogue(kinds: list[type[Effect]]) -> Page:
+    """Return the page of all effects."""
+    parts = []
     for kind in kinds:
         inner = "".join(f" + {name.replace('_', ' ')}" for name in kind.inner)
-        console.print(f"[bold]{kind.title}[/bold]  {escape(kind.formula)}")
         alike = f"; easily taken for {', '.join(kind.look_alikes)}" if kind.look_alikes else ""
         text = f"{kind.size}{inner}, {unit_text(kind.unit)}; {kind.scope}; excited by {kind.excited_by}{alike}"
-        console.print(Padding(text, (0, 0, 0, 4)), markup=False)
+        parts.append(Section(kind.title, (kind.formula, text)))
+    return Page(f"{len(kinds)} effects", ("`jaximu effects NAME` shows one in full.",), first=parts)
 
 
-def _print_entry(kind: type[Effect]) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.padding import Padding
-
-    console = Console(highlight=False)
-    console.print(f"[bold]{kind.title}[/bold]   {escape(kind.formula)}\n")
+def _page(kind: type[Effect]) -> Page:
+    """Return the page of one effect."""
     paragraphs = (inspect.getdoc(kind) or "").split("\n\n")
-    for paragraph in paragraphs:
-        console.print(Padding(" ".join(paragraph.split()), (0, 0, 1, 2)), markup=False)
-    rows = {
-        "coefficients": f"{kind.size}, in {unit_text(kind.unit)}"
-        + ('; "output" is the triad\'s output unit' if "output" in kind.unit else ""),
-        "usual size": f"{plain(kind.typical)}, for outputs in SI",
-        "scope": {
-            "device": "device: belongs to the unit and holds in other recordings",
-            "session": "session: belongs to this recording",
-            "fixture": "fixture: belongs to the set-up",
-        }[kind.scope],
-        "acts on": "what the sensors go through, as against what the set-up says"
-        if kind.owner == "setup"
-        else {"input": "what the axes sense, before the gain", "output": "what the axes put out"}[kind.refers_to],
-        "needs": ", ".join(need.replace("_", " ") for need in kind.needs),
-        "excited by": kind.excited_by,
-        "easily taken for": ", ".join(kind.look_alikes) or "nothing else in the catalogue",
-        "compensation": kind.recovery,
-        "source": kind.source,
-    }
+    rows = [
+        (
+            "coefficients",
+            f"{kind.size}, in {unit_text(kind.unit)}"
+            + ('; "output" is the triad\'s output unit' if "output" in kind.unit else ""),
+        ),
+        ("usual size", f"{plain(kind.typical)}, for outputs in SI"),
+        ("scope", _SCOPES[kind.scope]),
+        ("acts on", _SETUP if kind.owner == "setup" else _ACTS_ON[kind.refers_to]),
+        ("needs", ", ".join(need.replace("_", " ") for need in kind.needs)),
+        ("excited by", kind.excited_by),
+        ("easily taken for", ", ".join(kind.look_alikes) or "nothing else in the catalogue"),
+        ("compensation", kind.recovery),
+        ("source", kind.source),
+    ]
     for inner, parameter in kind.inner.items():
         usual = joined(plain(parameter.typical), unit_text(parameter.unit))
-        rows[inner.replace("_", " ")] = (
-            f"{parameter.meaning}; {usual}, from {plain(parameter.low)} to {plain(parameter.high)}"
-        )
-    from rich.table import Table
-
-    table = Table(show_header=False, box=None, padding=(0, 2))
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for title, text in rows.items():
-        table.add_row(title, escape(text))
-    console.print(table)
+        text = f"{parameter.meaning}; {usual}, from {plain(parameter.low)} to {plain(parameter.high)}"
+        rows.append((inner.replace("_", " "), text))
+    text = [" ".join(paragraph.split()) for paragraph in paragraphs]
+    return Page(kind.title, (kind.formula,), first=(*text, Table((), rows)))

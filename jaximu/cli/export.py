@@ -10,6 +10,8 @@ from jaximu.cli import options
 from jaximu.cli.messages import say
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
+from jaximu.ground.page import Code, Items, Page, Part, Section
+from jaximu.ground.reexport import later
 from jaximu.report.export.catalogue import WRITERS, writer
 from jaximu.report.export.noise import TARGETS
 
@@ -81,12 +83,12 @@ def run(
             }
         )
         return
-    print(f"{axes}\n\nConvention: {written.convention}\n\nApply:\n{written.equation}\n")
-    if lost:
-        print(f"Not in the file, and what that costs over {extent.text()}:")
-        print("\n".join(f"- {loss.text()}" for loss in lost))
-    if left:
-        print(f"- {', '.join(left)}: of one session, not of the unit, and never exported.")
+    costs = [loss.text() for loss in lost]
+    costs += [f"{', '.join(left)}: of one session, not of the unit, and never exported."] if left else []
+    parts: list[Part] = [f"Convention: {written.convention}", Section("Apply:", (Code(written.equation),))]
+    if costs:
+        parts.append(Section(f"Not in the file, and what that costs over {extent.text()}:", (Items(costs),)))
+    later("report.terminal", "show")(Page(f"Calibration for {to}", (axes,), first=parts))
     say(f"Written: {', '.join(map(str, paths))}")
 
 

@@ -109,6 +109,8 @@ EffectNames = Annotated[
 INERTIAL = ("accelerometer", "gyroscope")
 """The sensors that a calibration of poses and turns can hold."""
 _LARGEST_TEXT = 1 << 20  # bytes; a specification is no longer
+_PLACEHOLDER = re.compile(r"(?<![\w/.-])CALIBRATION(_\d+)?(?![\w/.-])")
+"""In a page's next command: a file that is being written."""
 
 
 @dataclass(frozen=True)
@@ -405,11 +407,15 @@ class Results:
 
         @cache
         def made() -> Page:
-            content = page()
-            if self.output is None or "calibration" not in documents:
+            content, folder = page(), self.output
+            if folder is None:
                 return content
-            path = shlex.quote(str(self.output / "calibration.json"))
-            return replace(content, next=content.next.replace("CALIBRATION", path))
+
+            def file(match: re.Match[str]) -> str:
+                name = match[0].lower()
+                return shlex.quote(str(folder / f"{name}.json")) if name in documents else match[0]
+
+            return replace(content, next=_PLACEHOLDER.sub(file, content.next))
 
         self.give(
             lambda: later("report.terminal", "show")(made()),

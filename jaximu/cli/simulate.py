@@ -14,6 +14,8 @@ from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
+from jaximu.ground.page import Code, Page, Section
+from jaximu.ground.reexport import later
 
 __all__ = ["run"]
 
@@ -46,7 +48,7 @@ def run(
         print(inspect.getdoc(specification))
         return
     if protocols:
-        _print_protocols()
+        later("report.terminal", "show")(_protocols())
         return
     if specification_file is None or output is None:
         raise InputError("name a specification and where to write: jaximu simulate SPEC.toml -o LOG.parquet.")
@@ -84,20 +86,16 @@ def _numbered(output: Path, unit: int | None, recording: int | None) -> Path:
     return output.with_name(stem + output.suffix)
 
 
-def _print_protocols() -> None:
-    from rich.console import Console
-
+def _protocols() -> Page:
+    """Return the page of the protocols, each with its keys as a specification has them."""
     from jaximu.simulation.protocols import PROTOCOLS
 
-    console = Console(highlight=False)
+    parts = []
     for kind, protocol in PROTOCOLS.items():
-        console.print(f"[bold]{kind}[/bold]")
-        for paragraph in (inspect.getdoc(protocol) or "").split("\n\n"):
-            console.print(" ".join(paragraph.split()), markup=False)
-        for key in fields(protocol):
-            default = "" if key.default is MISSING else f" = {_toml(key.default)}"
-            console.print(f"    {key.name}{default}", markup=False)
-        console.print()
+        text = [" ".join(paragraph.split()) for paragraph in (inspect.getdoc(protocol) or "").split("\n\n")]
+        keys = [key.name + ("" if key.default is MISSING else f" = {_toml(key.default)}") for key in fields(protocol)]
+        parts.append(Section(kind, (*text, Code("\n".join(keys)))))
+    return Page("Protocols and their keys", (), first=parts)
 
 
 def _toml(value: object) -> str:

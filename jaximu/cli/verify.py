@@ -10,8 +10,16 @@ from tyro.conf import Positional
 from jaximu.cli import options
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
+from jaximu.ground.page import Page, Table
+from jaximu.ground.reexport import later
 
 __all__ = ["run"]
+
+_VERDICTS = {
+    "changed": "Changed: at least one file is not what it was when the result was written.",
+    "intact": "Intact: every file is what it was.",
+    "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
+}
 
 
 def run(
@@ -46,14 +54,9 @@ def run(
     if as_json:
         options.print_json({"verdict": verdict, "files": [vars(link) for link in links]})
     else:
-        for link in links:
-            print(f"{link.state}: {link.what} {link.file}")
-        print(
-            {
-                "changed": "Changed: at least one file is not what it was when the result was written.",
-                "intact": "Intact: every file is what it was.",
-                "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
-            }[verdict]
-        )
+        rows = [(link.state, link.what, link.file) for link in links]
+        marked = [index for index, link in enumerate(links) if link.state == CHANGED]
+        table = Table(("state", "what", "file"), rows, marked=marked)
+        later("report.terminal", "show")(Page(_VERDICTS[verdict], (), first=(table,)))
     if verdict != "intact":
         raise SystemExit(3 if changed else 4)

@@ -28,6 +28,7 @@ from jaximu.estimation.problem import Name, names_of
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.stored import compiled
@@ -104,8 +105,8 @@ class MonteCarlo:
         return np.sqrt(np.mean(self.errors**2, axis=0))
 
 
-@dataclass(frozen=True, eq=False)
-class Consequences(Document):
+@dataclass(frozen=True, repr=False, eq=False)
+class Consequences(Result, Document, page="consequences"):
     """The errors (1σ) of navigation along a path.
 
     times: (T,) s. terms: by name the variances (T, 9) of each kind of calibrated number by itself and of each noise,

@@ -38,6 +38,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import Gravity
+from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import number
 from jaximu.ground.stored import compiled
@@ -73,12 +74,6 @@ _BLOCKS = 10
 """Parts of a motion whose errors are taken as independent of each other's, unless the stretches are longer."""
 _LEAP = 30.0
 """Times the median difference from the unit's acceleration beyond which a reference leaps; vibration reaches ten."""
-_LEAST = 0.05
-"""Terms that stay below this multiple of N are not shown."""
-_QUIETER = 0.99
-"""Multiplier whose whole interval lies below this: the user is told that N is not made smaller."""
-_HOLDS = (0.8, 1.25)
-"""NEES that counts as one where a user is told at which lengths the numbers hold."""
 _COLUMNS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 6)}
 _ROWS = {"rotation": slice(0, 3), "velocity": slice(3, 6), "displacement": slice(6, 9)}
 _OWN = {"gyroscope": _ROWS["rotation"], "accelerometer": _ROWS["velocity"]}
@@ -366,8 +361,8 @@ class TriadNoise:
         return np.maximum(self.multiplier, 1.0)
 
 
-@dataclass(frozen=True, eq=False)
-class EstimatorNoise(Document):
+@dataclass(frozen=True, repr=False, eq=False)
+class EstimatorNoise(Result, Document, page="estimator_noise"):
     """Multipliers of white noise by triad, and the NEES of increments with them.
 
     lengths: (L,) s; chosen: which of them the numbers are for. nees: by increment (L, 2), with the noise as it was
@@ -398,49 +393,10 @@ class EstimatorNoise(Document):
         at = f"{self.lengths[self.chosen]:g} s"
         parts = [
             f"the {name}'s white noise by {number(triad.applied[self.chosen])} "
-            f"({number(triad.low[self.chosen], 2)} to {number(triad.high[self.chosen], 2)})"
+            f"({number(triad.low[self.chosen])} to {number(triad.high[self.chosen])})"
             for name, triad in self.triads.items()
         ]
         return f"For an estimator whose states are {at} apart, multiply {' and '.join(parts)}; {self.words}."
-
-    def rows(self) -> list[tuple[str, ...]]:
-        """Return the multipliers, what they are made of, and the NEES that follow, by length."""
-        shown: list[tuple[str, ...]] = []
-        for name, triad in self.triads.items():
-            cells = [
-                f"{number(m)} ({number(low, 2)} to {number(high, 2)})"
-                for m, low, high in zip(triad.multiplier, triad.low, triad.high, strict=True)
-            ]
-            shown.append((f"{name}, N times", *cells))
-            for term, values in triad.terms.items():
-                if np.max(values) >= _LEAST:
-                    shown.append((f"  {term}", *(f"{value:.2f}" for value in values)))
-        for name, values in self.nees.items():
-            shown.append((f"NEES of {name}, as stated", *(number(value, 2) for value in values[:, 0])))
-            shown.append((f"NEES of {name}, multiplied", *(number(value, 2) for value in values[:, 1])))
-        return shown
-
-    def statements(self) -> list[str]:
-        """Say for which lengths the numbers hold, and where they do not."""
-        at = f"{self.lengths[self.chosen]:g} s"
-        sentences = [
-            f"The {name}'s errors ask for {number(triad.multiplier[self.chosen])} times its white noise over {at}. "
-            "It is left as it is, because in motion a sensor is no quieter than at rest."
-            for name, triad in self.triads.items()
-            if triad.high[self.chosen] < _QUIETER
-        ]
-        for name, values in self.nees.items():
-            off = [
-                f"{number(value, 2)} at {length:g} s"
-                for length, value in zip(self.lengths, values[:, 1], strict=True)
-                if not _HOLDS[0] <= value <= _HOLDS[1]
-            ]
-            if off:
-                sentences.append(
-                    f"No white noise makes the NEES of {name} one at every length: with the numbers for {at} it is "
-                    f"{', '.join(off)}. Above one the estimator trusts the unit too much, below one too little."
-                )
-        return sentences
 
     def document(self) -> dict[str, Any]:
         """Return it as the JSON document of schema `jaximu.estimator-noise/1`; densities are SI and continuous."""

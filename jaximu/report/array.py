@@ -1,7 +1,8 @@
-"""What is said of units on one body: where each is, how it is turned, whose noise it is; the page and its picture."""
+"""The page of units on one body: what averaging gains, which one disturbs, where each is and how it is turned."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -11,91 +12,110 @@ import numpy as np
 import scipy
 
 from jaximu.calibration.array_units import Array, ArrayUnit
+from jaximu.ground.page import Page, Picture, Statement, Table
 from jaximu.ground.quantities import number, with_interval
+from jaximu.ground.summary import sentence
 from jaximu.report.figures import AXES, dressed, new_figure
-from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["HEADERS", "headline", "statements", "unit_rows", "write_array"]
+__all__ = ["page_of"]
 
-HEADERS = ("unit", "turned [°]", "position x, y, z [mm]", "clock late by [ms]", "scatter [°/s]", "scatter [m/s²]")
+_HEADERS = ("unit", "turned [°]", "position x, y, z [mm]", "clock late by [ms]", "scatter [°/s]", "scatter [m/s²]")
 
 
-def headline(array: Array) -> str:
-    """Return the answer in one sentence."""
+def page_of(array: Array) -> Page:
+    """Return what averaging gains, which unit disturbs, and where each unit is."""
     rate, force = (noise[0] / noise[1] for noise in (array.averaged.rate, array.averaged.force))
-    return (
-        f"{len(array.units)} units on one body: at rest the weighted mean of all has {rate:.2g} times less gyroscope "
-        f"noise and {force:.2g} times less accelerometer noise than a typical unit."
+    suspects = dict.fromkeys(unit.name for unit, *_ in array.suspects())
+    picture = Picture(
+        "array",
+        partial(_figure, array),
+        "The units' positions and axes",
+        "The units as the first one sees them, from above and from the side: positions with 95 % intervals, and the "
+        "directions of their axes. Numbers: units in the order of the files.",
+    )
+    return Page(
+        f"An array of {len(array.units)} units",
+        (
+            *(f"{Path(name).name} disturbs the array." for name in suspects),
+            f"At rest the weighted mean of all {len(array.units)} units has {rate:.2g} times less gyroscope noise and "
+            f"{force:.2g} times less accelerometer noise than a typical unit.",
+        ),
+        f"{rate:.2g}×",
+        "less gyroscope noise in the mean of all units",
+        (picture, *_suspects(array), _table(array), *_noise(array)),
+        notes=[sentence(note) for note in array.notes],
+        next=_next(array),
     )
 
 
-def statements(array: Array) -> Iterator[str]:
-    """Return what else is to be known, a sentence each."""
-    for (unit, mean, expected), words, factor, spoken in (
+def _next(array: Array) -> str:
+    """Say how to find why a unit disturbs, or how to apply the first unit's calibration."""
+    for unit, *_ in array.suspects():
+        return f"`jaximu diagnose {shlex.quote(unit.name)} -o RESULTS` looks for the cause of its scatter."
+    log = shlex.quote(array.units[0].name)
+    return f"`jaximu compensate CALIBRATION_1 {log} -o CORRECTED.csv` applies the first unit's calibration."
+
+
+def _suspects(array: Array) -> Iterator[Statement]:
+    """Say which units scatter far more than the others."""
+    for unit, words, times in array.suspects():
+        text = (
+            f"It scatters {times:.2g} times as far about the shared motion as a typical unit in {words}: look for the "
+            "cause with `jaximu diagnose`, or leave it out of the mean."
+        )
+        yield Statement(Path(unit.name).name, text, True)
+    if len(array.units) == 2:
+        yield Statement("Scatter", "Two units cannot show which of them scatters: add a third.")
+
+
+def _noise(array: Array) -> Iterator[Statement]:
+    """Say what averaging gains at rest, beside what it would if the units' noises were independent."""
+    for (unit, mean, expected), words, factor, printed in (
         (array.averaged.rate, "gyroscope", np.degrees(1.0), "°/s"),
         (array.averaged.force, "accelerometer", 1e3, "mm/s²"),
     ):
-        yield (
-            f"Noise of the {words} at rest, means of a quarter of a second: {factor * unit:.3g} {spoken} of a typical "
-            f"unit, {factor * mean:.3g} {spoken} of the mean; {factor * expected:.3g} {spoken} if the units' noises "
-            "were independent."
+        text = (
+            f"Means of a quarter of a second: {factor * unit:.3g} {printed} of a typical unit, {factor * mean:.3g} "
+            f"{printed} of the mean; {factor * expected:.3g} {printed} if the units' noises were independent."
         )
-    for unit, words, times in array.suspects():
-        yield (
-            f"{Path(unit.name).name} scatters {times:.2g} times as far about the shared motion as a typical unit in "
-            f"{words}: look for its cause with `jaximu diagnose`, or leave it out of the mean."
-        )
-    if len(array.units) == 2:
-        yield "Two units cannot show which of them scatters: add a third."
+        yield Statement(f"Noise of the {words} at rest", text)
 
 
-def unit_rows(array: Array) -> TextRows:
-    """Return the table of units, with 95 % intervals."""
-
-    def scatter(value: float | None, factor: float) -> str:
-        return "" if value is None else number(factor * value, 2)
-
-    rows = []
-    for unit in array.units:
-        position = ", ".join(
-            with_interval(1e3 * value, 1e3 * sigma)
-            for value, sigma in zip(unit.position, unit.position_sigma, strict=True)
-        )
-        first = unit is array.units[0]
-        angle = np.degrees(2 * np.arccos(min(1.0, abs(unit.rotation[0]))))
-        width = np.degrees(np.max(unit.rotation_sigma))
-        delay = with_interval(1e3 * unit.time_offset, 1e3 * unit.time_offset_sigma)
-        rows.append(
-            (
-                Path(unit.name).name,
-                "the first" if first else with_interval(angle, width),
-                "0" if first else position,
-                "0" if first else delay,
-                scatter(unit.rate_scatter, np.degrees(1.0)),
-                scatter(unit.force_scatter, 1.0),
-            )
-        )
-    return rows
-
-
-def write_array(array: Array, folder: Folder) -> Path:
-    """Write `report.html`, whose path is returned, and `array.png`. Raises `InputError` where they cannot be."""
-    return write_page(
-        folder,
-        "array",
-        {"array": partial(_figure, array)},
-        title=f"An array of {len(array.units)} units",
-        lead=headline(array),
-        number=f"{array.averaged.rate[0] / array.averaged.rate[1]:.2g}×",
-        meaning="less gyroscope noise in the mean of all units",
-        headers=HEADERS,
-        rows=unit_rows(array),
-        statements=[*statements(array)],
-        notes=array.notes,
+def _table(array: Array) -> Table:
+    """Return how each unit is turned and placed, how late its clock is, and its scatter; suspects are marked."""
+    suspects = [unit for unit, *_ in array.suspects()]
+    marked = [index for index, unit in enumerate(array.units) if any(unit is suspect for suspect in suspects)]
+    caption = (
+        "± is 95 %; positions in the first unit's axes. Scatter: standard deviation of an axis about the motion that "
+        "all units share, over eight samples."
     )
+    rows = [_row(unit, unit is array.units[0]) for unit in array.units]
+    return Table(_HEADERS, rows, caption, marked, brief=max([12, *(index + 1 for index in marked)]))
+
+
+def _row(unit: ArrayUnit, first: bool) -> tuple[str, ...]:
+    """Return a unit's row, with 95 % intervals."""
+    position = ", ".join(
+        with_interval(1e3 * value, 1e3 * sigma) for value, sigma in zip(unit.position, unit.position_sigma, strict=True)
+    )
+    angle = np.degrees(2 * np.arccos(min(1.0, abs(unit.rotation[0]))))
+    delay = with_interval(1e3 * unit.time_offset, 1e3 * unit.time_offset_sigma)
+    return (
+        Path(unit.name).name,
+        "the first" if first else with_interval(angle, np.degrees(np.max(unit.rotation_sigma))),
+        "0" if first else position,
+        "0" if first else delay,
+        _scatter(unit.rate_scatter, np.degrees(1.0)),
+        _scatter(unit.force_scatter, 1.0),
+    )
+
+
+def _scatter(value: float | None, factor: float) -> str:
+    """Return a unit's scatter; zero is what the other units' hides."""
+    return "" if value is None else number(factor * value, 2) if value else "≈ 0"
 
 
 def _figure(array: Array) -> Figure:

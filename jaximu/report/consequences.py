@@ -1,53 +1,121 @@
-"""The report of what errors do to navigation: the budget of position over time, and tracks of draws."""
+"""The page of what errors do to navigation: the budget of position over time, tracks of draws, noise for estimators."""
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.page import Code, Items, Page, Part, Picture, Section, Statement, Table
 from jaximu.ground.quantities import Z95, number
+from jaximu.ground.summary import sentence
 from jaximu.navigation.consequences import Consequences, position
+from jaximu.navigation.estimator_noise import EstimatorNoise
 from jaximu.report import figures
 from jaximu.report.figures import LEAST_SHARE, OTHERS, PALETTE, dressed, legend, legend_below
-from jaximu.report.html import Folder, TextRows, write_page
-from jaximu.report.words import Statement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["budget_rows", "headers", "headline", "statements", "total_rows", "write_consequences"]
+__all__ = ["page_of"]
 
 _SHOWN = (1.0, 10.0, 60.0, 600.0)  # s
+_BRIEF = 8  # rows of the budget on the first screen: all together and the five largest terms
 _COMMON = 0.1  # by how much the calibration's terms together may differ from their root sum of squares unsaid
 
 
-def write_consequences(consequences: Consequences, folder: Folder) -> Path:
-    """Write `report.html`, whose path is returned, `budget.png` and, with draws, `tracks.png`.
-
-    Raises `InputError` where they cannot be written.
-    """
-    drawn = {"budget": partial(_budget_figure, consequences)}
-    if consequences.check:
-        drawn["tracks"] = partial(_tracks_figure, consequences)
-    return write_page(
-        folder,
-        "consequences",
-        drawn,
-        title=f"What the errors of {Path(consequences.calibration_file).name} do",
-        lead=headline(consequences),
-        number=_metres(_at_end(consequences.total)),
-        meaning=f"error of position after {_end(consequences)} (1σ)",
-        path=consequences.trajectory.words,
-        statements=statements(consequences),
-        headers=headers(consequences),
-        rows=budget_rows(consequences),
-        totals=total_rows(consequences),
-        notes=consequences.notes,
+def page_of(
+    consequences: Consequences,
+    noise: Mapping[str, EstimatorNoise] = MappingProxyType({}),
+    files: Mapping[str, bytes] = MappingProxyType({}),
+) -> Page:
+    """Return the budget of position over time; `noise` for estimators, by where it is from, and its `files`."""
+    return Page(
+        f"Navigating by {Path(consequences.calibration_file).name} alone",
+        _verdict(consequences),
+        _metres(_at_end(consequences.total)),
+        f"error of position after {_end(consequences)} (1σ)",
+        (
+            _budget_picture(consequences),
+            f"Path: {consequences.trajectory.words}. Position, velocity and attitude at the start are taken as known "
+            "exactly.",
+            *_statements(consequences),
+            *_tables(consequences),
+            *_for_estimators(noise, files),
+        ),
+        partial(_tracks, consequences),
+        [sentence(note) for note in consequences.notes],
+        _next(consequences),
     )
+
+
+def _verdict(consequences: Consequences) -> tuple[str, ...]:
+    """Say how far position is off at the end, and why."""
+    name = _order(consequences)[0]
+    largest, total = _at_end(consequences.terms[name]), _at_end(consequences.total)
+    return (
+        f"Navigating by this unit alone, position is off by {_metres(total)} (1σ) after {_end(consequences)}.",
+        f"The largest term is {name}: {_metres(largest)} by itself.",
+    )
+
+
+def _next(consequences: Consequences) -> str:
+    """Say which command makes the error smaller, where a better calibration would."""
+    if _at_end(consequences.calibration) < _at_end(consequences.noise):
+        return ""
+    file = consequences.calibration_file
+    file = shlex.quote(file) if Path(file).suffix else "CALIBRATION"
+    return f"`jaximu plan {file} -o plan` plans the poses and turns that improve the calibration most."
+
+
+def _budget_picture(consequences: Consequences) -> Picture:
+    return Picture(
+        "budget",
+        partial(_budget_figure, consequences),
+        "Position error over time, and the share of each term",
+        "Above: the error of position in space (1σ) and its largest terms. Below: how the squares of the terms share "
+        "the sum.",
+    )
+
+
+def _tracks(consequences: Consequences) -> Iterator[Part]:
+    if consequences.check is not None:
+        yield Picture(
+            "tracks",
+            partial(_tracks_figure, consequences),
+            "Tracks of position error of all draws",
+            "Each line is one draw of all errors, through the whole mechanisation: a unit as good as this calibration "
+            "says. The ellipse holds 95 % of the draws if the budget is right.",
+        )
+
+
+def _tables(consequences: Consequences) -> Iterator[Section]:
+    """Return the position error by term, and all errors by direction, at the times that are shown."""
+    times = _headers(consequences)
+    caption = (
+        "Position: root sum of squares of east, north and up. A term is what it makes by itself; correlated terms of "
+        "the calibration together are in the row “calibration, all together”. To first order along the path."
+    )
+    budget = _budget_rows(consequences)
+    yield Section("Position error by term (1σ)", [Table(("", *times), budget, caption, brief=_BRIEF)])
+    yield Section("All errors, by direction (1σ)", [Table(("", *times), _total_rows(consequences))])
+
+
+def _for_estimators(noise: Mapping[str, EstimatorNoise], files: Mapping[str, bytes]) -> Iterator[Section]:
+    """Return the noise for estimators, by where it is from, and the files that carry it."""
+    for origin, one in noise.items():
+        page = one.summary()
+        notes = [Items(page.notes)] if page.notes else []
+        yield Section(f"Noise for estimators, {origin}", (*page.verdict, *page.first, *notes))
+    if files:
+        parts = [Section(name, [Code(text.decode().rstrip())], 3) for name, text in files.items()]
+        yield Section("Files for estimators", parts)
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -80,7 +148,7 @@ def _places(consequences: Consequences) -> list[int]:
     return list(dict.fromkeys([*nearest, len(consequences.times) - 1]))
 
 
-def headers(consequences: Consequences) -> list[str]:
+def _headers(consequences: Consequences) -> list[str]:
     """Return the times that are shown, in words."""
     return [f"after {_seconds(consequences.times[row])}" for row in _places(consequences)]
 
@@ -90,32 +158,21 @@ def _order(consequences: Consequences) -> list[str]:
     return sorted(consequences.terms, key=lambda name: -_at_end(consequences.terms[name]))
 
 
-def headline(consequences: Consequences) -> str:
-    """Say how far position is off at the end, and why."""
-    name = _order(consequences)[0]
-    largest, total = _at_end(consequences.terms[name]), _at_end(consequences.total)
-    return (
-        f"Navigating by this unit alone, position is off by {_metres(total)} (1σ) after "
-        f"{_end(consequences)}. The largest term is {name}: {_metres(largest)} by itself."
-    )
-
-
-def budget_rows(consequences: Consequences) -> TextRows:
-    """Return each term and its position error at the times that are shown, the largest first, then the total."""
+def _budget_rows(consequences: Consequences) -> list[tuple[str, ...]]:
+    """Return the position error at the times that are shown: the total, then each term, the largest first."""
     rows = _places(consequences)
 
     def row(name: str, variances: FloatArray) -> tuple[str, ...]:
         return name, *(_metres(error) for error in position(variances)[rows])
 
-    shown = [row(name, consequences.terms[name]) for name in _order(consequences)]
-    shown.append(row("calibration, all together", consequences.calibration))
-    shown.append(row("everything", consequences.total))
+    shown = [row("everything", consequences.total)]
     if consequences.check is not None:
         shown.append(row(f"everything, {len(consequences.check.errors)} draws", consequences.check.sigma**2))
-    return shown
+    shown.append(row("calibration, all together", consequences.calibration))
+    return [*shown, *(row(name, consequences.terms[name]) for name in _order(consequences))]
 
 
-def total_rows(consequences: Consequences) -> TextRows:
+def _total_rows(consequences: Consequences) -> list[tuple[str, ...]]:
     """Return the errors of position, velocity and attitude by direction at the times that are shown."""
     rows, sigma = _places(consequences), np.sqrt(consequences.total)
     shown = []
@@ -128,7 +185,7 @@ def total_rows(consequences: Consequences) -> TextRows:
     return shown
 
 
-def statements(consequences: Consequences) -> list[Statement]:
+def _statements(consequences: Consequences) -> list[Statement]:
     """Return what the budget means, each with what it is about."""
     total, end = position(consequences.total), _end(consequences)
     last = total[-1]
@@ -136,7 +193,7 @@ def statements(consequences: Consequences) -> list[Statement]:
         f"{name} from {round(start, 1):g} to {round(stop, 1):g} s" for name, start, stop in consequences.dominant()
     ]
     more = f" and {len(parts) - 6} changes more" if len(parts) > 6 else ""
-    texts = {"What dominates when": f"{'; '.join(parts[:6])}{more}."}
+    texts = {"What dominates when": sentence(f"{'; '.join(parts[:6])}{more}.")}
 
     def better(variances: FloatArray) -> float:
         return _at_end(variances + consequences.noise)

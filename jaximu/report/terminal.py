@@ -6,6 +6,7 @@ import io
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from textwrap import indent
 
 from rich import box
 from rich.console import Console
@@ -52,8 +53,7 @@ def show(content: Page | Part, screen: Console | None = None) -> None:
         case Items(texts=texts):
             _print_items(texts, screen)
         case Code(text=lines):
-            for line in lines.split("\n"):
-                screen.print(f"  {line}", soft_wrap=True)  # what is cut into lines cannot be pasted
+            screen.print(indent(lines, "  "), soft_wrap=True)  # a folded line is no longer what is to be copied
         case Section(title=title, parts=parts):
             screen.print(f"\n{title}", style="bold")
             _print_parts(parts, screen)
