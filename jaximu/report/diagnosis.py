@@ -18,7 +18,7 @@ from jaximu.diagnosis.noise import NoiseFinding
 from jaximu.estimation.rows import TIME
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Page, Part, Picture, Section, Statement, Table
-from jaximu.ground.quantities import change, listed, number, probability, readable, size
+from jaximu.ground.quantities import Z95, change, listed, number, probability, readable, size, with_interval
 from jaximu.ground.summary import sentence
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
@@ -174,9 +174,9 @@ def _causes(diagnosis: Diagnosis) -> str:
 def _gained(diagnosis: Diagnosis) -> str:
     """Say what modelling the causes, or else the smooth curve, gains on data that was not fitted."""
     gain, learned = diagnosis.gain, diagnosis.learned
-    subject = "them" if len(diagnosis.named) > 1 else "it"
+    effects = [cause.effect for cause in diagnosis.named]
     if gain is not None:
-        effect = diagnosis.named[0].effect
+        effect, subject = effects[0], "them" if len(effects) > 1 else "it"
     elif learned is not None:
         gain, effect, subject = learned.gain, learned.effect, "this as a smooth curve"
     else:
@@ -321,8 +321,9 @@ def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
     ]
     if diagnosis.learned is not None:
         learned = diagnosis.learned
-        swing = size(float(np.ptp(learned.y, axis=0).max()), SENSOR_UNITS[learned.triad])
-        outputs.append(f"with {learned.covariate}, the {learned.triad}'s output changes by up to {swing}")
+        peak = np.unravel_index(np.argmax(np.abs(learned.y)), learned.y.shape)
+        swing = with_interval(abs(learned.y[peak]), learned.half_width[peak] / Z95, SENSOR_UNITS[learned.triad])
+        outputs.append(f"{learned.covariate} changes the {learned.triad}'s output by up to {swing} (95 %)")
     if outputs:
         yield Statement("What it costs without the extension", f"In this recording, {'; '.join(outputs)}.")
     elif diagnosis.verdict == "unexplained":
