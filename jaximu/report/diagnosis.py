@@ -130,7 +130,7 @@ def _what_is_wrong(diagnosis: Diagnosis) -> Iterator[str]:
             f"{1 / diagnosis.p_value:.0f} looks like this, and no known effect explains it."
         )
         if diagnosis.shape is not None:
-            yield f"It looks as if {diagnosis.shape}."
+            yield f"It looks like this: {diagnosis.shape}."
         if diagnosis.learned is not None:
             yield f"The {diagnosis.learned.triad}'s misfit depends on {diagnosis.learned.covariate}."
         if diagnosis.effects:
@@ -214,13 +214,14 @@ def _number(diagnosis: Diagnosis) -> tuple[str, str]:
 def _next(diagnosis: Diagnosis, files: list[str]) -> str:
     """Return what to record or run next."""
     repairs = dict.fromkeys(finding.repair for finding in _standing(diagnosis) if finding.repair)
-    if repairs:
+    by_hand = diagnosis.experiment.data.by_hand  # else the command has more arguments
+    if repairs and by_hand:
         again = f"`jaximu diagnose {' '.join([*files, *repairs])} -o RESULTS`"
         return f"{diagnosis.suggestion} {again} repeats the diagnosis."
     if diagnosis.suggestion:
         together = f"`jaximu diagnose {' '.join(files)} NEW_LOG -o RESULTS` diagnoses both recordings together."
-        recorded = diagnosis.experiment.data.by_hand and " record" in diagnosis.suggestion
-        return diagnosis.suggestion + (f" {together}" if recorded and not _standing(diagnosis) else "")
+        recorded = by_hand and " record" in diagnosis.suggestion and not _standing(diagnosis)
+        return diagnosis.suggestion + f" {together}" * recorded
     what = "extended calibration" if diagnosis.extended.effects else "calibration"
     return f"`jaximu compensate CALIBRATION {files[0]} -o CORRECTED.csv` applies the {what}."
 
@@ -299,7 +300,9 @@ def _gain_table(diagnosis: Diagnosis, what: str, gain: Gain) -> Table:
 
 def _certainty(diagnosis: Diagnosis) -> Iterator[Statement]:
     """Say how probable such data are if the model is complete, what the tests allow for, and which cause is weak."""
-    verdict = "This is consistent with noise" if diagnosis.p_value > _DOUBT else "This is not chance"
+    verdict = "This is not chance"
+    if diagnosis.p_value > _DOUBT:
+        verdict = "This is consistent with noise" if diagnosis.verdict == "adequate" else "This may be chance"
     text = (
         f"{verdict}: if the model were complete, data at least this unusual would have the probability p "
         f"{probability(diagnosis.p_value)} (all tests together)."
@@ -327,7 +330,8 @@ def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
     if outputs:
         yield Statement("What it costs without the extension", f"In this recording, {'; '.join(outputs)}.")
     elif diagnosis.verdict == "unexplained":
-        text = "An unmodelled effect may bias the parameters by more than their intervals show."
+        cause = "A mistake in the recording" if _standing(diagnosis) else "An unmodelled effect"
+        text = f"{cause} may bias the parameters by more than their intervals show."
         yield Statement("What it costs", text, caution=True)
 
 
