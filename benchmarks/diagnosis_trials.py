@@ -142,7 +142,7 @@ def trial(task):
                 "preflight": [each.name for each in said.preflight],
                 "learned": None if said.learned is None else said.learned.effect.name,
                 "p_value": said.p_value,
-                "text": said.headline(),
+                "text": " ".join(said.summary().verdict),
                 "notes": list(said.notes),
             })  # fmt: skip
     return found

@@ -22,7 +22,7 @@ from jaximu import LocalGravity, ReadOptions, diagnose, read_recording
 from jaximu.diagnosis import diagnose_against_attitude, diagnose_thermal, diagnose_turntable
 from jaximu.ground.errors import JaximuError, NotPossibleError
 from jaximu.recordings.readers import read_attitude, read_reference
-from jaximu.report.diagnosis import write_diagnosis
+from jaximu.report.html import write_report
 
 jax.config.update("jax_enable_x64", True)
 
@@ -111,7 +111,9 @@ def other_kinds(folder):
         left = "" if gain is None else " → ".join(f"{each.chi_squared / each.count:.2f}"
                                                   for each in (gain.before, gain.after))  # fmt: skip
         said = ", ".join(dict.fromkeys(each.name for each in found.preflight))
-        table.add(name, kind, found.verdict, named, found.headline()[:300], said, left, f"{seconds:.1f}")
+        table.add(
+            name, kind, found.verdict, named, " ".join(found.summary().verdict)[:300], said, left, f"{seconds:.1f}"
+        )
         kept = ("verdict", "effects", "preflight", "p_value", "checks", "notes")
         figures[name] = {key: found.document()[key] for key in kept if key in found.document()} | {"seconds": seconds}
     finish("real_diagnosis_others", [table], figures, script="real_diagnosis")
@@ -146,7 +148,7 @@ def main():
         seconds = time.perf_counter() - started
         if not figures and not options.small:  # the README's first picture
             with tempfile.TemporaryDirectory() as folder:
-                write_diagnosis(found, folder)
+                write_report(found, folder)
                 shutil.copy(Path(folder) / "diagnosis.png", RESULTS / "xsens_diagnosis.png")
         named = "; ".join(each.name + (f" ({', '.join(each.rivals)})" if each.rivals else "") for each in found.effects)
         gain = found.gain

@@ -12,7 +12,6 @@ from jaximu import LocalGravity, load_calibration, read_recording
 from jaximu.cli.app import main
 from jaximu.diagnosis import diagnose, twin_of
 from jaximu.noise.at_rest import fit_noise
-from jaximu.report.words import lead
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 ANSWERS = "answers.json"
@@ -126,8 +125,8 @@ def test_nothing_hidden_is_adequate_with_limits(clean_found):
     # structurally blind, or without what excites them
     assert {"setup.time_offset", "accel.size_effect", "accel.temperature"} <= set(found.not_observable)
     assert not set(found.detection_limits) & set(found.not_observable)
-    assert "adequate" not in found.headline()
-    assert found.headline().startswith("The model fits")
+    assert "adequate" not in found.summary().verdict[0]
+    assert found.summary().verdict[0].startswith("The model fits")
 
 
 def test_limit_is_what_the_prototype_reached(clean_found):
@@ -229,7 +228,7 @@ def test_what_is_not_in_the_catalogue_stays_unexplained(name, size, said, tmp_pa
     files = case.write(tmp_path, ("fit", "static"))
     found = diagnose(read_recording(files["fit"]), GRAVITY, static=read_recording(files["static"]))
     assert found.verdict == "unexplained"
-    assert "no known effect explains" in found.headline()
+    assert "no known effect explains" in found.summary().verdict[0]
     assert found.suggestion
     assert said in " ".join(found.notes)
 
@@ -312,6 +311,6 @@ def test_an_exact_fit_is_no_evidence(clean_found):
     assert (
         "none by construction" in str(exact.summary()) and "→ 1" not in str(exact.summary()).partition("Direction")[0]
     )
-    assert lead(exact).number == "not checked"
-    headline = replace(clean_found, calibration=exact).headline()
+    assert exact.summary().number == "not checked"
+    headline = replace(clean_found, calibration=exact).summary().verdict[0]
     assert "gravity norm at rest cannot be checked" in headline and "explain this recording" not in headline

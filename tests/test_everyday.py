@@ -70,7 +70,7 @@ def test_a_bias_that_swings_is_no_noise_and_its_period_is_told(tmp_path):
     period = case.hidden[0].inner["period"]
     found = said(case, tmp_path)
     assert (found.verdict, named(found)) == ("unexplained", [])
-    assert found.shape is not None and "gyroscope's bias swings" in found.headline()
+    assert found.shape is not None and "gyroscope's bias swings" in found.summary().verdict[1]
     assert abs(float(found.shape.split()[-2]) / period - 1) < 0.1
     assert "cycles" in found.suggestion
 
@@ -82,7 +82,7 @@ def test_a_scale_that_jumps_is_named_with_its_time(tmp_path):
     (effect,) = (each.effect for each in found.named)
     assert abs(effect.onset - case.protocol.duration / 2) < 6
     assert effect.coefficients[2] == pytest.approx(2.5e-3, rel=0.2)
-    assert f"from {float(effect.onset):.4g} s on" in found.headline()
+    assert f"from {float(effect.onset):.4g} s on" in found.summary().verdict[0]
 
 
 def test_turns_that_lost_a_sample_are_left_out_and_told(tmp_path):

@@ -97,7 +97,7 @@ def test_a_bump_over_temperature_is_unexplained_and_learned(bumped):
     assert (learned.covariate, learned.triad) == ("temperature", "accelerometer")
     assert learned.gain.data == "another recording"
     assert learned.gain.log_likelihood > 50
-    assert "accelerometer's misfit depends on temperature: a smooth term of it" in found.headline()
+    assert "The accelerometer's misfit depends on temperature." in found.summary().verdict
     assert "accel.learned_temperature" in found.suggestion
     # the curve against the truth, constants off: nine tenths within its 95 % band, which is not all there is
     truth = np.outer(bump(_At(learned.x - 273.15), case.hidden[0].inner), case.hidden[0].coefficients)

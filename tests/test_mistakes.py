@@ -295,7 +295,7 @@ def test_a_gyroscope_that_reads_zero_at_rest_is_named():
     silent = np.where(np.abs(signal.values) < 0.05, 0.0, signal.values)
     found = diagnose(replace(recording, gyroscope=replace(signal, values=silent)), GRAVITY)
     assert "data.auto_zero" in {each.name for each in found.preflight} and not found.effects
-    assert "zeroes it at rest" in found.headline()
+    assert "zeroes it at rest" in found.summary().verdict[0]
 
 
 def test_no_effect_is_named_while_a_mistake_stands():
@@ -304,14 +304,14 @@ def test_no_effect_is_named_while_a_mistake_stands():
     assert standing.verdict == "unexplained"
     assert not standing.effects
     assert "--repair" in standing.suggestion
-    assert "No effect can be named" in standing.headline()
+    assert "No effect can be named" in standing.summary().verdict[0]
 
 
 @pytest.mark.parametrize("name", ["zero_rows", "wrap_around", "jitter"])
 def test_a_mistake_that_is_gone_leaves_the_verdict_adequate(name):
     case = planted(name, 0)
     found = diagnose(case.log.to_recording(), GRAVITY, repair=True)
-    assert found.verdict == "adequate", found.headline()
+    assert found.verdict == "adequate", found.summary().verdict[0]
     assert names(found.preflight) & set(case.names)
 
 
@@ -402,7 +402,7 @@ def test_samples_lost_everywhere_in_a_measured_recording_leave_it_unexplained(da
     kept = np.random.default_rng(1).random(log.count) >= 0.03
     found = diagnose(generator.renumbered(log, np.flatnonzero(kept)).to_recording(), GRAVITY)
     assert found.verdict == "unexplained" and not found.effects
-    assert "samples were lost" in found.headline()
+    assert "samples were lost" in found.summary().verdict[0]
     assert "data.lost_samples" in names(found.preflight)
 
 

@@ -155,7 +155,7 @@ def test_noise_doubled_against_the_static_log(clean, tmp_path):
     (effect,) = found.effects
     assert effect.name == "noise.white"
     assert np.all(np.abs(effect.factor - 2.0) < 4 * effect.sigma)
-    assert "noise.white" in found.headline()
+    assert "noise.white" in found.summary().verdict[0]
     assert "recording at rest" in found.suggestion
     document = found.document()
     (entry,) = document["effects"]

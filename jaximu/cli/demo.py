@@ -105,14 +105,14 @@ def _simulate(imu: Imu, seed: int, output: Path) -> None:
 def _print_truth(imu: Imu, flaw: Effect) -> None:
     import numpy as np
 
-    from jaximu.cli.shown import console
     from jaximu.ground.quantities import number, readable
+    from jaximu.report.terminal import show
 
     (triad,) = (triad for triad in imu.triads().values() if triad.effects)
     values = np.asarray(flaw.coefficients)
     factor, unit = readable(flaw.coefficient_unit(triad.output_unit), float(np.abs(values).max()))
     coefficients = ", ".join(number(factor * value) for value in values)
-    console().print(
+    show(
         f"\nHidden in this unit was {flaw.title}: {flaw.formula} with c = ({coefficients}) {unit}. "
         f"`jaximu effects {flaw.name}` explains it."
     )

@@ -115,62 +115,11 @@ def run(
 def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
     """Print a diagnosis; write it, the extended calibration and the report where asked."""
     documents = {} if results.output is None else {"calibration": diagnosis.extended_calibration()}
-    results.give(
-        lambda: print_diagnosis(diagnosis),
-        options.drawn("diagnosis", "write_diagnosis", diagnosis),
+    results.present(
+        diagnosis.summary,
         "diagnosis.json, calibration.json and report.html",
         {},
         diagnosis.text,
         diagnosis=diagnosis,
         **documents,
     )
-
-
-def print_diagnosis(diagnosis: Diagnosis) -> None:
-    """Print the sentence, the effects with their evidence, and what else a person should know."""
-    from jaximu.cli.shown import console, print_all
-    from jaximu.ground.quantities import probability
-    from jaximu.ground.summary import sentence
-    from jaximu.mistakes.titles import effect_title
-    from jaximu.report.diagnosis import limit_rows
-
-    console().print(diagnosis.summary().title, style="bold")
-    print_all(
-        f"{diagnosis.verdict}: {diagnosis.headline()}",
-        *(f"- {sentence(effect_title(finding.name))}. {sentence(finding.text)}" for finding in diagnosis.preflight),
-    )
-    if diagnosis.effects:
-        rows = [
-            (
-                effect_title(effect.name),
-                "\n".join(effect.numbers()),
-                effect.evidence + (" (weak)" if effect.weak else ""),
-                "\n".join(map(effect_title, effect.rivals)),
-            )
-            for effect in diagnosis.effects
-        ]
-        print_all((("effect", "coefficients ± 95 %", "evidence", "or"), rows))
-    texts = []
-    gain, words = diagnosis.gain, {kind.name: kind.words for kind in diagnosis.experiment.real.kinds}
-    if gain is not None:
-        before, after = (part.chi_squared / part.count for part in (gain.before, gain.after))
-        texts.append(
-            f"On data not fitted ({gain.data}): χ² per condition {before:.2f} → {after:.2f}, log-likelihood "
-            f"{gain.log_likelihood:+.1f}."
-        )
-        texts += [f"  {words[kind]}: rms {gain.errors(kind)}" for kind in gain.before.rms]
-    wrong = sorted((check for check in diagnosis.checks if check.adjusted < 1e-2), key=lambda check: check.adjusted)
-    texts += [f"base model: {check.text} (p {probability(check.adjusted)})" for check in wrong[:6]]
-    learned = diagnosis.learned
-    if learned is not None:
-        gain, title = learned.gain, learned.effect.title
-        texts += [f"  {words[kind]}, with {title}: rms {gain.errors(kind)}" for kind in gain.before.rms]
-    print_all(*texts)
-    if not diagnosis.effects:
-        headers = ("effect", "could be up to this size unnoticed (90 % power)")
-        print_all((headers, limit_rows(diagnosis), "Detection limits"))
-    if diagnosis.unit > 1.05:
-        print_all(f"- Remaining scatter: {diagnosis.unit:.2f} × noise. The tests allow for it.")
-    if diagnosis.suggestion:
-        print_all(f"Next: {diagnosis.suggestion}")
-    print_all(*(f"- {sentence(note)}" for note in diagnosis.notes))

@@ -225,6 +225,16 @@ class Resting(OfOneUnit):
         group = np.tile(np.repeat([0, 1], 3), count)
         return Covariance(whole.reshape(size, size), factors, np.ones(size), group)  # pyright: ignore[reportArgumentType]
 
+    def allowed(self, count: int) -> FloatArray:
+        """Return the columns (count, k) of the levels of the rests and of smooth functions, in standard deviations."""
+        blocks = self.blocks
+        levels = np.equal(blocks.level[:, None], np.unique(blocks.level)).astype(float)
+        shapes = np.concatenate([levels, self.curves], axis=1) if self.smooth else levels
+        columns = np.zeros((len(blocks), 6, shapes.shape[1], 6))
+        for column, size in enumerate(np.repeat(_FREE, 3) * self._scale):
+            columns[:, column, :, column] = size * shapes
+        return columns.reshape(count, -1)
+
     def _added(self, imu: Imu, tracks: Sequence[dict[str, Track]]) -> FloatArray:
         """What the unit's effects add to the mean outputs (n, 6)."""
         count = len(self.blocks)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -31,8 +30,9 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
-from jaximu.ground.quantities import Z95, change, listed, probability, size, with_interval, with_intervals
-from jaximu.ground.summary import Block, Described, Summary, sentence
+from jaximu.ground.page import Result
+from jaximu.ground.quantities import Z95, listed, probability, size, with_interval, with_intervals
+from jaximu.ground.summary import sentence
 from jaximu.mistakes import prepare, prepared
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect, register
@@ -56,10 +56,6 @@ __all__ = [
     "without_effects",
 ]
 
-_DOUBT = 0.01
-"""Probability below which chance is no longer offered as an explanation."""
-_LITTLE = 0.95
-"""Share of an error that must be left for a gain to be called little."""
 SCHEMA = "jaximu.diagnosis/1"
 _OTHER_UNIT = 0.005
 """Difference of gains, in scales, from which two recordings are hardly of one unit."""
@@ -137,7 +133,7 @@ class Named:
         )
 
     def sentence(self) -> str:
-        """Return what it adds, for the headline."""
+        """Return what it adds, for the verdict."""
         start = self.effect.since()
         since = "" if start is None else f", from {start:.4g} s on"
         return f"{self.effect.title}, up to {self.size()}{since}"
@@ -204,7 +200,7 @@ class Option:
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Diagnosis(Described, Document):
+class Diagnosis(Result, Document, page="diagnosis"):
     """What a recording says of its model.
 
     verdict: "adequate", "effects" or "unexplained". effects: causes jointly present, strongest first; what is wrong
@@ -241,33 +237,6 @@ class Diagnosis(Described, Document):
         """The effects that are terms of the model."""
         return tuple(effect for effect in self.effects if isinstance(effect, Named))
 
-    @property
-    def files(self) -> str:
-        """The names of the files that were diagnosed."""
-        files = [Path(str(file["file"])).name for file in self.calibration.data.get("files", ())]
-        return ", ".join(files) or "a recording"
-
-    def summary(self) -> Summary:
-        """Return the verdict, the effects with their size and evidence, and what to do next."""
-        rows = [
-            (
-                effect_title(effect.name),
-                effect.size() if isinstance(effect, Named) else "",
-                f"p {probability(effect.p_value)}",
-                ", ".join(map(effect_title, effect.rivals)) or "—",
-                "weak" if effect.weak else "",
-            )
-            for effect in self.effects
-        ]
-        headers = ("effect", "adds up to", "evidence", "not told apart from", "")
-        notes = [finding.text for finding in self.preflight] + ([f"Next: {self.suggestion}"] if self.suggestion else [])
-        return Summary(
-            f"Diagnosis of {self.files}: {self.verdict}",
-            (self.headline(),),
-            Block(headers, tuple(rows)) if rows else None,
-            tuple(map(sentence, (*notes, *self.notes))),
-        )
-
     def document(self) -> dict[str, Any]:
         """Return the diagnosis as the JSON document of schema `jaximu.diagnosis/1`."""
         return {
@@ -303,70 +272,6 @@ class Diagnosis(Described, Document):
             "suggestion": self.suggestion,
         }
         return replace(extended(self.calibration, self.experiment, self.extended), diagnosis=diagnosis)
-
-    def headline(self) -> str:
-        """Return the one sentence a person wants first."""
-        if self.verdict == "adequate":
-            beside = min(self.checks, key=lambda check: check.adjusted, default=None)
-            if beside is not None and beside.adjusted < _DOUBT:
-                return (
-                    f"No effect shows (p {probability(self.p_value)}), but the noise is not all that was assumed: "
-                    f"{beside.text} (p {probability(beside.adjusted)})."
-                )
-            if self.calibration.exact:
-                kinds = {kind.name: kind.words for kind in self.experiment.real.kinds}
-                unchecked = listed([kinds.get(name, name) for name in self.calibration.exact])
-                return (
-                    f"No effect shows (p {probability(self.p_value)}), but {unchecked} "
-                    "cannot be checked: there are as many parameters as conditions, and no degrees of freedom are "
-                    "left. Record more poses."
-                )
-            return (
-                "The model fits: bias, scale and misalignment explain this recording to its noise "
-                f"(p {probability(self.p_value)})."
-            )
-        standing = [
-            finding
-            for finding in self.preflight
-            if finding.spoils or (finding.partial and self.verdict == "unexplained")
-        ]
-        if standing:
-            return f"No effect can be named from this recording. {standing[0].text}"
-        causes = "; ".join(self._named_words(effect) for effect in self.effects)
-        if self.verdict != "unexplained":
-            sure = "Probably" if all(effect.weak for effect in self.effects) else "Found"
-            return f"{sure} {causes}.{self._gained()}"
-        text = "The model does not fit, and no known effect explains why."
-        if self.p_value > _DOUBT:
-            text = (
-                "The model may not fit: of recordings that it describes completely, one in "
-                f"{1 / self.p_value:.0f} looks like this, and no known effect explains it."
-            )
-        if self.shape is not None:
-            text += f" It looks as if {self.shape}."
-        if self.learned is not None:
-            text += f" {self.learned.text()[:1].upper()}{self.learned.text()[1:]}."
-        return f"{text} Part of it is {causes}.{self._gained()}" if causes else text
-
-    def _gained(self) -> str:
-        """Say what modelling the causes gains on data that was not fitted."""
-        if self.gain is None:
-            return ""
-        kind = self.gain.best_kind(self.named[0].effect)
-        (before, unit), (after, _) = self.gain.before.rms[kind], self.gain.after.rms[kind]
-        data, many = f"the error on data not fitted ({self.gain.data})", len(self.named) > 1
-        if after >= before:
-            return f" Modelling {'them' if many else 'it'} does not reduce {data}, {size(after, unit)}."
-        little = "only " if after > _LITTLE * before else ""
-        cut = change(before, after, unit).replace("→", "to")
-        return f" Modelling {'them' if many else 'it'} cuts {data} {little}from {cut}."
-
-    @staticmethod
-    def _named_words(effect: Named | NoiseFinding) -> str:
-        if not effect.rivals:
-            return effect.sentence()
-        rivals = " or ".join(map(effect_title, effect.rivals))
-        return f"{effect.sentence()}, or {rivals} (this recording cannot tell them apart)"
 
 
 def extended(calibration: Calibration, experiment: Experiment, state: State) -> Calibration:

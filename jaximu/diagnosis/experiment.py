@@ -379,13 +379,13 @@ class Experiment(Data):
         )
 
     def by_setup(self, state: State) -> FloatArray:
-        """Return what the set-up most likely adds to the real conditions (m,): its numbers' mean, given these.
+        """Return what the set-up, and what may lie off beforehand, most likely add to the real conditions (m,).
 
-        Near the level a tilted reference looks like a bias of the accelerometer; which of both it is, nothing tells.
+        That is the mean of their numbers, given the conditions. Near the level a tilted reference looks like a bias of
+        the accelerometer; which of both it is, nothing tells.
         """
-        if not self.setup:
-            return np.zeros(len(state.conditions))
-        unknown = self._evaluated(state.model)[2][self.used]
+        parts = [self._evaluated(state.model)[2]] if self.setup else []
+        unknown = np.concatenate([*parts, self.data.allowed(len(self.used))], axis=1)[self.used]
         return unknown @ ((state.weights @ unknown).T @ (state.weights @ state.conditions))
 
     def errors(self, state: State) -> list[FloatArray]:

@@ -63,14 +63,6 @@ class LearnedTerm:
         """Whose output it is: the accelerometer's or the gyroscope's."""
         return self.effect.owner
 
-    def text(self) -> str:
-        """Return the sentence."""
-        data = "parts left out" if self.gain.data.endswith("left out in turn") else self.gain.data
-        return (
-            f"the {self.triad}'s misfit depends on {self.covariate}: a smooth term of it ({self.effect.name}) gains "
-            f"{self.gain.log_likelihood:+.1f} log-likelihood on {data}"
-        )
-
     def document(self) -> dict[str, Any]:
         """Return the term as `diagnosis.json` has it."""
         kinds = {kind: (before, self.gain.after.rms[kind]) for kind, before in self.gain.before.rms.items()}

@@ -99,7 +99,7 @@ class NoiseFinding:
     gain: ClassVar[None] = None
 
     def sentence(self) -> str:
-        """Return what is found, for the headline."""
+        """Return what was found, for the verdict."""
         worst = int(np.argmax(np.abs(np.log(self.factor))))
         triad, _, axis = self.axes[worst].rpartition(" ")
         times = number(self.factor[worst])

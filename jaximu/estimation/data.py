@@ -277,6 +277,10 @@ class Data(ABC):
         """Return the observations along which shapes without a cause are looked for."""
         raise NotImplementedError
 
+    def allowed(self, count: int) -> FloatArray:
+        """Return what may lie off beforehand, as good as free: columns (count, k) at one standard deviation."""
+        return np.zeros((count, 0))
+
     def rms(self, imu: Imu, details: Any, conditions: FloatArray) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual of all conditions (n,), with its unit, as a calibration has it."""
         rows = self.rows(imu)

@@ -1,118 +1,428 @@
-"""The report of a diagnosis: one sentence, one picture, one number, then the evidence."""
+"""The page of a diagnosis: what is wrong, how sure that is, what the extension gains, then the evidence."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import partial
+import shlex
+from collections.abc import Callable, Iterator
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.diagnosis import Diagnosis, twin_of
+from jaximu.diagnosis import Check, Diagnosis, Named, twin_of
 from jaximu.diagnosis.experiment import Experiment, State
+from jaximu.diagnosis.improvement import Gain
 from jaximu.diagnosis.learned import LearnedTerm
+from jaximu.diagnosis.noise import NoiseFinding
 from jaximu.estimation.rows import TIME
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.quantities import probability, readable, size
+from jaximu.ground.page import Page, Part, Picture, Section, Statement, Table
+from jaximu.ground.quantities import Z95, change, listed, number, probability, readable, size, with_interval
 from jaximu.ground.summary import sentence
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import ZERO_CELSIUS
 from jaximu.noise.deviations import deviation
+from jaximu.recordings.finding import Finding
 from jaximu.report import figures
 from jaximu.report.figures import band, dressed, legend, zero_line
-from jaximu.report.html import Folder, TextRows, write_page
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["limit_rows", "write_diagnosis"]
+    Twin = Callable[[], tuple[Experiment, State]]
+    """The recording as the fitted model simulates it, and its fit; made when a picture first needs it."""
+
+__all__ = ["page_of"]
 
 _MEASURED, _TWIN, _EXTENDED = figures.FLAGGED, figures.BEFORE, figures.AFTER
 _SHOWN = 12
 _AN_ERROR = 1e-3  # m/s², rad/s: sizes that errors have, whose unit the axes take
+_DOUBT = 0.01
+"""Probability below which chance is no longer offered as an explanation."""
+_LITTLE = 0.95
+"""Share of an error that must be left for a gain to be called little."""
+_NOISY = 1.05
+"""Scatter, in multiples of the noise, from which on it is reported."""
+_BRIEF = 6  # rows of evidence on the first screen
+_SCOPES = {"device": "unit", "session": "recording", "fixture": "set-up"}
 
 
-def write_diagnosis(diagnosis: Diagnosis, folder: Folder) -> Path:
-    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
-    twin = twin_of(diagnosis)
-    copied = twin.fit(asking=())  # its errors alone are shown
-    drawn = {
-        name: partial(figure, diagnosis, twin, copied)
-        for name, figure in (("diagnosis", _lead), ("dependence", _dependence))
-    }
-    if diagnosis.experiment.still_parts("gyroscope")[0]:
-        drawn["noise"] = partial(_noise, diagnosis, twin)
+def page_of(diagnosis: Diagnosis) -> Page:
+    """Return what is wrong, how sure that is, what it costs, what the extension gains, and what to do next."""
+    files = [str(file["file"]) for file in diagnosis.calibration.data.get("files", ())]
+    names = ", ".join(Path(file).name for file in files) or "a recording"
+
+    @cache
+    def twin() -> tuple[Experiment, State]:
+        """Simulate the recording and fit it: its errors alone are shown."""
+        simulated = twin_of(diagnosis)
+        return simulated, simulated.fit(asking=())
+
+    return Page(
+        f"Diagnosis of {names}: {diagnosis.verdict}",
+        [*filter(None, (*_what_is_wrong(diagnosis), _gained(diagnosis)))],
+        *_number(diagnosis),
+        [*_first(diagnosis, twin)],
+        rest=partial(_rest, diagnosis, twin),
+        notes=[sentence(note) for note in diagnosis.notes],
+        next=_next(diagnosis, [shlex.quote(file) for file in files] or ["LOG"]),
+    )
+
+
+def _first(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
+    """Return the picture of the errors, how sure the verdict is, its cost, mistakes, causes, gain and failed checks."""
+    yield Picture(
+        "diagnosis",
+        partial(_lead, diagnosis, twin),
+        "Errors of the recording, its twin and the extended model",
+        "Each dot is the error of one pose, turn or interval. Grey: the same recording simulated by the fitted model, "
+        "noise included (its twin): errors scatter like this if nothing is missing. Right: the test of each effect, "
+        "alone; beyond the dashed line an effect stands out from what chance produces in this many tests.",
+    )
+    yield from _certainty(diagnosis)
+    yield from _cost(diagnosis)
+    mistakes = [_mistake(diagnosis, finding) for finding in diagnosis.preflight]
+    if mistakes:
+        yield Section("The recording itself", mistakes)
+    if diagnosis.effects:
+        yield Section("What is missing in the model", [_effects_table(diagnosis)])
+    yield from _learned_part(diagnosis)
+    yield from _gains(diagnosis)
+    if diagnosis.verdict == "adequate":
+        yield Section("What could still hide in this recording", [*_limits(diagnosis)])
+    wrong = [check for check in diagnosis.checks if check.adjusted < _DOUBT]
+    if wrong:
+        yield Section("What the fitted model gets wrong", [_checks_table(wrong)])
+
+
+def _rest(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
+    """Return how to separate causes, the passed checks, the errors against what they may depend on, and the limits."""
+    if diagnosis.options:
+        yield Section("What would separate the causes", [*_options(diagnosis)])
+    right = [check for check in diagnosis.checks if not check.adjusted < _DOUBT]
+    yield Section("What the fitted model gets right", [_checks_table(right), *_evidence(diagnosis, twin)])
+    if diagnosis.verdict != "adequate":
+        yield Section("What could still hide in this recording", [*_limits(diagnosis)])
+    if diagnosis.not_observable:
+        yield Section("Not observable here", [_blind_table(diagnosis)])
+
+
+def _what_is_wrong(diagnosis: Diagnosis) -> Iterator[str]:
+    """Say whether the model fits, and if not, what it lacks."""
+    standing = _standing(diagnosis)
+    if diagnosis.verdict == "adequate":
+        yield _adequate(diagnosis)
+    elif standing:
+        yield f"No effect can be named from this recording. {standing[0].text}"
+    elif diagnosis.verdict != "unexplained":
+        sure = "Probably" if all(effect.weak for effect in diagnosis.effects) else "Found"
+        yield f"{sure} {_causes(diagnosis)}."
+    else:
+        unlikely = diagnosis.p_value <= _DOUBT
+        yield (
+            "The model does not fit, and no known effect explains why."
+            if unlikely
+            else "The model may not fit: of recordings that it describes completely, one in "
+            f"{1 / diagnosis.p_value:.0f} looks like this, and no known effect explains it."
+        )
+        if diagnosis.shape is not None:
+            yield f"It looks like this: {diagnosis.shape}."
+        if diagnosis.learned is not None:
+            yield f"The {diagnosis.learned.triad}'s misfit depends on {diagnosis.learned.covariate}."
+        if diagnosis.effects:
+            yield f"Part of it is {_causes(diagnosis)}."
+
+
+def _standing(diagnosis: Diagnosis) -> list[Finding]:
+    """Return the mistakes in the recording for which no effect can be named."""
+    unexplained = diagnosis.verdict == "unexplained"
+    return [finding for finding in diagnosis.preflight if finding.spoils or (finding.partial and unexplained)]
+
+
+def _adequate(diagnosis: Diagnosis) -> str:
+    """Say that nothing is missing, and whether all of the noise is as assumed and everything could be checked."""
+    sure = f"(p {probability(diagnosis.p_value)})"
+    worst = min(diagnosis.checks, key=lambda check: check.adjusted, default=None)
+    if worst is not None and worst.adjusted < _DOUBT:
+        return (
+            f"No effect shows {sure}, but the noise is not all that was assumed: {worst.text} "
+            f"(p {probability(worst.adjusted)})."
+        )
+    if diagnosis.calibration.exact:
+        words = _kind_words(diagnosis)
+        unchecked = listed([words.get(name, name) for name in diagnosis.calibration.exact])
+        return (
+            f"No effect shows {sure}, but {unchecked} cannot be checked: there are as many parameters as conditions, "
+            "and no degrees of freedom are left. Record more poses."
+        )
+    return f"The model fits: bias, scale and misalignment explain this recording to its noise {sure}."
+
+
+def _causes(diagnosis: Diagnosis) -> str:
+    """Return the causes, each with what it adds and what it cannot be distinguished from."""
+    texts = []
+    for effect in diagnosis.effects:
+        rivals = " or ".join(map(effect_title, effect.rivals))
+        texts.append(effect.sentence() + (f", or {rivals} (this recording cannot tell them apart)" if rivals else ""))
+    return "; ".join(texts)
+
+
+def _gained(diagnosis: Diagnosis) -> str:
+    """Say what modelling the causes, or else the smooth curve, gains on data that was not fitted."""
+    gain, learned = diagnosis.gain, diagnosis.learned
+    effects = [cause.effect for cause in diagnosis.named]
+    if gain is not None:
+        effect, subject = effects[0], "them" if len(effects) > 1 else "it"
+    elif learned is not None:
+        gain, effect, subject = learned.gain, learned.effect, "this as a smooth curve"
+    else:
+        return ""
+    kind = gain.best_kind(effect)
+    (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
+    data = f"the error on data not fitted ({gain.data})"
+    if after >= before:
+        return f"Modelling {subject} does not reduce {data}, {size(after, unit)}."
+    little = "only " if after > _LITTLE * before else ""
+    return f"Modelling {subject} cuts {data} {little}from {change(before, after, unit).replace('→', 'to')}."
+
+
+def _number(diagnosis: Diagnosis) -> tuple[str, str]:
+    """Return an error on data not fitted, without and with the extension, or else that of the fit; and what it is."""
     gain, learned = diagnosis.gain, diagnosis.learned
     if learned is not None:
-        drawn["learned"], gain = partial(_learned, learned), learned.gain
-    words = {kind.name: kind.words for kind in diagnosis.experiment.real.kinds}
-    index = _shown_kind(diagnosis)
-    shown = diagnosis.experiment.real.kinds[index]
-    measured, simulated = (
-        size(np.sqrt(np.mean(np.square(errors[index]))), shown.unit, 2)
-        for errors in (diagnosis.experiment.errors(diagnosis.base), twin.errors(copied))
-    )
-    number, meaning = measured, f"rms of {shown.words}: no more than noise, drift and handling leave"
-    if diagnosis.verdict != "adequate":
-        meaning = f"rms of {shown.words}; a simulation of this model and its noise leaves {simulated}"
+        gain = learned.gain
     if gain is not None:
         kind = gain.best_kind(diagnosis.named[0].effect if learned is None else learned.effect)
-        number = gain.errors(kind)
-        meaning = f"rms of {words[kind]} on data that was not fitted ({gain.data}), without and with the extension"
-    return write_page(
-        folder,
-        "diagnosis",
-        drawn,
-        title=f"Diagnosis of {diagnosis.files}",
-        lead=diagnosis.headline(),
-        number=number,
-        meaning=meaning,
-        diagnosis=diagnosis,
-        notes=diagnosis.notes,
-        effects=[(effect, CATALOGUE.get(effect.name), effect.numbers()) for effect in diagnosis.effects],
-        gain=gain,
-        gains=[] if gain is None else [(words[kind], gain.errors(kind)) for kind in gain.before.rms],
-        options=_option_rows(diagnosis),
-        limits=limit_rows(diagnosis),
-        checks=[
-            (check.text, probability(check.adjusted).removeprefix("= "), bool(check.adjusted < 0.01))
-            for check in diagnosis.checks
-        ],
-        not_observable=_by_reason(diagnosis.not_observable),
+        meaning = f"rms of {_kind_words(diagnosis)[kind]} on data not fitted ({gain.data}), without and with the "
+        return gain.errors(kind), meaning + ("extension" if learned is None else "curve")
+    index = _shown_kind(diagnosis)
+    shown = diagnosis.experiment.real.kinds[index]
+    measured = np.sqrt(np.mean(np.square(diagnosis.experiment.errors(diagnosis.base)[index])))
+    if diagnosis.verdict == "adequate":
+        meaning = f"rms of {shown.words}: no more than noise, drift and handling leave"
+    else:
+        present = np.unique(diagnosis.experiment.real.kind).tolist()
+        times = np.sqrt(diagnosis.checks[present.index(index)].statistic)
+        meaning = f"rms of {shown.words}, {number(times, 2)} × what noise, drift and handling leave"
+    return size(measured, shown.unit, 2), meaning
+
+
+def _next(diagnosis: Diagnosis, files: list[str]) -> str:
+    """Return what to record or run next."""
+    repairs = dict.fromkeys(finding.repair for finding in _standing(diagnosis) if finding.repair)
+    by_hand = diagnosis.experiment.data.by_hand  # else the command has more arguments
+    if repairs and by_hand:
+        again = f"`jaximu diagnose {' '.join([*files, *repairs])} -o RESULTS`"
+        return f"{diagnosis.suggestion} {again} repeats the diagnosis."
+    if diagnosis.suggestion:
+        together = f"`jaximu diagnose {' '.join(files)} NEW_LOG -o RESULTS` diagnoses both recordings together."
+        recorded = by_hand and " record" in diagnosis.suggestion and not _standing(diagnosis)
+        return diagnosis.suggestion + f" {together}" * recorded
+    what = "extended calibration" if diagnosis.extended.effects else "calibration"
+    return f"`jaximu compensate CALIBRATION {files[0]} -o CORRECTED.csv` applies the {what}."
+
+
+def _mistake(diagnosis: Diagnosis, finding: Finding) -> Statement:
+    """Return a mistake in the recording: what is wrong unless the verdict says so, where, and how to repair it."""
+    texts = [] if finding in _standing(diagnosis)[:1] and diagnosis.verdict != "adequate" else [sentence(finding.text)]
+    if finding.rows:
+        texts.append(f"Row{'s' * (len(finding.rows) > 1)} {', '.join(map(str, finding.rows))}.")
+    if finding.repair:
+        texts.append(f"Repair: `{finding.repair}`.")
+    if finding.rivals:
+        texts.append(f"This recording cannot distinguish it from {listed([*map(effect_title, finding.rivals)], 'or')}.")
+    return Statement(sentence(effect_title(finding.name)), " ".join(texts) or "See above.", caution=True)
+
+
+def _effects_table(diagnosis: Diagnosis) -> Table:
+    """Return each cause with what it is, what it adds to the output, its coefficients and its evidence."""
+    headers = ("effect", "adds up to", "coefficients ± 95 %", "evidence")
+    return Table(headers, [_effect_row(effect) for effect in diagnosis.effects])
+
+
+def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
+    """Return a cause's cells."""
+    evidence = effect.evidence + " (weak)" * effect.weak
+    numbers = "\n".join(effect.numbers())
+    if isinstance(effect, NoiseFinding):
+        about = "the noise model is wrong by these factors; it was corrected before anything else was tested"
+        return f"{effect_title(effect.name)}\n{about}", "", numbers, evidence
+    about = f"{effect.effect.formula}; belongs to the {_SCOPES[effect.scope]}"
+    return f"{effect.effect.title}\n{about}", f"{effect.size()}\n({effect.triad})", numbers, evidence
+
+
+def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
+    """Return the smooth curve that the misfit follows."""
+    learned = diagnosis.learned
+    if learned is None:
+        return
+    text = (
+        f"No known effect explains it, but the {learned.triad}'s misfit depends on {learned.covariate}: a smooth curve "
+        f"({learned.effect.name}) follows it, and the extended calibration contains the curve."
+    )
+    picture = Picture(
+        "learned",
+        partial(_learned, learned),
+        "The smooth curve that the misfit follows, with its band",
+        f"What the {learned.triad} puts out by {learned.covariate}, learned from the recording without a cause, with "
+        "its 95 % band; a constant is part of the bias. Beyond its ends the extended calibration keeps the curve "
+        "constant.",
+    )
+    yield Section("What the misfit depends on", [text, picture])
+
+
+def _gains(diagnosis: Diagnosis) -> Iterator[Section]:
+    """Return the errors on data that was not fitted, with what was added to the model."""
+    gains = [("extended model", diagnosis.gain)]
+    if diagnosis.learned is not None:
+        gains.append(("with the smooth curve", diagnosis.learned.gain))
+    tables = [_gain_table(diagnosis, what, gain) for what, gain in gains if gain is not None]
+    if tables:
+        yield Section("What the extension gains on data that was not fitted", tables)
+
+
+def _gain_table(diagnosis: Diagnosis, what: str, gain: Gain) -> Table:
+    """Return the errors of a model without and with an extension."""
+    words = _kind_words(diagnosis)
+    before, after = (part.chi_squared / part.count for part in (gain.before, gain.after))
+    caption = (
+        f"Measured on {gain.data}. χ² per condition {before:.2f} → {after:.2f} (1 is noise alone), log-likelihood "
+        f"{gain.log_likelihood:+.1f}."
+    )
+    return Table(
+        ("error, rms", f"base model → {what}"), [(words[kind], gain.errors(kind)) for kind in gain.before.rms], caption
     )
 
 
-def limit_rows(diagnosis: Diagnosis) -> TextRows:
-    """Return each effect with the size up to which it could be there unnoticed."""
-    return [(effect_title(name), size(*limit, 2)) for name, limit in sorted(diagnosis.detection_limits.items())]
+def _certainty(diagnosis: Diagnosis) -> Iterator[Statement]:
+    """Say how probable such data are if the model is complete, what the tests allow for, and which cause is weak."""
+    verdict = "This is not chance"
+    if diagnosis.p_value > _DOUBT:
+        verdict = "This is consistent with noise" if diagnosis.verdict == "adequate" else "This may be chance"
+    text = (
+        f"{verdict}: if the model were complete, data at least this unusual would have the probability p "
+        f"{probability(diagnosis.p_value)} (all tests together)."
+    )
+    if diagnosis.unit > _NOISY:
+        text += f" Remaining scatter: {diagnosis.unit:.2f} × noise. The tests allow for it."
+    yield Statement("How sure", text)
+    for effect in diagnosis.effects:
+        if effect.weak:
+            text = f"{sentence(effect_title(effect.name))}: an effect outside the catalogue may take its name."
+            yield Statement("The detection is weak", text, caution=True)
 
 
-def _by_reason(reasons: Mapping[str, str]) -> TextRows:
+def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
+    """Say by how much the output is wrong where the calibration lacks the causes."""
+    outputs = [
+        f"{effect.effect.title} changes the {effect.triad}'s output by up to {effect.size()}"
+        for effect in diagnosis.named
+    ]
+    if diagnosis.learned is not None:
+        learned = diagnosis.learned
+        peak = np.unravel_index(np.argmax(np.abs(learned.y)), learned.y.shape)
+        swing = with_interval(abs(learned.y[peak]), learned.half_width[peak] / Z95, SENSOR_UNITS[learned.triad])
+        outputs.append(f"{learned.covariate} changes the {learned.triad}'s output by up to {swing} (95 %)")
+    if outputs:
+        yield Statement("What it costs without the extension", f"In this recording, {'; '.join(outputs)}.")
+    elif diagnosis.verdict == "unexplained":
+        cause = "A mistake in the recording" if _standing(diagnosis) else "An unmodelled effect"
+        text = f"{cause} may bias the parameters by more than their intervals show."
+        yield Statement("What it costs", text, caution=True)
+
+
+def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
+    """Return the detection limits, those that leave most room first."""
+    yield (
+        "An effect could be there unnoticed up to its detection limit: the size (coefficients in a random direction) "
+        "that its test finds with 90 % power."
+    )
+    order = sorted(diagnosis.detection_limits, key=lambda name: -_in_plausible_sizes(diagnosis, name))
+    rows = [
+        (
+            effect_title(name),
+            size(*diagnosis.detection_limits[name], 2),
+            f"{number(_in_plausible_sizes(diagnosis, name), 2)} ×",
+        )
+        for name in order
+    ]
+    yield Table(("effect", "detection limit", "compared with a plausible size"), rows, brief=_BRIEF)
+
+
+def _in_plausible_sizes(diagnosis: Diagnosis, name: str) -> float:
+    """Return an effect's detection limit in multiples of a plausible size."""
+    kind, imu = CATALOGUE[name], diagnosis.base.imu
+    triad = imu.triads().get(kind.owner, imu.accelerometer)
+    scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
+    return diagnosis.detection_limits[name][0] / (kind.typical * (scale if kind.unit.startswith("output") else 1.0))
+
+
+def _options(diagnosis: Diagnosis) -> Iterator[Part]:
+    """Return the powers of recordings that could be made to distinguish the causes, and of this one."""
+    yield (
+        "Each recording is simulated with this unit and its noise; the power is that of distinguishing the causes (at "
+        "the 1 % level), or of finding the only one."
+    )
+    first = diagnosis.options[0]
+    lines = [("this recording", first.before), *((option.text, option.powers) for option in diagnosis.options)]
+    rows = [(text, *(f"{100 * power:.0f} %" for power in powers.values())) for text, powers in lines]
+    yield Table(("do this", *map(effect_title, first.powers)), rows)
+
+
+def _checks_table(checks: list[Check]) -> Table:
+    """Return checks of the base model, the most significant first."""
+    rows = [
+        (*check.text.rpartition(": ")[::2], probability(check.adjusted).removeprefix("= "))
+        for check in sorted(checks, key=lambda check: check.adjusted)
+    ]
+    caption = (
+        "p-values allow for all checks together: below 0.01 the model or its noise is wrong there; above, chance does "
+        "as much."
+    )
+    return Table(("check of the base model", "statistic", "p-value"), rows, caption, brief=_BRIEF)
+
+
+def _evidence(diagnosis: Diagnosis, twin: Twin) -> Iterator[Picture]:
+    """Return errors against what they may depend on, and the noise at rest."""
+    yield Picture(
+        "dependence",
+        partial(_dependence, diagnosis, twin),
+        "Errors against time, temperature and orientation",
+        "The base model's errors against what they may depend on; grey is the twin. A shape here that grey lacks is "
+        "model error; scatter alike in both is noise.",
+    )
+    if diagnosis.experiment.still_parts("gyroscope")[0]:
+        yield Picture(
+            "noise",
+            partial(_noise, diagnosis, twin),
+            "Spectrum and Allan deviation at rest, measured and simulated",
+            "What the sensors put out while the unit was still, measured and twin, mean of the axes. Above: spectrum, "
+            "mean of all poses. Below: Allan deviation over the longest still part, with 95 % intervals. Where they "
+            "differ, the noise model does not fit this recording.",
+        )
+
+
+def _blind_table(diagnosis: Diagnosis) -> Table:
     """Return each reason once, with the effects that it hides."""
-    return [
+    reasons = diagnosis.not_observable
+    rows = [
         (sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))
         for reason in dict.fromkeys(reasons.values())
     ]
+    return Table(("reason", "effects that it hides"), rows)
 
 
-def _option_rows(diagnosis: Diagnosis) -> list[list[str]]:
-    """Return the names of the causes, then of this recording and of each option the powers to tell them apart."""
-    if not diagnosis.options:
-        return []
-    first = diagnosis.options[0]
-    lines = [("this recording", first.before), *((option.text, option.powers) for option in diagnosis.options)]
-    return [
-        [effect_title(name) for name in first.powers],
-        *([text, *(f"{100 * power:.0f} %" for power in powers.values())] for text, powers in lines),
-    ]
+def _kind_words(diagnosis: Diagnosis) -> dict[str, str]:
+    """Return what each kind of error is called."""
+    return {kind.name: kind.words for kind in diagnosis.experiment.real.kinds}
 
 
 def _shown_kind(diagnosis: Diagnosis) -> int:
-    """The kind of error that the lead is about, as a place among the experiment's."""
+    """Return the index of the kind of error that the first picture shows."""
     kinds = [kind.name for kind in diagnosis.experiment.real.kinds]
     if diagnosis.learned is not None:
         return kinds.index(diagnosis.learned.gain.best_kind(diagnosis.learned.effect))
@@ -123,14 +433,16 @@ def _shown_kind(diagnosis: Diagnosis) -> int:
     return int(present[first.index(min(first, key=lambda check: check.p_value))])
 
 
-def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
+def _lead(diagnosis: Diagnosis, twin: Twin) -> Figure:
+    """Draw the errors of the recording, its twin and the extended model, and the test of each effect."""
+    simulated, refit = twin()
     figure = figures.new_figure(4.3)
     left, right = figure.subplots(1, 2, width_ratios=[1.35, 1])
     kind = _shown_kind(diagnosis)
     experiment = diagnosis.experiment
     shown = experiment.real.kinds[kind]
     factor, unit = readable(shown.unit, _AN_ERROR)
-    series = [("twin", _TWIN, twin, copied), ("measured, base model", _MEASURED, experiment, diagnosis.base)]
+    series = [("twin", _TWIN, simulated, refit), ("measured, base model", _MEASURED, experiment, diagnosis.base)]
     if diagnosis.extended.effects:
         series.append(("measured, extended model", _EXTENDED, experiment, diagnosis.extended))
     for label, colour, source, state in series:
@@ -144,6 +456,7 @@ def _lead(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
 
 
 def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
+    """Draw the evidence of each effect, the strongest on top."""
     evidence = diagnosis.base.evidence
     scores = evidence.scores()
     best: dict[str, float] = {}
@@ -162,13 +475,14 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
     panel.tick_params(axis="y", labelsize=7)
 
 
-def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure:
-    real = diagnosis.experiment.real
+def _dependence(diagnosis: Diagnosis, twin: Twin) -> Figure:
+    """Draw each kind of error against what it may depend on."""
+    real, (simulation, refit) = diagnosis.experiment.real, twin()
     rows = [int(kind) for kind in np.unique(real.kind)]
-    covariates, shadow = ({row: source.dependences(row) for row in rows} for source in (real, twin.real))
+    covariates, shadow = ({row: source.dependences(row) for row in rows} for source in (real, simulation.real))
     figure = figures.new_figure(2.1 * len(rows) + 0.4)
     panels = figure.subplots(len(rows), max(len(table) for table in covariates.values()), squeeze=False, sharey="row")
-    measured, simulated = diagnosis.experiment.errors(diagnosis.base), twin.errors(copied)
+    measured, simulated = diagnosis.experiment.errors(diagnosis.base), simulation.errors(refit)
     for line, row in zip(panels, rows, strict=True):
         kind = real.kinds[row]
         factor, unit = readable(kind.unit, _AN_ERROR)
@@ -186,17 +500,18 @@ def _dependence(diagnosis: Diagnosis, twin: Experiment, copied: State) -> Figure
 
 
 def _learned(learned: LearnedTerm) -> Figure:
+    """Draw the smooth curve of each axis with its band."""
     unit, factor, shift = learned.effect.covariate_unit, 1.0, 0.0
     if learned.effect.words == "temperature":
         unit, shift = "°C", ZERO_CELSIUS
     elif unit == "rad/s":
         unit, factor = "°/s", np.degrees(1.0)
-    size, label = readable(SENSOR_UNITS[learned.triad], _AN_ERROR)
+    scale, label = readable(SENSOR_UNITS[learned.triad], _AN_ERROR)
     figure = figures.new_figure(2.8)
     x = factor * learned.x - shift
     panels = figure.subplots(1, 3, sharey=True)
     for axis, panel in enumerate(panels):
-        band(panel, x, size * learned.y[:, axis], size * learned.half_width[:, axis], _EXTENDED)
+        band(panel, x, scale * learned.y[:, axis], scale * learned.half_width[:, axis], _EXTENDED)
         zero_line(panel)
         dressed(panel, f"{learned.triad} {'xyz'[axis]}", xlabel=f"{learned.covariate} [{unit.replace('^2', '²')}]")
         panel.xaxis.label.set_size(8)
@@ -204,12 +519,13 @@ def _learned(learned: LearnedTerm) -> Figure:
     return figure
 
 
-def _noise(diagnosis: Diagnosis, twin: Experiment) -> Figure:
+def _noise(diagnosis: Diagnosis, twin: Twin) -> Figure:
+    """Draw spectrum and Allan deviation at rest, measured and simulated."""
     figure = figures.new_figure(5.8)
     panels = figure.subplots(2, 2)
     for column, (name, unit) in enumerate((("accelerometer", "m/s²"), ("gyroscope", "rad/s"))):
         spectrum, allan = panels[:, column]
-        for label, colour, experiment in (("measured", _MEASURED, diagnosis.experiment), ("twin", _TWIN, twin)):
+        for label, colour, experiment in (("measured", _MEASURED, diagnosis.experiment), ("twin", _TWIN, twin()[0])):
             frequency, density = _density(experiment, name)
             spectrum.plot(frequency, np.sqrt(density), color=colour, linewidth=1, label=label)
             tau, value, low, high = _allan(experiment, name)
