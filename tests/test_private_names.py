@@ -15,6 +15,9 @@ HANDED_UP = {
     "jaximu.recordings.recording from jaximu.recordings.write",
     "jaximu.recordings.recording from jaximu.report.figures",
     "jaximu.calibration.calibration from jaximu.report.figures",
+    "jaximu.ground.page from jaximu.report.html",
+    "jaximu.ground.page from jaximu.report.terminal",
+    "jaximu.ground.page from jaximu.report.{self._page}",
 }
 """Methods that hand their object to a higher layer by name, `reexport.later`; nothing below depends on what comes."""
 
@@ -76,7 +79,8 @@ def handed_up() -> set[str]:
         if any(each.source == "jaximu.ground.reexport" and each.name == "later" for each, _ in IMPORTS[module]):
             assert calls or module.startswith("jaximu.cli"), f"{module} uses `later` otherwise than by calling it"
             if not module.startswith("jaximu.cli"):
-                found |= {f"{module} from jaximu.{ast.literal_eval(node.args[0])}" for node in calls}
+                texts = [ast.unparse(node.args[0]).removeprefix("f").strip("'\"") for node in calls]
+                found |= {f"{module} from jaximu.{text}" for text in texts}
     return found
 
 

@@ -215,7 +215,7 @@ class LogOptions:
         return ReadOptions(**stated, gravity=gravity, check=check, alone=alone)
 
     def read_unit(
-        self, paths: tuple[Path, ...], gravity: LocalGravity, noise: NoiseOptions, alone: bool = False
+        self, paths: tuple[Path, ...], gravity: LocalGravity, noise: NoiseOptions | None = None, alone: bool = False
     ) -> tuple[list[Recording], Recording | NoiseModel | None]:
         """Read the logs of one unit, and its recording at rest, or the noise that is stated, if there is one."""
         if not paths:
@@ -223,6 +223,7 @@ class LogOptions:
         if self.gyro_log is not None and len(paths) > 1:
             raise InputError("--gyro-log goes with one LOG; with several, each must hold its own gyroscope.")
         with progress("reading"):
+            noise = noise or NOISE
             require_files(*paths, noise.static, noise.noise)
             recordings = [self.read(path, gravity, alone=alone) for path in paths]
             return recordings, noise.value(replace(self, gyro_log=None), gravity)  # --gyro-log is LOG's

@@ -35,7 +35,7 @@ _OUTPUTS = {
 _NEXT = {
     "valid": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
     "session": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
-    "shifted": "`jaximu calibrate LOG -o RESULTS` calibrates anew.",
+    "shifted": "`jaximu calibrate LOG -o RESULTS` calibrates the unit again.",
     "effect": "`jaximu diagnose LOG -o RESULTS` finds the effect and writes the extended calibration.",
     "unexplained": "`jaximu diagnose LOG -o RESULTS` shows what does not fit.",
 }
