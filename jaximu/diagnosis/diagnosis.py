@@ -20,6 +20,7 @@ from jaximu.diagnosis.drift import DriftComponents, drifted, estimate_drift, han
 from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
+from jaximu.diagnosis.hidden import Hidden, hidden_causes
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import LearnedTerm, learn, left_out_likelihood
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise, usual_noise
@@ -247,6 +248,10 @@ class Diagnosis(Result, Document, page="diagnosis"):
             "detection_limits": {
                 name: {"value": value, "unit": unit} for name, (value, unit) in self.detection_limits.items()
             },
+            "hidden": [
+                {"name": cause.name, "limit": cause.limit, "unit": cause.unit, "shift": cause.shift}
+                for cause in self.hidden
+            ],
             "not_observable": self.not_observable,
             "checks": [check.document() for check in self.checks],
             "suggestion": self.suggestion,
@@ -261,6 +266,11 @@ class Diagnosis(Result, Document, page="diagnosis"):
             "data": self.calibration.data,
             "software": SOFTWARE,
         }
+
+    @cached_property
+    def hidden(self) -> list[Hidden]:
+        """What each cause at its detection limit would do to the numbers of the extended fit, the worst first."""
+        return hidden_causes(self.extended)
 
     def extended_calibration(self) -> Calibration:
         """Return the calibration with the effects that were found: it is used and saved like any other."""

@@ -12,10 +12,12 @@ import numpy as np
 
 from jaximu.diagnosis import Check, Diagnosis, Named, twin_of
 from jaximu.diagnosis.experiment import Experiment, State
+from jaximu.diagnosis.hidden import Hidden
 from jaximu.diagnosis.improvement import Gain
 from jaximu.diagnosis.learned import LearnedTerm
 from jaximu.diagnosis.noise import NoiseFinding
 from jaximu.estimation.rows import TIME
+from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Page, Part, Picture, Section, Statement, Table
 from jaximu.ground.quantities import Z95, change, listed, number, probability, readable, size, with_interval
@@ -336,29 +338,40 @@ def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
 
 
 def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
-    """Return the detection limits, those that leave most room first."""
+    """Return the detection limits and what an effect of that size would do, the worst first."""
     yield (
         "An effect could be there unnoticed up to its detection limit: the size (coefficients in a random direction) "
-        "that its test finds with 90 % power."
+        "that its test finds with 90 % power. It would shift the calibrated numbers by as much as the last column says, "
+        "in their standard deviations (σ): the intervals do not include that."
     )
-    order = sorted(diagnosis.detection_limits, key=lambda name: -_in_plausible_sizes(diagnosis, name))
     rows = [
         (
-            effect_title(name),
-            size(*diagnosis.detection_limits[name], 2),
-            f"{number(_in_plausible_sizes(diagnosis, name), 2)} ×",
+            effect_title(cause.name),
+            size(cause.limit, cause.unit, 2),
+            f"{number(_in_plausible_sizes(diagnosis, cause.name, cause.limit), 2)} ×",
+            _shift_words(diagnosis, cause),
         )
-        for name in order
+        for cause in diagnosis.hidden
     ]
-    yield Table(("effect", "detection limit", "compared with a plausible size"), rows, brief=_BRIEF)
+    headers = ("effect", "detection limit", "compared with a plausible size", "would shift most")
+    yield Table(headers, rows, brief=_BRIEF)
 
 
-def _in_plausible_sizes(diagnosis: Diagnosis, name: str) -> float:
+def _shift_words(diagnosis: Diagnosis, cause: Hidden) -> str:
+    """Return which number a cause would shift most, and by how much."""
+    name, sigmas = cause.worst
+    if not name:
+        return "nothing"
+    names = {str(known): known for known in diagnosis.extended.names}
+    return f"{describe(names[name], diagnosis.extended.model)}, {number(sigmas, 2)} σ"
+
+
+def _in_plausible_sizes(diagnosis: Diagnosis, name: str, limit: float) -> float:
     """Return an effect's detection limit in multiples of a plausible size."""
     kind, imu = CATALOGUE[name], diagnosis.base.imu
     triad = imu.triads().get(kind.owner, imu.accelerometer)
     scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
-    return diagnosis.detection_limits[name][0] / (kind.typical * (scale if kind.unit.startswith("output") else 1.0))
+    return limit / (kind.typical * (scale if kind.unit.startswith("output") else 1.0))
 
 
 def _options(diagnosis: Diagnosis) -> Iterator[Part]:
