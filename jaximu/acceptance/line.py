@@ -103,13 +103,14 @@ class Batch:
 class Alarm:
     """What charts, stations, lots or a golden unit show. kind: value, jump, average, station, lot or golden.
 
-    parts: a sentence in parts, of which amounts are a number in SI with its significant digits.
+    texts, amounts: a sentence, a text and an amount in turns; an amount is a number in SI and its digits.
     """
 
     kind: str
     name: str
     where: str
-    parts: tuple[str | tuple[float, int], ...]
+    texts: tuple[str, ...]
+    amounts: tuple[tuple[float, int], ...]
 
     @property
     def text(self) -> str:
@@ -118,8 +119,8 @@ class Alarm:
 
     def words(self, stated: str = "") -> str:
         """Return the sentence with amounts in the unit that a file of limits states."""
-        unit = si_unit(self.name)
-        return "".join(part if isinstance(part, str) else amount(part[0], unit, part[1], stated) for part in self.parts)
+        amounts = [amount(value, si_unit(self.name), digits, stated) for value, digits in self.amounts]
+        return "".join(map(str.__add__, self.texts, [*amounts, ""]))
 
     def document(self) -> dict[str, str]:
         """Return the alarm as JSON has it."""
@@ -451,12 +452,11 @@ def _alarms(
         if len(chart.drifting):
             start, most = int(chart.drifting[0]), int(chart.drifting[np.argmax(off[chart.drifting])])
             side = "above" if chart.average[most] > chart.centre else "below"
-            parts = (
+            texts = (
                 f"{what}: the moving average left its limits at {_when(table, int(places[start]))} and is farthest, ",
-                (float(off[most]), 3),
                 f" {side} the mean of all, at {_when(table, int(places[most]))}",
             )
-            alarms.append(Alarm("average", name, station, parts))
+            alarms.append(Alarm("average", name, station, texts, ((float(off[most]), 3),)))
         # a value far off is a jump, too: it is said once
         kind, hits = ("value", chart.beyond) if len(chart.beyond) else ("jump", chart.jumps)
         if len(hits):
@@ -465,17 +465,12 @@ def _alarms(
             most = int(hits[np.argmax(np.abs(away[hits]))])
             relation = "is off the mean by" if kind == "value" else "differs from the unit before by"
             more = f"; {len(hits) - 1} more units are beyond the limits" if len(hits) > 1 else ""
-            parts = (f"{what}: {_when(table, int(places[most]))} {relation} ", (float(away[most]), 3), more)
-            alarms.append(Alarm(kind, name, station, parts))
+            texts = (f"{what}: {_when(table, int(places[most]))} {relation} ", more)
+            alarms.append(Alarm(kind, name, station, texts, ((float(away[most]), 3),)))
     if course is not None and course.p_value * questions < LEVEL:
-        parts = (
-            f"{spoken(name)} of the golden unit {golden} drifts by ",
-            (30 * course.slope, 3),
-            " in 30 days (± ",
-            (30 * 1.96 * course.sigma, 2),
-            ", 95 %)",
-        )
-        alarms.append(Alarm("golden", name, "", parts))
+        texts = (f"{spoken(name)} of the golden unit {golden} drifts by ", " in 30 days (± ", ", 95 %)")
+        amounts = ((30 * course.slope, 3), (30 * 1.96 * course.sigma, 2))
+        alarms.append(Alarm("golden", name, "", texts, amounts))
     return alarms
 
 
@@ -509,7 +504,7 @@ def _compared(
             break
         verb = "measures" if kind == "station" else "has"
         than = f" {'more' if shift > 0 else 'less'} than the other {kind}s"
-        alarms.append(Alarm(kind, name, label, (f"{kind} {label} {verb} {spoken(name)} ", (abs(shift), 3), than)))
+        alarms.append(Alarm(kind, name, label, (f"{kind} {label} {verb} {spoken(name)} ", than), ((abs(shift), 3),)))
         del left[label]  # those that remain are compared without it
     return alarms
 

@@ -25,7 +25,6 @@ from jaximu.report.tables import provenance
 __all__ = ["certificate_of", "item_row", "page_of"]
 
 _COLUMNS = ("name", "value", "limits", "probability", "verdict", "coverage", "freedom", "recording", "gravity")
-_NAMED = 3  # items in the first sentence
 
 
 def page_of(acceptance: Acceptance) -> Page:
@@ -70,7 +69,7 @@ def _verdict(verdict: str, items: Sequence[Item]) -> Iterator[str]:
     if verdict == PASS:
         yield "Every item conforms with its limits."
         return
-    rows = [item_row(item) for item in deciding[:_NAMED]]
+    rows = [item_row(item) for item in deciding[:3]]
     named = "; ".join(f"{row['name']} is {row['value']}, limits {row['limits']}" for row in rows)
     more = len(deciding) - len(rows)
     also = f"; and {counted(more, 'more item')}" if more else ""

@@ -37,9 +37,6 @@ _KINDS = (
     ("gyroscope", "gain", False, "gyroscope misalignment", "mrad", 1e3),
     ("gyroscope", "bias", True, "gyroscope bias", "°/s", float(np.degrees(1.0))),
 )
-_HELPED = 0.8
-"""Uncertainty with the prior over that without, below which the prior is worth having."""
-_MOST_DOTS = 500  # units drawn of one parameter
 
 
 def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
@@ -226,7 +223,7 @@ def _prior(fleet: Fleet) -> Iterator[Section]:
         mean = fleet.population.mean[k] - (name.part == "gain" and name.axes[0] == name.axes[1])
         sizes = (mean, fleet.population.spread[k], alone[k], prior[k])
         rows.append((describe(name), *(amount(name, float(size)) for size in sizes)))
-    helped = np.flatnonzero(prior < _HELPED * alone).tolist()
+    helped = np.flatnonzero(prior < 0.8 * alone).tolist()
     headers = (
         "parameter",
         "mean",
@@ -325,11 +322,10 @@ def prior_figure(fleet: Fleet) -> Figure:
     population = fleet.population
     assert population is not None
     figure, panels = _panels(population, "Uncertainty with the fleet as prior, in percent of that alone")
-    shown = np.unique(np.linspace(0, len(fleet.sigma) - 1, _MOST_DOTS).astype(int))
-    share = 100 * fleet.shrunk_sigma[shown] / fleet.sigma[shown]
+    share = 100 * fleet.shrunk_sigma / fleet.sigma
     for axes, kind, columns in panels:
         for column, k in enumerate(columns):
-            axes.plot(_beside(column, len(shown)), share[:, k], ".", color=_PRIOR, alpha=0.5, ms=5, mew=0)
+            axes.plot(_beside(column, len(share)), share[:, k], ".", color=_PRIOR, alpha=0.5, ms=5, mew=0)
         figures.zero_line(axes, 100.0)
         _axis_names(axes, population, columns)
         dressed(axes, kind[3], ylabel="with prior / alone [%]", ylim=(0, 108))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -12,7 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.acceptance.decision import FAIL, PASS
+from jaximu.acceptance.limits import Limit
 from jaximu.acceptance.line import FollowedQuantity, Line
+from jaximu.acceptance.statistics import Chart
 from jaximu.acceptance.words import amount, between, in_shown_unit, si_unit, spoken
 from jaximu.ground.page import Page, Picture, Section, Table
 from jaximu.ground.quantities import Z95, counted, number, with_interval
@@ -40,8 +41,6 @@ _TITLES = {
     "golden": "The golden unit drifts",
 }
 _ORDER = ("golden", "station", "lot", "average", "value", "jump")
-_FARTHEST = 5.0
-"""Times what the units of a chart are off their mean, from which on a limit is beyond the panel."""
 _VALUE, _OUT, _AVERAGE = figures.AXES.values()
 
 
@@ -124,17 +123,14 @@ def _why_not_capable(quantity: FollowedQuantity) -> str:
 
 
 def _next(line: Line) -> str:
-    table, failing = shlex.quote(line.table.file), line.items(1)
     if line.limits is None:
-        return f"`jaximu accept {table} --limits LIMITS.toml -o LINE` holds every unit to limits."
-    if failing:
-        device, item = failing[0]
+        return (
+            f"`jaximu accept {shlex.quote(line.table.file)} --limits LIMITS.toml -o LINE` holds every unit to limits."
+        )
+    for device, item in line.items(1):
         log = shlex.quote(line.table.files[line.table.devices.index(device)])
         return f"`jaximu diagnose {log} -o RESULTS` shows what is unusual about {device} ({spoken(item.name)})."
-    if line.golden:
-        return ""
-    limits = shlex.quote(line.limits.file)
-    return f"`jaximu accept {table} --limits {limits} --golden DEVICE -o LINE` also watches the line by one unit."
+    return ""
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -143,16 +139,14 @@ def _next(line: Line) -> str:
 def _capability(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> Iterator[Section]:
     if not able:
         return
-    failed: Counter[str] = Counter()
-    if line.judged is not None:
-        for name, verdicts in zip(line.judged.names, line.judged.verdict.T, strict=True):
-            failed[name] = int(np.sum(verdicts == FAIL))
+    judged = line.judged
+    failed = {} if judged is None else dict(zip(judged.names, np.sum(judged.verdict == FAIL, axis=0), strict=True))
     headers = ("quantity", "Cpk (95 %)", "Cp (95 %)", "mean ± standard deviation", "limits", "fail")
     caption = (
         "Of each device's first recording; the deviation is that of all units, drift between them included. Marked: "
         f"Cpk below {_CAPABLE}. Fail: recordings of all."
     )
-    rows = [_capability_row(quantity, failed[quantity.name]) for quantity, _ in able]
+    rows = [_capability_row(quantity, failed.get(quantity.name, 0)) for quantity, _ in able]
     marked = [row for row, (_, cpk) in enumerate(able) if cpk < _CAPABLE]
     yield Section("Capability", [Table(headers, rows, caption, marked, brief=6)])
 
@@ -271,7 +265,7 @@ def _chart_figure(line: Line, drawn: list[tuple[FollowedQuantity, str]]) -> Figu
             (above, chart.values, chart.beyond, (chart.centre - bound, chart.centre + bound)),
             (below, ranges, chart.jumps, (np.sqrt(2) * bound,)),
         ):
-            size = 4 if len(places) < 200 else 3 if len(places) < 2000 else 1.5
+            size = 4 if len(places) < 200 else 2.5
             dots = axes.plot(across, factor * values, "o", color=_VALUE, ms=size, alpha=0.6, mew=0, label="unit")
             finite = np.isfinite(values)
             named(dots[0], [line.table.devices[row] for row in places[finite]])
@@ -285,20 +279,19 @@ def _chart_figure(line: Line, drawn: list[tuple[FollowedQuantity, str]]) -> Figu
             end = chart.centre + side * chart.average_bound * chart.deviation
             above.plot(across, factor * end, color=_AVERAGE, linestyle=":", linewidth=1)
         title = spoken(quantity.name) + (f", station {station}" if station else "")
-        dressed(above, title + _draw_limits(above, quantity, chart.values, factor), ylabel=f"[{unit}]")
+        dressed(above, title + _draw_limits(above, quantity.limit, chart, factor), ylabel=f"[{unit}]")
         dressed(below, xlabel="" if dated else "unit", ylabel=f"moving range\n[{unit}]")
         below.yaxis.label.set_size(8)
     figures.legend_below(drawing, rows[0], 5)
     return drawing
 
 
-def _draw_limits(axes: Axes, quantity: FollowedQuantity, values: np.ndarray, factor: float) -> str:
+def _draw_limits(axes: Axes, limit: Limit | None, chart: Chart, factor: float) -> str:
     """Draw the limits that units are held to, and return what they are; those far off are beyond the panel."""
-    limit = quantity.limit
     if limit is None:
         return ""
-    most = float(np.nanmax(np.abs(values - np.nanmean(values))))
-    ends = [end for end in (limit.low, limit.high) if abs(end - np.nanmean(values)) < _FARTHEST * most]
+    farthest = 2 * chart.bound * chart.deviation
+    ends = [end for end in (limit.low, limit.high) if abs(end - chart.centre) < farthest]
     for end in ends:
         axes.axhline(factor * end, color="black", linewidth=1.4, label="limit" if end == ends[0] else None)
     return f", limits {between(limit.low, limit.high, limit.unit, limit.stated)}" + ("" if ends else " (off the panel)")
