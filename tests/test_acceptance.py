@@ -633,7 +633,7 @@ def test_the_page_of_a_line(tmp_path):
     text = str(line.summary())
     number = f"{worst.capability.cpk[0]:.2f}".replace("-", "−")
     assert f"\n{number}" in text and "Cpk of accelerometer bias x, the worst quantity" in text
-    assert "The worst quantity is accelerometer bias x: the mean, 0.0" in text
+    assert "The line is not capable: accelerometer bias x has a mean, 0.0" in text
     assert pq.read_table(tmp_path / "out" / "table.parquet")["acceptance"].to_pylist() == line.verdicts.tolist()
 
 

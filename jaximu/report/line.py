@@ -91,16 +91,16 @@ def _number(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> tuple
 
 
 def _verdict(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> Iterator[str]:
+    if able and able[0][1] < _CAPABLE:
+        yield _why_not_capable(able[0][0])
+    elif able:
+        yield f"Every quantity is capable: Cpk is {_CAPABLE} or more."
     if line.limits is not None:
         counts = line.counts
         yield (
             f"{counts['pass']} of {line.table.total} recordings pass, {counts['fail']} fail, {counts['undecided']} are "
             "undecided."
         )
-    if able and able[0][1] < _CAPABLE:
-        yield _why_not_capable(able[0][0])
-    elif able:
-        yield f"Every quantity is capable: Cpk is {_CAPABLE} or more."
     if line.alarms:
         first = _alarm_rows(line)[0][0]
         yield f"{counted(len(line.alarms), 'alarm')}{', the first' * (len(line.alarms) > 1)}: {first.lower()}."
@@ -116,10 +116,10 @@ def _why_not_capable(quantity: FollowedQuantity) -> str:
     assert capability is not None and limit is not None
     limits = between(limit.low, limit.high, unit, limit.stated)
     if capability.cp[0] < _CAPABLE:
-        why = f"units differ too much for the limits {limits}"
+        why = f"varies too much for the limits {limits}"
     else:
-        why = f"the mean, {amount(capability.mean, unit, 3, limit.stated)}, is too near a limit ({limits})"
-    return f"The worst quantity is {spoken(quantity.name)}: {why}."
+        why = f"has a mean, {amount(capability.mean, unit, 3, limit.stated)}, too near a limit ({limits})"
+    return f"The line is not capable: {spoken(quantity.name)} {why}."
 
 
 def _next(line: Line) -> str:
