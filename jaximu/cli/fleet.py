@@ -132,6 +132,7 @@ def run(
 
     show_page(page)
     if line is not None:
+        print()
         show_page(line.summary())
     print(f"Written: {', '.join(map(str, (output, *written)))}")
 

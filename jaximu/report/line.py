@@ -119,7 +119,8 @@ def _why_not_capable(quantity: FollowedQuantity) -> str:
         why = f"varies too much for the limits {limits}"
     else:
         why = f"has a mean, {amount(capability.mean, unit, 3, limit.stated)}, too near a limit ({limits})"
-    return f"The line is not capable: {spoken(quantity.name)} {why}."
+    verb = "is not" if capability.cpk[2] < _CAPABLE else "may not be"  # by the interval's upper end
+    return f"The line {verb} capable: {spoken(quantity.name)} {why}."
 
 
 def _next(line: Line) -> str:
