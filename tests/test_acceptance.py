@@ -572,7 +572,11 @@ def test_the_command_decides_certifies_and_verifies(folder, capsys):
     capsys.readouterr()
     assert main([*given_, "--json"]) == 3
     assert json.loads(capsys.readouterr().out)["verdict"] == "fail"
-    assert main([*given_, "--fail-on", "never"]) == 0
+    assert main([*given_, "--fail-on", "never", "-o", str(folder / "out")]) == 0
+    page = (folder / "out" / "certificate.html").read_text()
+    first = page.partition("<h2")[0]
+    assert '<p class="number caution"><b>Fail</b>' in first and "Fails: accelerometer bias x is" in first
+    assert "limits ±0.001 mg" in first and "mm/s²" not in page  # the unit of the file of limits
     (folder / "limits.toml").write_text(LIMITS + '"gyroscope.N" = "1 deg/s/sqrt(Hz)"\n')
     assert main(given_) == 4
     assert main([*given_, "--fail-on", "fail"]) == 0
@@ -604,7 +608,7 @@ def test_without_what_a_certificate_needs_there_is_a_verdict(folder, calibration
     said = "no certificate without operator, certificate.customer"
     assert main([*given_, "-o", str(folder / "out")]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert ": pass" in printed and f"note: {said}" in printed
+    assert "Pass 12 pass, 0 fail, 0 undecided of 12 items" in printed and f"- N{said[1:]}" in printed
     assert [path.name for path in (folder / "out").iterdir()] == ["acceptance.json"]
     written = json.loads((folder / "out" / "acceptance.json").read_text())
     assert written["verdict"] == "pass" and any(note.startswith(said) for note in written["notes"])
@@ -625,6 +629,11 @@ def test_the_page_of_a_line(tmp_path):
     assert main([*given_, "-o", str(tmp_path / "out")]) == 3
     page = (tmp_path / "out" / "report.html").read_text()
     assert "What does not pass" in page and "Capability" in page and "accelerometer bias x" in page
+    (worst,) = [quantity for quantity in line.followed if quantity.capability is not None]
+    text = str(line.summary())
+    number = f"{worst.capability.cpk[0]:.2f}".replace("-", "−")
+    assert f"\n{number}" in text and "Cpk of accelerometer bias x, the worst quantity" in text
+    assert "The line is not capable: accelerometer bias x has a mean, 0.0" in text
     assert pq.read_table(tmp_path / "out" / "table.parquet")["acceptance"].to_pylist() == line.verdicts.tolist()
 
 

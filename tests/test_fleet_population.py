@@ -11,7 +11,8 @@ from scipy.stats import binom, chi2
 from jaximu.fleets.population import estimate_population, read_fleet, write_shrunk
 from jaximu.fleets.rows import PARAMETERS, SCHEMA
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.report.fleet import difference_words, write_fleet
+from jaximu.report.fleet import difference_words
+from jaximu.report.html import write_report
 
 FREE = [k for k, name in enumerate(PARAMETERS)
         if name not in ("accelerometer.gain[0,1]", "accelerometer.gain[0,2]", "accelerometer.gain[1,2]")]  # fmt: skip
@@ -285,22 +286,26 @@ def test_page_of_a_fleet(tmp_path):
     y[8, 3] += 20 * np.sqrt(covariance[3, 3])
     path = write(tmp_path / "t.parquet", values_of(y), noise, lot=lots.tolist())
     fleet = read_fleet(path)
-    written = write_fleet(fleet, path)
-    assert [each.name for each in written] == ["t.html", "t.json", "t.shrunk.parquet"]
-    page = written[0].read_text(encoding="utf-8")
+    page = write_report(fleet, tmp_path).read_text(encoding="utf-8")
     assert "unit8" in page and "&lt;L1&gt;" in page and "<L1>" not in page
     assert "http://" not in page and "https://" not in page
-    assert page.count("<svg ") == 3
-    document = json.loads(written[1].read_text(encoding="utf-8"))
+    assert page.count("<svg ") == 2 and "the fleet as prior makes none a fifth better" in page
+    assert str(fleet.summary()).startswith("Fleet of 80 recordings, t.parquet\nAll recordings were calibrated.")
+    document = fleet.document()
     assert document["schema"] == "jaximu.fleet/1" and document["population"]["units"] == 79
     assert difference_words(fleet.differences[0]).startswith(
         "Lot <L1> (20 units) differs from the other lots: gyroscope"
     )
 
 
+def test_a_prior_that_helps_is_drawn(tmp_path):
+    _, _, _, y, noise = draw(13, 40, weak=20)
+    page = write_report(read_fleet(write(tmp_path / "t.parquet", values_of(y), noise)), tmp_path)
+    assert page.read_text(encoding="utf-8").count("<svg ") == 2 and (tmp_path / "prior.png").exists()
+
+
 def test_page_without_a_population(tmp_path):
     _, _, _, y, noise = draw(12, 3)
     path = write(tmp_path / "t.parquet", values_of(y), noise)
-    written = write_fleet(read_fleet(path), path)
-    assert [each.name for each in written] == ["t.html", "t.json"]
-    assert "too few to speak of a population" in written[0].read_text(encoding="utf-8")
+    page = write_report(read_fleet(path), tmp_path).read_text(encoding="utf-8")
+    assert "Too few units to speak of a population" in page and "<svg " not in page

@@ -20,6 +20,7 @@ from jaximu.estimation.problem import flatten, names_of, typical_sizes
 from jaximu.estimation.uncertainty import pose_advice, station_advice
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.page import Result
 from jaximu.ground.quantities import Z95
 
 __all__ = ["SCHEMA", "Acceptance", "Judged", "accept", "judge"]
@@ -28,8 +29,8 @@ SCHEMA = "jaximu.acceptance/1"
 _BY_HAND = ("joint", "two-step", "two-step-rk4", "accelerometer")
 
 
-@dataclass(frozen=True, eq=False)
-class Acceptance(Document):
+@dataclass(frozen=True, eq=False, repr=False)
+class Acceptance(Result, Document, page="certificate"):
     """The verdict on one unit. trace: what is known of the unit and of how it was calibrated."""
 
     items: tuple[Item, ...]

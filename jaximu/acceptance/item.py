@@ -20,7 +20,8 @@ _MOST = 100.0
 class Item:
     """One limit on one axis, with what was found. value, sigma, gravity, recording: SI (`unit`); None where not known.
 
-    gravity, recording: the parts of sigma. reason: why there is no value; advice: what would decide it.
+    gravity, recording: the parts of sigma. reason: why there is no value; advice: what would decide it. stated: the
+    unit in which a file states the limit, "" where none does.
     """
 
     name: str
@@ -37,11 +38,12 @@ class Item:
     advice: str = ""
     gravity: float = 0.0
     recording: float = 0.0
+    stated: str = ""
 
     @classmethod
     def of(cls, limit: Limit, name: str, **result: Any) -> Item:
         """Return the item of a limit with what was found: undecided where that is nothing."""
-        return cls(name, limit.low, limit.high, limit.unit, limit.source, **result)
+        return cls(name, limit.low, limit.high, limit.unit, limit.source, stated=limit.stated, **result)
 
     def said(self) -> str:
         """Return why it is undecided and what would decide it, in sentences; "" where nothing is to be said."""

@@ -71,8 +71,7 @@ class Limit:
 
     owner: the triad, or "navigation". part: "bias", "scale", "misalignment", "output", "raw_output", "repeatability", a
     noise term, an effect's name, "position" or "heading". axes: () for all. over: of outputs, the largest magnitude of
-    the input, SI. temperature: °C.
-    after: s, of navigation.
+    the input, SI. temperature: °C. after: s, of navigation. stated: the unit in which a file states the limit.
     """
 
     key: str
@@ -86,6 +85,7 @@ class Limit:
     over: float = 0.0
     temperature: tuple[float, float] | None = None
     after: float = 0.0
+    stated: str = ""
 
     def nearest(self, value: float) -> float:
         """Return how far a value is from the nearer bound."""
@@ -172,7 +172,8 @@ def _limit(key: str, stated: Any, source: str, where: str) -> Limit:
             raise InputError(f"{where}: an error about zero is limited, after a time up to {_LONGEST:g} s.")
     elif "after" in entry:
         raise InputError(f"{where}: `after` belongs to limits of navigation.")
-    return Limit(key, owner, part, axes, low, high, base, source, over, temperature, after)
+    _, stated_unit = _split(entry[bounds[0]], where, "")
+    return Limit(key, owner, part, axes, low, high, base, source, over, temperature, after, stated_unit)
 
 
 def _meaning(key: str, where: str) -> tuple[str, str, tuple[int, ...], str]:

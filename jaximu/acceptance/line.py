@@ -39,6 +39,7 @@ from jaximu.ground.atomic import atomic_write
 from jaximu.ground.distributions import student_cdf
 from jaximu.ground.document import Document, file_digest
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.page import Result
 from jaximu.ground.units import SENSORS
 from jaximu.model.sensor import Imu
 
@@ -100,12 +101,30 @@ class Batch:
 
 @dataclass(frozen=True)
 class Alarm:
-    """What charts, stations, lots or a golden unit show. kind: value, jump, average, station, lot or golden."""
+    """What charts, stations, lots or a golden unit show. kind: value, jump, average, station, lot or golden.
+
+    texts, amounts: a sentence, a text and an amount in turns; an amount is a number in SI and its digits.
+    """
 
     kind: str
     name: str
     where: str
-    text: str
+    texts: tuple[str, ...]
+    amounts: tuple[tuple[float, int], ...]
+
+    @property
+    def text(self) -> str:
+        """The sentence, as documents have it."""
+        return self.words()
+
+    def words(self, stated: str = "") -> str:
+        """Return the sentence with amounts in the unit that a file of limits states."""
+        amounts = [amount(value, si_unit(self.name), digits, stated) for value, digits in self.amounts]
+        return "".join(map(str.__add__, self.texts, [*amounts, ""]))
+
+    def document(self) -> dict[str, str]:
+        """Return the alarm as JSON has it."""
+        return {"kind": self.kind, "name": self.name, "where": self.where, "text": self.text}
 
 
 @dataclass(frozen=True)
@@ -124,8 +143,8 @@ class FollowedQuantity:
     drift: Drift | None
 
 
-@dataclass(frozen=True, eq=False)
-class Line(Document):
+@dataclass(frozen=True, eq=False, repr=False)
+class Line(Result, Document, page="line"):
     """A table's verdicts and statistics. verdicts: (rows,) of the table, undecided for what was not calibrated."""
 
     table: Batch
@@ -193,7 +212,7 @@ class Line(Document):
             "decision": None if limits is None else limits.rule.document(),
             "items": items,
             "line": [_entry(quantity) for quantity in self.followed],
-            "alarms": [vars(alarm) for alarm in self.alarms],
+            "alarms": [alarm.document() for alarm in self.alarms],
             "golden": self.golden or None,
             "notes": list(self.notes),
         }
@@ -402,7 +421,7 @@ def follow(table: Batch, limits: Limits | None = None, golden: str = "") -> Line
         study = gauge(values, recording, table.devices, table.stations)
         course = drift(table.days[watched], values[watched]) if np.sum(watched) >= _GOLDEN else None
         followed.append(FollowedQuantity(name, limit, able, by_lot, charts, study, course))
-        alarms += _alarms(table, name, si_unit(name), charts, course, golden, len(shown))
+        alarms += _alarms(table, name, charts, course, golden, len(shown))
         for kind, labels in (("station", table.stations), ("lot", table.lots)):
             alarms += _compared(kind, _groups(labels, first), name, values[first], first, len(shown))
     if not any(quantity.charts for quantity in followed):
@@ -421,7 +440,6 @@ def _when(table: Batch, row: int) -> str:
 def _alarms(
     table: Batch,
     name: str,
-    unit: str,
     charts: dict[str, tuple[Chart, NDArray[np.int64]]],
     course: Drift | None,
     golden: str,
@@ -434,18 +452,11 @@ def _alarms(
         if len(chart.drifting):
             start, most = int(chart.drifting[0]), int(chart.drifting[np.argmax(off[chart.drifting])])
             side = "above" if chart.average[most] > chart.centre else "below"
-            alarms.append(
-                Alarm(
-                    "average",
-                    name,
-                    station,
-                    (
-                        f"{what}: the moving average left its limits at {_when(table, int(places[start]))} and is "
-                        f"farthest, {amount(off[most], unit)} {side} the mean of all, at "
-                        f"{_when(table, int(places[most]))}"
-                    ),
-                )
+            texts = (
+                f"{what}: the moving average left its limits at {_when(table, int(places[start]))} and is farthest, ",
+                f" {side} the mean of all, at {_when(table, int(places[most]))}",
             )
+            alarms.append(Alarm("average", name, station, texts, ((float(off[most]), 3),)))
         # a value far off is a jump, too: it is said once
         kind, hits = ("value", chart.beyond) if len(chart.beyond) else ("jump", chart.jumps)
         if len(hits):
@@ -454,20 +465,12 @@ def _alarms(
             most = int(hits[np.argmax(np.abs(away[hits]))])
             relation = "is off the mean by" if kind == "value" else "differs from the unit before by"
             more = f"; {len(hits) - 1} more units are beyond the limits" if len(hits) > 1 else ""
-            text = f"{what}: {_when(table, int(places[most]))} {relation} {amount(away[most], unit)}{more}"
-            alarms.append(Alarm(kind, name, station, text))
+            texts = (f"{what}: {_when(table, int(places[most]))} {relation} ", more)
+            alarms.append(Alarm(kind, name, station, texts, ((float(away[most]), 3),)))
     if course is not None and course.p_value * questions < LEVEL:
-        alarms.append(
-            Alarm(
-                "golden",
-                name,
-                "",
-                (
-                    f"{spoken(name)} of the golden unit {golden} drifts by {amount(30 * course.slope, unit)} in "
-                    f"30 days (± {amount(30 * 1.96 * course.sigma, unit, 2)}, 95 %)"
-                ),
-            )
-        )
+        texts = (f"{spoken(name)} of the golden unit {golden} drifts by ", " in 30 days (± ", ", 95 %)")
+        amounts = ((30 * course.slope, 3), (30 * 1.96 * course.sigma, 2))
+        alarms.append(Alarm("golden", name, "", texts, amounts))
     return alarms
 
 
@@ -499,9 +502,9 @@ def _compared(
         shift, p_value = shifts[label]
         if p_value * questions * len(groups) >= LEVEL:
             break
-        off = f"{amount(abs(shift), si_unit(name))} {'more' if shift > 0 else 'less'} than the other {kind}s"
         verb = "measures" if kind == "station" else "has"
-        alarms.append(Alarm(kind, name, label, f"{kind} {label} {verb} {spoken(name)} {off}"))
+        than = f" {'more' if shift > 0 else 'less'} than the other {kind}s"
+        alarms.append(Alarm(kind, name, label, (f"{kind} {label} {verb} {spoken(name)} ", than), ((abs(shift), 3),)))
         del left[label]  # those that remain are compared without it
     return alarms
 

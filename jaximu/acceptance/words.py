@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
-from jaximu.ground.quantities import number, unit_text
+from jaximu.ground.quantities import number, plain, unit_text
 from jaximu.ground.units import SENSOR_UNITS, STANDARD_GRAVITY
+from jaximu.model.data_sheet import parse_quantity
 
 __all__ = ["amount", "between", "in_shown_unit", "si_unit", "spoken"]
 
@@ -48,21 +49,28 @@ def spoken(name: str) -> str:
     return f"{owner} {_PARTS[part]} {' from '.join(letters)}".strip()
 
 
-def in_shown_unit(unit: str) -> tuple[str, float]:
-    """Return the unit in which amounts of an SI unit are shown, whatever their size, and the factor to it."""
+def in_shown_unit(unit: str, stated: str = "") -> tuple[str, float]:
+    """Return the unit in which amounts of an SI unit are shown, whatever their size, and the factor to it.
+
+    **Arguments:** `stated`: the unit that a file of limits states, which is then the one.
+    """
+    if stated.replace(" ", "") == unit.replace(" ", ""):
+        return unit_text(unit), 1.0
+    if stated:
+        return unit_text(stated), 1.0 / parse_quantity(f"1 {stated}", unit)
     return _SHOWN.get(unit) or (unit_text(unit), 1.0)
 
 
-def amount(value: float, unit: str, digits: int = 3) -> str:
+def amount(value: float, unit: str, digits: int = 3, stated: str = "") -> str:
     """Return a value of an SI unit in the one it is shown in."""
-    shown, factor = in_shown_unit(unit)
+    shown, factor = in_shown_unit(unit, stated)
     return f"{number(factor * value, digits)} {shown}"
 
 
-def between(low: float, high: float, unit: str) -> str:
+def between(low: float, high: float, unit: str, stated: str = "") -> str:
     """Say between which values of an SI unit something must lie."""
-    shown, factor = in_shown_unit(unit)
-    below, above = (number(factor * end) for end in (low, high))
+    shown, factor = in_shown_unit(unit, stated)
+    below, above = ((plain if stated else number)(factor * end) for end in (low, high))
     if low == -high:
         return f"±{above} {shown}"
     if not np.isfinite(low):

@@ -16,13 +16,12 @@ from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
-from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
     from jaximu.acceptance import Acceptance, Limits, Line
     from jaximu.calibration import Calibration
 
-__all__ = ["limits_of", "print_line", "run"]
+__all__ = ["limits_of", "run", "write_line"]
 
 _STATUS = {"pass": 0, "fail": 3, "undecided": 4}
 
@@ -167,7 +166,7 @@ def _units(
         f"{stem}acceptance.json": (acceptance.text() + "\n").encode()
         for stem, acceptance in _stems(acceptances).items()
     }
-    results.give(lambda: [*map(_print, acceptances)], write, names, files, text)
+    results.give(lambda: _show(*acceptances), write, names, files, text)
     _measurements(acceptances, measurements)
     return verdict
 
@@ -249,35 +248,26 @@ def _stems(acceptances: Sequence[Acceptance]) -> dict[str, Acceptance]:
 
 def _write(
     acceptances: Sequence[Acceptance], loaded: Sequence[Calibration], certificate: bool, output: Path
-) -> list[Path]:
+) -> tuple[Path, ...]:
+    from jaximu.ground.atomic import write_files
     from jaximu.recordings.trace import missing
-    from jaximu.report.certificate import write_certificate
+    from jaximu.report.certificate import certificate_of
+    from jaximu.report.html import encoded
 
     units = zip(_stems(acceptances).items(), loaded, strict=True)
-    return [
-        write_certificate(acceptance, calibration, output / f"{stem}certificate.html")
+    pages = {
+        output / f"{stem}certificate.html": encoded(certificate_of(acceptance, calibration))[0]
         for (stem, acceptance), calibration in units
         if certificate and not missing(acceptance.trace)
-    ]
+    }
+    return write_files(pages)
 
 
-def _print(acceptance: Acceptance) -> None:
-    from jaximu.cli.shown import print_all
-    from jaximu.report.certificate import item_row, remarks, sources
+def _show(*results: Acceptance | Line) -> None:
+    from jaximu.report.terminal import show
 
-    columns = ("name", "value", "limits", "probability", "verdict")
-    rows = [tuple(row[key] for key in columns) for row in map(item_row, acceptance.items)]
-    serial = f", serial number {acceptance.serial}" if acceptance.serial else ""
-    limits = sources(acceptance)
-    print_all(
-        f"{acceptance.file}{serial}: {acceptance.verdict}",
-        (("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"), rows),
-        *(f"{', '.join(names)}: {text}" for text, names in remarks(acceptance).items()),
-        acceptance.rule.words(),
-        *([f"Limits from: {limits}."] if limits else []),
-        notes=acceptance.notes,
-        width=120,
-    )
+    for result in results:
+        show(result.summary())
 
 
 # --- a fleet's table --------------------------------------------------------------------------------------------------
@@ -293,8 +283,8 @@ def _line(path: Path, limits: Limits | None, golden: str, measurements: Path | N
     with progress("following the line"):
         line = follow(read_table(path), limits, golden)
     results.give(
-        lambda: print_line(line),
-        lambda folder: later("report.line", "write_line")(line, folder / "report.html", folder / path.name),
+        lambda: _show(line),
+        lambda folder: write_line(line, folder / "report.html", folder / path.name),
         "acceptance.json, report.html and the table with verdicts",
         acceptance=line,
     )
@@ -302,15 +292,16 @@ def _line(path: Path, limits: Limits | None, golden: str, measurements: Path | N
     return "pass" if limits is None else line.verdict
 
 
-def print_line(line: Line) -> None:
-    """Print verdicts and alarms of a table."""
-    from jaximu.report.line import headline, line_alarms
+def write_line(line: Line, page: Path, table: Path) -> tuple[Path, ...]:
+    """Write, where there are limits, the table with a verdict in every row, and the page; return their paths.
 
-    print(headline(line))
-    shown = line_alarms(line)
-    for title, text in shown[:8]:
-        print(f"{title}: {text}.")
-    if len(shown) > 8:
-        print(f"… and {len(shown) - 8} more alarms on the page.")
-    for note in line.notes:
-        print(f"note: {note}")
+    Raises `InputError` where one cannot be written.
+    """
+    from jaximu.acceptance.line import write_verdicts
+    from jaximu.ground.atomic import write_files
+    from jaximu.report.html import encoded
+
+    tables = () if line.limits is None else (table,)
+    for path in tables:
+        write_verdicts(line, path)
+    return *tables, *write_files({page: encoded(line.summary())[0]})

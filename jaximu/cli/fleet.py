@@ -19,6 +19,7 @@ from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.fleets.population import Fleet
+    from jaximu.ground.page import Page
 
 __all__ = ["run"]
 
@@ -106,48 +107,49 @@ def run(
     except KeyboardInterrupt:
         say(f"{kept_rows(output)} of {len(jobs)} rows are kept: the same command goes on from there.")
         raise
+    from jaximu.fleets.field import field_words
     from jaximu.fleets.population import read_fleet  # only now: what it imports takes a second
-    from jaximu.report.fleet import write_fleet
+    from jaximu.report.fleet import page_of
 
     with progress("questioning the fleet"):
         fleet = read_fleet(output)
-    written = options.draw(lambda: write_fleet(fleet, output), output.with_suffix(".html"))
+    page, html = page_of(fleet, field_words(output)), output.with_suffix(".html")
+    written = options.draw(lambda: _write(fleet, page, output), html)
     line = None
     if held is not None and statuses["ok"]:
         from jaximu.acceptance.line import follow, read_table
-        from jaximu.report.line import write_line
+        from jaximu.cli.accept import write_line
 
         with progress("following the line"):
             line = follow(read_table(output), held, golden)
-        page, document = (output.with_suffix(f".acceptance{suffix}") for suffix in (".html", ".json"))
+        line_html, document = (output.with_suffix(f".acceptance{suffix}") for suffix in (".html", ".json"))
         line.save(document)
-        written += [*options.draw(lambda: write_line(line, page, output)[-1:], page), document]
+        written += [*options.draw(lambda: write_line(line, line_html, output)[-1:], line_html), document]
     if as_json:
         options.print_json(fleet.document() | ({"acceptance": line.document()} if line else {}))
         return
-    print(f"{len(jobs)} recordings: {', '.join(f'{count} {status}' for status, count in statuses.most_common())}.")
-    _print(fleet, output)
-    if line is not None:
-        from jaximu.cli.accept import print_line
+    from jaximu.report.terminal import show as show_page
 
-        print_line(line)
+    show_page(page)
+    if line is not None:
+        print()
+        show_page(line.summary())
     print(f"Written: {', '.join(map(str, (output, *written)))}")
 
 
-def _print(fleet: Fleet, table: Path) -> None:
-    """Print what failed, what the fleet shows, and which lots, dates and units differ."""
-    from jaximu.fleets.field import field_words
-    from jaximu.report.fleet import difference_words, failure_words, headline
+def _write(fleet: Fleet, page: Page, table: Path) -> tuple[Path, ...]:
+    """Write, beside the table, its page, its findings and, where there is a population, its units with it as prior."""
+    from jaximu.fleets.population import write_shrunk
+    from jaximu.ground.atomic import write_files
+    from jaximu.report.html import encoded
 
-    for reason, files, count in failure_words(fleet, 5, 3):
-        print(f"  {count} not calibrated: {reason}{f' ({files})' if files else ''}")
-    for text in (headline(fleet), *field_words(table)):
-        print(text)
-    for difference in fleet.differences[:5]:
-        print(f"{difference_words(difference)}.")
-    if fleet.strangers:
-        shown = ", ".join(stranger.device for stranger in fleet.strangers[:10])
-        print(f"units that do not belong: {shown}{' …' if len(fleet.strangers) > 10 else ''}")
+    html, document = table.with_suffix(".html"), table.with_suffix(".json")
+    fleet.save(document)
+    shrunk = () if fleet.population is None else (table.with_suffix(".shrunk.parquet"),)
+    for path in shrunk:
+        write_shrunk(fleet, path)
+    write_files({html: encoded(page)[0]})  # drawn when all else is there
+    return html, document, *shrunk
 
 
 @contextmanager

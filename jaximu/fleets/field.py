@@ -85,6 +85,6 @@ def field_words(table: str | os.PathLike[str]) -> list[str]:
     if not done and not reasons:
         return []
     return [
-        f"magnetometers: {done} of {done + reasons.total()} calibrated.",
-        *(f"  {count} not calibrated: {reason}" for reason, count in reasons.most_common(3)),
+        f"{done} of {done + reasons.total()} calibrated.",
+        *(f"{count} not calibrated: {reason}" for reason, count in reasons.most_common(3)),
     ]

@@ -29,6 +29,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.page import Result
 from jaximu.mistakes.titles import effect_title
 
 __all__ = [
@@ -152,8 +153,8 @@ class Shifts:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Fleet(Document):
+@dataclass(frozen=True, eq=False, repr=False)
+class Fleet(Result, Document, page="fleet"):
     """A table's units as a population, and what stands out.
 
     failed: the files that could not be calibrated by reason, most first; reasons that differ in numbers only are one.

@@ -102,7 +102,7 @@ class Page:
 
     verdict: sentences. number, meaning: the one number, with its interval, and what it is of. first: what the first
     screen shows below them, everywhere (the terminal leaves pictures out). rest: what only the HTML file goes on with,
-    made when it is written. next: what to run next, in a sentence.
+    made when it is written. next: what to run next, in a sentence. caution: the number is bad news, and coloured so.
     """
 
     title: str
@@ -113,6 +113,7 @@ class Page:
     rest: Callable[[], Iterable[Part]] = tuple
     notes: Sequence[str] = ()
     next: str = ""
+    caution: bool = False
 
     def __str__(self) -> str:
         return later("report.terminal", "text")(self)

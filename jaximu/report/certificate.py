@@ -1,114 +1,135 @@
-"""The certificate of a unit: one printable page with what ISO/IEC 17025, 7.8.2 and 7.8.4, asks for."""
+"""The verdict on a unit as a page, and its certificate with what ISO/IEC 17025, 7.8.2 and 7.8.4, asks for."""
 
 from __future__ import annotations
 
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from jaximu.acceptance.acceptance import Acceptance
-from jaximu.acceptance.decision import coverage
+from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, coverage
 from jaximu.acceptance.item import Item
 from jaximu.acceptance.words import amount, between, in_shown_unit, spoken
 from jaximu.calibration import Calibration
-from jaximu.ground.atomic import write_files
 from jaximu.ground.document import digest
+from jaximu.ground.page import Page, Part, Section, Statement, Table
+from jaximu.ground.quantities import counted, unit_text
 from jaximu.ground.summary import sentence
-from jaximu.report.html import page
+from jaximu.recordings.trace import missing
 from jaximu.report.tables import provenance
 
-__all__ = ["item_row", "remarks", "sources", "write_certificate"]
+__all__ = ["certificate_of", "item_row", "page_of"]
 
 _COLUMNS = ("name", "value", "limits", "probability", "verdict", "coverage", "freedom", "recording", "gravity")
-_MEANINGS = {
-    "pass": "all items conform with their limits",
-    "fail": "at least one item does not conform with its limits",
-    "undecided": "no item fails, and at least one cannot be decided by this calibration",
-}
 
 
-def write_certificate(acceptance: Acceptance, calibration: Calibration, path: Path) -> Path:
-    """Write the certificate of a unit of which nothing is `missing` and return its path.
+def page_of(acceptance: Acceptance) -> Page:
+    """Return the verdict with the items that decide it, every item beside its limits, and the decision rule."""
+    items = sorted(acceptance.items, key=lambda item: (item.verdict != FAIL, item.verdict == PASS))
+    counts = Counter(item.verdict for item in items)
+    serial = f", serial number {acceptance.serial}" if acceptance.serial else ""
+    return Page(
+        f"Acceptance of {Path(acceptance.file).name}{serial}",
+        tuple(_verdict(acceptance.verdict, items)),
+        acceptance.verdict.capitalize(),
+        ", ".join(f"{counts[verdict]} {verdict}" for verdict in (PASS, FAIL, UNDECIDED))
+        + f" of {counted(len(items), 'item')}",
+        (Section("Results", [_results(items), *_remarks(items), *_rule(acceptance)]),),
+        lambda: [_uncertainty(items)],
+        [sentence(note) for note in acceptance.notes],
+        _next(acceptance),
+        caution=acceptance.verdict != PASS,
+    )
 
-    Raises `InputError` where it cannot be written.
-    """
-    return write_files({path: _certificate(acceptance, calibration)})[0]
 
-
-def _certificate(acceptance: Acceptance, calibration: Calibration) -> bytes:
-    trace = acceptance.trace or {}
+def certificate_of(acceptance: Acceptance, calibration: Calibration) -> Page:
+    """Return the page of a verdict as the certificate of a unit of which nothing is `missing`."""
+    page, trace = page_of(acceptance), acceptance.trace or {}
     stated = trace["certificate"]
-    known = dict(provenance(calibration))
-    issued = known.pop("Report written")
-    conditions = "; ".join(f"{key.replace('_', ' ')} {text}" for key, text in trace["environment"].items())
-    facts = [("Customer", stated["customer"]), ("Item", f"{trace['model']}, serial number {trace['serial']}")]
-    facts += [(key.capitalize(), trace[key]) for key in ("lot", "station", "fixture") if key in trace]
-    facts += [("Received", trace["received"])] if "received" in trace else []
-    facts += [("Calibrated", f"{trace['date']} by {trace['operator']}"), ("Conditions", conditions)]
-    facts += [(name, known[name]) for name in ("Method", "Gravity", "Used", "Sample rate", "Software") if name in known]
-    hashes = [
-        (f"Recording {Path(str(file.get('file', ''))).name}", str(file.get("sha256", "")))
-        for file in calibration.data.get("files", ())
-    ]
-    hashes += [("Calibration", acceptance.digest or "not sealed"), ("Limits", acceptance.limits["sha256"])]
-    hashes += [("Verdict (acceptance.json)", digest(acceptance.document()))]
-    return page(
-        "certificate",
-        {},
-        title=f"Certificate of calibration {stated['number']}",
-        laboratory=f"{stated['laboratory']}, {stated['address']}",
-        verdict=acceptance.verdict.capitalize(),
-        meaning=_MEANINGS[acceptance.verdict],
-        facts=facts,
-        rows=[(*(row[key] for key in _COLUMNS), row["verdict"] != "pass") for row in map(item_row, acceptance.items)],
-        open=[(sentence(", ".join(names)), text) for text, names in remarks(acceptance).items()],
-        remarks=" ".join(sentence(note) for note in acceptance.notes),
-        rule=acceptance.rule.words(),
-        limits=f"{sources(acceptance) or 'as stated'} ({Path(acceptance.limits['file']).name})",
-        statement="The accelerometer's scale is traced to the local gravity stated above, the gyroscope's scale to the "
-        "angles of turns, as gravity or a table shows them, and to the clock of the recording, by the references below;"
-        " the results are in SI units. The hashes let anyone check with `jaximu verify` that no file was changed.",
-        references=[
-            (
-                reference["name"],
-                ", ".join(
-                    filter(
-                        None,
-                        (
-                            f"certificate {reference['certificate']}",
-                            f"valid to {reference['expires']}" if "expires" in reference else "",
-                            reference.get("value", ""),
-                            reference.get("uncertainty", ""),
-                        ),
-                    )
-                ),
-            )
-            for reference in trace["reference"]
-        ],
-        hashes=hashes,
-        closing=f"Issued {issued}. Authorised by {stated['authorised_by']}. The results hold for this item as it was "
-        "calibrated. The certificate may not be reproduced except in full without approval of the laboratory.",
-    )[0]
+    facts = provenance(calibration)
+    return replace(
+        page,
+        title=f"Certificate of calibration {stated['number']}, serial number {acceptance.serial}",
+        first=(f"{stated['laboratory']}, {stated['address']}", _item(trace, dict(facts)), *page.first),
+        rest=lambda: [*page.rest(), *_traceability(acceptance, calibration, dict(facts)["Report written"])],
+        next="",
+    )
 
 
-def remarks(acceptance: Acceptance) -> dict[str, list[str]]:
-    """Return what is to be said of items beside their row, each text with the items that it is about."""
+# --- the verdict ------------------------------------------------------------------------------------------------------
+
+
+def _verdict(verdict: str, items: Sequence[Item]) -> Iterator[str]:
+    """Yield what decides: the items that fail, else those that are undecided, with value and limits."""
+    deciding = [item for item in items if item.verdict == verdict]
+    if verdict == PASS:
+        yield "Every item conforms with its limits."
+        return
+    rows = [item_row(item) for item in deciding[:3]]
+    named = "; ".join(f"{row['name']} is {row['value']}, limits {row['limits']}" for row in rows)
+    more = len(deciding) - len(rows)
+    also = f"; and {counted(more, 'more item')}" if more else ""
+    subject = "Fails" if verdict == FAIL else "Cannot be decided"
+    yield f"{subject}: {named}{also}."
+
+
+def _next(acceptance: Acceptance) -> str:
+    file, limits = (shlex.quote(str(name)) for name in (acceptance.file, acceptance.limits["file"]))
+    if acceptance.verdict == PASS and missing(acceptance.trace):
+        return f"`jaximu accept {file} --limits {limits} --trace TRACE.toml -o RESULTS` writes the certificate."
+    if acceptance.verdict == PASS:
+        return "`jaximu verify RESULTS/acceptance.json` checks at any time that no file was changed."
+    if acceptance.verdict == FAIL:
+        return "`jaximu diagnose LOG -o RESULTS` shows, before the unit is rejected, whether the model fits its log."
+    return "`jaximu calibrate LOG MORE -o RESULTS` calibrates with another recording; what to record is stated above."
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def _results(items: Sequence[Item]) -> Table:
+    rows = [item_row(item) for item in items]
+    headers = ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict")
+    cells = [tuple(row[column] for column in _COLUMNS[:5]) for row in rows]
+    return Table(headers, cells, marked=[index for index, item in enumerate(items) if item.verdict != PASS])
+
+
+def _uncertainty(items: Sequence[Item]) -> Section:
+    headers = ("quantity", "U covers", "degrees of freedom", "U from the recording", "U from gravity")
+    rows = [item_row(item) for item in items if item.sigma is not None]
+    caption = (
+        "U is the expanded uncertainty, k = 2 times the standard uncertainty; how probably it covers follows from the "
+        "effective degrees of freedom. The last two columns are its budget: the recording (noise, drift and scatter) "
+        "and the local gravity; they add by their squares."
+    )
+    cells = [(row["name"], *(row[column] for column in _COLUMNS[5:])) for row in rows]
+    return Section("Uncertainty", [Table(headers, cells, caption)])
+
+
+def _remarks(items: Sequence[Item]) -> Iterator[Statement]:
+    """Yield why items are undecided and what would decide them, each text with the items that it is about."""
     texts: dict[str, list[str]] = {}
-    for item in acceptance.items:
+    for item in items:
         if text := item.said():
             texts.setdefault(text, []).append(spoken(item.name))
-    return texts
+    for text, names in texts.items():
+        yield Statement(sentence(", ".join(names)), text, caution=True)
 
 
-def sources(acceptance: Acceptance) -> str:
-    """Return where the limits come from, as far as they say it."""
-    return "; ".join(dict.fromkeys(item.source for item in acceptance.items if item.source))
+def _rule(acceptance: Acceptance) -> Iterator[Statement]:
+    yield Statement("Decision rule", f"{acceptance.rule.words()} Each item is decided by itself.")
+    sources = "; ".join(dict.fromkeys(item.source for item in acceptance.items if item.source)) or "As stated"
+    yield Statement("Limits", f"{sentence(sources)} ({Path(acceptance.limits['file']).name}).")
 
 
 def item_row(item: Item) -> dict[str, str]:
-    """Return an item's cells: value and expanded uncertainty to the latter's second digit, in one unit."""
-    shown, factor = in_shown_unit(item.unit)
-    limits = between(item.low, item.high, item.unit)
+    """Return an item's cells, in the unit of its limits; value and U to the second digit of U."""
+    shown, factor = in_shown_unit(item.unit, item.stated)
+    limits = between(item.low, item.high, item.unit, item.stated)
     row = {"name": spoken(item.name), "limits": limits, "verdict": item.verdict}
     if item.value is None or item.sigma is None:
         return dict.fromkeys(_COLUMNS, "") | {"value": "not determined"} | row
@@ -120,8 +141,8 @@ def item_row(item: Item) -> dict[str, str]:
         "coverage": f"{100 * coverage(item.freedom):.1f} %",
         "freedom": f"{item.freedom:.0f}" if item.freedom < 1e4 else "∞",
         "probability": probability_words(item.probability),
-        "recording": amount(2 * item.recording, item.unit, 2),
-        "gravity": amount(2 * item.gravity, item.unit, 2) if item.gravity else "0",
+        "recording": amount(2 * item.recording, item.unit, 2, item.stated),
+        "gravity": amount(2 * item.gravity, item.unit, 2, item.stated) if item.gravity else "0",
     }
 
 
@@ -131,3 +152,46 @@ def probability_words(probability: float | None) -> str:
         return ""
     percent = 100 * probability
     return "> 99.9 %" if percent > 99.9 else "< 0.1 %" if percent < 0.1 else f"{percent:.1f} %"
+
+
+# --- the certificate --------------------------------------------------------------------------------------------------
+
+
+def _item(trace: dict, facts: dict[str, str]) -> Section:
+    stated = trace["certificate"]
+    conditions = "; ".join(
+        f"{key.replace('_', ' ')} {unit_text(str(text))}" for key, text in trace["environment"].items()
+    )
+    rows = [("Customer", stated["customer"]), ("Item", f"{trace['model']}, serial number {trace['serial']}")]
+    rows += [(key.capitalize(), str(trace[key])) for key in ("lot", "station", "fixture", "received") if key in trace]
+    rows += [("Calibrated", f"{trace['date']} by {trace['operator']}"), ("Conditions", conditions)]
+    rows += [(name, facts[name]) for name in ("Method", "Gravity", "Used", "Sample rate", "Software") if name in facts]
+    return Section("Item and calibration", [Table((), rows)])
+
+
+def _traceability(acceptance: Acceptance, calibration: Calibration, issued: str) -> Iterator[Part]:
+    trace = acceptance.trace or {}
+    references = [(reference["name"], _reference(reference)) for reference in trace["reference"]]
+    hashes = [
+        (f"Recording {Path(str(file.get('file', ''))).name}", str(file.get("sha256", "")))
+        for file in calibration.data.get("files", ())
+    ]
+    hashes += [("Calibration", acceptance.digest or "not sealed"), ("Limits", acceptance.limits["sha256"])]
+    hashes += [("Verdict (acceptance.json)", digest(acceptance.document()))]
+    statement = (
+        "The accelerometer's scale is traced to the local gravity stated above, the gyroscope's scale to the angles "
+        "of turns, as gravity or a table shows them, and to the clock of the recording, by the references below; the "
+        "results are traceable to the SI (1 g is 9.80665 m/s²). The hashes let anyone check with `jaximu verify` "
+        "that no file was changed."
+    )
+    closing = (
+        f"Issued {issued}. Authorised by {trace['certificate']['authorised_by']}. The results hold for this item as it "
+        "was calibrated. The certificate may not be reproduced except in full without approval of the laboratory."
+    )
+    yield Section("Traceability", [statement, Table((), references), Table((), hashes), closing])
+
+
+def _reference(reference: dict[str, str]) -> str:
+    validity = f"valid to {reference['expires']}" if "expires" in reference else ""
+    parts = (f"certificate {reference['certificate']}", validity, reference.get("value"), reference.get("uncertainty"))
+    return ", ".join(filter(None, parts))

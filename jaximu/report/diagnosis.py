@@ -341,8 +341,8 @@ def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
     """Return the detection limits and what an effect of that size would do, the worst first."""
     yield (
         "An effect could be there unnoticed up to its detection limit: the size (coefficients in a random direction) "
-        "that its test finds with 90 % power. It would shift the calibrated numbers by as much as the last column says, "
-        "in their standard deviations (σ): the intervals do not include that."
+        "that its test finds with 90 % power. It would shift the calibrated numbers by as much as the last column "
+        "says, in their standard deviations (σ): the intervals do not include that."
     )
     rows = [
         (

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,30 +12,21 @@ import numpy as np
 
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
-from jaximu.fleets.population import Difference, Fleet, Population, write_shrunk
-from jaximu.ground.atomic import write_files
-from jaximu.ground.quantities import Z95, number, probability
+from jaximu.fleets.population import Difference, Fleet, Population
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.page import Items, Page, Part, Picture, Section, Table
+from jaximu.ground.quantities import counted, number, probability, with_interval
 from jaximu.ground.summary import sentence
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
 from jaximu.report.figures import dressed
 from jaximu.report.html import MOST_ROWS
-from jaximu.report.html import page as page_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "amount",
-    "difference_words",
-    "failure_words",
-    "headline",
-    "lot_figure",
-    "population_figure",
-    "prior_figure",
-    "write_fleet",
-]
+__all__ = ["amount", "difference_words", "lot_figure", "page_of", "population_figure", "prior_figure"]
 
 _UNIT, _STRANGER, _PRIOR = figures.AXES.values()
 _KINDS = (
@@ -48,85 +39,50 @@ _KINDS = (
 )
 
 
-def write_fleet(fleet: Fleet, table: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Write, beside the table, its page (`.html`), its findings (`.json`) and its units with the fleet as prior.
+def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
+    """Return the population, outliers, what lots and dates change, what failed; `magnetometers`: sentences on these."""
+    done, document = fleet.statuses["ok"], Path(fleet.table).with_suffix(".json").name
 
-    **Returns:** the paths written; the last, `.shrunk.parquet`, only where there is a population. Raises `InputError`
-    where they cannot be written.
-    """
-    base = Path(table)
-    page, document = base.with_suffix(".html"), base.with_suffix(".json")
-    fleet.save(document)
-    shrunk = () if fleet.population is None else (base.with_suffix(".shrunk.parquet"),)
-    for path in shrunk:
-        write_shrunk(fleet, path)
-    write_files({page: _page(fleet, document.name)})  # drawn when all else is there
-    return page, document, *shrunk
+    def rest() -> Iterator[Part]:
+        yield from _lots(fleet)
+        yield from _prior(fleet)
+        yield from _diagnoses(fleet)
 
-
-def _page(fleet: Fleet, document: str) -> bytes:
-    drawn = {}
-    if fleet.population is not None:
-        drawn = {"population": partial(population_figure, fleet), "prior": partial(prior_figure, fleet)}
-        if lots := [difference for difference in fleet.differences if difference.kind == "lot"]:
-            drawn["lots"] = partial(lot_figure, fleet, lots[0])
-    strangers = [
+    return Page(
+        f"Fleet of {counted(fleet.recordings, 'recording')}, {Path(fleet.table).name}",
+        tuple(_verdict(fleet)),
+        f"{done} of {fleet.recordings}",
+        "recordings calibrated",
         (
-            stranger.device,
-            "; ".join(f"{describe(name)} ({z:+.1f}σ)" for name, _, z in stranger.parameters if abs(z) > 2)
-            or "no single parameter: in how they go together",
-            probability(stranger.p_value).removeprefix("= "),
-            stranger.file,
-        )
-        for stranger in fleet.strangers[:MOST_ROWS]
-    ]
-    statuses = sorted(fleet.statuses.items(), key=lambda item: (item[0] != "ok", -item[1]))
-    return page_of(
-        "fleet",
-        drawn,
-        title=f"Fleet of {fleet.recordings} recordings, {Path(fleet.table).name}",
-        lead=headline(fleet),
-        number=f"{fleet.statuses['ok']} of {fleet.recordings}",
-        meaning="recordings calibrated",
-        statuses=[(status, count, status != "ok") for status, count in statuses],
-        failures=[(reason, count, files, True) for reason, files, count in failure_words(fleet, 20, 10)],
-        verdicts=", ".join(f"{count} {name}" for name, count in fleet.verdicts.most_common()),
-        effects=[(effect_title(name), count) for name, count in fleet.effects.most_common()],
-        differences=[(_about(difference), difference_words(difference), True) for difference in fleet.differences]
-        or [("Lots, dates, devices recorded again", _nothing(fleet))],
-        strangers=strangers,
-        more=max(0, len(fleet.strangers) - MOST_ROWS),
-        document=document,
-        rows=_rows(fleet),
-        notes=fleet.notes,
-    )[0]
+            *_population(fleet),
+            *_outliers(fleet, document),
+            *_differences(fleet),
+            *_failures(fleet, document),
+            *([Section("Magnetometers", [Items(magnetometers)])] if magnetometers else []),
+        ),
+        rest,
+        [sentence(note) for note in fleet.notes],
+        _next(fleet),
+        caution=not done,
+    )
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
-def headline(fleet: Fleet) -> str:
-    """Say in a sentence what the fleet tells."""
-    done = fleet.statuses["ok"]
-    text = f"{done} of {fleet.recordings} recordings were calibrated"
+def _verdict(fleet: Fleet) -> Iterator[str]:
+    failed = fleet.recordings - fleet.statuses["ok"]
+    yield f"{counted(failed, 'recording')} could not be calibrated." if failed else "All recordings were calibrated."
     if fleet.population is None:
-        return f"{text}; too few to speak of a population."
-    count = len(fleet.strangers)
-    text += (
-        "; no unit falls out of the population"
-        if not count
-        else (f"; {count} unit{'s do' if count > 1 else ' does'} not belong to the population")
-    )
-    groups = list(
-        dict.fromkeys(
-            f"{difference.kind} {difference.group}" for difference in fleet.differences if difference.kind != "date"
-        )
-    )
-    if groups:
-        text += f"; different from the rest: {_first(groups, 3)}"
+        yield "Too few units to speak of a population."
+        return
+    devices = [stranger.device for stranger in fleet.strangers]
+    yield f"{counted(len(devices), 'outlier')}: {_first(devices, 3)}." if devices else "No outliers."
+    groups = [f"{difference.kind} {difference.group}" for difference in fleet.differences if difference.kind != "date"]
+    if groups := [*dict.fromkeys(groups)]:
+        yield f"Different from the rest: {_first(groups, 3)}."
     if any(difference.kind == "date" for difference in fleet.differences):
-        text += "; parameters drift with the date"
-    return f"{text}."
+        yield "Parameters drift with the date."
 
 
 def _first(names: Sequence[str], most: int) -> str:
@@ -134,31 +90,63 @@ def _first(names: Sequence[str], most: int) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def failure_words(fleet: Fleet, reasons: int, files: int) -> list[tuple[str, str, int]]:
-    """Return, for the commonest reasons why recordings failed, the reason, files that it met, and how many those are.
-
-    What is left out is counted, too.
-    """
-    rows = []
-    for reason, met in list(fleet.failed.items())[:reasons]:
-        rows.append((sentence(reason), _first(met, files), len(met)))
-    rest = list(fleet.failed.values())[reasons:]
-    if rest:
-        rows.append((f"{len(rest)} other reasons, in the table's column `message`.", "", sum(map(len, rest))))
-    return rows
+def _next(fleet: Fleet) -> str:
+    if fleet.population is None:
+        return ""
+    files = [stranger.file for stranger in fleet.strangers]
+    if files:
+        return f"`jaximu diagnose {shlex.quote(files[0])} -o RESULTS` shows why the first outlier differs."
+    table = shlex.quote(fleet.table)
+    return f"`jaximu accept {table} --limits LIMITS.toml -o LINE` holds every unit to limits and follows the line."
 
 
-def _about(difference: Difference) -> str:
-    names = {"lot": "Lot", "date": "Drift", "device": "Recorded again", "effect": "Effect shared by a lot"}
-    return f"{names[difference.kind]}, p {probability(difference.p_value)}"
+def _outliers(fleet: Fleet, document: str) -> Iterator[Part]:
+    if not fleet.strangers:
+        return
+    rows = [
+        (
+            stranger.device,
+            "; ".join(
+                f"{describe(name)} ({z:+.1f}σ)".replace("-", "−") for name, _, z in stranger.parameters if abs(z) > 2
+            )
+            or "no single parameter, but their combination",
+            probability(stranger.p_value).removeprefix("= "),
+            Path(stranger.file).name,
+        )
+        for stranger in fleet.strangers[:MOST_ROWS]
+    ]
+    more = len(fleet.strangers) - MOST_ROWS
+    caption = "p: probability that a fleet of this size has a unit as far off as this one, if all belonged."
+    if more > 0:
+        caption += f" {more} more outliers are in `{document}`."
+    headers = ("device", "most unlike the others in", "p", "file")
+    yield Section("Outliers", [Table(headers, rows, caption, brief=10)])
+
+
+def _differences(fleet: Fleet) -> Iterator[Part]:
+    """Yield what differs by lot, date or recording, the surest first; else what was compared."""
+    names = {"lot": "lot", "date": "drift", "device": "recorded again", "effect": "effect shared by a lot"}
+    rows = [
+        (names[difference.kind], difference_words(difference), probability(difference.p_value).removeprefix("= "))
+        for difference in fleet.differences
+    ]
+    if rows:
+        caption = "± 95 %. p: probability of a difference at least as large by chance, all questions allowed for."
+        yield Section("Lots, dates, repeated recordings", [Table(("", "difference", "p"), rows, caption, brief=5)])
+    elif fleet.population is not None:
+        lots = len({lot for lot in fleet.lots if lot})
+        yield (
+            f"{lots} lots were compared; none differs from the others."
+            if lots > 1
+            else "No difference by lot or date. A manifest states lots; logs or a manifest state dates."
+        )
 
 
 def difference_words(difference: Difference) -> str:
     """Say what a group changes, with 95 % intervals."""
     rate = " a year" if difference.kind == "date" else ""
     parts = [
-        f"{describe(name)} by {amount(name, value, Z95 * sigma)}{rate}"
-        for name, value, sigma in difference.parameters[:5]
+        f"{describe(name)} by {amount(name, value, sigma)}{rate}" for name, value, sigma in difference.parameters[:5]
     ]
     more = len(difference.parameters) - 5
     if more > 0:
@@ -166,43 +154,106 @@ def difference_words(difference: Difference) -> str:
     return sentence(difference.text + (f": {', '.join(parts)}" if parts else ""))
 
 
-def _nothing(fleet: Fleet) -> str:
-    lots = len({lot for lot in fleet.lots if lot})
-    if lots < 2:
-        return "Nothing. Lots are compared if a manifest states them, dates if logs or a manifest do."
-    return f"Nothing: {lots} lots were compared, and none differs from the others."
+def _failures(fleet: Fleet, document: str) -> Iterator[Part]:
+    """Yield the commonest reasons why recordings were not calibrated, with files; what is left out is counted."""
+    if not fleet.failed:
+        return
+    most = 20
+    rows = [
+        (sentence(reason), str(len(files)), _first([Path(file).name for file in files], 5))
+        for reason, files in [*fleet.failed.items()][:most]
+    ]
+    if others := [*fleet.failed.values()][most:]:
+        rows.append((f"{len(others)} other reasons", str(sum(map(len, others))), ""))
+    statuses = ", ".join(f"{count} {status}" for status, count in fleet.statuses.most_common())
+    caption = f"By status: {statuses}. All files are listed in `{document}`."
+    yield Section("Not calibrated", [Table(("reason", "recordings", "files"), rows, caption, brief=5)])
 
 
-def amount(name: Name, value: float, half: float | None = None) -> str:
-    """Put a relative parameter into the unit a person compares, with half its 95 % interval."""
+def _diagnoses(fleet: Fleet) -> Iterator[Part]:
+    parts: list[Part] = []
+    if fleet.verdicts:
+        parts.append(f"Verdicts: {', '.join(f'{count} {name}' for name, count in fleet.verdicts.most_common())}.")
+    if fleet.effects:
+        rows = [(effect_title(name), str(count)) for name, count in fleet.effects.most_common()]
+        parts.append(Table(("effect", "units"), rows))
+    if parts:
+        yield Section("Diagnoses", parts)
+
+
+def amount(name: Name, value: float, sigma: float = 0.0) -> str:
+    """Put a relative parameter into the unit a person compares, with half its 95 % interval where it has one."""
     *_, unit, factor = next(kind for kind in _KINDS if _is(name, kind))
-    text = f"{number(factor * value, 3)}"
-    return f"{text} {unit}" if half is None else f"{text} ± {number(factor * half, 2)} {unit}"
+    return with_interval(factor * value, factor * sigma, unit) if sigma else f"{number(factor * value, 3)} {unit}"
 
 
 def _is(name: Name, kind) -> bool:
     return kind[:3] == (name.owner, name.part, name.axes[0] == name.axes[-1])
 
 
-def _rows(fleet: Fleet) -> list[tuple[str, str, str, str, str, bool]]:
-    if fleet.population is None:
-        return []
-    rows = []
-    alone, prior = (np.quantile(sigma, 0.9, axis=0) for sigma in (fleet.sigma, fleet.shrunk_sigma))
-    for k, name in enumerate(fleet.population.names):
-        scale = name.part == "gain" and name.axes[0] == name.axes[1]
-        mean = fleet.population.mean[k] - (1.0 if scale else 0.0)
-        rows.append(
-            (
-                describe(name),
-                amount(name, mean),
-                amount(name, fleet.population.spread[k]),
-                amount(name, alone[k]),
-                amount(name, prior[k]),
-                bool(prior[k] < 0.8 * alone[k]),
-            )
+# --- the population ---------------------------------------------------------------------------------------------------
+
+
+def _population(fleet: Fleet) -> Iterator[Picture]:
+    if fleet.population is not None:
+        yield Picture(
+            "population",
+            partial(population_figure, fleet),
+            "Units by parameter",
+            "Each dot is a unit, as estimated from its own recording; the bar is the mean of the fleet and two "
+            "standard deviations to each side, the noise of the estimates taken off. Orange: outliers.",
         )
-    return rows
+
+
+def _lots(fleet: Fleet) -> Iterator[Section]:
+    lots = [difference for difference in fleet.differences if difference.kind == "lot"]
+    if lots and fleet.population is not None:
+        caption = "The parameter that differs most, unit by unit in each lot; lots that differ are orange."
+        picture = Picture("lots", partial(lot_figure, fleet, lots[0]), "A parameter by lot", caption)
+        yield Section("Lots", [picture])
+
+
+def _prior(fleet: Fleet) -> Iterator[Section]:
+    """Yield the parameters, and how much better a unit is known with the fleet as prior."""
+    if fleet.population is None:
+        return
+    alone, prior = (np.quantile(sigma, 0.9, axis=0) for sigma in (fleet.sigma, fleet.shrunk_sigma))
+    rows = []
+    for k, name in enumerate(fleet.population.names):
+        mean = fleet.population.mean[k] - (name.part == "gain" and name.axes[0] == name.axes[1])
+        sizes = (mean, fleet.population.spread[k], alone[k], prior[k])
+        rows.append((describe(name), *(amount(name, float(size)) for size in sizes)))
+    helped = np.flatnonzero(prior < 0.8 * alone).tolist()
+    headers = (
+        "parameter",
+        "mean",
+        "spread between units (1σ)",
+        "a unit by itself (1σ)",
+        "with the fleet as prior (1σ)",
+    )
+    caption = (
+        "Scale and misalignment are relative to the data sheet's scale. The last two columns are the uncertainty that "
+        "nine tenths of the units stay below, without gravity's part, which all units share; marked where the prior "
+        "makes it a fifth smaller or more."
+    )
+    parts: list[Part] = [Table(headers, rows, caption, helped)]
+    if helped:
+        parts.insert(
+            0,
+            Picture(
+                "prior",
+                partial(prior_figure, fleet),
+                "Uncertainty with the fleet as prior, relative to that of the unit alone",
+                "Each dot is a unit: its uncertainty with the fleet as prior, in percent of that from its own "
+                "recording alone. Low dots are units whose recording determines the parameter poorly, and the fleet "
+                "better.",
+            ),
+        )
+    else:
+        parts.append(
+            "The units' own recordings determine every parameter well: the fleet as prior makes none a fifth better."
+        )
+    yield Section("Parameters, and the fleet as prior", parts)
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -218,17 +269,27 @@ def _panels(population: Population, title: str) -> tuple[Figure, list[tuple[Axes
     return figure, [(figure.add_subplot(rows, 3, position), *panel) for position, panel in enumerate(there, 1)]
 
 
+def _beside(column: int, count: int) -> FloatArray:
+    """Return where the dots of a column stand, spread out so that they do not cover each other."""
+    return column + 0.3 * np.random.default_rng(column).uniform(-1, 1, count)
+
+
+def _axis_names(axes: Axes, population: Population, columns: Sequence[int]) -> None:
+    names = ["".join("xyz"[axis] for axis in dict.fromkeys(population.names[k].axes)) for k in columns]
+    axes.set_xticks(range(len(columns)), names)
+    axes.set_xlim(-0.6, len(columns) - 0.4)
+
+
 def population_figure(fleet: Fleet) -> Figure:
     """Draw every unit in every parameter, off the mean of the fleet."""
     population = fleet.population
     assert population is not None
     figure, panels = _panels(population, f"{len(fleet.values)} units about the mean of the fleet")
-    spread_out, opaque = np.random.default_rng(0), 0.7 if len(fleet.values) < 200 else 0.35
+    opaque = 0.7 if len(fleet.values) < 200 else 0.35
     for axes, kind, columns in panels:
         for column, k in enumerate(columns):
             values = kind[-1] * (fleet.values[:, k] - population.mean[k])
-            width = 0.3 * spread_out.uniform(-1, 1, len(values))
-            axes.plot(column + width, values, ".", color=_UNIT, alpha=opaque, markersize=5, markeredgewidth=0)
+            axes.plot(_beside(column, len(values)), values, ".", color=_UNIT, alpha=opaque, ms=5, mew=0)
             two = 2 * kind[-1] * population.spread[k]
             axes.plot([column, column], [-two, two], color="black", linewidth=2.2, solid_capstyle="butt")
             axes.plot([column - 0.12, column + 0.12], [0, 0], color="black", linewidth=2.2)
@@ -251,27 +312,23 @@ def population_figure(fleet: Fleet) -> Figure:
                     va="center",
                     ha="right" if last else "left",
                 )
-        axes.set_xticks(
-            range(len(columns)),
-            ["".join("xyz"[axis] for axis in dict.fromkeys(population.names[k].axes)) for k in columns],
-        )
-        axes.set_xlim(-0.6, len(columns) - 0.4)
+        _axis_names(axes, population, columns)
         dressed(axes, kind[3], ylabel=f"off the mean [{kind[4]}]")
     return figure
 
 
 def prior_figure(fleet: Fleet) -> Figure:
-    """Draw each unit's uncertainty alone and with the fleet as prior."""
+    """Draw each unit's uncertainty with the fleet as prior, in percent of that alone, parameter by parameter."""
     population = fleet.population
     assert population is not None
-    figure, panels = _panels(population, "How well a unit is known, alone and with the fleet as prior")
+    figure, panels = _panels(population, "Uncertainty with the fleet as prior, in percent of that alone")
+    share = 100 * fleet.shrunk_sigma / fleet.sigma
     for axes, kind, columns in panels:
-        alone, prior = (kind[-1] * sigma[:, columns].ravel() for sigma in (fleet.sigma, fleet.shrunk_sigma))
-        ends = min(alone.min(), prior.min()) / 1.3, alone.max() * 1.3
-        axes.plot(ends, ends, color="#8A8A8A", linewidth=1)
-        axes.plot(alone, prior, ".", color=_PRIOR, alpha=0.4, markersize=4, markeredgewidth=0)
-        figures.logarithmic(axes)
-        dressed(axes, kind[3], xlabel=f"alone, 1σ [{kind[4]}]", ylabel=f"with prior, 1σ [{kind[4]}]")
+        for column, k in enumerate(columns):
+            axes.plot(_beside(column, len(share)), share[:, k], ".", color=_PRIOR, alpha=0.5, ms=5, mew=0)
+        figures.zero_line(axes, 100.0)
+        _axis_names(axes, population, columns)
+        dressed(axes, kind[3], ylabel="with prior / alone [%]", ylim=(0, 108))
     return figure
 
 
@@ -289,19 +346,10 @@ def lot_figure(fleet: Fleet, difference: Difference) -> Figure:
         names = [*different[:10], *[lot for lot in names if lot not in different][:30]]
     figure = figures.new_figure(3.2)
     axes = figure.add_subplot()
-    spread_out = np.random.default_rng(0)
     for column, lot in enumerate(names):
         points = values[lots == lot]
         color = _STRANGER if lot in different else _UNIT
-        axes.plot(
-            column + 0.25 * spread_out.uniform(-1, 1, len(points)),
-            points,
-            ".",
-            color=color,
-            alpha=0.5,
-            markersize=5,
-            markeredgewidth=0,
-        )
+        axes.plot(_beside(column, len(points)), points, ".", color=color, alpha=0.5, ms=5, mew=0)
         axes.plot([column - 0.3, column + 0.3], [np.median(points)] * 2, color="black", linewidth=2)
     dressed(axes, ylabel=f"off the mean [{kind[4]}]")
     axes.set_xticks(range(len(names)), names, rotation=0 if len(names) < 15 else 90, fontsize=8)

@@ -151,7 +151,7 @@ def _kind_of_cell(text: str) -> Markup:
     """Return the attribute of a cell that is a number, and stays on one line, or a long word, which is broken."""
     if max(map(len, text.split()), default=0) > _LONG_WORD:
         return Markup(' class="long"')
-    return Markup(' class="value"') if re.match("[-+−±]?[0-9]", text) and len(text) < _LONG_WORD else Markup("")
+    return Markup(' class="value"') if re.match("([<>] )?[-+−±]?[0-9]", text) and len(text) < _LONG_WORD else Markup("")
 
 
 def write_failure(path: Path, error: Exception) -> tuple[Path, ...]:

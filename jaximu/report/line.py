@@ -1,29 +1,34 @@
-"""The page of a production line: verdicts, alarms, control charts, capability, gauge study."""
+"""The page of a production line: capability, control charts, alarms, what does not pass, gauge study."""
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.acceptance.line import FollowedQuantity, Line, write_verdicts
+from jaximu.acceptance.decision import FAIL, PASS
+from jaximu.acceptance.limits import Limit
+from jaximu.acceptance.line import FollowedQuantity, Line
+from jaximu.acceptance.statistics import Chart
 from jaximu.acceptance.words import amount, between, in_shown_unit, si_unit, spoken
-from jaximu.ground.atomic import write_files
-from jaximu.ground.quantities import number
+from jaximu.ground.page import Page, Picture, Section, Table
+from jaximu.ground.quantities import Z95, counted, number, with_interval
 from jaximu.ground.summary import sentence
 from jaximu.report import figures
 from jaximu.report.certificate import item_row
 from jaximu.report.figures import dressed
 from jaximu.report.html import MOST_ROWS
-from jaximu.report.html import page as page_of
 from jaximu.report.vector import named
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["headline", "line_alarms", "write_line"]
+__all__ = ["page_of"]
 
 _CHARTS = 4  # drawn
 _CAPABLE, _CATEGORIES, _LEVEL = 1.33, 5, 0.01
@@ -39,143 +44,255 @@ _ORDER = ("golden", "station", "lot", "average", "value", "jump")
 _VALUE, _OUT, _AVERAGE = figures.AXES.values()
 
 
-def headline(line: Line) -> str:
-    """Say in a sentence or two what came out."""
-    text = ""
+def page_of(line: Line) -> Page:
+    """Return the worst quantity's Cpk, charts with the limits, capability, alarms; what does not pass and the gauge."""
+    able, charts = _by_capability(line), _to_draw(line)
+    pictures = [
+        Picture(
+            "charts",
+            partial(_chart_figure, line, charts),
+            "Control charts",
+            "Units in the order of their dates. Above: single units and their moving average, each with its control "
+            "limits, which chance crosses in one table of a hundred; black: the limits that units are held to. Below: "
+            "differences from the unit before.",
+        )
+    ]
+    value, meaning = _number(line, able)
+    return Page(
+        f"Production line, {Path(line.table.file).name}",
+        tuple(_verdict(line, able)),
+        value,
+        meaning,
+        (*(pictures if charts else []), *_capability(line, able), *_alarms(line)),
+        lambda: [*_not_passed(line), *_worst_lots(able), *_gauge(line)],
+        [sentence(note) for note in line.notes],
+        _next(line),
+        caution=bool(line.counts[FAIL] or (able and able[0][1] < _CAPABLE)),
+    )
+
+
+# --- the first lines --------------------------------------------------------------------------------------------------
+
+
+def _by_capability(line: Line) -> list[tuple[FollowedQuantity, float]]:
+    """Return the quantities that have limits with their Cpk, the worst first."""
+    able = [(quantity, quantity.capability.cpk[0]) for quantity in line.followed if quantity.capability is not None]
+    return sorted(able, key=lambda pair: pair[1])
+
+
+def _number(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> tuple[str, str]:
+    """Return the worst Cpk with its interval, else how many recordings pass, and what it is."""
+    if able and (capability := able[0][0].capability) is not None:
+        meaning = f"Cpk of {spoken(able[0][0].name)}, the worst quantity (95 %); a capable line has {_CAPABLE} or more"
+        return _index(capability.cpk), meaning
+    if line.limits is not None:
+        return f"{100 * line.counts[PASS] / line.table.total:.3g} %", "of the recordings pass"
+    return "", ""
+
+
+def _verdict(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> Iterator[str]:
+    if able and able[0][1] < _CAPABLE:
+        yield _why_not_capable(able[0][0])
+    elif able:
+        yield f"Every quantity is capable: Cpk is {_CAPABLE} or more."
     if line.limits is not None:
         counts = line.counts
-        text = f"{counts['pass']} of {line.table.total} recordings pass, "
-        text += f"{counts['fail']} fail, {counts['undecided']} are undecided. "
-    if not line.alarms:
-        drawn = any(quantity.charts for quantity in line.followed)
-        return text + ("No alarm on the line." if drawn else "Too few units for control charts.")
-    return text + f"{len(line.alarms)} alarm{'s' if len(line.alarms) > 1 else ''}: {line_alarms(line)[0][1]}."
+        yield (
+            f"{counts['pass']} of {line.table.total} recordings pass, {counts['fail']} fail, {counts['undecided']} are "
+            "undecided."
+        )
+    if line.alarms:
+        first = _alarm_rows(line)[0][0]
+        yield f"{counted(len(line.alarms), 'alarm')}{', the first' * (len(line.alarms) > 1)}: {first.lower()}."
+    elif any(quantity.charts for quantity in line.followed):
+        yield "No alarm: nothing changed along the line."
+    else:
+        yield "Too few units for control charts."
 
 
-def line_alarms(line: Line) -> list[tuple[str, str]]:
-    """Return title and sentence of each alarm, those of the whole line first."""
-    ordered = sorted(line.alarms, key=lambda alarm: _ORDER.index(alarm.kind))
-    return [(_TITLES[alarm.kind], sentence(alarm.text)) for alarm in ordered]
+def _why_not_capable(quantity: FollowedQuantity) -> str:
+    """Say whether a quantity's scatter or its mean brings units beyond its limits."""
+    capability, limit, unit = quantity.capability, quantity.limit, si_unit(quantity.name)
+    assert capability is not None and limit is not None
+    limits = between(limit.low, limit.high, unit, limit.stated)
+    if capability.cp[0] < _CAPABLE:
+        why = f"varies too much for the limits {limits}"
+    else:
+        why = f"has a mean, {amount(capability.mean, unit, 3, limit.stated)}, too near a limit ({limits})"
+    verb = "is not" if capability.cpk[2] < _CAPABLE else "may not be"  # by the interval's upper end
+    return f"The line {verb} capable: {spoken(quantity.name)} {why}."
 
 
-def write_line(line: Line, page: Path, table: Path) -> tuple[Path, ...]:
-    """Write, where there are limits, the table with a verdict in every row, and the page; return their paths.
-
-    Raises `InputError` where one cannot be written.
-    """
-    tables = () if line.limits is None else (table,)
-    for path in tables:
-        write_verdicts(line, path)
-    return *tables, *write_files({page: _page(line)})
-
-
-def _page(line: Line) -> bytes:
-    total = sum(len(line.missed(row)) for row in range(len(line.table.rows)))
-    drawn, counts, questions = _to_draw(line), line.counts, max(1, len(line.followed))
-    quiet = "No control chart, station or golden unit shows more than chance."
-    alarms: dict[str, list[str]] = {}
-    for about, text in line_alarms(line):
-        alarms.setdefault(about, []).append(text)
-    items = []
-    for device, item in line.items(MOST_ROWS):
-        row = item_row(item)
-        items.append((device, *(row[key] for key in ("name", "value", "limits", "probability", "verdict")), True))
-    return page_of(
-        "line",
-        {"charts": partial(_chart_figure, line, drawn)} if drawn else {},
-        lead=headline(line),
-        title=f"Production line, {Path(line.table.file).name}",
-        meaning="of the recordings pass",
-        number=f"{100 * counts['pass'] / line.table.total:.3g} %" if line.limits else "",
-        alarms=alarms,
-        quiet=quiet if drawn else "There is nothing to chart: too few units.",
-        items=items,
-        more=max(0, total - MOST_ROWS),
-        notes=line.notes,
-        capability=[_capability(quantity) for quantity in line.followed if quantity.capability],
-        gauge=[_gauge(quantity, questions) for quantity in line.followed if quantity.gauge],
-    )[0]
+def _next(line: Line) -> str:
+    if line.limits is None:
+        return (
+            f"`jaximu accept {shlex.quote(line.table.file)} --limits LIMITS.toml -o LINE` holds every unit to limits."
+        )
+    for device, item in line.items(1):
+        log = shlex.quote(line.table.files[line.table.devices.index(device)])
+        return f"`jaximu diagnose {log} -o RESULTS` shows what is unusual about {device} ({spoken(item.name)})."
+    return ""
 
 
-def _capability(quantity: FollowedQuantity) -> tuple[str, str, str, str, str, str, bool]:
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def _capability(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> Iterator[Section]:
+    if not able:
+        return
+    judged = line.judged
+    failed = {} if judged is None else dict(zip(judged.names, np.sum(judged.verdict == FAIL, axis=0), strict=True))
+    headers = ("quantity", "Cpk (95 %)", "Cp (95 %)", "mean ± standard deviation", "limits", "fail")
+    caption = (
+        "Of each device's first recording; the deviation is that of all units, drift between them included. Marked: "
+        f"Cpk below {_CAPABLE}. Fail: recordings of all."
+    )
+    rows = [_capability_row(quantity, failed.get(quantity.name, 0)) for quantity, _ in able]
+    marked = [row for row, (_, cpk) in enumerate(able) if cpk < _CAPABLE]
+    yield Section("Capability", [Table(headers, rows, caption, marked, brief=6)])
+
+
+def _capability_row(quantity: FollowedQuantity, failed: int) -> tuple[str, ...]:
     capability, limit, unit = quantity.capability, quantity.limit, si_unit(quantity.name)
     assert capability is not None and limit is not None
 
-    def said(index: tuple[float, float, float]) -> str:
-        return "" if np.isnan(index[0]) else f"{index[0]:.2f} ({index[1]:.2f} to {index[2]:.2f})".replace("-", "−")
-
-    worst = min(quantity.lots, key=lambda lot: quantity.lots[lot].cpk[0], default="")
-    shown, factor = in_shown_unit(unit)
-    mean = f"{number(factor * capability.mean)} ± {number(factor * capability.deviation, 2)} {shown}"
+    shown, factor = in_shown_unit(unit, limit.stated)
     return (
         spoken(quantity.name),
-        mean,
-        between(limit.low, limit.high, unit),
-        said(capability.cp),
-        said(capability.cpk),
-        f"{worst}: {said(quantity.lots[worst].cpk).partition(' ')[0]}" if worst else "",
-        capability.cpk[0] < _CAPABLE,
+        _index(capability.cpk),
+        _index(capability.cp),
+        with_interval(factor * capability.mean, factor * capability.deviation / Z95, shown),  # ± one deviation
+        between(limit.low, limit.high, unit, limit.stated),
+        str(failed),
     )
 
 
-def _gauge(quantity: FollowedQuantity, questions: int) -> tuple[str, str, str, str, str, str, bool]:
-    gauge, unit = quantity.gauge, si_unit(quantity.name)
-    assert gauge is not None
-    shown, factor = in_shown_unit(unit)
-    value, low, high = (number(factor * end, 2) for end in gauge.repeatability)
-    mark = " *" if gauge.p_value * questions < _LEVEL else ""
-    stations = amount(gauge.reproducibility, unit, 2) if gauge.crossed else "not crossed"
-    return (
-        spoken(quantity.name),
-        f"{value} ({low} to {high}) {shown}",
-        stations,
-        amount(gauge.parts, unit, 2),
-        str(gauge.categories),
-        f"{gauge.explained:.2f}{mark}",
-        gauge.categories < _CATEGORIES,
-    )
+def _worst_lots(able: Sequence[tuple[FollowedQuantity, float]]) -> Iterator[Section]:
+    rows = []
+    for quantity, _ in able:
+        if quantity.lots:
+            worst = min(quantity.lots, key=lambda lot: quantity.lots[lot].cpk[0])
+            rows.append((spoken(quantity.name), worst, _index(quantity.lots[worst].cpk)))
+    if rows:
+        yield Section("Worst lots", [Table(("quantity", "lot", "Cpk of the lot (95 %)"), rows)])
+
+
+def _index(ends: tuple[float, float, float]) -> str:
+    """Return an index of capability with its 95 % interval; nothing where there is none."""
+    return "" if np.isnan(ends[0]) else with_interval(ends[0], (ends[2] - ends[1]) / (2 * Z95))
+
+
+def _alarm_rows(line: Line) -> list[tuple[str, str]]:
+    """Return title and sentence of each alarm, those of the whole line first."""
+    stated = {quantity.name: quantity.limit.stated for quantity in line.followed if quantity.limit is not None}
+    ordered = sorted(line.alarms, key=lambda alarm: _ORDER.index(alarm.kind))
+    return [(_TITLES[alarm.kind], f"{sentence(alarm.words(stated.get(alarm.name, '')))}.") for alarm in ordered]
+
+
+def _alarms(line: Line) -> Iterator[Section]:
+    if line.alarms:
+        yield Section("Alarms", [Table(("alarm", "what it shows"), _alarm_rows(line), brief=8)])
+
+
+def _not_passed(line: Line) -> Iterator[Section]:
+    cells = ("name", "value", "limits", "probability", "verdict")
+    rows = [(device, *(item_row(item)[cell] for cell in cells)) for device, item in line.items(MOST_ROWS)]
+    more = sum(len(line.missed(row)) for row in range(len(line.table.rows))) - len(rows)
+    if rows:
+        headers = ("device", "quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict")
+        caption = f"And {more} more; the table's column `not_passed` has all." if more else ""
+        yield Section("What does not pass", [Table(headers, rows, caption)])
+
+
+def _gauge(line: Line) -> Iterator[Section]:
+    questions, rows, marked = max(1, len(line.followed)), [], []
+    for quantity in line.followed:
+        gauge, unit, stated = quantity.gauge, si_unit(quantity.name), quantity.limit.stated if quantity.limit else ""
+        if gauge is None:
+            continue
+        shown, factor = in_shown_unit(unit, stated)
+        value, low, high = (number(factor * end, 2) for end in gauge.repeatability)
+        if gauge.categories < _CATEGORIES:
+            marked.append(len(rows))
+        row = (
+            spoken(quantity.name),
+            f"{value} ({low} to {high}) {shown}",
+            amount(gauge.reproducibility, unit, 2, stated) if gauge.crossed else "not crossed",
+            amount(gauge.parts, unit, 2, stated),
+            str(gauge.categories),
+            f"{gauge.explained:.2f}{' *' if gauge.p_value * questions < _LEVEL else ''}",
+        )
+        rows.append(row)
+    if rows:
+        headers = ("quantity", "repeatability (95 %)", "between stations", "between units", "ndc", "observed / stated")
+        caption = (
+            "Standard deviations by analysis of variance. ndc: groups of units that the measurement can distinguish; "
+            "marked below 5 (AIAG). Observed / stated: scatter of a unit's repeated recordings, in multiples of the "
+            "uncertainty that each states; 1 is expected, and * marks what chance does not explain (p < 1 %, all "
+            "quantities allowed for)."
+        )
+        yield Section("Gauge: repeated recordings", [Table(headers, rows, caption, marked)])
+
+
+# --- charts -----------------------------------------------------------------------------------------------------------
 
 
 def _to_draw(line: Line) -> list[tuple[FollowedQuantity, str]]:
-    """Return the charts that show most: those with alarms, else the first ones."""
+    """Return the charts that show most: of the least capable quantity, those with alarms, those of a low Cpk."""
     charts = [(quantity, station) for quantity in line.followed for station in quantity.charts]
+    cpk = {quantity.name: value for quantity, value in _by_capability(line)}
+    worst = next(iter(cpk), "")
 
-    def shows(entry: tuple[FollowedQuantity, str]) -> int:
-        chart, _ = entry[0].charts[entry[1]]
-        return len(chart.drifting) + len(chart.beyond) + len(chart.jumps)
+    def rank(entry: tuple[FollowedQuantity, str]) -> tuple[bool, int, float]:
+        name, (chart, _) = entry[0].name, entry[0].charts[entry[1]]
+        return name != worst, -len(chart.drifting) - len(chart.beyond) - len(chart.jumps), cpk.get(name, np.inf)
 
-    return sorted(charts, key=shows, reverse=True)[:_CHARTS]
+    return sorted(charts, key=rank)[:_CHARTS]
 
 
 def _chart_figure(line: Line, drawn: list[tuple[FollowedQuantity, str]]) -> Figure:
-    """Draw control charts: values and moving average above, moving ranges below."""
-    drawing = figures.new_figure(0.3 + 3.0 * len(drawn))
+    """Draw control charts: values, moving average and limits above, moving ranges below."""
+    drawing = figures.new_figure(0.6 + 3.0 * len(drawn))
     rows = drawing.subplots(2 * len(drawn), 1, height_ratios=[2.2, 1] * len(drawn), squeeze=False)[:, 0]
     for (quantity, station), above, below in zip(drawn, rows[::2], rows[1::2], strict=True):
         chart, places = quantity.charts[station]
-        unit, factor = in_shown_unit(si_unit(quantity.name))
+        unit, factor = in_shown_unit(si_unit(quantity.name), quantity.limit.stated if quantity.limit else "")
         days = line.table.days[places]
         dated = bool(np.isfinite(days).all() and np.ptp(days) > 0)
         across = (days * 86400).astype("datetime64[s]") if dated else np.arange(len(places))
         ranges = np.abs(np.diff(chart.values, prepend=np.nan))
-        limit = chart.bound * chart.deviation
+        bound = chart.bound * chart.deviation
         for axes, values, hits, ends in (
-            (above, chart.values, chart.beyond, (chart.centre - limit, chart.centre + limit)),
-            (below, ranges, chart.jumps, (np.sqrt(2) * limit,)),
+            (above, chart.values, chart.beyond, (chart.centre - bound, chart.centre + bound)),
+            (below, ranges, chart.jumps, (np.sqrt(2) * bound,)),
         ):
-            small = 4 if len(places) < 200 else 1.5
-            dots = axes.plot(across, factor * values, "o", color=_VALUE, markersize=small, alpha=0.6, markeredgewidth=0)
+            size = 4 if len(places) < 200 else 2.5
+            dots = axes.plot(across, factor * values, "o", color=_VALUE, ms=size, alpha=0.6, mew=0, label="unit")
             finite = np.isfinite(values)
             named(dots[0], [line.table.devices[row] for row in places[finite]])
-            axes.plot(across[hits], factor * values[hits], "D", color=_OUT, markersize=5)
+            axes.plot(across[hits], factor * values[hits], "D", color=_OUT, ms=5, label="beyond control limits")
             for end in ends:
-                axes.axhline(factor * end, color="#5C5C66", linestyle="--", linewidth=1)
-        above.plot(across, factor * chart.average, color=_AVERAGE, linewidth=1.5)
+                line_of_end = axes.axhline(factor * end, color="#5C5C66", linestyle="--", linewidth=1)
+            line_of_end.set_label("control limits of a unit")
+        above.plot(across, factor * chart.average, color=_AVERAGE, linewidth=1.5, label="moving average")
         above.plot(across[chart.drifting], factor * chart.average[chart.drifting], ".", color=_OUT, markersize=4)
         for side in (-1, 1):
             end = chart.centre + side * chart.average_bound * chart.deviation
             above.plot(across, factor * end, color=_AVERAGE, linestyle=":", linewidth=1)
-        dressed(above, spoken(quantity.name) + (f", station {station}" if station else ""), ylabel=f"[{unit}]")
+        title = spoken(quantity.name) + (f", station {station}" if station else "")
+        dressed(above, title + _draw_limits(above, quantity.limit, chart, factor), ylabel=f"[{unit}]")
         dressed(below, xlabel="" if dated else "unit", ylabel=f"moving range\n[{unit}]")
         below.yaxis.label.set_size(8)
+    figures.legend_below(drawing, rows[0], 5)
     return drawing
+
+
+def _draw_limits(axes: Axes, limit: Limit | None, chart: Chart, factor: float) -> str:
+    """Draw the limits that units are held to, and return what they are; those far off are beyond the panel."""
+    if limit is None:
+        return ""
+    farthest = 2 * chart.bound * chart.deviation
+    ends = [end for end in (limit.low, limit.high) if abs(end - chart.centre) < farthest]
+    for end in ends:
+        axes.axhline(factor * end, color="black", linewidth=1.4, label="limit" if end == ends[0] else None)
+    return f", limits {between(limit.low, limit.high, limit.unit, limit.stated)}" + ("" if ends else " (off the panel)")

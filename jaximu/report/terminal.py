@@ -49,7 +49,7 @@ def show(content: Page | Part, screen: Console | None = None) -> None:
         case Table(rows=rows, brief=brief):
             _print_table(replace(content, rows=rows[:brief]), screen)
             if brief is not None and len(rows) > brief:
-                screen.print(f"… and {len(rows) - brief} more in report.html")
+                screen.print(f"… and {len(rows) - brief} more in the report")
         case Items(texts=texts):
             _print_items(texts, screen)
         case Code(text=lines):
