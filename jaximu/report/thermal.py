@@ -48,13 +48,14 @@ _ROWS = 45  # three to a term of a regression
 _WORTH = 1.2  # times as large a share that a ramp must leave of some effect to be proposed
 _LEAST_SHARE = 1e-3  # of an effect's shape that is stated
 _MOST_DOTS = 600  # of a surface's data
-_BESIDE_DATA = 0.08  # of the range of temperatures and of rates, about each block, in which a surface is drawn
+_BESIDE_DATA = 0.04  # of the range of temperatures and of rates, about the blocks, to which a surface is drawn
 
 
 def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] = ()) -> Page:
     """Return what temperature did to each sensor, what remains of it, by which model, and what an autopilot loses."""
     files, command = files_and_next(thermal.blocks.recordings)
     value, meaning = _number(thermal)
+    effects = effect_table(thermal.calibration)
     return Page(
         f"Bias over temperature of {files}",
         (*_verdict(thermal),),
@@ -65,7 +66,7 @@ def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] 
             _remainder(thermal),
             *(_model(thermal, name) for name in thermal.fits),
             Section("What these recordings can separate", [*thermal.identifiability.words, *_ways(thermal)]),
-            Section("Effects", [effect_table(thermal.calibration)]),
+            *([Section("Effects", [effects])] if effects.rows else []),
             Section("Models that were tried", [*_candidates(thermal)]),
             *(_export(export, thermal) for export in exports),
         ),
@@ -104,11 +105,11 @@ def _span(thermal: ThermalCalibration) -> str:
 
 def _verdict(thermal: ThermalCalibration) -> Iterator[str]:
     """Say what temperature did to each sensor and what remains, and whether the recordings show more than one way."""
-    included = ", jumps included" * bool(thermal.jumps)
+    jumps = ", jumps included" * bool(thermal.jumps)
     for name, fit in thermal.fits.items():
         moves = f"{_size(name, fit.before)} (rms) between {_span(thermal)}"
         if fit.candidate.names:
-            after = f"with the model {_size(name, fit.after)} remain{included}"
+            after = f"with the model {_size(name, fit.after)} remain{jumps}"
             yield f"The {name}'s output at rest moves by {moves}; {after}."
         else:
             yield f"The {name}'s output at rest moves by {moves}; no model of temperature improves it."
@@ -123,15 +124,10 @@ def _number(thermal: ThermalCalibration) -> tuple[str, str]:
     """Return what remains of the first corrected sensor on parts left out of the fit, and what that is."""
     corrected = [name for name, fit in thermal.fits.items() if fit.candidate.names]
     name = [*corrected, *thermal.fits][0]
-    before, after = (float(np.linalg.norm(held.rms)) for held in _held(thermal, name))
+    fit = thermal.fits[name]
+    before, after = (float(np.linalg.norm(held.rms)) for held in (fit.held_before, fit.candidate.held))
     meaning = f"left of the {name}'s output, all axes together (rms), on {_parts(thermal)} that the fit did not use"
     return size(after, SENSOR_UNITS[name]), f"{meaning}: {how_much_smaller(before, after)} than without a model"
-
-
-def _held(thermal: ThermalCalibration, name: str) -> tuple[Any, Any]:
-    """Return how a triad's left out parts are predicted without and with the model."""
-    fit = thermal.fits[name]
-    return fit.held_before, fit.candidate.held
 
 
 def _band_picture(thermal: ThermalCalibration, name: str) -> Picture:
@@ -147,7 +143,7 @@ def _band_picture(thermal: ThermalCalibration, name: str) -> Picture:
 
 def _remainder(thermal: ThermalCalibration) -> Table:
     """Return rms over temperature, after the model, and on what was left out, axis by axis."""
-    rows = []
+    rows, jumps = [], ", jumps included" * bool(thermal.jumps)
     for name, fit in thermal.fits.items():
         factor, unit = _unit(thermal, name)
         sizes = factor * np.stack([fit.before, fit.after, fit.candidate.held.rms], axis=1)
@@ -156,7 +152,7 @@ def _remainder(thermal: ThermalCalibration) -> Table:
             after += " (not corrected)" * (family == "constant")
             rows.append((f"{name} {axis} [{unit}]", before, after, left_out))
     return Table(
-        ("output, rms", "over temperature", "left by the model", f"on {_parts(thermal)} left out"),
+        ("output, rms", "over temperature", f"left by the model{jumps}", f"on {_parts(thermal)} left out"),
         rows,
         f"The {_parts(thermal)} left out are predicted from all other blocks, with what they show of slow noise: that "
         "may leave less than the model alone.",
@@ -167,7 +163,7 @@ def _model(thermal: ThermalCalibration, name: str) -> Statement:
     """Say which effects model a sensor, and what remains on parts left out."""
     fit = thermal.fits[name]
     effects = [effect_title(f"{PREFIXES[name]}.{effect}") for effect in fit.candidate.names]
-    before, after = (_size(name, held.rms) for held in _held(thermal, name))
+    before, after = (_size(name, held.rms) for held in (fit.held_before, fit.candidate.held))
     apart = " (jumps apart)" * bool(thermal.jumps)
     if effects:
         text = f"With {listed(effects)}, {after} remain on {_parts(thermal)} left out{apart}, {before} without a model."
@@ -191,7 +187,9 @@ def candidate_table(thermal: ThermalCalibration, name: str) -> Table:
     """Return family, effects, rms on what was left out and score of each model; those chosen first, with their axes."""
     fit = thermal.fits[name]
     best = np.max([candidate.scores for candidate in fit.candidates], axis=0)
-    candidates = sorted(fit.candidates, key=lambda one: (one.family not in fit.families, -one.score))
+    candidates = sorted(
+        fit.candidates, key=lambda one: (one.family not in fit.families, one.family != CUBIC, -one.score)
+    )
     rows = []
     for candidate in candidates:
         axes = [axis for axis, family in zip("xyz", fit.families, strict=True) if family == candidate.family]
@@ -249,7 +247,8 @@ def _coefficient_rows(title: str, entry: dict[str, Any]) -> list[tuple[str, ...]
 
 def _largest_change(calibration: Calibration, owner: str, plain: str) -> tuple[str, ...]:
     """Return the largest change of steady bias that an effect makes over the range, ± 95 %, by axis, and the unit."""
-    temperature = np.linspace(*calibration.data["temperature_range"], 101)
+    low, high = calibration.data["temperature_range"]
+    temperature = np.linspace(low, high, 101)
     scale = np.linalg.norm(np.asarray(calibration.triads()[owner].gain), axis=1)
     value, sigma = (values / scale for values in change(calibration, owner, (plain,), temperature))
     rows = np.argmax(np.abs(value), axis=0), np.arange(3)
@@ -278,8 +277,8 @@ def _rest(thermal: ThermalCalibration) -> Iterator[Part]:
             f"surface_{name}",
             partial(surface_figure, thermal, name),
             f"Bias of the {name} over temperature and its rate",
-            f"The {name}'s bias, counted from {thermal.reference:g} °C: the model as a surface, drawn where there are "
-            "data near, and the data as dots, less the level of each rest.",
+            f"The {name}'s bias, counted from {thermal.reference:g} °C: the model as a surface, as far as the data go, "
+            "and the data as dots, less the level of each rest.",
         )
         residual = Picture(
             f"residual_{name}",
@@ -309,7 +308,7 @@ def _ways(thermal: ThermalCalibration) -> list[Part]:
         return []
     text = (
         f"{sentence(options[0].text)}, with a soak at each end ({options[0].duration / 60:.0f} min), and give both "
-        "recordings to `jaximu thermal`: it separates most of what looks alike now."
+        "recordings to `jaximu thermal`: of the ramps tried it separates best what looks alike now."
     )
     rows = [(name.replace("_", " "), *(_share(parts[name].apart) for parts in (now, then))) for name in weak]
     shares = Table(("effect", "share that no other can imitate, now", "with that ramp"), rows)
@@ -336,7 +335,8 @@ def _ambient(thermal: ThermalCalibration) -> Iterator[Statement]:
     )
     factors = {"T": blocks.temperature, "dT": blocks.rate, "To": blocks.ambient, "dTo": rate}
     for name, fit in thermal.fits.items():
-        fits = [multifactor(factors, values) for values in _added(thermal, name).T]
+        added = blocks.means[name] - fit.level.T[blocks.level]
+        fits = [multifactor(factors, values) for values in added.T]
         held, kept = np.array([rms for _, rms in fits]), max(len(terms) for terms, _ in fits)
         text = (
             f"At most {kept} of 15 terms kept: {_size(name, held)} rms on fifths left out, against "
@@ -361,10 +361,16 @@ def loss_words(parameters: AutopilotParameters, thermal: ThermalCalibration) -> 
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def _added(thermal: ThermalCalibration, name: str) -> np.ndarray:
-    """Return what temperature added to each block (n, 3) by the data: the output less the level of its rest, SI."""
-    fit, blocks = thermal.fits[name], thermal.blocks
-    return blocks.means[name] - fit.level.T[blocks.level]
+def residual_dots(thermal: ThermalCalibration, name: str) -> FloatArray:
+    """Return what the model leaves of each block (n, 3), SI, about its mean at each level: jumps are no residuals."""
+    residual, level = thermal.fits[name].residual, thermal.blocks.level
+    mean = np.stack([np.bincount(level, axis) / np.bincount(level) for axis in residual.T], axis=1)
+    return residual - mean[level]
+
+
+def bias_dots(thermal: ThermalCalibration, name: str) -> FloatArray:
+    """Return what temperature added to each block (n, 3), SI: the data less the level of its rest, jumps included."""
+    return thermal.fits[name].fitted + residual_dots(thermal, name)
 
 
 def _both_ways(thermal: ThermalCalibration) -> list[tuple[np.ndarray, dict[str, str]]]:
@@ -376,12 +382,13 @@ def _both_ways(thermal: ThermalCalibration) -> list[tuple[np.ndarray, dict[str, 
     return [(part, style) for part, style in parts if part.any()]
 
 
-def _near_data(thermal: ThermalCalibration, temperature: FloatArray, rates: FloatArray) -> np.ndarray:
-    """Return at which rates and temperatures (r, m) there are blocks near."""
-    blocks = thermal.blocks
-    along = (temperature[:, None] - blocks.temperature) / np.ptp(temperature)
-    across = (rates[:, None] - blocks.rate) / max(np.ptp(rates), 1e-12)
-    return np.array([np.min(np.hypot(along, row), axis=1) < _BESIDE_DATA for row in across])
+def _within_data(thermal: ThermalCalibration, temperature: FloatArray, rates: FloatArray) -> np.ndarray:
+    """Return at which rates and temperatures (r, m) there are blocks, or blocks on either side at that temperature."""
+    blocks, margin = thermal.blocks, _BESIDE_DATA * np.ptp(rates)
+    near = np.abs(temperature[:, None] - blocks.temperature) < _BESIDE_DATA * np.ptp(temperature)
+    low = np.min(np.where(near, blocks.rate, np.inf), axis=1) - margin
+    high = np.max(np.where(near, blocks.rate, -np.inf), axis=1) + margin
+    return (low <= rates[:, None]) & (rates[:, None] <= high)
 
 
 def surface_figure(thermal: ThermalCalibration, name: str) -> Figure:
@@ -392,12 +399,14 @@ def surface_figure(thermal: ThermalCalibration, name: str) -> Figure:
     temperature = np.linspace(*blocks.range, 61)
     rates = np.linspace(blocks.rate.min(), blocks.rate.max(), 41)
     surface = np.stack([thermal.bias(name, temperature, rate)[0] for rate in rates])  # (r, m, 3)
-    surface[~_near_data(thermal, temperature, rates)] = np.nan
-    data, parts = _added(thermal, name), _both_ways(thermal)
+    surface[~_within_data(thermal, temperature, rates)] = np.nan
+    data, parts = bias_dots(thermal, name), _both_ways(thermal)
     for axis in range(3):
         panel: Any = figure.add_subplot(1, 3, axis + 1, projection="3d")
         x, y = np.meshgrid(temperature, 60 * rates)
-        panel.plot_surface(x, y, factor * surface[:, :, axis], color="#BBBBBB", alpha=0.45, linewidth=0)
+        panel.plot_surface(
+            x, y, factor * surface[:, :, axis], color="#BBBBBB", alpha=0.45, linewidth=0, rcount=61, ccount=61
+        )
         for part, style in parts:
             few = np.flatnonzero(part)[:: 1 + len(blocks) // _MOST_DOTS]
             panel.scatter(
@@ -420,7 +429,7 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
     factor, unit = _unit(thermal, name)
     temperature = np.linspace(*thermal.blocks.range, 201)
     value, sigma = thermal.bias(name, temperature)
-    data, parts = _added(thermal, name), _both_ways(thermal)
+    data, parts = bias_dots(thermal, name), _both_ways(thermal)
     figure = new_figure(3.4)
     for axis, panel in enumerate(figure.subplots(1, 3)):
         for part, style in parts:
@@ -428,7 +437,7 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
         low, high = (factor * (value + sign * Z95 * sigma)[:, axis] for sign in (-1, 1))
         panel.fill_between(temperature, low, high, color="0.5", alpha=0.35, linewidth=0)
         panel.plot(temperature, factor * value[:, axis], color="black", lw=1.1, label="steady, with 95 % band")
-        dressed(panel, f"{'xyz'[axis]} [{unit}]", xlabel="temperature [°C]")
+        dressed(panel, f"{sentence(name)} {'xyz'[axis]} [{unit}]", xlabel="temperature [°C]")
     legend(figure.axes[0])
     return figure
 
@@ -436,7 +445,7 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
 def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
     """Draw what the model leaves of each block against temperature and time, up and down in two colours."""
     factor, unit = _unit(thermal, name)
-    blocks, residual = thermal.blocks, factor * thermal.fits[name].residual
+    blocks, residual = thermal.blocks, factor * residual_dots(thermal, name)
     figure, parts = new_figure(6.0), _both_ways(thermal)
     grid = figure.subplots(3, 2, sharey="row", sharex="col")
     for axis in range(3):
@@ -445,8 +454,8 @@ def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
                 panel.plot(x[part], residual[part, axis], ".", ms=3, **style)
             zero_line(panel)
             dressed(panel)
-        grid[axis][0].set_ylabel(f"{'xyz'[axis]} [{unit}]")
-    dressed(grid[0][0], "Left of the bias, by temperature")
+        grid[axis][0].set_ylabel(f"{name} {'xyz'[axis]} [{unit}]", fontsize=9)
+    dressed(grid[0][0], "Residual bias by temperature")
     dressed(grid[0][1], "by time")
     legend(grid[0][0], 2)
     grid[2][0].set_xlabel("temperature [°C]")
