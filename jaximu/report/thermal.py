@@ -127,6 +127,7 @@ def _number(thermal: ThermalCalibration) -> tuple[str, str]:
     fit = thermal.fits[name]
     before, after = (float(np.linalg.norm(held.rms)) for held in (fit.held_before, fit.candidate.held))
     meaning = f"left of the {name}'s output, all axes together (rms), on {_parts(thermal)} that the fit did not use"
+    meaning += ", jumps apart" * bool(thermal.jumps)
     return size(after, SENSOR_UNITS[name]), f"{meaning}: {how_much_smaller(before, after)} than without a model"
 
 
