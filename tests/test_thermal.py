@@ -26,6 +26,7 @@ from jaximu.recordings.recording import Signal
 from jaximu.report.export import ExportedUnit
 from jaximu.report.export.catalogue import writer
 from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
+from jaximu.report.thermal import bias_dots, effect_table, residual_dots
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.simulation.protocols import Environment, SoakAndRamp, Static
@@ -421,9 +422,17 @@ def test_the_measured_leg(leg):
         assert fit.candidate.family != "constant"
     for name, fit in found.fits.items():  # the dots that are drawn lie on the curve, but for what the model leaves
         assert not set(fit.candidate.names) & {"temperature_rate", "thermal_lag"}
-        curve = found.bias(name, found.blocks.temperature)[0]
-        dots = found.blocks.means[name] - fit.level.T[found.blocks.level]
-        np.testing.assert_allclose(dots - curve, fit.residual, atol=0.02 * float(np.ptp(curve)))
+        curve, level = found.bias(name, found.blocks.temperature)[0], found.blocks.level
+        dots, residual = bias_dots(found, name), residual_dots(found, name)
+        np.testing.assert_allclose(dots - curve, residual, atol=0.02 * float(np.ptp(curve)))
+        assert level.max() == 1  # the knock's offset is in neither picture
+        for rest in (level == 0, level == 1):
+            np.testing.assert_allclose(residual[rest].mean(axis=0), 0.0, atol=1e-12)
+            np.testing.assert_allclose(np.ptp((residual - fit.residual)[rest], axis=0), 0.0, atol=1e-12)
+    (curve,) = (row for row in effect_table(found.calibration).rows if "learned_temperature" in row[0])
+    largest = np.max(np.abs(found.bias("accelerometer", np.linspace(*found.blocks.range, 101))[0]), axis=0)
+    shown = [abs(float(cell.split()[0].replace("−", "-"))) for cell in curve[1:4]]
+    np.testing.assert_allclose(shown, largest, rtol=0.01)
     held = without_startup(leg)
     assert len(held.accelerometer) == len(leg.accelerometer) - 1
 

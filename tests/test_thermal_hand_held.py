@@ -14,9 +14,9 @@ from jaximu.diagnosis import thermal_hand_held
 from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.page import Section, Table
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings import write_recording
-from jaximu.report.thermal_hand_held import headline, limit_rows
 from jaximu.simulation import simulate
 from jaximu.simulation.draw import consumer_noise, draw_imu
 from jaximu.simulation.protocols import Environment, HandHeld, SoakAndRamp
@@ -72,11 +72,13 @@ def test_the_report_s_numbers(found):
     poses = found.experiment.data.observations.poses
     kelvin = np.asarray(poses.temperature)[np.asarray(poses.mask)]
     expected = np.degrees(np.linalg.norm(EFFECTS["gyro.temperature"]) * np.std(kelvin))
-    (said,) = (each for each in headline(found) if each.startswith("Rate at rest"))
+    (said,) = (line for line in str(found.summary()).splitlines() if line.startswith("Rate at rest"))
     ratio = float(re.findall(r"[\d.]+", said)[0]) / expected
     assert 0.995 < ratio < 1.02  # about a bias that the turns have a say in, errors are larger than about their mean
     names = [CATALOGUE[name].title for name, *_ in found.steps]
-    rows = {name: size for name, _, size in limit_rows(found)}
+    (hiding,) = (part for part in found.summary().first if isinstance(part, Section) and "hide" in part.title)
+    (table,) = (part for part in hiding.parts if isinstance(part, Table))
+    rows = {name: size for name, _, size in table.rows}
     assert names and not set(rows) & set(names)
     limit, unit = found.limits["accel.temperature_squared"]
     assert unit == "(m/s^2)/K^2"
@@ -89,7 +91,7 @@ def test_what_is_not_there_is_not_taken_in_and_could_hide_below_a_limit(found):
     nothing = calibrate_thermal_by_hand(by_hand(2), gravity=GRAVITY)
     assert not nothing.steps and not nothing.calibration.imu.accelerometer.effects
     assert 0 < nothing.limits["accel.scale_temperature"][0] < 1e-4
-    assert "nothing of temperature" in headline(nothing)[0]
+    assert "show no effect of temperature" in nothing.summary().verdict[0]
 
 
 def test_it_compensates_another_recording(found, tmp_path):

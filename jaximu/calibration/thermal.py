@@ -31,6 +31,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Document
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD
+from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
@@ -54,8 +55,8 @@ _MISFIT = 1.5
 """χ² per degree of freedom from which on a model is said not to explain the recordings to their noise."""
 
 
-@dataclass(frozen=True, eq=False)
-class ThermalCalibration(Document):
+@dataclass(frozen=True, repr=False, eq=False)
+class ThermalCalibration(Result, Document, page="thermal"):
     """A unit whose bias depends on temperature: the calibration, and the working behind it.
 
     reference: °C at which the effects count as zero. fits: by triad. identifiability: what the path of temperature can
@@ -72,13 +73,13 @@ class ThermalCalibration(Document):
     jumps: tuple[tuple[int, float], ...] = ()  # recording, and time on its clock, s
     software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
 
-    def bias(self, triad: str, kelvin: FloatArray, rate: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    def bias(self, triad: str, temperature: FloatArray, rate: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Return the change of bias (m, 3) from the reference temperature to temperatures (m,) °C, and its sigma, SI.
 
         At a temperature that has long been what it is, or (`rate`, K/s) with what the rate terms add.
         """
         scale = getattr(self.blocks.recordings[0], triad).nominal_scale
-        value, sigma = change(self.calibration, triad, THERMAL, kelvin, rate=rate)
+        value, sigma = change(self.calibration, triad, THERMAL, temperature, rate=rate)
         return value / scale, sigma / scale
 
     def document(self) -> dict[str, Any]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,12 +14,9 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 
 if TYPE_CHECKING:
-    from jaximu.calibration import ThermalCalibration
-    from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
     from jaximu.ground.gravity import LocalGravity
     from jaximu.model.noise_model import NoiseModel
     from jaximu.recordings.recording import Recording
-    from jaximu.report.export.thermal_autopilot import AutopilotParameters
 
 __all__ = ["run"]
 
@@ -89,12 +84,10 @@ def run(
         exports = {"px4.params": px4_parameters(thermal, sensor or 0, accel_id, gyro_id)} if "px4" in to else {}
         if "ardupilot" in to:
             exports["ardupilot.param"] = ardupilot_parameters(thermal, 1 if sensor is None else sensor)
-    parameters = tuple(exports.values())
-    results.give(
-        lambda: _print(thermal, parameters),
-        lambda folder: later("report.thermal", "write_thermal")(thermal, folder, parameters),
-        text=thermal.text,
+    results.present(
+        lambda: later("report.thermal", "page_of")(thermal, (*exports.values(),)),
         files={name: export.text.encode() for name, export in exports.items()},
+        text=thermal.text,
         calibration=thermal.calibration,
         thermal=thermal,
     )
@@ -108,46 +101,4 @@ def _give_by_hand(
 
     with progress("fitting"):
         thermal = calibrate_thermal_by_hand(recordings, known, gravity)
-    page = options.drawn("thermal_hand_held", "write_thermal_by_hand", thermal)
-    show = partial(_print_by_hand, thermal)
-    results.give(show, page, text=thermal.text, calibration=thermal.calibration, thermal=thermal)
-
-
-_EFFECTS = "Effects, ± half of the 95 % interval"
-
-
-def _print_by_hand(thermal: HandHeldThermal) -> None:
-    from jaximu.cli.shown import print_all
-    from jaximu.report.thermal import EFFECTS, effect_rows
-    from jaximu.report.thermal_hand_held import headline, limit_rows, undetermined
-
-    effects = (EFFECTS, effect_rows(thermal.calibration), _EFFECTS)
-    limits = (
-        ("effect", "size", "at the end"),
-        limit_rows(thermal),
-        "Smaller than this, others could hide (90 % power)",
-    )
-    print_all(
-        *headline(thermal),
-        *([effects] if thermal.steps else []),
-        *([limits] if thermal.limits else []),
-        *undetermined(thermal),
-        notes=thermal.notes,
-    )
-
-
-def _print(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters]) -> None:
-    from jaximu.cli.shown import print_all
-    from jaximu.report import thermal as report
-
-    print_all(*report.headline(thermal))
-    for name in thermal.fits:
-        unit, rows = report.rms_rows(thermal, name)
-        print_all(
-            (("axis", "over temperature", "left", "held out"), rows, f"{name}, rms in {unit}"),
-            (("model", "effects", "held out, rms", "score, nats"), report.candidate_rows(thermal, name)),
-        )
-    effects = (report.EFFECTS, report.effect_rows(thermal.calibration), _EFFECTS)
-    print_all(effects, *report.words(thermal), notes=thermal.notes)
-    for export in exports:
-        print_all(report.loss_words(export, thermal), *(f"{export.name}: {note}" for note in export.notes))
+    results.present(thermal.summary, text=thermal.text, calibration=thermal.calibration, thermal=thermal)

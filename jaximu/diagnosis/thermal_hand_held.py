@@ -24,6 +24,7 @@ from jaximu.diagnosis.noise import usual_noise
 from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.page import Result
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
 from jaximu.noise.at_rest import noise_of
@@ -40,8 +41,8 @@ _FIRST = {"temperature_squared": "temperature", "temperature_cubed": "temperatur
 _POSES, _LONG = 9, 300.0  # fewest poses by hand; s, of rests that are longer than a hand is still
 
 
-@dataclass(frozen=True, eq=False)
-class HandHeldThermal(Document):
+@dataclass(frozen=True, repr=False, eq=False)
+class HandHeldThermal(Result, Document, page="thermal_hand_held"):
     """A unit calibrated by hand over temperature.
 
     calibration: with the effects chosen. base, state: the fits without and with them. steps: what each effect, in the

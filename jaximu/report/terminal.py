@@ -28,7 +28,7 @@ def console() -> Console:
 
 
 def _screen(**options) -> Console:
-    return Console(highlight=False, markup=False, width=_WIDTH, **options)
+    return Console(highlight=False, markup=False, width=_WIDTH, force_jupyter=False, **options)  # not into the notebook
 
 
 def text(content: Page | Part) -> str:

@@ -1,7 +1,8 @@
-"""What `jaximu thermal` says and draws: bias over temperature and its rate, what is left of it, what was covered."""
+"""The page of a calibration over temperature: what temperature does to the bias, what remains, what was covered."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,18 +12,22 @@ import numpy as np
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.identifiability import ENOUGH
-from jaximu.calibration.thermal import ThermalCalibration
+from jaximu.calibration.thermal import ThermalCalibration, change
 from jaximu.calibration.thermal_regression import multifactor
 from jaximu.calibration.thermal_selection import CUBIC
+from jaximu.calibration.thermal_terms import LEARNED, NETWORK
 from jaximu.data.rest_blocks import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.estimation.track import TEMPERATURE_WINDOW
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.page import Items, Page, Part, Picture, Section, Statement, Table
 from jaximu.ground.quantities import Z95, listed, number, readable, size, unit_text, with_interval
+from jaximu.ground.summary import sentence
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.planning.ramps import next_ramps
-from jaximu.recordings.recording import smoothed_slope
+from jaximu.recordings.recording import Recording, smoothed_slope
 from jaximu.report.figures import dressed, legend, new_figure, zero_line
-from jaximu.report.html import Folder, TextRows, write_page
+from jaximu.report.words import how_much_smaller
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,26 +35,56 @@ if TYPE_CHECKING:
     from jaximu.report.export.thermal_autopilot import AutopilotParameters
 
 __all__ = [
-    "EFFECTS",
     "band_figure",
-    "candidate_rows",
-    "effect_rows",
-    "headline",
+    "candidate_table",
+    "effect_table",
+    "files_and_next",
     "loss_words",
+    "page_of",
     "residual_figure",
-    "rms_rows",
-    "words",
-    "write_thermal",
 ]
 
-EFFECTS = ("effect", "x", "y", "z", "unit")
-"""Headers of `effect_rows`."""
 _ROWS = 45  # three to a term of a regression
 _WORTH = 1.2  # times as large a share that a ramp must leave of some effect to be proposed
+_LEAST_SHARE = 1e-3  # of an effect's shape that is stated
 _MOST_DOTS = 600  # of a surface's data
+_BESIDE_DATA = 0.04  # of the range of temperatures and of rates, about the blocks, to which a surface is drawn
 
 
-def _size(name: str, axes: np.ndarray) -> str:
+def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] = ()) -> Page:
+    """Return what temperature did to each sensor, what remains of it, by which model, and what an autopilot loses."""
+    files, command = files_and_next(thermal.blocks.recordings)
+    value, meaning = _number(thermal)
+    effects = effect_table(thermal.calibration)
+    return Page(
+        f"Bias over temperature of {files}",
+        (*_verdict(thermal),),
+        value,
+        meaning,
+        (
+            *(_band_picture(thermal, name) for name in thermal.fits),
+            _remainder(thermal),
+            *(_model(thermal, name) for name in thermal.fits),
+            Section("What these recordings can separate", [*thermal.identifiability.words, *_ways(thermal)]),
+            *([Section("Effects", [effects])] if effects.rows else []),
+            Section("Models that were tried", [*_candidates(thermal)]),
+            *(_export(export, thermal) for export in exports),
+        ),
+        partial(_rest, thermal),
+        [sentence(note) for note in thermal.notes],
+        command,
+    )
+
+
+def files_and_next(recordings: Sequence[Recording]) -> tuple[str, str]:
+    """Return the names of the recordings' files, and the sentence on what to run next."""
+    files = [str(source.path) for recording in recordings for source in recording.sources]
+    log = shlex.quote(files[0]) if files else "LOG"
+    names = ", ".join(Path(file).name for file in files) or "a recording"
+    return names, f"`jaximu compensate CALIBRATION {log} -o CORRECTED.csv` applies it at the logged temperatures."
+
+
+def _size(name: str, axes: FloatArray) -> str:
     """Return the rms of three axes together, SI, in the unit in which a person reads it."""
     return size(float(np.linalg.norm(axes)), SENSOR_UNITS[name])
 
@@ -59,74 +94,211 @@ def _unit(thermal: ThermalCalibration, name: str) -> tuple[float, str]:
     return readable(SENSOR_UNITS[name], np.max(thermal.fits[name].after))
 
 
-def headline(thermal: ThermalCalibration) -> Iterator[str]:
-    """Return the sentences that a person wants first: what temperature did, what is left, by which model."""
-    span = "{:.0f} and {:.0f} °C".format(*thermal.blocks.range).replace("-", "−")
-    included, apart = (", jumps included", ", jumps apart") if thermal.jumps else ("", "")
-    for name, fit in thermal.fits.items():
-        effects = [effect_title(f"{PREFIXES[name]}.{effect}") for effect in fit.candidate.names]
-        yield (
-            f"The {name}'s output at rest moves by {_size(name, fit.before)} rms between {span}. "
-            f"With {listed(effects) if effects else 'no effect'} modelled, {_size(name, fit.after)} remain"
-            f"{included}, {_size(name, fit.candidate.held.rms)} on {_folds(thermal)} left out{apart}."
-        )
-
-
-def _folds(thermal: ThermalCalibration) -> str:
+def _parts(thermal: ThermalCalibration) -> str:
+    """Return what was left out of the fit and predicted."""
     return "ramps" if len(thermal.identifiability.legs) > 3 else "stretches"
 
 
-def rms_rows(thermal: ThermalCalibration, name: str) -> tuple[str, TextRows]:
-    """Return the unit, and a row for each axis: rms over temperature, after the model, and on what was left out."""
-    (factor, unit), fit = _unit(thermal, name), thermal.fits[name]
-    sizes = factor * np.stack([fit.before, fit.after, fit.candidate.held.rms], axis=1)
-    return unit, [(axis, *map(number, row)) for axis, row in zip("xyz", sizes.tolist(), strict=True)]
+def _span(thermal: ThermalCalibration) -> str:
+    return "{:.0f} and {:.0f} °C".format(*thermal.blocks.range).replace("-", "−")
 
 
-def candidate_rows(thermal: ThermalCalibration, name: str) -> TextRows:
-    """Return rows of family, effects, rms on what was left out and score; those chosen are marked with their axes."""
+def _verdict(thermal: ThermalCalibration) -> Iterator[str]:
+    """Say what temperature did to each sensor and what remains, and whether the recordings show more than one way."""
+    jumps = ", jumps included" * bool(thermal.jumps)
+    for name, fit in thermal.fits.items():
+        moves = f"{_size(name, fit.before)} (rms) between {_span(thermal)}"
+        if fit.candidate.names:
+            after = f"with the model {_size(name, fit.after)} remain{jumps}"
+            yield f"The {name}'s output at rest moves by {moves}; {after}."
+        else:
+            yield f"The {name}'s output at rest moves by {moves}; no model of temperature improves it."
+    if all(part.apart < ENOUGH for part in thermal.identifiability.parts.values()):
+        yield (
+            "The recordings cannot separate temperature from its rate: use the calibration only where the temperature "
+            "changes as it did here."
+        )
+
+
+def _number(thermal: ThermalCalibration) -> tuple[str, str]:
+    """Return what remains of the first corrected sensor on parts left out of the fit, and what that is."""
+    corrected = [name for name, fit in thermal.fits.items() if fit.candidate.names]
+    name = [*corrected, *thermal.fits][0]
     fit = thermal.fits[name]
-    rows = []
+    before, after = (float(np.linalg.norm(held.rms)) for held in (fit.held_before, fit.candidate.held))
+    meaning = f"left of the {name}'s output, all axes together (rms), on {_parts(thermal)} that the fit did not use"
+    meaning += ", jumps apart" * bool(thermal.jumps)
+    return size(after, SENSOR_UNITS[name]), f"{meaning}: {how_much_smaller(before, after)} than without a model"
+
+
+def _band_picture(thermal: ThermalCalibration, name: str) -> Picture:
+    return Picture(
+        f"bias_{name}",
+        partial(band_figure, thermal, name),
+        f"Bias of the {name} over temperature with its band",
+        f"The {name}'s bias at steady temperature, counted from {thermal.reference:g} °C, with its 95 % band. The "
+        "level of each rest, jumps included, is taken off the dots; dots off the band, warming on one side and "
+        "cooling on the other, show a rate, a lag or a hysteresis.",
+    )
+
+
+def _remainder(thermal: ThermalCalibration) -> Table:
+    """Return rms over temperature, after the model, and on what was left out, axis by axis."""
+    rows, jumps = [], ", jumps included" * bool(thermal.jumps)
+    for name, fit in thermal.fits.items():
+        factor, unit = _unit(thermal, name)
+        sizes = factor * np.stack([fit.before, fit.after, fit.candidate.held.rms], axis=1)
+        for axis, family, row in zip("xyz", fit.families, sizes.tolist(), strict=True):
+            before, after, left_out = map(number, row)
+            after += " (not corrected)" * (family == "constant")
+            rows.append((f"{name} {axis} [{unit}]", before, after, left_out))
+    return Table(
+        ("output, rms", "over temperature", f"left by the model{jumps}", f"on {_parts(thermal)} left out"),
+        rows,
+        f"The {_parts(thermal)} left out are predicted from all other blocks, with what they show of slow noise: that "
+        "may leave less than the model alone.",
+    )
+
+
+def _model(thermal: ThermalCalibration, name: str) -> Statement:
+    """Say which effects model a sensor, and what remains on parts left out."""
+    fit = thermal.fits[name]
+    effects = [effect_title(f"{PREFIXES[name]}.{effect}") for effect in fit.candidate.names]
+    before, after = (_size(name, held.rms) for held in (fit.held_before, fit.candidate.held))
+    apart = " (jumps apart)" * bool(thermal.jumps)
+    if effects:
+        text = f"With {listed(effects)}, {after} remain on {_parts(thermal)} left out{apart}, {before} without a model."
+    else:
+        text = f"No effect of temperature improves the prediction of {_parts(thermal)} left out: {after} remain{apart}."
+    return Statement(f"Model of the {name}", text)
+
+
+def _candidates(thermal: ThermalCalibration) -> Iterator[Part]:
+    """Return the models that were tried, and a regression where the ambient temperature is known."""
+    for name in thermal.fits:
+        yield Section(sentence(name), [candidate_table(thermal, name)], 3)
+    yield (
+        "The arrow marks the simplest of those that did best: by log-likelihood on what was left out and in all, less "
+        "the information criterion's penalty, counted from the best."
+    )
+    yield from _ambient(thermal)
+
+
+def candidate_table(thermal: ThermalCalibration, name: str) -> Table:
+    """Return family, effects, rms on what was left out and score of each model; those chosen first, with their axes."""
+    fit = thermal.fits[name]
     best = np.max([candidate.scores for candidate in fit.candidates], axis=0)
-    for candidate in fit.candidates:
+    candidates = sorted(
+        fit.candidates, key=lambda one: (one.family not in fit.families, one.family != CUBIC, -one.score)
+    )
+    rows = []
+    for candidate in candidates:
         axes = [axis for axis, family in zip("xyz", fit.families, strict=True) if family == candidate.family]
-        chosen = "  " if not axes else "→ " if len(axes) == 3 else f"→ {', '.join(axes)}: "
+        chosen = "" if not axes else "→ " if len(axes) == 3 else f"→ {', '.join(axes)}: "
         title = f"{candidate.family} (as the autopilots fit it)" if candidate.family == CUBIC else candidate.family
         gap = np.sum(candidate.scores - best)
         effects = "; ".join(effect_title(f"{PREFIXES[name]}.{one}").removeprefix(f"{name} ") for one in candidate.names)
         rows.append(
             (chosen + title, effects or "none", _size(name, candidate.held.rms), f"{gap:+.1f}".replace("-", "−"))
         )
-    return rows
+    chosen_rows = range(len({*fit.families}))
+    headers = ("model", "effects kept by the information criterion", "left out, rms", "score, nats")
+    return Table(headers, rows, "", chosen_rows, brief=max(3, len(chosen_rows)))
 
 
-def effect_rows(calibration: Calibration) -> TextRows:
-    """Return rows of effects' coefficients with 95 % half-widths, three a row, and one for each inner parameter."""
+def effect_table(calibration: Calibration) -> Table:
+    """Return effects' coefficients ± 95 %, three a row, and each inner parameter, of curves the largest change."""
     rows, document = [], calibration.document()
-    for name, entry in (item for triad in calibration.triads() for item in document[triad]["effects"].items()):
-        coefficients, sigma = entry["coefficients"], entry["sigma"]
-        if len(coefficients) <= 6 and sigma is not None:
-            factor, unit = readable(entry["unit"], max(map(abs, coefficients)))
-            cells = [
-                "–" if c == s == 0 else with_interval(factor * c, factor * s)
-                for c, s in zip(coefficients, sigma, strict=True)
-            ]
-            rows += [("" if k else effect_title(name), *cells[k : k + 3], unit) for k in range(0, len(cells), 3)]
+    curves = False
+    effects = ((owner, *effect) for owner in calibration.triads() for effect in document[owner]["effects"].items())
+    for triad, name, entry in effects:
+        plain = name.partition(".")[2]
+        if plain in (LEARNED, NETWORK):
+            curves = True
+            rows.append((f"{effect_title(name)}, largest change", *_largest_change(calibration, triad, plain)))
         else:
-            rows.append((effect_title(name), "a curve,", "see the", "report", ""))
+            rows += _coefficient_rows(effect_title(name), entry)
         for key, parameter in entry["inner"].items():
             spread = parameter.get("sigma")
             value = number(parameter["value"], 4) if spread is None else with_interval(parameter["value"], spread)
             rows.append((f"  {key.replace('_', ' ')}", value, "", "", unit_text(parameter["unit"])))
-    return rows
+    low, high = (number(end) for end in calibration.data["temperature_range"])
+    caption = (
+        f"In y = gain·u + bias + effects, counted from {calibration.imu.accelerometer.temperature_reference:g} °C, ± "
+        f"half of the 95 % interval. They hold from {low} to {high} °C; beyond is extrapolation, and compensation "
+        "reports it. Gain and bias are in calibration.json."
+    )
+    if curves:
+        caption += " Of a learned curve the table has the largest change of steady bias in this range."
+    return Table(("effect", "x", "y", "z", "unit"), rows, caption)
 
 
-def words(thermal: ThermalCalibration) -> list[str]:
-    """Say what the path of temperature separates, what to record next, and what a regression would leave."""
-    return [*thermal.identifiability.words, *_ways(thermal), *_ambient(thermal)]
+def _coefficient_rows(title: str, entry: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return an effect's coefficients, three a row, with intervals where they are known."""
+    coefficients = entry["coefficients"]
+    sigma = entry["sigma"] or [0.0] * len(coefficients)
+    factor, unit = readable(entry["unit"], max(map(abs, coefficients)))
+    cells = [
+        "–" if value == spread == 0 else with_interval(factor * value, factor * spread)
+        for value, spread in zip(coefficients, sigma, strict=True)
+    ]
+    cells += [""] * (-len(cells) % 3)
+    return [("" if k else title, *cells[k : k + 3], unit) for k in range(0, len(cells), 3)]
 
 
-def _ways(thermal: ThermalCalibration) -> list[str]:
+def _largest_change(calibration: Calibration, owner: str, plain: str) -> tuple[str, ...]:
+    """Return the largest change of steady bias that an effect makes over the range, ± 95 %, by axis, and the unit."""
+    low, high = calibration.data["temperature_range"]
+    temperature = np.linspace(low, high, 101)
+    scale = np.linalg.norm(np.asarray(calibration.triads()[owner].gain), axis=1)
+    value, sigma = (values / scale for values in change(calibration, owner, (plain,), temperature))
+    rows = np.argmax(np.abs(value), axis=0), np.arange(3)
+    factor, unit = readable(SENSOR_UNITS[owner], np.max(np.abs(value)))
+    cells = zip(factor * value[rows], factor * sigma[rows], strict=True)
+    return (*(with_interval(largest, spread) for largest, spread in cells), unit)
+
+
+def _export(export: AutopilotParameters, thermal: ThermalCalibration) -> Section:
+    """Say what an autopilot's parameters lose, and how to use them."""
+    return Section(f"{export.name} parameters", [loss_words(export, thermal), Items([*map(sentence, export.notes)])])
+
+
+def _rest(thermal: ThermalCalibration) -> Iterator[Part]:
+    """Return the temperatures covered, each sensor's surface and residuals, and how it was done."""
+    covered = Picture(
+        "covered",
+        partial(covered_figure, thermal),
+        "Temperatures and rates covered",
+        "Each dot is a block of the recording. Where dots lie on one line only, temperature and its rate go together, "
+        "and their effects cannot be separated.",
+    )
+    yield Section("Temperatures covered", [covered])
+    for name in thermal.fits:
+        surface = Picture(
+            f"surface_{name}",
+            partial(surface_figure, thermal, name),
+            f"Bias of the {name} over temperature and its rate",
+            f"The {name}'s bias, counted from {thermal.reference:g} °C: the model as a surface, as far as the data go, "
+            "and the data as dots, less the level of each rest.",
+        )
+        residual = Picture(
+            f"residual_{name}",
+            partial(residual_figure, thermal, name),
+            f"Residuals of the {name}",
+            "Residuals of the model, less the level of each rest, jumps included; a slope, a curve or two colours "
+            "apart would be something it misses.",
+        )
+        yield Section(f"The {name}", [surface, residual])
+    text = (
+        f"{len(thermal.blocks)} blocks of {thermal.blocks.duration:.3g} s. The rate of temperature is the slope of a "
+        f"line through {TEMPERATURE_WINDOW:g} s (attenuates {RATE_BANDWIDTH:.2g} Hz by 29 %). Least squares with the "
+        "covariance of the noise, which ties blocks to each other: a long soak counts for no more than it contains, "
+        f"and slow bias does not pass for temperature. jaximu {thermal.software['version']}."
+    )
+    yield Section("How it was done", [text])
+
+
+def _ways(thermal: ThermalCalibration) -> list[Part]:
     """Say which ramp to run next, where the path hardly separates some effect."""
     weak = [name for name, part in thermal.identifiability.parts.items() if part.apart < ENOUGH]
     if not weak:
@@ -135,16 +307,20 @@ def _ways(thermal: ThermalCalibration) -> list[str]:
     then = options[0].parts
     if all(then[name].apart < _WORTH * now[name].apart for name in weak):
         return []
-    shares = ", ".join(
-        f"{name.replace('_', ' ')} {100 * now[name].apart:.2g} → {100 * then[name].apart:.2g} %" for name in weak
+    text = (
+        f"{sentence(options[0].text)}, with a soak at each end ({options[0].duration / 60:.0f} min), and give both "
+        "recordings to `jaximu thermal`: of the ramps tried it separates best what looks alike now."
     )
-    return [
-        f"What to record next: {options[0].text}, with a soak at each end ({options[0].duration / 60:.0f} min). It "
-        f"separates most of what looks alike now. Share of each effect that no other can imitate, now → then: {shares}."
-    ]
+    rows = [(name.replace("_", " "), *(_share(parts[name].apart) for parts in (now, then))) for name in weak]
+    shares = Table(("effect", "share that no other can imitate, now", "with that ramp"), rows)
+    return [Statement("What to record next", text, True), shares]
 
 
-def _ambient(thermal: ThermalCalibration) -> Iterator[str]:
+def _share(share: float) -> str:
+    return f"{100 * share:.2g} %" if share > _LEAST_SHARE else f"< {100 * _LEAST_SHARE:g} %"
+
+
+def _ambient(thermal: ThermalCalibration) -> Iterator[Statement]:
     """Say what a regression on the sensor's and the ambient temperature and their rates would leave, where it is known.
 
     The full quadratic of the four has 15 terms, of which an information criterion keeps some.
@@ -160,13 +336,14 @@ def _ambient(thermal: ThermalCalibration) -> Iterator[str]:
     )
     factors = {"T": blocks.temperature, "dT": blocks.rate, "To": blocks.ambient, "dTo": rate}
     for name, fit in thermal.fits.items():
-        fits = [multifactor(factors, values) for values in _added(thermal, name).T]
+        added = blocks.means[name] - fit.level.T[blocks.level]
+        fits = [multifactor(factors, values) for values in added.T]
         held, kept = np.array([rms for _, rms in fits]), max(len(terms) for terms, _ in fits)
-        yield (
-            f"The {name} by a regression on sensor and ambient temperature and their rates, at most {kept} of 15 terms "
-            f"kept: {_size(name, held)} rms on fifths left out, against {_size(name, fit.candidate.held.rms)} of the "
-            f"model above on {_folds(thermal)}."
+        text = (
+            f"At most {kept} of 15 terms kept: {_size(name, held)} rms on fifths left out, against "
+            f"{_size(name, fit.candidate.held.rms)} of the model above on {_parts(thermal)} left out."
         )
+        yield Statement(f"Regression of the {name} on sensor and ambient temperature and their rates", text)
 
 
 def loss_words(parameters: AutopilotParameters, thermal: ThermalCalibration) -> str:
@@ -185,10 +362,16 @@ def loss_words(parameters: AutopilotParameters, thermal: ThermalCalibration) -> 
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def _added(thermal: ThermalCalibration, name: str) -> np.ndarray:
-    """Return what temperature added to each block (n, 3) by the data: the output less the level of its rest, SI."""
-    fit, blocks = thermal.fits[name], thermal.blocks
-    return blocks.means[name] - fit.level.T[blocks.level]
+def residual_dots(thermal: ThermalCalibration, name: str) -> FloatArray:
+    """Return what the model leaves of each block (n, 3), SI, about its mean at each level: jumps are no residuals."""
+    residual, level = thermal.fits[name].residual, thermal.blocks.level
+    mean = np.stack([np.bincount(level, axis) / np.bincount(level) for axis in residual.T], axis=1)
+    return residual - mean[level]
+
+
+def bias_dots(thermal: ThermalCalibration, name: str) -> FloatArray:
+    """Return what temperature added to each block (n, 3), SI: the data less the level of its rest, jumps included."""
+    return thermal.fits[name].fitted + residual_dots(thermal, name)
 
 
 def _both_ways(thermal: ThermalCalibration) -> list[tuple[np.ndarray, dict[str, str]]]:
@@ -200,19 +383,31 @@ def _both_ways(thermal: ThermalCalibration) -> list[tuple[np.ndarray, dict[str, 
     return [(part, style) for part, style in parts if part.any()]
 
 
+def _within_data(thermal: ThermalCalibration, temperature: FloatArray, rates: FloatArray) -> np.ndarray:
+    """Return at which rates and temperatures (r, m) there are blocks, or blocks on either side at that temperature."""
+    blocks, margin = thermal.blocks, _BESIDE_DATA * np.ptp(rates)
+    near = np.abs(temperature[:, None] - blocks.temperature) < _BESIDE_DATA * np.ptp(temperature)
+    low = np.min(np.where(near, blocks.rate, np.inf), axis=1) - margin
+    high = np.max(np.where(near, blocks.rate, -np.inf), axis=1) + margin
+    return (low <= rates[:, None]) & (rates[:, None] <= high)
+
+
 def surface_figure(thermal: ThermalCalibration, name: str) -> Figure:
     """Draw the bias over temperature and its rate with the data on it, an axis a panel."""
     factor, unit = _unit(thermal, name)
     blocks = thermal.blocks
     figure = new_figure(4.2)
-    temperature = np.linspace(*blocks.range, 31)
-    rates = np.linspace(blocks.rate.min(), blocks.rate.max(), 15)
+    temperature = np.linspace(*blocks.range, 61)
+    rates = np.linspace(blocks.rate.min(), blocks.rate.max(), 41)
     surface = np.stack([thermal.bias(name, temperature, rate)[0] for rate in rates])  # (r, m, 3)
-    data, parts = _added(thermal, name), _both_ways(thermal)
+    surface[~_within_data(thermal, temperature, rates)] = np.nan
+    data, parts = bias_dots(thermal, name), _both_ways(thermal)
     for axis in range(3):
         panel: Any = figure.add_subplot(1, 3, axis + 1, projection="3d")
         x, y = np.meshgrid(temperature, 60 * rates)
-        panel.plot_surface(x, y, factor * surface[:, :, axis], color="#BBBBBB", alpha=0.45, linewidth=0)
+        panel.plot_surface(
+            x, y, factor * surface[:, :, axis], color="#BBBBBB", alpha=0.45, linewidth=0, rcount=61, ccount=61
+        )
         for part, style in parts:
             few = np.flatnonzero(part)[:: 1 + len(blocks) // _MOST_DOTS]
             panel.scatter(
@@ -235,7 +430,7 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
     factor, unit = _unit(thermal, name)
     temperature = np.linspace(*thermal.blocks.range, 201)
     value, sigma = thermal.bias(name, temperature)
-    data, parts = _added(thermal, name), _both_ways(thermal)
+    data, parts = bias_dots(thermal, name), _both_ways(thermal)
     figure = new_figure(3.4)
     for axis, panel in enumerate(figure.subplots(1, 3)):
         for part, style in parts:
@@ -243,7 +438,7 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
         low, high = (factor * (value + sign * Z95 * sigma)[:, axis] for sign in (-1, 1))
         panel.fill_between(temperature, low, high, color="0.5", alpha=0.35, linewidth=0)
         panel.plot(temperature, factor * value[:, axis], color="black", lw=1.1, label="steady, with 95 % band")
-        dressed(panel, f"{'xyz'[axis]} [{unit}]", xlabel="temperature [°C]")
+        dressed(panel, f"{sentence(name)} {'xyz'[axis]} [{unit}]", xlabel="temperature [°C]")
     legend(figure.axes[0])
     return figure
 
@@ -251,7 +446,7 @@ def band_figure(thermal: ThermalCalibration, name: str) -> Figure:
 def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
     """Draw what the model leaves of each block against temperature and time, up and down in two colours."""
     factor, unit = _unit(thermal, name)
-    blocks, residual = thermal.blocks, factor * thermal.fits[name].residual
+    blocks, residual = thermal.blocks, factor * residual_dots(thermal, name)
     figure, parts = new_figure(6.0), _both_ways(thermal)
     grid = figure.subplots(3, 2, sharey="row", sharex="col")
     for axis in range(3):
@@ -260,8 +455,8 @@ def residual_figure(thermal: ThermalCalibration, name: str) -> Figure:
                 panel.plot(x[part], residual[part, axis], ".", ms=3, **style)
             zero_line(panel)
             dressed(panel)
-        grid[axis][0].set_ylabel(f"{'xyz'[axis]} [{unit}]")
-    dressed(grid[0][0], "Left of the bias, by temperature")
+        grid[axis][0].set_ylabel(f"{name} {'xyz'[axis]} [{unit}]", fontsize=9)
+    dressed(grid[0][0], "Residual bias by temperature")
     dressed(grid[0][1], "by time")
     legend(grid[0][0], 2)
     grid[2][0].set_xlabel("temperature [°C]")
@@ -281,31 +476,3 @@ def covered_figure(thermal: ThermalCalibration) -> Figure:
     dressed(left, "Temperatures and rates covered", xlabel="temperature [°C]", ylabel="rate of temperature [K/min]")
     dressed(right, "Over time", xlabel="time [h]", ylabel="temperature [°C]")
     return figure
-
-
-def write_thermal(thermal: ThermalCalibration, folder: Folder, exports: Sequence[AutopilotParameters] = ()) -> Path:
-    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
-    panels = {"bias": band_figure, "surface": surface_figure, "residual": residual_figure}
-    drawn = {f"{part}_{name}": partial(draw, thermal, name) for name in thermal.fits for part, draw in panels.items()}
-    low, high = thermal.blocks.range
-    names = ", ".join(Path(source.path).name for recording in thermal.blocks.recordings for source in recording.sources)
-    return write_page(
-        folder,
-        "thermal",
-        {"covered": partial(covered_figure, thermal), **drawn},
-        title=f"Bias over temperature of {names or 'a recording'}",
-        lead=[*headline(thermal)],
-        words=words(thermal),
-        effects=effect_rows(thermal.calibration),
-        low=number(low),
-        high=number(high),
-        triads=[(name, *rms_rows(thermal, name), candidate_rows(thermal, name)) for name in thermal.fits],
-        reference=f"{thermal.reference:g}",
-        block=f"{thermal.blocks.duration:.3g}",
-        blocks=len(thermal.blocks),
-        window=f"{TEMPERATURE_WINDOW:g}",
-        bandwidth=f"{RATE_BANDWIDTH:.2g}",
-        notes=thermal.notes,
-        exports=[(export.name, loss_words(export, thermal), export.notes) for export in exports],
-        version=thermal.software["version"],
-    )

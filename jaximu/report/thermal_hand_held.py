@@ -1,9 +1,9 @@
-"""What `jaximu thermal` says and draws of poses by hand: what temperature does to bias and scale, what is left."""
+"""The page of poses by hand over temperature: what it does to bias and scale, what remains, what may still hide."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,46 +12,111 @@ from jaximu.calibration.thermal import change
 from jaximu.calibration.thermal_terms import POWERS, SCALE
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
 from jaximu.estimation.rows import TEMPERATURE
-from jaximu.ground.quantities import Z95, readable, size
+from jaximu.ground.page import Page, Part, Picture, Section, Statement, Table
+from jaximu.ground.quantities import Z95, listed, readable, size
+from jaximu.ground.quantities import change as changed
 from jaximu.ground.summary import sentence
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
 from jaximu.report.figures import AFTER, AXES, BEFORE, band, dressed, legend, legend_below, new_figure, zero_line
-from jaximu.report.html import Folder, TextRows, write_page
-from jaximu.report.thermal import effect_rows
+from jaximu.report.thermal import effect_table, files_and_next
+from jaximu.report.words import how_much_smaller
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["headline", "limit_rows", "undetermined", "write_thermal_by_hand"]
+__all__ = ["page_of"]
 
 _POWER = {name: power for power, name in enumerate(POWERS, 1)}
 
 
-def headline(thermal: HandHeldThermal) -> list[str]:
-    """Return the sentences that a person wants first: what is needed, and what it makes of each kind of error."""
-    low, high = thermal.range
-    names = ", ".join(effect_title(name) for name, *_ in thermal.steps)
-    texts = [
-        f"Poses and turns by hand between {low:.0f} and {high:.0f} °C: "
-        + (
-            f"{names} improve{'s' * (len(thermal.steps) == 1)} the prediction of parts left out."
-            if names
-            else "nothing of temperature pays on parts left out; what may still hide is below."
+def page_of(thermal: HandHeldThermal) -> Page:
+    """Return which effects of temperature are needed, the errors without and with them, and what may still hide."""
+    files, command = files_and_next(thermal.experiment.recordings)
+    value, meaning = _number(thermal)
+    return Page(
+        f"Bias and scale over temperature of {files}",
+        _verdict(thermal),
+        value,
+        meaning,
+        (*_first(thermal),),
+        partial(_rest, thermal),
+        [*map(sentence, thermal.notes), f"Written by jaximu {thermal.software['version']}."],
+        command,
+    )
+
+
+def _verdict(thermal: HandHeldThermal) -> list[str]:
+    """Say which effects of temperature improve the prediction of parts left out."""
+    between = "between {:.0f} and {:.0f} °C".format(*thermal.range).replace("-", "−")
+    titles = [CATALOGUE[name].english for name, *_ in thermal.steps]
+    if not titles:
+        return [
+            f"Poses and turns by hand {between} show no effect of temperature: none improves the prediction of parts "
+            "left out. What may still hide is below."
+        ]
+    improve = f"improve{'s' * (len(titles) == 1)} the prediction of parts left out"
+    return [f"Temperature matters {between}: {listed(titles)} {improve}."]
+
+
+def _sizes(thermal: HandHeldThermal) -> list[tuple[str, float, float, str]]:
+    """Return each kind of error in words, its rms without and with the effects, and the unit."""
+    before, after = (thermal.experiment.real.rms(state.conditions) for state in (thermal.base, thermal.state))
+    kinds = thermal.experiment.real.kinds
+    return [(kind.words, before[kind.name][0], after[kind.name][0], kind.unit) for kind in kinds]
+
+
+def _number(thermal: HandHeldThermal) -> tuple[str, str]:
+    """Return the first kind of error with the effects, and what it is."""
+    _, before, after, unit = _sizes(thermal)[0]
+    if not thermal.steps:
+        return size(after, unit), "error against gravity at rest, rms over all temperatures"
+    smaller = f"{how_much_smaller(before, after)} than with one bias and scale for all temperatures"
+    return size(after, unit), f"error against gravity at rest with these effects (rms), {smaller}"
+
+
+def _first(thermal: HandHeldThermal) -> Iterator[Part]:
+    """Return bias and scale over temperature, the errors, the effects and what may still hide."""
+    reference = f"{thermal.calibration.imu.accelerometer.temperature_reference:g} °C"
+    if _changed(thermal):
+        yield Picture(
+            "over_temperature",
+            partial(_change_figure, thermal),
+            "Bias and scale over temperature",
+            f"Counted from {reference}, with 95 % bands. What is not drawn was not needed.",
         )
-    ]
-    if names:
-        before, after = (thermal.experiment.real.rms(state.conditions) for state in (thermal.base, thermal.state))
-        for kind in thermal.experiment.real.kinds:
-            texts.append(
-                f"{sentence(kind.words)}: {size(before[kind.name][0], kind.unit)} rms with one bias and scale for all "
-                f"temperatures, {size(after[kind.name][0], kind.unit)} with these effects."
-            )
-    return texts
+    yield Picture(
+        "errors",
+        partial(_error_figure, thermal),
+        "Errors of poses and turns over temperature",
+        "Each dot is a pose or a turn: how far gravity is from its size and, carried over a turn by the gyroscope, "
+        "from its direction, and what the gyroscope shows at rest. What goes with temperature the model lacks.",
+    )
+    if thermal.steps:
+        rows = [(sentence(words), changed(before, after, unit)) for words, before, after, unit in _sizes(thermal)]
+        yield Table(("error, rms", "one bias and scale → with the effects"), rows)
+        yield Section("Effects", [effect_table(thermal.calibration)])
+    yield Section("What may still hide", [*_limits(thermal)])
 
 
-def limit_rows(thermal: HandHeldThermal) -> TextRows:
+def _limits(thermal: HandHeldThermal) -> Iterator[Part]:
+    """Return the smallest effects that would have been found, and those that the recordings do not determine."""
+    if thermal.limits:
+        yield Table(
+            ("effect", "size that could hide", "at the end of the range"),
+            _limit_rows(thermal),
+            "Effects that were tested and are not needed. Larger ones would have been found nine times in ten.",
+        )
+    for name, why in thermal.undetermined.items():
+        yield Statement(sentence(effect_title(name)), f"Not determined: {why}.", True)
+    yield (
+        "The rate of temperature, a lag and a hysteresis are not tested in poses by hand: record ramps at rest for "
+        "them."
+    )
+
+
+def _limit_rows(thermal: HandHeldThermal) -> list[tuple[str, ...]]:
     """Return by effect that was not taken in: its detection limit, and what that is at the end of the range.
 
     Of a scale or a misalignment in percent.
@@ -66,11 +131,6 @@ def limit_rows(thermal: HandHeldThermal) -> TextRows:
         shown = size(most, SENSOR_UNITS[kind.owner], 2) if kind.plain in POWERS else size(100 * most, "%", 2)
         rows.append((kind.title, size(value, unit, 2), shown))
     return rows
-
-
-def undetermined(thermal: HandHeldThermal) -> list[str]:
-    """Say which effects the recordings do not tell, and why."""
-    return [f"{sentence(effect_title(name))} is not determined: {why}." for name, why in thermal.undetermined.items()]
 
 
 def _changed(thermal: HandHeldThermal) -> list[tuple[str, str, tuple[str, ...], float]]:
@@ -132,26 +192,12 @@ def _error_figure(thermal: HandHeldThermal) -> Figure:
     return figure
 
 
-def write_thermal_by_hand(thermal: HandHeldThermal, folder: Folder) -> Path:
-    """Write pictures and `report.html`, whose path is returned. Raises `InputError` where they cannot be written."""
-    drawn = {"errors": partial(_error_figure, thermal)}
-    if _changed(thermal):
-        drawn["over_temperature"] = partial(_change_figure, thermal)
-    names = ", ".join(
-        Path(source.path).name for recording in thermal.experiment.recordings for source in recording.sources
-    )
-    return write_page(
-        folder,
-        "thermal_hand_held",
-        drawn,
-        title=f"Bias and scale over temperature of {names or 'a recording'}",
-        lead=headline(thermal),
-        effects=effect_rows(thermal.calibration),
-        limits=limit_rows(thermal),
-        gains=[(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in thermal.steps],
-        undetermined=undetermined(thermal),
-        low=f"{thermal.range[0]:.1f}",
-        high=f"{thermal.range[1]:.1f}",
-        reference=f"{thermal.calibration.imu.accelerometer.temperature_reference:g}",
-        notes=[*thermal.notes, f"written by jaximu {thermal.software['version']}."],
-    )
+def _rest(thermal: HandHeldThermal) -> Iterator[Part]:
+    """Return what each effect gained."""
+    if thermal.steps:
+        rows = [(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in thermal.steps]
+        caption = (
+            "In the order in which they were taken in: χ² of the score test when tested, and log-likelihood gained on "
+            "parts left out."
+        )
+        yield Section("What each effect gained", [Table(("effect", "χ²", "gain, nats"), rows, caption)])
