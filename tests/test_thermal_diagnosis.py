@@ -53,6 +53,10 @@ def test_a_lag_is_named_beyond_any_smooth_function_of_temperature(lagging):
     assert max(extended.excess.values()) < 0.5
     assert any("smooth function of temperature" in note for note in lagging.notes)
     assert lagging.gain is not None and lagging.gain.log_likelihood > 0
+    # what the page shows is what is beyond the smooth function, as is what was left out
+    shown = lagging.experiment.errors(lagging.extended)
+    for errors, (left_out, _) in zip(shown, lagging.gain.after.rms.values(), strict=True):
+        assert np.sqrt(np.mean(errors**2)) < 1.5 * left_out
 
 
 def test_where_only_smooth_functions_of_temperature_show_the_calibration_loads(tmp_path):
