@@ -18,9 +18,9 @@ from jaximu.ground.document import SOFTWARE, Document, damage, read_document
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.page import Result
+from jaximu.ground.parameters import Parameter, ParameterTable
 from jaximu.ground.quantities import unit_text
 from jaximu.ground.reexport import later
-from jaximu.ground.summary import Parameter, ParameterTable
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu, Triad

@@ -12,8 +12,7 @@ from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import UNDETERMINED
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
-from jaximu.ground.quantities import Z95, number
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, number, sentence
 
 __all__ = ["refuse_undetermined", "relative_covariance", "require_determined", "require_solved", "require_spanning"]
 

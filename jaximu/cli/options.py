@@ -62,7 +62,6 @@ __all__ = [
     "Traced",
     "beginning",
     "draw",
-    "drawn",
     "effects_of",
     "field_strength",
     "is_toml",
@@ -451,11 +450,6 @@ def draw(write: Callable[[], Path | Iterable[Path]], page: Path) -> list[Path]:
     except Exception as error:
         files = later("report.html", "write_failure")(page, error)
     return [files] if isinstance(files, Path) else [*files]
-
-
-def drawn(module: str, name: str, *objects: Any) -> Callable[[Path], Any]:
-    """Return what writes the report of some objects into a folder; its module of `report` is loaded only then."""
-    return lambda folder: later(f"report.{module}", name)(*objects, folder)
 
 
 def print_json(value: Any) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS, Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import sentence
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.columns.names import COUNTS_ADVICE

@@ -32,8 +32,7 @@ from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.page import Result
-from jaximu.ground.quantities import Z95, listed, probability, size, with_interval, with_intervals
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, listed, probability, sentence, size, with_interval, with_intervals
 from jaximu.mistakes import prepare, prepared
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect, register

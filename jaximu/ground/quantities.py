@@ -18,6 +18,7 @@ __all__ = [
     "probability",
     "raised",
     "readable",
+    "sentence",
     "size",
     "unit_text",
     "with_interval",
@@ -141,6 +142,11 @@ def with_intervals(values: Collection[float], sigmas: Collection[float], unit: s
 def counted(count: int, noun: str) -> str:
     """Return how many there are of what, in the singular or the plural."""
     return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def sentence(text: str) -> str:
+    """Return the text with a capital at its start, unless it starts with the name of a file or an identifier."""
+    return text if re.match(r"\S*[._/\\]\w", text) else text[:1].upper() + text[1:]
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:

@@ -19,8 +19,8 @@ from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.page import Result
+from jaximu.ground.parameters import data_frame
 from jaximu.ground.reexport import later
-from jaximu.ground.summary import data_frame
 from jaximu.ground.tracing import is_traced
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, STANDARD_GRAVITY
 from jaximu.recordings.alignment import CORRELATED, Turning, turning, turns_backwards

@@ -15,8 +15,7 @@ import numpy as np
 from jaximu._version import __version__
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Code, Page, Part, Picture, Section, Statement, Table
-from jaximu.ground.quantities import listed, number, unit_text
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import listed, number, sentence, unit_text
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
 from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
 from jaximu.noise.analysis import NoiseAnalysis

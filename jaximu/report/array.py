@@ -13,8 +13,7 @@ import scipy
 
 from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.ground.page import Page, Picture, Statement, Table
-from jaximu.ground.quantities import number, with_interval
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import number, sentence, with_interval
 from jaximu.report.figures import AXES, dressed, new_figure
 
 if TYPE_CHECKING:

@@ -10,8 +10,7 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.ground.page import Page, Picture, Statement
-from jaximu.ground.quantities import Z95, unit_text
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, sentence, unit_text
 from jaximu.model.mounting import Mounting
 from jaximu.report.calibration import calibration_page
 from jaximu.report.figures import AFTER, BEFORE, dressed, legend, new_figure, zero_line

@@ -14,13 +14,11 @@ import numpy as np
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Page, Part, Picture, Section, Statement, Table
-from jaximu.ground.quantities import Z95, counted, listed, number, size, unit_text
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, counted, listed, number, sentence, size, unit_text
 from jaximu.planning.budget import Budget, Goal, Trials
 from jaximu.planning.setup_errors import ErrorSource
 from jaximu.report import figures
 from jaximu.report.figures import LEAST_SHARE, OTHERS, PALETTE, dressed, legend_below
-from jaximu.report.html import TextRows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -186,7 +184,7 @@ def _next(budget: Budget) -> str:
     return "`jaximu turntable LOG --reference schedule.csv -o RESULTS` calibrates a session on this set-up."
 
 
-def parameter_rows(budget: Budget) -> TextRows:
+def parameter_rows(budget: Budget) -> list[tuple[str, ...]]:
     """Return each parameter in words, its 1σ, what it is made of (dominant first), and its 1σ by Monte Carlo."""
     part, total, off = shares(budget), budget.total, budget.nonlinear()
     rows = []
@@ -204,7 +202,7 @@ def parameter_rows(budget: Budget) -> TextRows:
     return rows
 
 
-def source_rows(budget: Budget) -> TextRows:
+def source_rows(budget: Budget) -> list[tuple[str, ...]]:
     """Return each source, dominant first: in words, its size, its mean share, and the parameter it has most of."""
     part, known = shares(budget), np.flatnonzero(budget.determined)
     rows = []

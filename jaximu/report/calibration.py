@@ -13,8 +13,8 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.data.stations import station_errors
 from jaximu.ground.page import Code, Page, Part, Picture, Section, Statement, Table
-from jaximu.ground.quantities import Z95, change, counted, size, with_interval
-from jaximu.ground.summary import Parameter, sentence
+from jaximu.ground.parameters import Parameter
+from jaximu.ground.quantities import Z95, change, counted, sentence, size, with_interval
 from jaximu.report import figures, tables, words
 from jaximu.report.evidence import evidence
 

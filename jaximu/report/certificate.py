@@ -17,8 +17,7 @@ from jaximu.acceptance.words import amount, between, in_shown_unit, spoken
 from jaximu.calibration import Calibration
 from jaximu.ground.document import digest
 from jaximu.ground.page import Page, Part, Section, Statement, Table
-from jaximu.ground.quantities import counted, unit_text
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import counted, sentence, unit_text
 from jaximu.recordings.trace import missing
 from jaximu.report.tables import provenance
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Code, Items, Page, Part, Picture, Section, Statement, Table
-from jaximu.ground.quantities import Z95, number
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, number, sentence
 from jaximu.navigation.consequences import Consequences, position
 from jaximu.navigation.estimator_noise import EstimatorNoise
 from jaximu.report import figures

@@ -20,8 +20,7 @@ from jaximu.estimation.rows import TIME
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Page, Part, Picture, Section, Statement, Table
-from jaximu.ground.quantities import Z95, change, listed, number, probability, readable, size, with_interval
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, change, listed, number, probability, readable, sentence, size, with_interval
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaximu.ground.page import Page, Statement, Table
-from jaximu.ground.quantities import number
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import number, sentence
 from jaximu.navigation.estimator_noise import EstimatorNoise, TriadNoise
 
 __all__ = ["page_of", "statements"]

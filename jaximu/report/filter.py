@@ -12,8 +12,7 @@ from jaximu.calibration import Calibration, History
 from jaximu.estimation.uncertainty import label
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Page, Picture, Statement
-from jaximu.ground.quantities import Z95, number
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, number, sentence
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.report.attitude import mounting_words

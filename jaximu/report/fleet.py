@@ -15,12 +15,11 @@ from jaximu.estimation.uncertainty import describe
 from jaximu.fleets.population import Difference, Fleet, Population
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Items, Page, Part, Picture, Section, Table
-from jaximu.ground.quantities import counted, number, probability, with_interval
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import counted, number, probability, sentence, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
 from jaximu.report.figures import dressed
-from jaximu.report.html import MOST_ROWS
+from jaximu.report.tables import MOST_ROWS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,7 +7,7 @@ import hashlib
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -18,9 +18,6 @@ from markupsafe import Markup, escape
 from jaximu.ground.atomic import write_files, write_folder
 from jaximu.ground.errors import worded
 from jaximu.ground.page import Items, Page, Part, Picture, Result, Section
-from jaximu.ground.quantities import probability
-from jaximu.ground.reexport import later
-from jaximu.ground.summary import sentence
 
 if TYPE_CHECKING:
     import jinja2
@@ -28,62 +25,12 @@ if TYPE_CHECKING:
 
     from jaximu.report.vector import Drawing
 
-    Drawn = Mapping[str, Callable[[], Figure]]
-    """Figures by name, each drawn when its turn comes: one that fails takes nothing else with it."""
+__all__ = ["encoded", "fragment", "write_failure", "write_report"]
 
-__all__ = [
-    "MOST_ROWS",
-    "Folder",
-    "TextRows",
-    "page",
-    "write_failure",
-    "write_page",
-    "write_report",
-]
-
-
-Folder = str | os.PathLike[str]
-"""Where the files of a report go; made if it is missing."""
-TextRows = list[tuple[str, ...]]
-"""The rows of a table, as texts."""
 _LONG_WORD = 40  # letters from which on a cell's word is broken
-MOST_ROWS = 50
-"""Rows of a table that may grow with the number of units: what is beyond is counted."""
 
 
-def write_page(folder: Folder, template: str, drawn: Drawn, **values: Any) -> Path:
-    """Write a page as `report.html` and its pictures as PNGs into a folder, all or none; return the page's path.
-
-    Raises `InputError` where the folder cannot be made or written to.
-    """
-    text, pictures = page(template, drawn, **values)
-    return write_folder(folder, pictures | {"report.html": text})[-1]
-
-
-def page(template: str, drawn: Drawn, *, notes: Sequence[str] = (), **values: Any) -> tuple[bytes, dict[str, bytes]]:
-    """Return a page from one of this folder's templates, and its pictures by the names of their files.
-
-    The page has no folders of the machine that made it, and its tables say in each cell what its column is. A
-    template shows `title`, `lead` (a sentence or several), `number` with its `meaning`, and `notes` as all pages do.
-    In place of a figure that cannot be drawn the page says so.
-    """
-    pictures: dict[str, bytes] = {}
-    sources: dict[str, Drawing | str] = {}
-    for name, draw in drawn.items():
-        try:
-            sources[name], pictures[f"{name}.png"] = _drawn(draw(), name)
-        except Exception as error:
-            sources[name] = _failure(f"The figure “{name}”", error)
-    text = (
-        _environment()
-        .get_template(f"{template}.html.jinja")
-        .render(pictures=sources, notes=[sentence(note) for note in notes], **values)
-    )
-    text = _TABLE.sub(_labelled, _FOLDERS.sub("", text))
-    return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
-
-
-def write_report(result: Result | Page, folder: Folder) -> Path:
+def write_report(result: Result | Page, folder: str | os.PathLike[str]) -> Path:
     """Write a result's page as `report.html` and its pictures as PNGs into `folder`, which is made if it is missing.
 
     **Returns:** the path of `report.html`. Everything is drawn before anything is written, and each file is written
@@ -195,25 +142,7 @@ def _environment() -> jinja2.Environment:
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     }
     made.filters |= {"inline": _inline, "kind_of_cell": _kind_of_cell, "anchor": _anchor}
-    made.globals |= {
-        "title_of": lambda name: later("mistakes.titles", "effect_title")(name),
-        "probability": probability,
-        "sentence": sentence,
-    }
     return made
 
 
 _FOLDERS = re.compile(r"""(?<=[\s>("'])(?:/|[A-Za-z]:[\\/])(?:[^\s<>"'/\\;&]+[/\\])+(?=[^\s<>])""")
-_TABLE = re.compile(r'<div class="scroll"><table.*?</table>', re.DOTALL)
-
-
-def _labelled(match: re.Match[str]) -> str:
-    """Write into each cell of a table which column it is in: a telephone shows rows one below the other."""
-    head, separator, body = match[0].partition("</thead>")
-    labels = [re.sub("<[^>]*>", "", label) for label in re.findall(r"<th\b[^>]*>(.*?)</th>", head, re.DOTALL)]
-
-    def row(line: re.Match[str]) -> str:
-        cells = iter(labels)
-        return re.sub(r"<t([dh])\b", lambda cell: f'<t{cell[1]} data-label="{next(cells, "")}"', line[0])
-
-    return head + separator + (re.sub(r"<tr\b.*?</tr>", row, body, flags=re.DOTALL) if labels and separator else body)

@@ -16,12 +16,11 @@ from jaximu.acceptance.line import FollowedQuantity, Line
 from jaximu.acceptance.statistics import Chart
 from jaximu.acceptance.words import amount, between, in_shown_unit, si_unit, spoken
 from jaximu.ground.page import Page, Picture, Section, Table
-from jaximu.ground.quantities import Z95, counted, number, with_interval
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, counted, number, sentence, with_interval
 from jaximu.report import figures
 from jaximu.report.certificate import item_row
 from jaximu.report.figures import dressed
-from jaximu.report.html import MOST_ROWS
+from jaximu.report.tables import MOST_ROWS
 from jaximu.report.vector import named
 
 if TYPE_CHECKING:

@@ -10,8 +10,7 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.ground.page import Page, Picture, Statement
-from jaximu.ground.quantities import Z95, number
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, number, sentence
 from jaximu.report.calibration import calibration_page
 from jaximu.report.figures import dressed, hemispheres, legend, new_figure
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.ground.page import Page, Table
-from jaximu.ground.quantities import number, readable, size
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import number, readable, sentence, size
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_UNITS
 
 if TYPE_CHECKING:

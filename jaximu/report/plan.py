@@ -15,8 +15,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe, spoken_amount
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Page, Picture, Section, Statement, Table
-from jaximu.ground.quantities import Z95, number, plain
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, number, plain, sentence
 from jaximu.planning import Proposal
 from jaximu.report import figures
 

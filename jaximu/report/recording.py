@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.page import Code, Items, Page, Part, Picture, Section, Table
-from jaximu.ground.quantities import listed, number, unit_text
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import listed, number, sentence, unit_text
 from jaximu.ground.units import SENSORS
 from jaximu.recordings.recording import Recording, Signal
 

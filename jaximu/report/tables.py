@@ -19,7 +19,7 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
 
-__all__ = ["equations", "provenance", "rows", "short_name", "snippet"]
+__all__ = ["MOST_ROWS", "equations", "provenance", "rows", "short_name", "snippet"]
 
 
 class _Input(NamedTuple):
@@ -38,6 +38,8 @@ _INPUTS = {
     "gyroscope": _Input("ω", "angular rate", "rad/s", "rad/s", "w", "y_gyro"),
     "magnetometer": _Input("h", "magnetic field", "µT", "uT", "h", "y_mag"),
 }
+MOST_ROWS = 50
+"""Rows of a table that may grow with the number of units: what is beyond is counted."""
 _MILLI_G = 1e-3 * STANDARD_GRAVITY
 
 

@@ -20,8 +20,7 @@ from jaximu.data.rest_blocks import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.estimation.track import TEMPERATURE_WINDOW
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Items, Page, Part, Picture, Section, Statement, Table
-from jaximu.ground.quantities import Z95, listed, number, readable, size, unit_text, with_interval
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, listed, number, readable, sentence, size, unit_text, with_interval
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.planning.ramps import next_ramps

@@ -13,9 +13,8 @@ from jaximu.calibration.thermal_terms import POWERS, SCALE
 from jaximu.diagnosis.thermal_hand_held import HandHeldThermal
 from jaximu.estimation.rows import TEMPERATURE
 from jaximu.ground.page import Page, Part, Picture, Section, Statement, Table
-from jaximu.ground.quantities import Z95, listed, readable, size
+from jaximu.ground.quantities import Z95, listed, readable, sentence, size
 from jaximu.ground.quantities import change as changed
-from jaximu.ground.summary import sentence
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE

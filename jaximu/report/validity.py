@@ -15,8 +15,7 @@ from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.validity import Shift
 from jaximu.estimation.rows import TIME
 from jaximu.ground.page import Page, Part, Picture, Statement, Table
-from jaximu.ground.quantities import change, listed, number, probability, with_interval
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import change, listed, number, probability, sentence, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.report import figures
 from jaximu.report.figures import legend, zero_line

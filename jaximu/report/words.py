@@ -10,8 +10,7 @@ from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import WeakDirection
 from jaximu.ground.page import Statement
-from jaximu.ground.quantities import Z95, listed, number, size
-from jaximu.ground.summary import sentence
+from jaximu.ground.quantities import Z95, listed, number, sentence, size
 from jaximu.report.evidence import evidence, largest_gap
 
 __all__ = [

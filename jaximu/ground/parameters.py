@@ -1,18 +1,15 @@
-"""What an object says of itself in Python: `summary()` as text and as HTML, and parameters as a table by name."""
+"""Fitted numbers by name, as a table that prints itself."""
 
 from __future__ import annotations
 
 import difflib
-import html
-import re
-import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.ground.errors import InputError, worded
+from jaximu.ground.errors import InputError
 from jaximu.ground.page import Table
 from jaximu.ground.quantities import Z95, readable, with_interval
 
@@ -20,89 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]
     import pyarrow as pa
 
-__all__ = ["Block", "Described", "Parameter", "ParameterTable", "Summary", "data_frame", "sentence"]
-
-_WIDTH = 100
-
-
-def sentence(text: str) -> str:
-    """Return the text with a capital at its start, unless it starts with the name of a file or an identifier."""
-    return text if re.match(r"\S*[._/\\]\w", text) else text[:1].upper() + text[1:]
-
-
-@dataclass(frozen=True)
-class Block:
-    """A table of texts under headers."""
-
-    headers: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-    def text(self) -> str:
-        """Return the table in columns, the first to the left and the others to the right."""
-        table = [self.headers, *self.rows] if any(self.headers) else list(self.rows)
-        first, *others = (max(map(len, column)) for column in zip(*table, strict=True))
-        lines = ["  ".join([head.ljust(first), *map(str.rjust, cells, others)]).rstrip() for head, *cells in table]
-        if any(self.headers):
-            lines.insert(1, "─" * (first + sum(width + 2 for width in others)))
-        return "\n".join(lines)
-
-    def html(self) -> str:
-        """Return the table as HTML."""
-
-        def row(cells: Iterable[str], tag: str) -> str:
-            return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-        rows = "".join(row(cells, "td") for cells in self.rows)
-        return f"<table><thead>{row(self.headers, 'th')}</thead><tbody>{rows}</tbody></table>"
-
-
-@dataclass(frozen=True)
-class Summary:
-    """A title, the verdict in sentences, a table, and notes below it: printed as text, in a notebook as HTML."""
-
-    title: str
-    verdict: tuple[str, ...]
-    table: Block | None = None
-    notes: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        parts = [self.title, "═" * min(len(self.title), _WIDTH)]
-        parts += map(_filled, self.verdict)
-        if self.table is not None:
-            parts += ["", self.table.text()]
-        if self.notes:
-            parts += ["", *(_filled(note, "- ") for note in self.notes)]
-        return "\n".join(parts)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        parts = [f"<p><b>{html.escape(self.title)}</b></p>"]
-        parts += [f"<p>{html.escape(text)}</p>" for text in self.verdict]
-        if self.table is not None:
-            parts.append(self.table.html())
-        if self.notes:
-            parts.append(f"<ul>{''.join(f'<li>{html.escape(note)}</li>' for note in self.notes)}</ul>")
-        return worded("\n".join(parts))
-
-
-def _filled(text: str, start: str = "") -> str:
-    return textwrap.fill(start + worded(text), _WIDTH, subsequent_indent="  ")
-
-
-class Described:
-    """Something with a `summary()`: a short `repr`, and the summary in a notebook."""
-
-    def summary(self) -> Summary:
-        """Return what a person wants to know of this, as text that prints itself and as HTML."""
-        raise NotImplementedError
-
-    def __repr__(self) -> str:
-        summary = self.summary()
-        return f"<{type(self).__name__}: {'. '.join((summary.title, *summary.verdict[:1]))}>"
-
-    def _repr_html_(self) -> str:
-        return self.summary()._repr_html_()
+__all__ = ["Parameter", "ParameterTable", "data_frame"]
 
 
 @dataclass(frozen=True)
