@@ -63,23 +63,14 @@ def run(
             f"--method {method}": method.startswith("two-step"),
         }
         unusable = [name for name, stated in meant.items() if stated]
-        calibration = replace(_calibrated_means(logs, log, gravity, loss, unusable), trace=trace)
-        results.present(calibration.summary, calibration=calibration)
-        return
-    recordings, known = log.read_unit(logs, gravity, noise)
-    with progress("calibrating"):
-        from jaximu.calibration import calibrate
+        calibration = _calibrated_means(logs, log, gravity, loss, unusable)
+    else:
+        recordings, known = log.read_unit(logs, gravity, noise)
+        choices = {"static": known, "segmentation": poses.value(), "method": method, "loss": loss, "repair": repair}
+        with progress("calibrating"):
+            from jaximu.calibration import calibrate
 
-        calibration = calibrate(
-            recordings,
-            gravity,
-            static=known,
-            segmentation=poses.value(),
-            method=method,
-            loss=loss,
-            repair=repair,
-            **options.effects_of(effect),
-        )
+            calibration = calibrate(recordings, gravity, **choices, **options.effects_of(effect))
     calibration = replace(calibration, trace=trace)
     results.present(calibration.summary, calibration=calibration)
 

@@ -92,9 +92,9 @@ def run(
         result, trace=trace, diagnosis=diagnosis.document() | ({} if shift is None else {"check": shift.document()})
     )
 
-    asked = [part.text() for part in filter(None, (shift, *diagnosis.causes))]
+    remarks = [part.text() for part in filter(None, (shift, *diagnosis.causes))]
     page_of = later("report.magnetometer", "page_of")
-    results.present(lambda: page_of(result, measurement, heading, asked), calibration=result)
+    results.present(lambda: page_of(result, measurement, heading, remarks), calibration=result)
 
 
 def _strength(

@@ -115,6 +115,16 @@ class Page:
     next: str = ""
     caution: bool = False
 
+    def summary(self) -> Page:
+        """Return the page itself: a function that takes a result takes its page, too."""
+        return self
+
+    def section(self) -> Section:
+        """Return the first screen as one section."""
+        number = [f"{self.number}: {self.meaning}"] if self.number else []
+        notes = [Items(self.notes)] if self.notes else []
+        return Section(self.title, (*self.verdict, *number, *self.first, *notes), 4)
+
     def __str__(self) -> str:
         return later("report.terminal", "text")(self)
 

@@ -217,8 +217,8 @@ def _next(diagnosis: Diagnosis, files: list[str]) -> str:
     repairs = dict.fromkeys(finding.repair for finding in _standing(diagnosis) if finding.repair)
     by_hand = diagnosis.experiment.data.by_hand  # else the command has more arguments
     if repairs and by_hand:
-        again = f"`jaximu diagnose {' '.join([*files, *repairs])} -o RESULTS`"
-        return f"{diagnosis.suggestion} {again} repeats the diagnosis."
+        command = f"`jaximu diagnose {' '.join([*files, *repairs])} -o RESULTS`"
+        return f"{diagnosis.suggestion} {command} repeats the diagnosis."
     if diagnosis.suggestion:
         together = f"`jaximu diagnose {' '.join(files)} NEW_LOG -o RESULTS` diagnoses both recordings together."
         recorded = by_hand and " record" in diagnosis.suggestion and not _standing(diagnosis)

@@ -17,7 +17,7 @@ from markupsafe import Markup, escape
 
 from jaximu.ground.atomic import write_files, write_folder
 from jaximu.ground.errors import worded
-from jaximu.ground.page import Items, Page, Part, Picture, Result, Section
+from jaximu.ground.page import Page, Part, Picture, Result, Section
 
 if TYPE_CHECKING:
     import jinja2
@@ -36,7 +36,7 @@ def write_report(result: Result | Page, folder: str | os.PathLike[str]) -> Path:
     **Returns:** the path of `report.html`. Everything is drawn before anything is written, and each file is written
     whole or not at all. Raises `InputError` where the folder cannot be made or written to.
     """
-    text, pictures = encoded(result.summary() if isinstance(result, Result) else result)
+    text, pictures = encoded(result.summary())
     return write_folder(folder, pictures | {"report.html": text})[-1]
 
 
@@ -68,21 +68,17 @@ def _drawn(figure: Figure, name: str) -> tuple[Drawing, bytes]:
 
 def _pictures(parts: Iterable[Part]) -> Iterator[Picture]:
     for part in parts:
-        if isinstance(part, Picture):
-            yield part
-        elif isinstance(part, Section):
-            yield from _pictures(part.parts)
+        match part:
+            case Picture():
+                yield part
+            case Section(parts=inner):
+                yield from _pictures(inner)
 
 
 def fragment(content: Page | Part) -> str:
     """Return a page's first screen, or a part of one, as HTML for a notebook, without pictures."""
-    parts = [content]
-    if isinstance(content, Page):
-        number = [f"{content.number}: {content.meaning}"] if content.number else []
-        notes = [Items(content.notes)] if content.notes else []
-        parts = [Section(content.title, (*content.verdict, *number, *content.first, *notes), level=4)]
     macros: Any = _environment().get_template("page_parts.html.jinja").module
-    return worded(str(macros.all(parts, {})))
+    return worded(str(macros.all([content.section() if isinstance(content, Page) else content], {})))
 
 
 def _inline(text: str) -> Markup:

@@ -119,9 +119,9 @@ def _along(direction: Sequence[float]) -> str:
 
 
 def page_of(
-    calibration: Calibration, measurement: MagneticField, heading: Heading | None, asked: Sequence[str] = ()
+    calibration: Calibration, measurement: MagneticField, heading: Heading | None, remarks: Sequence[str] = ()
 ) -> Page:
-    """Return the page of a magnetometer's calibration; `asked`: what a check and a diagnosis say, in sentences."""
+    """Return the page of a magnetometer's calibration; `remarks`: what a check and a diagnosis say, in sentences."""
     caption = (
         "Left and middle: the directions that the field had, in the unit's axes, the two halves of the sphere seen "
         "along z; colours show how far the strength is off after calibration."
@@ -133,7 +133,7 @@ def page_of(
     )
     verdict, number, meaning = _lead(calibration)
     trust = statements(calibration)
-    return calibration_page(calibration, [picture], trust, tuple, (verdict, *asked), (number, meaning))
+    return calibration_page(calibration, [picture], trust, tuple, (verdict, *remarks), (number, meaning))
 
 
 def _figure(calibration: Calibration, measurement: MagneticField, heading: Heading | None) -> Figure:

@@ -6,7 +6,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.units import Unit, find_unit, unit
 from jaximu.recordings.columns.guess import advise
 from jaximu.recordings.columns.names import GROUPS, QUANTITIES, TIME, Column, header_columns, parse_columns
-from jaximu.recordings.columns.table import Table
+from jaximu.recordings.columns.table import LogTable
 
 __all__ = ["choose_columns", "choose_pair", "column_units"]
 
@@ -14,7 +14,7 @@ _LISTED = 30
 
 
 def column_units(
-    table: Table, columns: Sequence[Column], option: str = "--columns", sensor: str | None = None
+    table: LogTable, columns: Sequence[Column], option: str = "--columns", sensor: str | None = None
 ) -> dict[str, tuple[int, Unit]]:
     """The used columns of a table by canonical name: their index and unit.
 
@@ -51,7 +51,7 @@ def column_units(
 
 
 def choose_columns(
-    table: Table, columns: str | Sequence[str] | None, sensor: str = "accel", option: str = "--columns"
+    table: LogTable, columns: str | Sequence[str] | None, sensor: str = "accel", option: str = "--columns"
 ) -> tuple[Column, ...]:
     """The columns of a file that must hold `sensor`: from `columns` (naming all columns), else from its header."""
     if columns is not None:
@@ -65,14 +65,14 @@ def choose_columns(
     return named
 
 
-def _wrong_count(table: Table, count: int, option: str) -> InputError:
+def _wrong_count(table: LogTable, count: int, option: str) -> InputError:
     return InputError(
         f"{table.path}: {option} names {count} columns, the file has {len(table.columns)}; "
         f"name each one, for example {advise(table).sentence(option)}"
     )
 
 
-def _unnamed(table: Table, sensor: str, option: str) -> InputError:
+def _unnamed(table: LogTable, sensor: str, option: str) -> InputError:
     """The error for a file in which nobody has named the columns of a sensor that it must hold."""
     needed = ", ".join(GROUPS[sensor].columns)
     if table.names:
@@ -88,7 +88,7 @@ def _unnamed(table: Table, sensor: str, option: str) -> InputError:
 
 
 def choose_pair(
-    accel: Table, gyro: Table, columns: str | Sequence[str] | None, gyro_columns: str | Sequence[str] | None
+    accel: LogTable, gyro: LogTable, columns: str | Sequence[str] | None, gyro_columns: str | Sequence[str] | None
 ) -> tuple[tuple[Column, ...], tuple[Column, ...]]:
     """The columns of an accelerometer file and a gyroscope file.
 
@@ -124,7 +124,7 @@ def _without(columns: Sequence[Column], group: str) -> tuple[Column, ...]:
     return tuple(column for column in columns if not _is(column, group))
 
 
-def _fit(table: Table, *choices: tuple[Column, ...]) -> tuple[Column, ...]:
+def _fit(table: LogTable, *choices: tuple[Column, ...]) -> tuple[Column, ...]:
     """The first choice that has as many columns as the table."""
     for choice in choices:
         if len(choice) == len(table.columns):

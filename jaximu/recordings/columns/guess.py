@@ -26,7 +26,7 @@ from jaximu.recordings.columns.habits import QUANTITIES, Field, fields_of, senso
 from jaximu.recordings.columns.known import EPOCH
 from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
-from jaximu.recordings.columns.table import Table
+from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import Signal
 
 __all__ = ["Advice", "advise", "without_gravity"]
@@ -171,12 +171,12 @@ class _Triad:
         return best
 
 
-def advise(table: Table, sensor: str | None = None) -> Advice:
+def advise(table: LogTable, sensor: str | None = None) -> Advice:
     """Say how to read a table whose header does not say it all. `sensor`: the one that it must hold, if alone."""
     return _Guess(table, sensor).advice()
 
 
-def without_gravity(table: Table) -> str:
+def without_gravity(table: LogTable) -> str:
     """Say what stands in a table in place of an accelerometer, where its gravity was taken out; else nothing."""
     guess = _Guess(table, None)
     guess._named_triads()
@@ -184,7 +184,7 @@ def without_gravity(table: Table) -> str:
 
 
 class _Guess:
-    def __init__(self, table: Table, sensor: str | None):
+    def __init__(self, table: LogTable, sensor: str | None):
         self.table, self.role = table, sensor
         self.width = len(table.columns)
         self.fields = fields_of(table.names) if table.names else [Field((), None, None, None)] * self.width
@@ -826,7 +826,7 @@ def _alike(one: Field, other: Field) -> bool:
     return words[0] == words[1] and one.unit == other.unit
 
 
-def _lone_gyroscope(table: Table) -> str:
+def _lone_gyroscope(table: LogTable) -> str:
     path = Path(table.path)
     others = sorted(path.parent.glob(f"*{path.suffix}")) if path.is_file() else []
     names = [log.name for log in others if "acc" in log.name.lower() and "linear" not in log.name.lower()]

@@ -10,7 +10,7 @@ from pathlib import PurePath
 import numpy as np
 
 from jaximu.ground.units import find_unit, parse_column
-from jaximu.recordings.columns.table import Table
+from jaximu.recordings.columns.table import LogTable
 
 __all__ = ["EPOCH", "known_names", "sentence_names", "whole_stamps"]
 
@@ -100,7 +100,7 @@ _PAIRS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanoseconds"), ("s
 _SENSOR_LOGGER = {"time": "time [ns]", "seconds_elapsed": "", "x": "", "y": "", "z": ""}
 
 
-def known_names(table: Table) -> tuple[tuple[str, ...], str] | None:
+def known_names(table: LogTable) -> tuple[tuple[str, ...], str] | None:
     """The names in our words, with units, for a table whose names show what wrote it, and a note; None for any other.
 
     What is not used keeps its name.
@@ -148,7 +148,7 @@ _MESSAGE = re.compile(r"(?:.*[./_])?(angular_velocity|linear_acceleration)[./_](
 EPOCH = 1e9, 2.2e9  # s since 1970 that a log's stamps lie between
 
 
-def _of_message(table: Table, names: tuple[str, ...]) -> tuple[tuple[str, ...], str] | None:
+def _of_message(table: LogTable, names: tuple[str, ...]) -> tuple[tuple[str, ...], str] | None:
     """The names of a table of sensor_msgs/Imu, whatever stands before them: a topic, a message's name."""
     titles = {"angular_velocity": "gyro_{} [rad/s]", "linear_acceleration": "accel_{} [m/s^2]"}
     matches = [_MESSAGE.fullmatch(name.strip().lower()) for name in names]
@@ -170,7 +170,7 @@ def sentence_names(name: str, count: int) -> list[str] | None:
     return list(names[1:]) if names is not None and len(names) == count + 1 else None
 
 
-def _without_header(table: Table) -> tuple[tuple[str, ...], str] | None:
+def _without_header(table: LogTable) -> tuple[tuple[str, ...], str] | None:
     """The names of rows without a header that show what wrote them: VectorNav's sentences, ROS's own CSV."""
     first = table.columns[0]
     if len(table.columns) == len(_ECHOED) and [column.dtype.kind for column in table.columns[:3]] == ["i", "i", "O"]:
@@ -195,7 +195,7 @@ def _stated(name: str) -> bool:
     return bool(unit and find_unit(unit, "time"))
 
 
-def whole_stamps(table: Table) -> Table:
+def whole_stamps(table: LogTable) -> LogTable:
     """The table with its stamps as one column where its header has them as seconds and nanoseconds, as ROS writes them.
 
     The column of the seconds holds them then, as `time [ns]`; that of the nanoseconds stays.

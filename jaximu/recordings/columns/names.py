@@ -9,7 +9,7 @@ import numpy as np
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
 from jaximu.recordings.columns.habits import Field, fields_of
-from jaximu.recordings.columns.table import Table
+from jaximu.recordings.columns.table import LogTable
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def parse_columns(text: str | Sequence[str]) -> tuple[Column, ...]:
     return tuple(columns)
 
 
-def header_columns(table: Table) -> tuple[Column, ...] | None:
+def header_columns(table: LogTable) -> tuple[Column, ...] | None:
     """The columns that the file's own header names, or None without one that names any of ours.
 
     Of several columns of time the first that states its unit and rises counts.

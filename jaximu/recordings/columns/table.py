@@ -42,7 +42,7 @@ class MessageSelection:
 
 
 @dataclass(frozen=True)
-class Table:
+class LogTable:
     """A file's columns.
 
     names: the header, with units in brackets where the file states them; None where it has no header.
@@ -82,13 +82,13 @@ class Table:
         """The file and the number of a row, for messages."""
         return f"{self.path}, row {self.row(index)}"
 
-    def take(self, kept: np.ndarray) -> "Table":
+    def take(self, kept: np.ndarray) -> "LogTable":
         """The rows of these indices."""
         rows = np.arange(self.source.rows) + self.rows if isinstance(self.rows, int) else self.rows
         columns = tuple(column[kept] for column in self.columns)
         return replace(self, columns=columns, rows=rows[kept], source=replace(self.source, rows=len(kept)))
 
-    def with_column(self, index: int, values: np.ndarray) -> "Table":
+    def with_column(self, index: int, values: np.ndarray) -> "LogTable":
         """The table with other values in one column."""
         return replace(self, columns=(*self.columns[:index], values, *self.columns[index + 1 :]))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
-from jaximu.recordings.columns.table import Table
+from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import Source
 
 _WIDEST = 16  # an array with more columns than this is no sensor
@@ -18,7 +18,7 @@ _INTERVALS = dict.fromkeys(("ts", "dt", "sampletime", "sampleinterval", "samplin
 _AXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
 
 
-def table_of(variables: Mapping[str, Any], source: Source) -> Table:
+def table_of(variables: Mapping[str, Any], source: Source) -> LogTable:
     """The columns among named variables: n values, n × k or k × n, n being the length that most numbers have.
 
     Mappings in it are opened (names joined by a dot); a mapping `units` {name: unit} gives units to names without
@@ -58,7 +58,7 @@ def table_of(variables: Mapping[str, Any], source: Source) -> Table:
             title = base if count == 1 else f"{base}_{axis}"
             names.append(f"{title} [{unit}]" if unit else title)
             columns.append(np.ascontiguousarray(column, np.float64 if column.dtype.kind == "f" else np.int64))
-    return Table(source, tuple(names), tuple(columns), rate=rate)
+    return LogTable(source, tuple(names), tuple(columns), rate=rate)
 
 
 def _opened(variables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

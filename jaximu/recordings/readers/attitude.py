@@ -13,7 +13,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column, unit
 from jaximu.recordings.attitude import Attitude
-from jaximu.recordings.columns.table import Table
+from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.readers.reader import read_tables
 
 __all__ = ["holds_attitude", "read_attitude"]
@@ -64,14 +64,14 @@ def holds_attitude(path: str | os.PathLike[str]) -> bool:
     return bool(_tables(path))
 
 
-def _tables(path: str | os.PathLike[str]) -> list[tuple[Table, dict[str, dict[str, int]]]]:
+def _tables(path: str | os.PathLike[str]) -> list[tuple[LogTable, dict[str, dict[str, int]]]]:
     """Return the tables of a file that hold an attitude, and where their columns are."""
     tables = [(table, _places(table)) for table in read_tables(path)]
     kinds = {"quaternion", "numbered", "euler", "rotation vector", "table angles"}
     return [(table, places) for table, places in tables if kinds & set(places)]
 
 
-def _places(table: Table) -> dict[str, dict[str, int]]:
+def _places(table: LogTable) -> dict[str, dict[str, int]]:
     """Return by kind the columns of each axis, complete kinds alone."""
     if table.names is None:
         if len(table.columns) != len(_TUM):
@@ -95,7 +95,7 @@ def _places(table: Table) -> dict[str, dict[str, int]]:
     return {kind: axes for kind, axes in kinds.items() if whole(kind, axes)}
 
 
-def _columns(table: Table, places: dict[str, int], axes: Sequence[str], quantity: str = "") -> FloatArray:
+def _columns(table: LogTable, places: dict[str, int], axes: Sequence[str], quantity: str = "") -> FloatArray:
     """Return the columns (n, k) of some axes in SI; a column without a unit is in SI."""
     columns = []
     for axis in axes:
@@ -112,7 +112,7 @@ def _columns(table: Table, places: dict[str, int], axes: Sequence[str], quantity
     return np.stack(columns, axis=1)
 
 
-def _attitude(table: Table, places: dict[str, dict[str, int]], name: str) -> Attitude:
+def _attitude(table: LogTable, places: dict[str, dict[str, int]], name: str) -> Attitude:
     notes = list(table.notes)
     time, start = _time(table, places, name, notes)
     if "quaternion" in places:
@@ -143,7 +143,7 @@ def _attitude(table: Table, places: dict[str, dict[str, int]], name: str) -> Att
     return Attitude(time[kept], quaternion[kept], **vectors, start=start, name=name, notes=tuple(notes))
 
 
-def _from_angles(table: Table, places: dict[str, int], axes: dict[str, str], name: str) -> FloatArray:
+def _from_angles(table: LogTable, places: dict[str, int], axes: dict[str, str], name: str) -> FloatArray:
     """Return the quaternions (n, 4) of turns by the columns named, each about its axis as the ones before left it."""
     titles = [table.names[places[column]] for column in axes] if table.names else []
     for title in titles:
@@ -153,7 +153,7 @@ def _from_angles(table: Table, places: dict[str, int], axes: dict[str, str], nam
     return _quaternion(scipy.spatial.transform.Rotation.from_euler("".join(axes.values()).upper(), angles))
 
 
-def _time(table: Table, places: dict[str, dict[str, int]], name: str, notes: list[str]) -> tuple[FloatArray, float]:
+def _time(table: LogTable, places: dict[str, dict[str, int]], name: str, notes: list[str]) -> tuple[FloatArray, float]:
     """Return stamps (n,) in s since the first, and the first one's absolute stamp, s; zero where there is none."""
     if "time" not in places:
         if table.rate is None:

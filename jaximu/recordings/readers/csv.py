@@ -18,7 +18,7 @@ import pyarrow.csv as pc
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, stated_rate
-from jaximu.recordings.columns.table import HEAD, Table, from_arrow, parse_name
+from jaximu.recordings.columns.table import HEAD, LogTable, from_arrow, parse_name
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
@@ -38,7 +38,7 @@ class _Layout:
     rate: float | None = None  # Hz, where the lines before the data state it
 
 
-def read(path: Path, source: Source) -> Table:
+def read(path: Path, source: Source) -> LogTable:
     """The table in a text file. Raises InputError for what is not a table of numbers, naming the row where it can."""
     with path.open("rb") as file:
         head = file.read(HEAD)
@@ -81,7 +81,7 @@ def read(path: Path, source: Source) -> Table:
         if wide or whole is None
         else ("the file ends in zero bytes, as after a power loss: its last row is left out.",)
     )
-    return Table(source, names, tuple(columns), rows, layout.rate, notes=notes)
+    return LogTable(source, names, tuple(columns), rows, layout.rate, notes=notes)
 
 
 def _without_zeros(path: Path) -> bytes | None:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import MessageSelection, Table
+from jaximu.recordings.columns.table import LogTable, MessageSelection
 from jaximu.recordings.recording import Source
 
 _ACCEL = {f"Acc{axis.upper()}": f"accel_{axis} [m/s^2]" for axis in "xyz"}
@@ -28,7 +28,7 @@ _LATEST = 2.0**53  # us: beyond it a double is no exact stamp
 _KINDS = {"IMU": _ACCEL | _GYRO | {"T": "temperature [degC]"}, "ACC": _ACCEL, "GYR": _GYRO}
 
 
-def read(path: Path, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
+def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
     """The tables in a DataFlash log. Raises InputError for a message or an instance that it does not have."""
     from pymavlink.DFReader import DFReader_binary, DFReader_text
 
@@ -115,8 +115,8 @@ def _rows(log: Any) -> dict[tuple[str, int], np.ndarray]:
     return {key: np.array(numbers).reshape(-1, 2 + len(_KINDS[key[0]])) for key, numbers in rows.items()}
 
 
-def _table(source: Source, time: np.ndarray, values: dict[str, np.ndarray]) -> Table:
+def _table(source: Source, time: np.ndarray, values: dict[str, np.ndarray]) -> LogTable:
     if not (np.abs(time) < _LATEST).all():
         raise ValueError("a time stamp is no number of microseconds")
     columns = (time.astype(np.int64), *(np.ascontiguousarray(column, np.float64) for column in values.values()))
-    return Table(source, ("time [us]", *values), columns, messages=True)
+    return LogTable(source, ("time [us]", *values), columns, messages=True)

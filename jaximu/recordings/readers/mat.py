@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.recordings.columns.table import Table, Unpacking
+from jaximu.recordings.columns.table import LogTable, Unpacking
 from jaximu.recordings.readers.arrays import table_of
 from jaximu.recordings.readers.mat5 import checked
 from jaximu.recordings.recording import Source
 
 
-def read(data: bytes, source: Source) -> Table:
+def read(data: bytes, source: Source) -> LogTable:
     """The table in a MAT file of version 5; structs are opened; a row's number counts from 1."""
     import scipy.io
 
@@ -21,7 +21,7 @@ def read(data: bytes, source: Source) -> Table:
     return replace(table, notes=(f"variables not used: {', '.join(left_out)}.",)) if left_out else table
 
 
-def read_hdf5(data: bytes, source: Source) -> Table:
+def read_hdf5(data: bytes, source: Source) -> LogTable:
     """The table in a MAT file of version 7.3 or another HDF5 file; groups are opened, an attribute `unit` is read.
 
     Only what is in the file itself is read: no links to other files, and every object once.

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.lib import format as npy
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import Table, Unpacking
+from jaximu.recordings.columns.table import LogTable, Unpacking
 from jaximu.recordings.readers.arrays import table_of
 from jaximu.recordings.recording import Source
 
 
-def read(data: bytes, source: Source) -> Table:
+def read(data: bytes, source: Source) -> LogTable:
     """The table in an NPZ file; a row's number counts from 1."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()
@@ -30,7 +30,7 @@ def read(data: bytes, source: Source) -> Table:
         )
 
 
-def read_array(data: bytes, source: Source) -> Table:
+def read_array(data: bytes, source: Source) -> LogTable:
     """The table in an NPY file: the columns of one array without names, or its named fields."""
     table = table_of({"": _array(data)}, source)
     return table if any(not name.strip("_").isdigit() for name in table.names or ()) else replace(table, names=None)

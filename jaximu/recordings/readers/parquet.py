@@ -4,14 +4,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximu.recordings.columns.table import Table, Unpacking, from_arrow, mapped_axes, named_with_units
+from jaximu.recordings.columns.table import LogTable, Unpacking, from_arrow, mapped_axes, named_with_units
 from jaximu.recordings.recording import Source
 
 _BATCH = 1 << 18
 """Rows decoded at once: beside the columns themselves only so many are held."""
 
 
-def read(data: bytes, source: Source) -> Table:
+def read(data: bytes, source: Source) -> LogTable:
     """The table in a Parquet file, without columns of lists and the like; a row's number counts from 1."""
     schema = pq.read_schema(pa.BufferReader(data))
     flat = [field for field in schema if not pa.types.is_nested(field.type)]
@@ -33,7 +33,7 @@ def read(data: bytes, source: Source) -> Table:
                 columns[index] = columns[index].astype(np.result_type(values, columns[index]))
             columns[index][filled : filled + len(values)] = values
         filled += batch.num_rows
-    return Table(source, named_with_units(flat), tuple(columns), axes=mapped_axes(schema))
+    return LogTable(source, named_with_units(flat), tuple(columns), axes=mapped_axes(schema))
 
 
 def _numeric(kind: pa.DataType) -> bool:

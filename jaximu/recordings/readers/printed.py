@@ -14,7 +14,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit
-from jaximu.recordings.columns.table import HEAD, Table
+from jaximu.recordings.columns.table import HEAD, LogTable
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
@@ -188,7 +188,7 @@ def _numbers(texts: Sequence[str]) -> np.ndarray:
     return np.array(texts, np.float64)
 
 
-def read(data: bytes, source: Source) -> Table:
+def read(data: bytes, source: Source) -> LogTable:
     """The table in printed text. Raises InputError where no whole sample is there."""
     declared = _DECLARED.search(data)
     if declared is not None:
@@ -219,10 +219,10 @@ def read(data: bytes, source: Source) -> Table:
         stamps = seconds_of(np.array(texts, object)) if _CLOCK.fullmatch(texts[0]) else None
         columns.append(_numbers(texts) if stamps is None else stamps)
         names[at] = names[at] if stamps is None else "time of day [ns]"
-    return Table(source, tuple(names) if any(names) else None, tuple(columns), np.array(first), notes=(note,))
+    return LogTable(source, tuple(names) if any(names) else None, tuple(columns), np.array(first), notes=(note,))
 
 
-def _declared(data: bytes, source: Source, declared: re.Match[bytes]) -> Table:
+def _declared(data: bytes, source: Source, declared: re.Match[bytes]) -> LogTable:
     """The rows of $IMU in a text that declares its columns and their units, as FlySight writes it."""
     names, units = (part.decode().strip().split(",") for part in declared.groups())
     rows = [line.split(b",")[1:] for line in data.split(b"\n") if line.startswith(b"$IMU,")]
@@ -232,4 +232,4 @@ def _declared(data: bytes, source: Source, declared: re.Match[bytes]) -> Table:
     columns = [_numbers([cell.decode().strip() for cell in column]) for column in zip(*whole, strict=True)]
     titles = [f"{name} [{unit.replace('deg C', 'degC')}]" for name, unit in zip(names, units, strict=True)]
     note = "rows of several kinds, declared by $COL and $UNIT as FlySight writes them: those of $IMU are read."
-    return Table(source, tuple(titles), tuple(columns), notes=(note,))
+    return LogTable(source, tuple(titles), tuple(columns), notes=(note,))

@@ -35,8 +35,8 @@ from jaximu.recordings.columns.names import (
 from jaximu.recordings.columns.table import (
     FEW,
     HEAD,
+    LogTable,
     MessageSelection,
-    Table,
     from_arrow,
     mapped_axes,
     named_with_units,
@@ -125,7 +125,7 @@ def read_recording(
     return recording
 
 
-def _read(path: str | os.PathLike[str], options: ReadOptions) -> list[Table]:
+def _read(path: str | os.PathLike[str], options: ReadOptions) -> list[LogTable]:
     """The tables of a file, with the rows of one unit where several write into it in turn."""
     tables = read_tables(path, MessageSelection(options.topic, options.instance, options.stamp))
     return [table if table.messages else of_device(table, options.device) for table in tables]
@@ -146,7 +146,9 @@ def read_frame(frame: Any, options: ReadOptions | None = None) -> Recording:
             f"value of type {type(frame).__name__} ({str(error).splitlines()[0][:200]})."
         ) from error
     columns = tuple(from_arrow(column) for column in table.columns)
-    read = Table(Source("data frame", "", 0), named_with_units(table.schema), columns, axes=mapped_axes(table.schema))
+    read = LogTable(
+        Source("data frame", "", 0), named_with_units(table.schema), columns, axes=mapped_axes(table.schema)
+    )
     read = _checked(read, read.source)
     options = _alike(options, read)
     return _finished(_parts((read,), options), read, options)
@@ -168,7 +170,7 @@ def _sound(options: ReadOptions | None) -> ReadOptions:
     )
 
 
-def _alike(options: ReadOptions, table: Table) -> ReadOptions:
+def _alike(options: ReadOptions, table: LogTable) -> ReadOptions:
     """Return the options, with what `like` knows of a file of this header and options leave open."""
     like = options.like or Reading()
     if options.columns is None and options.gyro_columns is None and table.header == tuple(like.header):
@@ -179,7 +181,7 @@ def _alike(options: ReadOptions, table: Table) -> ReadOptions:
     return options
 
 
-def _of_two_files(options: ReadOptions, table: Table) -> bool:
+def _of_two_files(options: ReadOptions, table: LogTable) -> bool:
     """Whether the columns are those of this file and of the gyroscope's."""
     names = parse_columns(options.columns or ())
     return options.gyro_columns is not None or len(names) > len(table.columns)
@@ -193,7 +195,7 @@ def _counts(options: ReadOptions, name: str) -> tuple[Stated | None, Stated | No
 
 
 def _read_as(
-    options: ReadOptions, table: Table, parts: "Sequence[_FilePart]", signals: Mapping[str, Signal]
+    options: ReadOptions, table: LogTable, parts: "Sequence[_FilePart]", signals: Mapping[str, Signal]
 ) -> Reading:
     """Return how signals, in the log's axes still, were read; `table` is the file's first."""
     counts = [name for name in INERTIAL_QUANTITIES if name in signals and signals[name].unit == "count"]
@@ -219,12 +221,12 @@ def _read_as(
     )
 
 
-def _stamped(table: Table, columns: str | Sequence[str] | None) -> Table:
+def _stamped(table: LogTable, columns: str | Sequence[str] | None) -> LogTable:
     """Return the table with whole stamps, unless options name its columns as they stand."""
     return table if columns else whole_stamps(table)
 
 
-def _parts(tables: Sequence[Table], options: ReadOptions) -> "list[_FilePart]":
+def _parts(tables: Sequence[LogTable], options: ReadOptions) -> "list[_FilePart]":
     """Return the signals of one file's tables."""
     first = _stamped(tables[0], options.columns)
     named = {column.name for column in header_columns(first) or ()}
@@ -234,7 +236,7 @@ def _parts(tables: Sequence[Table], options: ReadOptions) -> "list[_FilePart]":
     return parts + [extract(table, header_columns(table) or (), options, set(GROUPS)) for table in tables[1:]]
 
 
-def _finished(parts: "Sequence[_FilePart]", table: Table, options: ReadOptions) -> Recording:
+def _finished(parts: "Sequence[_FilePart]", table: LogTable, options: ReadOptions) -> Recording:
     """Return the recording of all parts in body axes, checked; `table` is the file's first."""
     recording = _assemble(parts, table, options)
     if options.axes:
@@ -296,7 +298,7 @@ def read_means(path: str | os.PathLike[str], options: ReadOptions | None = None)
     return PoseMeans(recording, **sigma)
 
 
-def _sigma_of_means(table: Table, sensor: str, base: str) -> FloatArray | None:
+def _sigma_of_means(table: LogTable, sensor: str, base: str) -> FloatArray | None:
     """The standard deviations (P, 3) of a triad's means, from those of its samples and their number."""
     named = {name: (at, stated) for at, (name, stated) in enumerate(map(parse_column, table.names or ()))}
     names = [f"{sensor}_sigma_{axis}" for axis in "xyz"]
@@ -402,7 +404,7 @@ def _of_text(head: bytes, path: Path) -> _Format:
     return _PRINTED if prints(head) else _TEXT
 
 
-def read_table(path: str | os.PathLike[str]) -> Table:
+def read_table(path: str | os.PathLike[str]) -> LogTable:
     """The columns of a file that is one table. Raises InputError naming the file."""
     first, *others = read_tables(path)
     if others:
@@ -410,7 +412,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     return first
 
 
-def read_tables(path: str | os.PathLike[str], selection: MessageSelection | None = None) -> tuple[Table, ...]:
+def read_tables(path: str | os.PathLike[str], selection: MessageSelection | None = None) -> tuple[LogTable, ...]:
     """The tables of a file, the accelerometer's first; the format is found from the content.
 
     Raises InputError naming the file, and the package to install where one is missing.
@@ -457,7 +459,7 @@ def advise_reading(path: str | os.PathLike[str], rate: float | None = None) -> A
     return None if table.messages else advise(whole_stamps(table))
 
 
-def _checked(table: Table, source: Source) -> Table:
+def _checked(table: LogTable, source: Source) -> LogTable:
     """The table with its source and number of rows, in our names where its own show what wrote it."""
     rows = len(table.columns[0]) if table.columns else 0
     if rows < 2:
@@ -492,7 +494,7 @@ class _FilePart:
 
 
 def extract(
-    table: Table, columns: Sequence[Column], options: ReadOptions, groups: set[str], option: str = "--columns"
+    table: LogTable, columns: Sequence[Column], options: ReadOptions, groups: set[str], option: str = "--columns"
 ) -> _FilePart:
     """The signals of the wanted groups in a table, checked sample by sample."""
     group_of = {name: key for key, group in GROUPS.items() for name in group.columns}
@@ -545,7 +547,7 @@ def _per_second(unit: Unit, sensor: str, stamps: FloatArray) -> Unit:
     return Unit(unit.name, quantity, unit.factor / np.median(np.diff(stamps))) if quantity else unit
 
 
-def _carried_on(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
+def _carried_on(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTable, list[str]]:
     """The rows with a time that goes on where a counter passed its end, or a day or a week of GPS began, and a note."""
     index, unit = used[TIME]
     stamps = table.numbers(index)
@@ -570,7 +572,7 @@ def _carried_on(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table,
     return table, []
 
 
-def _ordered(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
+def _ordered(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTable, list[str]]:
     """The messages in the order of their stamps, each stamp once, and what was put right.
 
     Raises InputError where the clock was set back, or many messages share stamps.
@@ -606,7 +608,7 @@ def _ordered(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, li
     return table.take(kept), notes
 
 
-def _rising(table: Table, used: dict[str, tuple[int, Unit]]) -> tuple[Table, list[str]]:
+def _rising(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTable, list[str]]:
     """The rows of a table in the order of their stamps, each row once, and what was put right.
 
     Rows that share a stamp but differ keep it, unless so many do that the stamps are times of arrival in bursts: then
@@ -709,7 +711,7 @@ def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
 
 
 def _stamps(
-    table: Table, used: dict[str, tuple[int, Unit]], options: ReadOptions
+    table: LogTable, used: dict[str, tuple[int, Unit]], options: ReadOptions
 ) -> tuple[FloatArray, Fraction | float, list[str]]:
     """(rows,) seconds since the first stamp (NaN where it is missing), that stamp in seconds, notes.
 
@@ -734,7 +736,7 @@ def _stamps(
     return (stamps - stamps[0]) * unit.factor, exact, notes
 
 
-def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamps: FloatArray) -> tuple[Signal, int]:
+def _signal(table: LogTable, columns: Sequence[tuple[np.ndarray, int, Unit]], stamps: FloatArray) -> tuple[Signal, int]:
     """The signal of one sensor in its base unit, and how many rows hold no sample of it.
 
     Raises InputError for a sample of which only a part is there, a missing stamp, time that does not rise, and a
@@ -776,7 +778,7 @@ def _signal(table: Table, columns: Sequence[tuple[np.ndarray, int, Unit]], stamp
     return Signal(stamps, values, columns[0][2].base), rows - len(kept)
 
 
-def _assemble(parts: Sequence[_FilePart], table: Table, options: ReadOptions) -> Recording:
+def _assemble(parts: Sequence[_FilePart], table: LogTable, options: ReadOptions) -> Recording:
     """One recording from the signals of its files, on a common start; counts get their nominal scales."""
     start = min(part.origin for part in parts)
     notes = [note for part in parts for note in part.notes]

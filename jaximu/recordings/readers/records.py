@@ -17,7 +17,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
 from jaximu.recordings.columns.habits import fields_of, sensor_of, words_of
 from jaximu.recordings.columns.names import rises
-from jaximu.recordings.columns.table import Table
+from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.readers.arrays import table_of
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
@@ -27,7 +27,7 @@ _TRIADS = {"accel", "gyro", "mag"}
 _ANDROID = {"accel": "m/s^2", "gyro": "rad/s", "mag": "uT"}
 
 
-def read(data: bytes, source: Source) -> Table | tuple[Table, ...]:
+def read(data: bytes, source: Source) -> LogTable | tuple[LogTable, ...]:
     """The tables in a JSON document. Raises InputError naming the line that is no JSON, or what is missing."""
     text = data.decode("utf-8-sig", errors="replace").strip()
     try:
@@ -89,7 +89,7 @@ def _columns(records: list[dict[str, Any]]) -> dict[str, list[Any]]:
     return {name: [record.get(name) for record in flat] for name in names}
 
 
-def _table(columns: Mapping[str, Any], source: Source) -> Table:
+def _table(columns: Mapping[str, Any], source: Source) -> LogTable:
     """The columns as arrays: numbers also where they are written as text, times of day as stamps."""
     arrays: dict[str, Any] = {}
     for name, values in columns.items():
@@ -110,7 +110,7 @@ def _table(columns: Mapping[str, Any], source: Source) -> Table:
     return table_of(arrays, source)
 
 
-def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[str, Table]]:
+def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[str, LogTable]]:
     """A table for each sensor that the records name."""
     tag = next((key for key in records[0] if key.lower() in _TAGS and isinstance(records[0][key], str)), None)
     if tag is None:
@@ -135,7 +135,7 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
         yield sensor, replace(table, notes=(*table.notes, *notes))
 
 
-def apart(table: Table) -> Table:
+def apart(table: LogTable) -> LogTable:
     """A table whose rows name their sensor, as columns x, y, z, with columns for each sensor; any other as it is."""
     for at, column in enumerate(table.columns if table.names else ()):
         if column.dtype != object or len(tags := dict.fromkeys(column[:10000].tolist())) > 40:
@@ -169,7 +169,7 @@ _FEWEST, _MOST_DEVICES, _IN_TURN = 0.02, 64, 0.02
 """Share of the rows that a unit has at the least, number of units, and share of rows after which another one writes."""
 
 
-def of_device(table: Table, device: str | None) -> Table:
+def of_device(table: LogTable, device: str | None) -> LogTable:
     """A table with the rows of one unit where a column names several that write in turn; any other as it is.
 
     Raises `InputError` where none of them, or one that is not there, was chosen.
@@ -201,7 +201,7 @@ def of_device(table: Table, device: str | None) -> Table:
     return table
 
 
-def _alike(table: Table, groups: Sequence[np.ndarray]) -> bool:
+def _alike(table: LogTable, groups: Sequence[np.ndarray]) -> bool:
     """Whether the same columns are filled in the rows of each group."""
     for column in table.columns:
         filled = ~np.isnan(column) if column.dtype.kind == "f" else np.ones(len(column), bool)
@@ -217,7 +217,7 @@ def _sensor(tag: Any) -> str | None:
     return sensor if (sensor := sensor_of(tuple(words))[0]) in _TRIADS else None
 
 
-def _joined(tables: list[tuple[str, Table]]) -> Table:
+def _joined(tables: list[tuple[str, LogTable]]) -> LogTable:
     """The sensors' tables as one, in the order of their stamps."""
     if len(tables) == 1:
         return tables[0][1]
@@ -234,4 +234,4 @@ def _joined(tables: list[tuple[str, Table]]) -> Table:
             columns[name][places] = values
     columns[clock] = stamps
     first = tables[0][1]
-    return Table(replace(first.source, rows=len(stamps)), tuple(names), tuple(columns.values()), notes=first.notes)
+    return LogTable(replace(first.source, rows=len(stamps)), tuple(names), tuple(columns.values()), notes=first.notes)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import MessageSelection, Table, Unpacking
+from jaximu.recordings.columns.table import LogTable, MessageSelection, Unpacking
 from jaximu.recordings.recording import Source
 
 _BLOCK = 1 << 12  # messages held undecoded
@@ -74,7 +74,7 @@ class _File(io.BufferedReader):
         return super().read(size if size is None else min(size, self.size))
 
 
-def read_ros1(path: Path, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
+def read_ros1(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
     """The tables in a ROS 1 bag. Raises InputError where topics are missing or to be chosen."""
     from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag1 import Reader
@@ -103,7 +103,7 @@ def read_ros1(path: Path, source: Source, selection: MessageSelection) -> tuple[
         return _read(bag, bag.messages, source, selection, cdr=False)
 
 
-def read_ros2(path: Path, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
+def read_ros2(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
     """The tables in a ROS 2 bag: its folder, or one .db3 or .mcap file."""
     import apsw
     from lz4.frame import LZ4FrameDecompressor
@@ -156,7 +156,7 @@ def _check_packed(path: Path, zstd: Any, unpacking: Unpacking) -> None:
 
 def _read(
     bag: Any, iterate: Callable[[Sequence[Any]], Iterator[Any]], source: Source, selection: MessageSelection, cdr: bool
-) -> tuple[Table, ...]:
+) -> tuple[LogTable, ...]:
     wanted = _wanted(bag.connections, source, selection)
     kinds = {topic: kind for topic, kind, _ in wanted}
     chosen = [connection for connection in bag.connections if kinds.get(connection.topic) == connection.msgtype]
@@ -267,7 +267,7 @@ class _Columns:
         self.blocks.append((header, np.array(self.received, np.int64), numbers))
         self.received, self.data = [], []
 
-    def table(self, source: Source, topic: str, wanted: dict[str, int], stamp: str) -> Table | None:
+    def table(self, source: Source, topic: str, wanted: dict[str, int], stamp: str) -> LogTable | None:
         """The wanted columns under the stamps asked for; None without a message."""
         if self.data:
             self.decode()
@@ -289,4 +289,4 @@ class _Columns:
             if absent is None or not (double[absent] == -1.0).all():
                 names.append(name)
                 columns.append(double[at])
-        return Table(source, tuple(names), tuple(columns), notes=(f"{note}{clock[stamp]}.",), messages=True)
+        return LogTable(source, tuple(names), tuple(columns), notes=(f"{note}{clock[stamp]}.",), messages=True)

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import HEAD, MessageSelection, Table, from_arrow
+from jaximu.recordings.columns.table import HEAD, LogTable, MessageSelection, from_arrow
 from jaximu.recordings.recording import Source
 
 
@@ -54,11 +54,11 @@ def dialect(data: bytes) -> _Dialect | None:
     return next((dialect_of for dialect_of in _DIALECTS if dialect_of.sign.search(data[:HEAD])), None)
 
 
-def read(data: bytes, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
+def read(data: bytes, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
     """The tables in a tagged text, one a sensor. Raises InputError where no row of a sensor is there."""
     log = dialect(data)
     assert log is not None
-    tables: list[Table] = []
+    tables: list[LogTable] = []
     shift = 0 if b"Stream Type,F#" not in data[:HEAD] else -1  # older versions write no index
     stamp = selection.stamp if selection.stamp in log.notes else "header"
     for tag, (name, first) in log.tags.items():
@@ -81,7 +81,7 @@ def read(data: bytes, source: Source, selection: MessageSelection) -> tuple[Tabl
             raise InputError(f"{source.path}: rows of {tag} cannot be read as a table: {reason}") from None
         columns = map(from_arrow, table.columns)
         names = (f"time [{log.unit}]", *map(name.format, "xyz"))
-        tables.append(Table(source, names, tuple(columns), messages=True))
+        tables.append(LogTable(source, names, tuple(columns), messages=True))
     if not tables:
         raise InputError(f"{source.path}: is a log of {log.program} without a row of accelerometer or gyroscope.")
     note = f"a log of {log.program} (m/s^2, rad/s): {log.notes[stamp]}; each sensor has its own time stamps."

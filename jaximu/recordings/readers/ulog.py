@@ -18,7 +18,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import counted
-from jaximu.recordings.columns.table import MessageSelection, Table
+from jaximu.recordings.columns.table import LogTable, MessageSelection
 from jaximu.recordings.recording import Source
 
 _Fields = Mapping[str, np.ndarray]
@@ -83,7 +83,7 @@ _SOURCES = {
 """By `--topic`: the messages of accelerometer and gyroscope, the raw ones first."""
 
 
-def read(path: Path, source: Source, selection: MessageSelection) -> tuple[Table, ...]:
+def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
     """The tables in a ULog. Raises InputError for a topic or an instance that it does not have."""
     from pyulog import ULog
 
@@ -163,9 +163,9 @@ def _check_formats(formats: Mapping[str, Any]) -> None:
         raise ValueError("a message is defined to have more fields than any has")
 
 
-def _table(source: Source, time: np.ndarray, values: Mapping[str, np.ndarray], unit: str = "us") -> Table:
+def _table(source: Source, time: np.ndarray, values: Mapping[str, np.ndarray], unit: str = "us") -> LogTable:
     if time.dtype.kind not in "iu":
         raise ValueError("a time stamp is no number of microseconds")
     with np.errstate(invalid="ignore"):  # of a NaN that signals
         columns = (time.astype(np.int64), *(column.astype(np.float64, copy=False) for column in values.values()))
-    return Table(source, (f"time [{unit}]", *values), columns, messages=True)
+    return LogTable(source, (f"time [{unit}]", *values), columns, messages=True)
