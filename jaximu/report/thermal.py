@@ -391,22 +391,32 @@ def _within_data(thermal: ThermalCalibration, temperature: FloatArray, rates: Fl
     return (low <= rates[:, None]) & (rates[:, None] <= high)
 
 
+def _cells(points: FloatArray, drawn: np.ndarray) -> FloatArray:
+    """Return the corners (k, 4, 3) of a grid's cells, of points (r, m, 3), whose four corners are all drawn (r, m)."""
+    corners = [(slice(None, -1),) * 2, (slice(1, None), slice(None, -1)), (slice(1, None),) * 2]
+    corners.append((slice(None, -1), slice(1, None)))
+    whole = np.all([drawn[corner] for corner in corners], axis=0)
+    return np.stack([points[corner][whole] for corner in corners], axis=1)
+
+
 def surface_figure(thermal: ThermalCalibration, name: str) -> Figure:
     """Draw the bias over temperature and its rate with the data on it, an axis a panel."""
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
     factor, unit = _unit(thermal, name)
     blocks = thermal.blocks
     figure = new_figure(4.2)
     temperature = np.linspace(*blocks.range, 61)
     rates = np.linspace(blocks.rate.min(), blocks.rate.max(), 41)
     surface = np.stack([thermal.bias(name, temperature, rate)[0] for rate in rates])  # (r, m, 3)
-    surface[~_within_data(thermal, temperature, rates)] = np.nan
+    drawn = _within_data(thermal, temperature, rates)
     data, parts = bias_dots(thermal, name), _both_ways(thermal)
     for axis in range(3):
         panel: Any = figure.add_subplot(1, 3, axis + 1, projection="3d")
         x, y = np.meshgrid(temperature, 60 * rates)
-        panel.plot_surface(
-            x, y, factor * surface[:, :, axis], color="#BBBBBB", alpha=0.45, linewidth=0, rcount=61, ccount=61
-        )
+        cells = _cells(np.stack([x, y, factor * surface[:, :, axis]], axis=-1), drawn)
+        panel.add_collection3d(Poly3DCollection(cells, facecolors="#888888", alpha=0.45, linewidth=0))
+        panel.auto_scale_xyz(*cells.reshape(-1, 3).T)
         for part, style in parts:
             few = np.flatnonzero(part)[:: 1 + len(blocks) // _MOST_DOTS]
             panel.scatter(
