@@ -47,7 +47,6 @@ _LITTLE = 0.95
 """Share of an error that must be left for a gain to be called little."""
 _NOISY = 1.05
 """Scatter, in multiples of the noise, from which on it is reported."""
-_BRIEF = 6  # rows of evidence on the first screen
 _SCOPES = {"device": "unit", "session": "recording", "fixture": "set-up"}
 
 
@@ -216,8 +215,8 @@ def _next(diagnosis: Diagnosis, files: list[str]) -> str:
     repairs = dict.fromkeys(finding.repair for finding in _standing(diagnosis) if finding.repair)
     by_hand = diagnosis.experiment.data.by_hand  # else the command has more arguments
     if repairs and by_hand:
-        again = f"`jaximu diagnose {' '.join([*files, *repairs])} -o RESULTS`"
-        return f"{diagnosis.suggestion} {again} repeats the diagnosis."
+        command = f"`jaximu diagnose {' '.join([*files, *repairs])} -o RESULTS`"
+        return f"{diagnosis.suggestion} {command} repeats the diagnosis."
     if diagnosis.suggestion:
         together = f"`jaximu diagnose {' '.join(files)} NEW_LOG -o RESULTS` diagnoses both recordings together."
         recorded = by_hand and " record" in diagnosis.suggestion and not _standing(diagnosis)
@@ -350,7 +349,7 @@ def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
         )
         for name in order
     ]
-    yield Table(("effect", "detection limit", "compared with a plausible size"), rows, brief=_BRIEF)
+    yield Table(("effect", "detection limit", "compared with a plausible size"), rows, brief=6)
 
 
 def _in_plausible_sizes(diagnosis: Diagnosis, name: str) -> float:
@@ -383,7 +382,7 @@ def _checks_table(checks: list[Check]) -> Table:
         "p-values allow for all checks together: below 0.01 the model or its noise is wrong there; above, chance does "
         "as much."
     )
-    return Table(("check of the base model", "statistic", "p-value"), rows, caption, brief=_BRIEF)
+    return Table(("check of the base model", "statistic", "p-value"), rows, caption, brief=6)
 
 
 def _evidence(diagnosis: Diagnosis, twin: Twin) -> Iterator[Picture]:
