@@ -48,7 +48,6 @@ _LITTLE = 0.95
 """Share of an error that must be left for a gain to be called little."""
 _NOISY = 1.05
 """Scatter, in multiples of the noise, from which on it is reported."""
-_BRIEF = 6  # rows of evidence on the first screen
 _SCOPES = {"device": "unit", "session": "recording", "fixture": "set-up"}
 
 
@@ -353,7 +352,7 @@ def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
         for cause in diagnosis.hidden
     ]
     headers = ("effect", "detection limit", "compared with a plausible size", "would shift most")
-    yield Table(headers, rows, brief=_BRIEF)
+    yield Table(headers, rows, brief=6)
 
 
 def _shift_words(diagnosis: Diagnosis, cause: Hidden) -> str:
@@ -395,7 +394,7 @@ def _checks_table(checks: list[Check]) -> Table:
         "p-values allow for all checks together: below 0.01 the model or its noise is wrong there; above, chance does "
         "as much."
     )
-    return Table(("check of the base model", "statistic", "p-value"), rows, caption, brief=_BRIEF)
+    return Table(("check of the base model", "statistic", "p-value"), rows, caption, brief=6)
 
 
 def _evidence(diagnosis: Diagnosis, twin: Twin) -> Iterator[Picture]:
