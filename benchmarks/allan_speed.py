@@ -101,7 +101,7 @@ def main() -> None:
             "goal",
             "memory, input included, over the input",
         ],
-        "Whole calls of `deviation`, with intervals and exponents, after compilation.",
+        "Whole calls of `deviation`, with intervals and exponents.",
     )
     figures: dict = {"seconds": {}, "memory": {}, "loss": {}}
     for samples, runs in sizes.items():
