@@ -47,7 +47,7 @@ def figures() -> list[tuple[str, str, str, str]]:
         ("the same recording, diagnosed: χ² per condition left out, before and after",
          f"{explained['heldout_chi_squared_before']:.1f} → {explained['heldout_chi_squared_after']:.1f}", "≤ 1.1",
          "real_diagnosis"),
-        ("hidden effect, twice as large as its own test finds in 90 %, named first, of 38 kinds", share(*found), "99 %",
+        ("an effect of twice its 90 % detection limit, ranked first, of 38 kinds", share(*found), "99 %",
          "diagnosis"),
         ("hidden effect of just the size that a diagnosis prints as its detection limit, noticed",
          share(*result("diagnosis_at_limit")["one, at the printed limit: detected"]), "90 %", "diagnosis_at_limit"),
@@ -77,7 +77,7 @@ def figures() -> list[tuple[str, str, str, str]]:
         ("accelerometer's bias: scatter over sessions in stated uncertainties; less what a session does to all units",
          f"{bias['observed_over_stated']:.1f}; {bias['within_session']:.2f}",
          "1", "acceptance"),
-        ("joint fit of a unit in a fleet, and how much longer scipy's one solve takes",
+        ("joint fit of a unit in a fleet; speed-up over SciPy",
          f"{1e3 * fleet['jaximu, both triads']:.1f} ms, "
          f"{fleet['scipy, both triads'] / fleet['jaximu, both triads']:.1f} times", "20 times", "fleet"),
         ("`jaximu calibrate`, 51 000 rows, relative to importing JAX: compiled before; for the first time",

@@ -360,7 +360,7 @@ def test_command(cases, tmp_path, capsys):
     saved = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert saved["trace"] == {"date": "2026-03-04"} and any("WMM2025" in note for note in saved["fit"]["notes"])
     assert saved["field"]["strength"] == {"value": pytest.approx(48.21, abs=0.01), "sigma": 0.152, "unit": "uT"}
-    assert "A heading is good to" in said and "Hard iron" in said
+    assert "heading in this recording's surroundings is good to" in said and "Hard iron" in said
     assert saved["reading"]["units"]["magnetometer"] == "uT"
     page = (tmp_path / "out" / "report.html").read_text()
     assert "magnetometer" in page and (tmp_path / "out" / "calibration.json").exists()

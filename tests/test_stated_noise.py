@@ -60,7 +60,7 @@ def test_files_that_state_the_same_noise_give_the_same_calibration(folder, capsy
     first, *others = (np.array(document["covariance"]["matrix"]) for document in documents)
     for other in others:
         np.testing.assert_allclose(other, first, rtol=1e-6, atol=1e-6 * np.abs(first).max())
-    assert not [note for note in documents[0]["fit"]["notes"] if "were estimated from this recording" in note]
+    assert not [note for note in documents[0]["fit"]["notes"] if "were estimated from this" in note]
 
 
 def test_two_sources_and_files_that_state_none_are_refused(folder, capsys):

@@ -90,8 +90,8 @@ def calibrate(
     - `gravity`: local gravity; its uncertainty goes into the scales'. Where it states a latitude, the Earth's rotation
       is in the model, its heading free (one recording, every turn between its poses usable; not with other data).
     - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
-      bias, which ties poses and turns together; else the poses' own scatter tells the noise, as if it were white, and
-      of slow drift the uncertainty alone knows, by what this recording shows of it.
+      bias, which ties poses and turns together. Otherwise noise is estimated from the scatter within poses and assumed
+      white; drift only widens the uncertainty.
     - `segmentation`: what counts as a pose.
     - `effects`: effects of the catalogue to fit with gain and bias, by name or with a start; jointly only.
     - `effect_sigmas`: standard deviations, by effect, to which its coefficients are known beforehand about their start.

@@ -26,9 +26,9 @@ from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation
 
 __all__ = [
+    "DRIFT_ESTIMATED",
     "USUAL_DRIFT",
     "drift_components",
-    "drift_text",
     "mean_output_reactions",
     "power_on_text",
     "restricted_likelihood",
@@ -46,6 +46,11 @@ one power-on to the next, which is a few milligravity."""
 _USUAL_EXCESS = 0.3, 2.0
 """The same of what scatters from pose to pose and from turn to turn, over the noise within them: next to nothing is
 known beforehand."""
+DRIFT_ESTIMATED = (
+    "No recording at rest: noise and drift were estimated from this recording's rests. A recording at rest (--static "
+    "LOG) would determine them better."
+)
+"""What is said where drift was estimated from the recording itself."""
 _ASSUMED = (
     "Noise was estimated from the poses of this recording. Poses cannot show slow drift of the bias, so a typical "
     "drift was assumed; add --static LOG to measure it."
@@ -101,15 +106,6 @@ def with_usual_drift(noise: NoiseModel, shortest: float, duration: float) -> Noi
     return replace(noise, notes=(*noise.notes, _ASSUMED))
 
 
-def drift_text(sizes: Mapping[str, float]) -> str:
-    """Say how biases drift; `sizes`: standard deviations by name, relative to white noise over a second."""
-    instabilities = [f"{name} {size:.2g}" for name, size in sizes.items() if name.endswith("bias instability")]
-    return (
-        "Noise and bias drift were estimated from this recording (relative to white noise over a second: "
-        f"{', '.join(instabilities)}). A recording at rest (--static LOG) would determine them better."
-    )
-
-
 def power_on_text(units: Mapping[str, AxisNoise], sizes: Mapping[str, float]) -> list[str]:
     """Say how a bias changes from recording to recording, where it does; `sizes` of the drifts `units`, by name."""
     changes = {
@@ -155,7 +151,7 @@ def with_drift(
     react = np.asarray(fitted.covariance) / sizes @ np.linalg.solve(weighted, jacobian[used]).T
     drift_sizes = dict(zip(drifts, np.exp(log_size[len(excess) :] / 2), strict=True))
     total = np.asarray(fitted.covariance) + react @ changed @ react.T
-    return replace(fitted, covariance=total), (drift_text(drift_sizes), *power_on_text(drifts, drift_sizes))
+    return replace(fitted, covariance=total), (DRIFT_ESTIMATED, *power_on_text(drifts, drift_sizes))
 
 
 def _beforehand(priors: Sequence[tuple[float, float]]) -> tuple[FloatArray, FloatArray]:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.data.drift import (
+    DRIFT_ESTIMATED,
     USUAL_DRIFT,
-    drift_text,
     power_on_text,
     restricted_likelihood,
     with_noise,
@@ -118,7 +118,7 @@ class DriftComponents:
     def notes(self) -> list[str]:
         """What was estimated, in sentences."""
         sizes = {name: size for name, (size, _) in self.sizes.items()}
-        drifting = [drift_text(sizes)] if any(name.endswith("bias instability") for name in sizes) else []
+        drifting = [DRIFT_ESTIMATED] if any(name.endswith("bias instability") for name in sizes) else []
         return drifting + power_on_text(dict(zip(self.names, self.units, strict=False)), sizes)
 
 

@@ -228,7 +228,7 @@ class Validity(Result, Document, page="validity"):
         if self.verdict == "effect":
             what = "gain and bias, fitted without it, differ from a fresh fit's" if self.moved else "gain and bias hold"
             return (
-                f"The unit shows what the calibration lacks ({ratio}): {causes}; {what}. Diagnose a recording and keep "
+                f"The calibration is missing an effect ({ratio}): {causes}; {what}. Diagnose a recording and keep "
                 "the extended calibration."
             )
         words = [_shift_words(shift) for shift in self.moved[:3]]

@@ -57,7 +57,7 @@ _STILL = 1e-2
 _CLOSE = 1e-6
 """Typical sizes below which a step ends a pass: a Newton step takes off what it leaves, and another pass may follow."""
 _SWINGING = 5
-"""Passes after which the excess is improved by what two changes in a row tell of the way that is left."""
+"""After this many passes, the excess is extrapolated from its last two changes."""
 _FARTHEST = 16.0
 """Times a change of the excess that is taken at once where changes in a row are alike."""
 _DROWNED, _LEAP = 12, 0.3

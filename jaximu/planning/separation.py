@@ -80,23 +80,23 @@ def suggestion(cause: Named, candidates: Sequence[Option]) -> str:
     )
 
     def listed(names: Sequence[str], powers: dict[str, float]) -> str:
-        return ", ".join(f"{effect_title(name)} {100 * powers[name]:.0f} %" for name in names)
+        return ", ".join(f"{effect_title(name)} with {100 * powers[name]:.0f} % probability" for name in names)
 
     if list(best.powers) == [cause.name]:
         (power,) = best.powers.values()
         return (
-            f"To decide about {cause.effect.title}, {best.text}: power {100 * power:.0f} % (this recording: "
-            f"{100 * best.before[cause.name]:.0f} %)."
+            f"To decide about {cause.effect.title}, {best.text}. That would show it with {100 * power:.0f} % "
+            f"probability; this recording, with {100 * best.before[cause.name]:.0f} %."
         )
     open_ = [name for name in best.powers if name not in best.told]
     if not best.told:
         return (
             f"No recording that was tried distinguishes {cause.effect.title} from its rivals with "
-            f"{100 * LIMIT_POWER:.0f} % power; best: {best.text}, with power against {listed(open_, best.powers)}."
+            f"{100 * LIMIT_POWER:.0f} % probability; best: {best.text}, which rules out {listed(open_, best.powers)}."
         )
     text = (
-        f"To distinguish {cause.effect.title} from others, {best.text}: power against "
-        f"{listed(best.told, best.powers)}; this recording has {listed(best.told, best.before)}"
+        f"To distinguish {cause.effect.title} from others, {best.text}. That would rule out "
+        f"{listed(best.told, best.powers)}; this recording rules out {listed(best.told, best.before)}"
     )
     return text + (f". It would hardly distinguish it from {listed(open_, best.powers)}." if open_ else ".")
 

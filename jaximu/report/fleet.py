@@ -231,8 +231,8 @@ def _prior(fleet: Fleet) -> Iterator[Section]:
         "with the fleet as prior (1σ)",
     )
     caption = (
-        "Scale and misalignment are relative to the data sheet's scale. The last two columns are the uncertainty that "
-        "nine tenths of the units stay below, without gravity's part, which all units share; marked where the prior "
+        "Scale and misalignment are relative to the data sheet's scale. The last two columns are the 90th percentile "
+        "of the units' uncertainties, without gravity's part, which all units share; marked where the prior "
         "makes it a fifth smaller or more."
     )
     parts: list[Part] = [Table(headers, rows, caption, helped)]

@@ -41,8 +41,9 @@ def _lead(calibration: Calibration) -> tuple[str, str, str]:
         meaning = "scatter of the field's strength on parts of the recording that were left out of the fit"
         return f"After calibration {strength}.", f"{100 * spread['after']:.2g} %", meaning
     return (
-        f"A heading is good to {number(heading['rms'], 2)}° (level, one standard deviation); without calibration it is "
-        f"off by {number(heading['before']['rms'], 2)}° (rms). After calibration {strength}.",
+        f"A level heading in this recording's surroundings is good to {number(heading['rms'], 2)}° (one standard "
+        f"deviation); without calibration it is off by {number(heading['before']['rms'], 2)}° (rms). Iron elsewhere, "
+        f"which one recording does not show, is not in the figure. After calibration {strength}.",
         f"{number(heading['rms'], 2)}°",
         "standard deviation of the heading of a level unit whose vertical is known, in this field",
     )
