@@ -140,7 +140,7 @@ def test_command(calibrations, tmp_path, capsys):
     arguments = ["check", str(tmp_path / "calibration.json"), str(tmp_path / "use.parquet"), "--gravity", "9.80665"]
     assert main([*arguments, "-o", str(tmp_path / "out")]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "updates" in printed and "squared innovations of the filter" in printed
+    assert "updates" in printed and "Squared innovations of the filter" in printed
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "Innovations under the old calibration" in page and ">nan" not in page
+    assert "Squared innovations of the filter over time" in page and ">nan" not in page
     assert not (tmp_path / "out" / "check.png").exists()  # no parameter is told by itself, so none has a picture

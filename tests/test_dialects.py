@@ -7,15 +7,18 @@ import re
 import numpy as np
 import pytest
 from dialects import ALL, G, attempt, random_table, simulate, text, wrong_line, xyz
+from rich.console import Console
 
 from jaximu.cli import main
 from jaximu.ground.errors import InputError
+from jaximu.ground.page import Table
 from jaximu.recordings.alignment import turns_backwards
 from jaximu.recordings.columns.habits import stated_rate
 from jaximu.recordings.columns.names import canonical
 from jaximu.recordings.readers import ReadOptions, advise_reading, read_recording
 from jaximu.recordings.readers.reader import read_table
 from jaximu.report.export.catalogue import writer
+from jaximu.report.terminal import show
 
 AS_IS = ReadOptions(check=False)
 
@@ -239,10 +242,9 @@ def test_a_long_rest_is_offered_once_it_is_cut_out(tmp_path, capsys):
 
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_tables_never_cut_numbers_nor_swallow_units(width, capsys):
-    from jaximu.cli.shown import console, table
-
     row = ("gain [m/s^2]", *["7.078123e-05 ± 1.2e-06"] * 4)
-    table(console(width), ("parameter [unit]", "x", "y", "z", "mean"), [row], "Title [deg/s]")
+    table = Table(("parameter [unit]", "x", "y", "z", "mean"), [row], "Caption [deg/s]")
+    show(table, Console(width=width, highlight=False, markup=False))
     shown = capsys.readouterr().out
     assert shown.count("7.078123e-05") == 4 and shown.count("1.2e-06") == 4 and "…" not in shown
     assert max(map(len, shown.splitlines())) <= width

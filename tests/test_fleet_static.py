@@ -112,6 +112,6 @@ def test_the_command(folder, tmp_path, capsys):
     arguments = ["fleet", str(folder), "-o", str(tmp_path / "t.parquet"), "--workers", "1", "--static"]
     assert main([*arguments, str(folder / "rest")]) == 0
     printed = capsys.readouterr()
-    assert "1 of 2 have no recording at rest" in printed.err and "2 ok" in printed.out
+    assert "1 of 2 have no recording at rest" in printed.err and "All recordings were calibrated" in printed.out
     assert main([*arguments, str(folder / "nothing")]) == 2
     assert "no such file or folder" in capsys.readouterr().err

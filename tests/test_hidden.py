@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import jaximu
+from jaximu.diagnosis.diagnosis import recorded_by_hand
+from jaximu.diagnosis.experiment import Experiment
 from jaximu.diagnosis.hidden import hidden_causes, shift_by
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -21,32 +23,38 @@ def recording(*effects):
 
 @pytest.fixture(scope="module")
 def sound():
-    return jaximu.diagnose(recording(), GRAVITY, static=NOISE)
+    return fitted(recording())
+
+
+def fitted(made):
+    """Gain and bias alone, fitted to what was recorded with the noise that it has."""
+    calibration = jaximu.calibrate(made, GRAVITY, static=NOISE)
+    return Experiment(recorded_by_hand(calibration).with_noise(NOISE), calibration.imu).fit()
 
 
 @pytest.mark.parametrize("name", ["accel.quadratic", "gyro.g_sensitivity"])
 def test_a_hidden_cause_shifts_the_fit_as_was_said(sound, name):
-    limit, _ = sound.detection_limits[name]
+    limit, _ = sound.limits[name]
     size = CATALOGUE[name].dormant().size
     coefficients = np.random.default_rng(1).standard_normal(size)
     coefficients *= limit / np.linalg.norm(coefficients)
-    hidden = jaximu.diagnose(recording(CATALOGUE[name](coefficients)), GRAVITY, static=NOISE)
-    (block,) = (block for block in sound.base.evidence.blocks if block.name == name)
-    predicted = shift_by(sound.base, block) @ coefficients
+    hidden = fitted(recording(CATALOGUE[name](coefficients)))
+    (block,) = (block for block in sound.evidence.blocks if block.name == name)
+    predicted = shift_by(sound, block) @ coefficients
     numbers = [
         [np.asarray(getattr(state.imu.triads()[number.owner], number.part))[number.axes] for number in state.names]
-        for state in (sound.base, hidden.base)
+        for state in (sound, hidden)
     ]
-    moved = np.subtract(*reversed(numbers))[sound.base.fitted]
-    sigmas = np.sqrt(np.diag(sound.base.covariance))[sound.base.fitted]
+    moved = np.subtract(*reversed(numbers))[sound.fitted]
+    sigmas = np.sqrt(np.diag(sound.covariance))[sound.fitted]
     np.testing.assert_allclose(moved / sigmas, predicted / sigmas, atol=0.15 * np.max(np.abs(predicted / sigmas)))
 
 
 def test_the_worst_comes_first_and_each_number_is_named(sound):
-    causes = hidden_causes(sound.base)
-    assert [cause.name for cause in causes] != sorted(sound.detection_limits)
+    causes = hidden_causes(sound)
+    assert [cause.name for cause in causes] != sorted(sound.limits)
     worst = [cause.worst[1] for cause in causes]
     assert worst == sorted(worst, reverse=True) and worst[0] > 0.5
-    assert {cause.name for cause in causes} == set(sound.detection_limits)
-    names = {str(name) for name in sound.base.names}
+    assert {cause.name for cause in causes} == set(sound.limits)
+    names = {str(name) for name in sound.names}
     assert all(set(cause.shift) <= names for cause in causes)

@@ -63,7 +63,7 @@ def page(words: str = LONG) -> Page:
 def test_text_keeps_to_its_width_and_shows_what_the_first_screen_has():
     lines = str(page()).splitlines()
     assert max(len(line) for line in lines if line != f"  {LONG}") <= 100  # what is to be copied is not folded
-    assert "! " in str(page("short")) and "… and 2 more in report.html" in lines and "More" not in lines
+    assert "! " in str(page("short")) and "… and 2 more in the report" in lines and "More" not in lines
 
 
 @given(st.text(max_size=60))

@@ -323,7 +323,7 @@ def test_an_export_says_whose_axes_it_has(tmp_path, capsys):
     ):
         unit(axes, frame=frame).save(path)
         assert main(["export", str(path), "--to", to]) == 0
-        assert capsys.readouterr().out.startswith("Axes: ")
+        assert "\nAxes: " in capsys.readouterr().out
         assert main(["export", str(path), "--to", to, "--json"]) == 0
         document = json.loads(capsys.readouterr().out)
         assert words in document["axes"]

@@ -11,7 +11,7 @@ import pytest
 
 from jaximu.cli import main, messages, usage
 from jaximu.cli.app import GROUPS, VERBS
-from jaximu.cli.options import LogOptions
+from jaximu.cli.options import LogOptions, NoiseOptions
 from jaximu.ground.gravity import STANDARD
 from jaximu.recordings import write_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
@@ -181,7 +181,7 @@ def test_a_recording_at_rest_keeps_its_own_gyroscope(tmp_path):
             ]
         )
         np.savetxt(path, rows, delimiter=",", header=",".join(["time [s]", *kept]), comments="")
-    (recording,), rest = LogOptions(gyro_log=paths[1]).read_unit(paths[:1], STANDARD, paths[2])
+    (recording,), rest = LogOptions(gyro_log=paths[1]).read_unit(paths[:1], STANDARD, NoiseOptions(static=paths[2]))
     for read, path, columns in ((recording, paths[1], slice(1, 4)), (rest, paths[2], slice(4, 7))):
         wanted = np.loadtxt(path, delimiter=",", skiprows=1)[:, columns]
         np.testing.assert_allclose(read.gyroscope.values, wanted)

@@ -123,7 +123,9 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
             f"This path of temperature separates {listed([_WORDS[name] for name in separate])}." if separate else ""
         ]
         lacking = [_WORDS[name] for name in hidden]
-        sentences.append(f"It cannot separate {listed(lacking, 'or')} from plain temperature dependence." if hidden else "")
+        sentences.append(
+            f"It cannot separate {listed(lacking, 'or')} from plain temperature dependence." if hidden else ""
+        )
         if alike:
             share = 100 * (1 - min(parts[name].apart for name in alike))
             sentences.append(f"The other effects imitate {listed([_WORDS[name] for name in alike])} to {share:.2g} %.")

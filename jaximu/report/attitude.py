@@ -83,13 +83,12 @@ def share_words(calibration: Calibration) -> list[str]:
 
 def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
     """Return the page of a calibration against a measured attitude."""
-    trust = [
+    findings = [
         Statement("The reference", " ".join(mounting_words(calibration))),
         Statement(
             "What the misfit is made of",
             f"{sentence('; '.join(share_words(calibration)))}. The intervals contain all of it.",
         ),
-        *gravity_statements(calibration),
     ]
     picture = Picture(
         "residuals",
@@ -97,7 +96,8 @@ def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
         "Errors against the reference before and after",
         "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
     )
-    return calibration_page(calibration, [picture], trust, partial(limits, calibration))
+    trust, unknown = gravity_statements(calibration), partial(limits, calibration)
+    return calibration_page(calibration, [picture], trust, unknown, findings=findings)
 
 
 def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:

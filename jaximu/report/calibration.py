@@ -40,8 +40,22 @@ _ERRORS = {
 def page_of(calibration: Calibration) -> Page:
     """Return the page of a calibration from poses, turns or rests."""
     return calibration_page(
-        calibration, _pictures(calibration), words.trust(calibration), partial(words.limits, calibration)
+        calibration, _pictures(calibration), words.trust(calibration), partial(_limits, calibration)
     )
+
+
+def _limits(calibration: Calibration) -> Iterator[Part]:
+    """Return what the data cannot show, and where the poses pointed."""
+    errors = evidence(calibration)
+    yield from words.limits(calibration, errors)
+    if errors is not None:
+        yield Picture(
+            "orientations",
+            partial(figures.orientation_figure, errors),
+            "Map of the directions that pointed up in each pose",
+            "The two halves of the sphere of orientations, seen along z, areas true. A calibration speaks best for "
+            "orientations near its poses; colours that go with the direction point to a cause that the model lacks.",
+        )
 
 
 def _pictures(calibration: Calibration) -> Iterator[Picture]:
@@ -86,23 +100,26 @@ def calibration_page(
     calibration: Calibration,
     pictures: Iterable[Picture],
     trust: Iterable[Statement],
-    limits: Callable[[], Iterable[Statement]],
+    limits: Callable[[], Iterable[Part]],
     verdict: Sequence[str] = (),
     number: tuple[str, str] | None = None,
+    findings: Iterable[Statement] = (),
 ) -> Page:
     """Return the page of any calibration.
 
     **Arguments:** `trust`, `limits`: what to trust, what the data cannot show (only in the file); `verdict`: sentences
-    before those on the errors; `number`: the one number and what it is, the first error after calibration if None.
+    before those on the errors; `number`: the one number and what it is, the first error after calibration if None;
+    `findings`: what else was found, for the first screen.
     """
     known, trust = calibration.triads(), [*trust, *words.weak_statements(calibration.weak)]
     cautions = [statement for statement in trust if statement.caution]
+    warnings = [Section("Before you rely on it", cautions)] if cautions else []
     settled = [statement for statement in trust if not statement.caution]
 
     def rest() -> Iterator[Part]:
         if settled:
             yield Section("What to trust", settled)
-        yield Section("What the data cannot show", [*limits(), *_orientations(calibration)])
+        yield Section("What the data cannot show", [*limits()])
         yield from _equations(calibration)
         yield _correlation(calibration)
         yield from _origin(calibration)
@@ -114,7 +131,7 @@ def calibration_page(
         (*verdict, *_errors(calibration), *_determined(calibration)),
         value,
         meaning,
-        (*pictures, *([Section("Before you rely on it", cautions)] if cautions else []), *_parameters(calibration)),
+        (*pictures, *findings, *warnings, *_parameters(calibration)),
         rest,
         [sentence(note) for note in calibration.notes],
         f"`jaximu compensate CALIBRATION {shlex.quote(files[0]) if files else 'LOG'} -o CORRECTED.csv` applies it."
@@ -198,18 +215,6 @@ def _parameters(calibration: Calibration) -> Iterator[Part]:
 
 def _effect_row(parameter: Parameter) -> tuple[str, str]:
     return parameter.words + " *" * parameter.weak, with_interval(parameter.value, parameter.sigma, parameter.unit)
-
-
-def _orientations(calibration: Calibration) -> Iterator[Picture]:
-    errors = evidence(calibration)
-    if errors is not None:
-        yield Picture(
-            "orientations",
-            partial(figures.orientation_figure, errors),
-            "Map of the directions that pointed up in each pose",
-            "The two halves of the sphere of orientations, seen along z, areas true. A calibration speaks best for "
-            "orientations near its poses; colours that go with the direction point to a cause that the model lacks.",
-        )
 
 
 def _equations(calibration: Calibration) -> Iterator[Part]:

@@ -127,10 +127,11 @@ def page_of(calibration: Calibration, history: History) -> Page:
     return calibration_page(
         calibration,
         [picture],
-        [*_mounting(calibration), *statements(calibration, history), *gravity_statements(calibration)],
+        gravity_statements(calibration),
         partial(_limits, calibration),
         (f"The filter {verdict} through {minutes:.1f} min of rests and motion.",),
         (f"±{number(worst, 2)} °/s", "how well the gyroscope's bias is known at the end (95 %, the worst axis)"),
+        [*_mounting(calibration), *statements(calibration, history)],
     )
 
 

@@ -133,8 +133,8 @@ def page_of(
         "residuals", partial(_figure, calibration, measurement, heading), "Directions and headings", caption
     )
     verdict, number, meaning = _lead(calibration)
-    trust = statements(calibration)
-    return calibration_page(calibration, [picture], trust, tuple, (verdict, *remarks), (number, meaning))
+    findings = statements(calibration)
+    return calibration_page(calibration, [picture], (), tuple, (verdict, *remarks), (number, meaning), findings)
 
 
 def _figure(calibration: Calibration, measurement: MagneticField, heading: Heading | None) -> Figure:

@@ -11,7 +11,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import WeakDirection
 from jaximu.ground.page import Statement
 from jaximu.ground.quantities import Z95, listed, number, sentence, size
-from jaximu.report.evidence import evidence, largest_gap
+from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
 __all__ = [
     "counts",
@@ -152,7 +152,7 @@ def gravity_statements(calibration: Calibration) -> Iterator[Statement]:
     )
     if share > 0.01:
         text += " State the gravity of your place (--gravity, or --latitude and --height) to narrow it."
-    yield Statement("Gravity", text, share > 0.1)
+    yield Statement("Gravity", text, share > 0.01)
 
 
 def _temperature(calibration: Calibration) -> str:
@@ -172,9 +172,9 @@ def weak_statements(weak: Sequence[WeakDirection]) -> list[Statement]:
     ]
 
 
-def limits(calibration: Calibration) -> Iterator[Statement]:
+def limits(calibration: Calibration, errors: PoseAndTurnErrors | None = None) -> Iterator[Statement]:
     """Say what the data cannot tell."""
-    errors, triads = evidence(calibration), calibration.triads()
+    triads = calibration.triads()
     if errors is not None:
         gap, where = largest_gap(errors.directions)
         if gap > 60:
