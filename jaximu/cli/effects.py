@@ -24,7 +24,6 @@ _SCOPES = {
     "fixture": "fixture: belongs to the set-up",
 }
 _ACTS_ON = {"input": "what the axes sense, before the gain", "output": "what the axes put out"}
-_SETUP = "what the sensors go through, as against what the set-up says"
 
 
 def run(
@@ -95,7 +94,12 @@ def _page(kind: type[Effect]) -> Page:
         ),
         ("usual size", f"{plain(kind.typical)}, for outputs in SI"),
         ("scope", _SCOPES[kind.scope]),
-        ("acts on", _SETUP if kind.owner == "setup" else _ACTS_ON[kind.refers_to]),
+        (
+            "acts on",
+            "what the sensors go through, as against what the set-up says"
+            if kind.owner == "setup"
+            else _ACTS_ON[kind.refers_to],
+        ),
         ("needs", ", ".join(need.replace("_", " ") for need in kind.needs)),
         ("excited by", kind.excited_by),
         ("easily taken for", ", ".join(kind.look_alikes) or "nothing else in the catalogue"),

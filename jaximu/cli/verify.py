@@ -15,12 +15,6 @@ from jaximu.ground.reexport import later
 
 __all__ = ["run"]
 
-_VERDICTS = {
-    "changed": "Changed: at least one file is not what it was when the result was written.",
-    "intact": "Intact: every file is what it was.",
-    "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
-}
-
 
 def run(
     documents: Annotated[
@@ -57,6 +51,11 @@ def run(
         rows = [(link.state, link.what, link.file) for link in links]
         marked = [index for index, link in enumerate(links) if link.state == CHANGED]
         table = Table(("state", "what", "file"), rows, marked=marked)
-        later("report.terminal", "show")(Page(_VERDICTS[verdict], (), first=(table,)))
+        titles = {
+            "changed": "Changed: at least one file is not what it was when the result was written.",
+            "intact": "Intact: every file is what it was.",
+            "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
+        }
+        later("report.terminal", "show")(Page(titles[verdict], (), first=(table,)))
     if verdict != "intact":
         raise SystemExit(3 if changed else 4)

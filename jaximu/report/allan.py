@@ -54,7 +54,6 @@ _DISCRETE_UNITS = {
 _ORDER = ("gyroscope", "accelerometer", "magnetometer")
 """Whose noise matters most."""
 _AXES = ("x", "y", "z", "mean")
-_TERM_HEADERS = ("term", "unit", *_AXES)
 _Content = Callable[[NoiseAnalysis, str], Iterable[Part]]
 _NONE = "The data supports none of N, B and K."
 Cell = tuple[float, float, float] | float
@@ -416,7 +415,7 @@ def _terms(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
     """Yield a triad's terms with their intervals, in both units, what is not seen, and the lowest point."""
     axes, quantity = analysis.axes[name], SENSOR_QUANTITIES[name]
     if rows := [row.row(f"{row.term} {row.meaning}", row.first) for row in term_rows(axes, quantity)]:
-        yield Table(_TERM_HEADERS, rows)
+        yield Table(("term", "unit", *_AXES), rows)
     yield from unseen_notes(axes, quantity)
     at, size = _lowest(axes)
     yield f"Lowest point of the mean's curve: {_in_unit(size, quantity, 'B', 2)} at {_hours(at)}."
@@ -427,7 +426,7 @@ def _terms_in_si(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
     quantity = SENSOR_QUANTITIES[name]
     rows = [row for row in term_rows(analysis.axes[name], quantity) if row.unit == SI_UNITS[quantity][row.term]]
     named = [replace(row, first=True).row(f"{row.term} {row.meaning}") for row in rows]
-    yield Table(_TERM_HEADERS, named) if named else _NONE
+    yield Table(("term", "unit", *_AXES), named) if named else _NONE
 
 
 def _filter(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 __all__ = ["page_of"]
 
-_HEADERS = ("unit", "turned [°]", "position x, y, z [mm]", "clock late by [ms]", "scatter [°/s]", "scatter [m/s²]")
-
 
 def page_of(array: Array) -> Page:
     """Return what averaging gains, which unit disturbs, and where each unit is."""
@@ -92,7 +90,8 @@ def _table(array: Array) -> Table:
         "all units share, over eight samples."
     )
     rows = [_row(unit, unit is array.units[0]) for unit in array.units]
-    return Table(_HEADERS, rows, caption, marked, brief=max([12, *(index + 1 for index in marked)]))
+    headers = ("unit", "turned [°]", "position x, y, z [mm]", "clock late by [ms]", "scatter [°/s]", "scatter [m/s²]")
+    return Table(headers, rows, caption, marked, brief=max([12, *(index + 1 for index in marked)]))
 
 
 def _row(unit: ArrayUnit, first: bool) -> tuple[str, ...]:

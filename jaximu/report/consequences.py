@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = ["page_of"]
 
 _SHOWN = (1.0, 10.0, 60.0, 600.0)  # s
-_BRIEF = 8  # rows of the budget on the first screen: all together and the five largest terms
 _COMMON = 0.1  # by how much the calibration's terms together may differ from their root sum of squares unsaid
 
 
@@ -102,7 +101,7 @@ def _tables(consequences: Consequences) -> Iterator[Section]:
         "the calibration together are in the row “calibration, all together”. To first order along the path."
     )
     budget = _budget_rows(consequences)
-    yield Section("Position error by term (1σ)", [Table(("", *times), budget, caption, brief=_BRIEF)])
+    yield Section("Position error by term (1σ)", [Table(("", *times), budget, caption, brief=8)])
     yield Section("All errors, by direction (1σ)", [Table(("", *times), _total_rows(consequences))])
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -128,7 +128,7 @@ def page_of(calibration: Calibration, history: History) -> Page:
         calibration,
         [picture],
         gravity_statements(calibration),
-        partial(_limits, calibration),
+        partial(_limits, calibration, calibration.filter["open"]),
         (f"The filter {verdict} through {minutes:.1f} min of rests and motion.",),
         (f"±{number(worst, 2)} °/s", "how well the gyroscope's bias is known at the end (95 %, the worst axis)"),
         [*_mounting(calibration), *statements(calibration, history)],
@@ -140,9 +140,8 @@ def _mounting(calibration: Calibration) -> Iterator[Statement]:
         yield Statement("The reference", " ".join(mounting_words(calibration)))
 
 
-def _limits(calibration: Calibration) -> Iterator[Statement]:
-    assert calibration.filter is not None
-    for text in calibration.filter["open"] or ["This sequence leaves no number of the unit open."]:
+def _limits(calibration: Calibration, left_open: Sequence[str]) -> Iterator[Statement]:
+    for text in left_open or ["This sequence leaves no number of the unit open."]:
         yield Statement("Left open", text)
     yield from limits(calibration)
 

@@ -16,18 +16,6 @@ from jaximu.recordings.recording import Recording, Signal
 
 __all__ = ["log_page", "page_of", "signal_facts"]
 
-_HEADERS = (
-    "signal",
-    "unit",
-    "samples",
-    "rate [Hz]",
-    "jitter [ms]",
-    "longest gap [s]",
-    "duration [s]",
-    "minimum",
-    "maximum",
-)
-
 
 def page_of(recording: Recording) -> Page:
     """Return which sensors are in a recording, how they were sampled, and what reading it had to assume."""
@@ -106,7 +94,20 @@ def _table(signals: Mapping[str, Mapping[str, Any]]) -> Table:
         )
         for name, facts in signals.items()
     ]
-    return Table(_HEADERS, rows)
+    return Table(
+        (
+            "signal",
+            "unit",
+            "samples",
+            "rate [Hz]",
+            "jitter [ms]",
+            "longest gap [s]",
+            "duration [s]",
+            "minimum",
+            "maximum",
+        ),
+        rows,
+    )
 
 
 def _guess(guess: Mapping[str, Any] | None) -> Iterator[Part]:

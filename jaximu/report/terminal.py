@@ -91,7 +91,15 @@ def _print_table(table: Table, screen: Console) -> None:
     room = screen.width - 2 * len(widths)
     if sum(words) > room:
         _print_stacked(table, screen)
-        return
+    else:
+        _print_grid(table, words, widths, screen)
+    if table.caption:
+        show(table.caption, screen)
+
+
+def _print_grid(table: Table, words: Sequence[int], widths: list[int], screen: Console) -> None:
+    """Print a table whose columns are as wide as stated, or narrower where that is more than there is room for."""
+    room = screen.width - 2 * len(widths)
     while sum(widths) > room:
         widest = max(range(len(widths)), key=lambda at: widths[at] - words[at])
         widths[widest] -= 1
@@ -101,8 +109,6 @@ def _print_table(table: Table, screen: Console) -> None:
     for index, row in enumerate(table.rows):
         grid.add_row(*row, style="bold" if index in table.marked else None)
     screen.print(grid)
-    if table.caption:
-        show(table.caption, screen)
 
 
 def _print_stacked(table: Table, screen: Console) -> None:

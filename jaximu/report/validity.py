@@ -31,19 +31,19 @@ _OUTPUTS = {
     "gyroscope": "gyroscope's output, its bias re-zeroed",
     "turns": "rotation over a turn",
 }
-_NEXT = {
-    "valid": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
-    "session": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
-    "shifted": "`jaximu calibrate LOG -o RESULTS` calibrates the unit again.",
-    "effect": "`jaximu diagnose LOG -o RESULTS` finds the effect and writes the extended calibration.",
-    "unexplained": "`jaximu diagnose LOG -o RESULTS` shows what does not fit.",
-}
 
 
 def page_of(validity: Validity) -> Page:
     """Return what moved, what explains it, what using the old calibration would cost, and the errors under both."""
     log = str(validity.data.get("file", "LOG"))
     number, meaning = _number(validity)
+    following = {
+        "valid": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
+        "session": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
+        "shifted": "`jaximu calibrate LOG -o RESULTS` calibrates the unit again.",
+        "effect": "`jaximu diagnose LOG -o RESULTS` finds the effect and writes the extended calibration.",
+        "unexplained": "`jaximu diagnose LOG -o RESULTS` shows what does not fit.",
+    }
     return Page(
         f"Is the calibration still valid for {Path(log).name}?",
         (f"{sentence(validity.verdict)}: {validity.headline()}",),
@@ -52,7 +52,7 @@ def page_of(validity: Validity) -> Page:
         (*_shifts(validity), *_statements(validity), *_errors_table(validity)),
         rest=lambda: [_picture(validity)],
         notes=[sentence(note) for note in validity.notes],
-        next=_NEXT[validity.verdict].replace("LOG", shlex.quote(log)),
+        next=following[validity.verdict].replace("LOG", shlex.quote(log)),
     )
 
 
