@@ -47,8 +47,8 @@ _USUAL_EXCESS = 0.3, 2.0
 """The same of what scatters from pose to pose and from turn to turn, over the noise within them: next to nothing is
 known beforehand."""
 DRIFT_ESTIMATED = (
-    "No recording at rest: noise and drift were estimated from this recording's rests. A recording at rest (--static "
-    "LOG) would determine them better."
+    "No recording at rest: noise and bias drift were estimated from this recording's rests. A recording at rest "
+    "(--static LOG) would determine them better."
 )
 """What is said where drift was estimated from the recording itself."""
 _ASSUMED = (
