@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from jaximu.diagnosis.drift import DRAWS
@@ -116,6 +117,11 @@ class Evidence:
         self._reach = np.linalg.norm(raw[0], axis=0)
         self._gram = self.columns.T @ self.columns
         self._product = self.columns.T @ self.residual
+
+    @cached_property
+    def inverse(self) -> FloatArray:
+        """The pseudo-inverse (p, n) of the Jacobian."""
+        return np.asarray(scipy.linalg.pinv(self.jacobian))
 
     def _off_base(self, values: FloatArray) -> FloatArray:
         return values - self._base @ (self._base.T @ values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +41,7 @@ def shift_by(state: State, block: EffectBlock) -> FloatArray:
     that, to first order by −(JᵀJ)⁻¹JᵀC (the minimal detectable bias carried to the parameters: Baarda 1968; Teunissen
     2006).
     """
-    moved = -np.linalg.lstsq(state.evidence.jacobian, block.columns, rcond=None)[0]
+    moved = -state.evidence.inverse @ block.columns
     return np.asarray(moved * state.fitted_sizes[:, None] / block.sizes, np.float64)
 
 
@@ -54,17 +53,12 @@ def hidden_causes(state: State) -> list[Hidden]:
 
 def _shifts(state: State, name: str, limit: float) -> dict[str, float]:
     """Return the shifts by a cause, wherever on its grid it does most."""
-    sigmas = np.sqrt(np.maximum(np.diag(state.covariance), 0.0))[state.fitted]
-    largest = np.max([_spread(shift_by(state, block)) for block in _blocks(state, name)], axis=0)
-    sizes = limit * largest / np.where(sigmas > 0, sigmas, np.inf)
-    names = [str(state.names[row]) for row in state.fitted]
-    return {number: float(size) for number, size in zip(names, sizes, strict=True) if size >= _NOTHING}
+    sigmas = np.sqrt(np.diag(state.covariance)[state.fitted])
+    largest = np.max([_spread(shift_by(state, block)) for block in state.evidence.blocks if block.name == name], axis=0)
+    sizes = zip(state.fitted, limit * largest / sigmas, strict=True)
+    return {str(state.names[row]): float(size) for row, size in sizes if size >= _NOTHING}
 
 
 def _spread(shift: FloatArray) -> FloatArray:
     """Return the root mean square (p,) over coefficient vectors of length one and random direction."""
     return np.sqrt(np.mean(shift**2, axis=1))
-
-
-def _blocks(state: State, name: str) -> Iterator[EffectBlock]:
-    return (block for block in state.evidence.blocks if block.name == name and block.kind == "effect")
