@@ -621,6 +621,7 @@ def test_command(box, schedule, tmp_path, capsys):
     loaded = load_calibration(tmp_path / "out" / "calibration.json")
     assert loaded.method == "turntable" and within(loaded, truth.imu)
     assert loaded.reading is not None and loaded.reading.units["accelerometer"] == "m/s^2"
+    assert (tmp_path / "out" / "residuals.png").exists()
     page = (tmp_path / "out" / "report.html").read_text()
     assert "6 poses, 8 turns" in page and "not square" in page
     assert main([*given, "--json"]) == 0

@@ -70,7 +70,7 @@ def _pictures(calibration: Calibration) -> Iterator[Picture]:
         )
     if calibration.fit is not None and calibration.stations is not None:
         yield Picture(
-            "stations",
+            "residuals" if calibration.observations is None else "table_residuals",
             partial(_stations_figure, calibration),
             "Errors of each pose and turn after calibration",
             "Mean outputs less what the calibrated model makes of what the set-up says, by axis, in SI.",
