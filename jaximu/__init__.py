@@ -20,6 +20,7 @@ from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.acceptance import accept
+    from jaximu.acceptance.history import compare
     from jaximu.acceptance.verify import verify
     from jaximu.calibration import Calibration, calibrate, compensate, load_calibration
     from jaximu.calibration import calibrate_against_attitude as reference
@@ -79,6 +80,7 @@ __all__ = [
     "cache",
     "calibrate",
     "check",
+    "compare",
     "compensate",
     "consequences",
     "diagnose",

@@ -93,7 +93,7 @@ def judge(units: Units, limits: Limits) -> Judged:
     for limit in limits.limits:
         if limit.part in OF_ONE_UNIT:
             continue
-        stem = limit.part if "." in limit.part else f"{limit.owner}.{limit.part}"
+        stem = limit.stem
         if limit in outputs:
             start = first + 3 * outputs.index(limit)
             columns = {(axis,): start + axis for axis in range(3)}

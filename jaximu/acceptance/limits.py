@@ -87,6 +87,11 @@ class Limit:
     after: float = 0.0
     stated: str = ""
 
+    @property
+    def stem(self) -> str:
+        """What the names of its quantities begin with: `gyroscope.bias`, or an effect's name."""
+        return self.part if "." in self.part else f"{self.owner}.{self.part}"
+
     def nearest(self, value: float) -> float:
         """Return how far a value is from the nearer bound."""
         return min(abs(self.high - value), abs(value - self.low))
@@ -107,6 +112,15 @@ class Limits:
     nominal: dict[str, tuple[FloatArray, FloatArray]]
     file: str
     sha256: str
+
+    def applies(self, limit: Limit, name: str) -> bool:
+        """Return whether a limit is the one of a quantity such as `gyroscope.bias[2]`: one of its axis goes before."""
+        stem, _, axes = name.rstrip("]").partition("[")
+        if stem != limit.stem:
+            return False
+        named = tuple(map(int, axes.split(",")))
+        others = [other.axes for other in self.limits if other.stem == stem]
+        return limit.axes == named or (not limit.axes and named not in others)
 
 
 def read_limits(path: str | os.PathLike[str], rule: str | None = None, risk: float | None = None) -> Limits:

@@ -25,7 +25,7 @@ from jaximu.estimation.data import Data
 from jaximu.estimation.rows import TEMPERATURE
 from jaximu.estimation.uncertainty import describe, label
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import chi2_sf, normal_sf
+from jaximu.ground.distributions import chi2_sf, holm, normal_sf
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
@@ -493,9 +493,9 @@ def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
     difference, sigma = fresh.difference, np.sqrt(np.diag(fresh.covariance_of_difference))
     comparable = fresh.known(old)
     raw = 2 * normal_sf(np.abs(difference) / sigma)
-    tested = [k for k in np.argsort(raw) if comparable[k] and k not in old.allowed]
+    tested = [k for k in range(len(raw)) if comparable[k] and k not in old.allowed]
     p_value = np.ones(len(raw))
-    p_value[tested] = np.maximum.accumulate(np.minimum(raw[tested] * np.arange(len(tested), 0, -1), 1.0))
+    p_value[tested] = holm(raw[tested])
     shifts = []
     for k, name in enumerate(old.names):
         gain = name.part == "gain"

@@ -11,7 +11,7 @@ from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.experiment import LEAST_WARMING, Experiment, State
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import chi2_sf, kolmogorov_sf
+from jaximu.ground.distributions import chi2_sf, holm, kolmogorov_sf
 
 __all__ = ["Check", "checks_of"]
 
@@ -69,12 +69,8 @@ def checks_of(state: State, experiment: Experiment) -> tuple[Check, ...]:
     if experiment.data.by_hand:
         checks += _dependences(state, experiment)
     checks += [_distribution(state), _odd_even(state, experiment)]
-    order = sorted(range(len(checks)), key=lambda k: checks[k].p_value)
-    largest = 0.0
-    for rank, k in enumerate(order):
-        largest = max(largest, min((len(order) - rank) * checks[k].p_value, 1.0))
-        checks[k] = replace(checks[k], adjusted=largest)
-    return tuple(checks)
+    adjusted = holm([check.p_value for check in checks]).tolist()
+    return tuple(replace(check, adjusted=value) for check, value in zip(checks, adjusted, strict=True))
 
 
 def _by_kind(state: State, experiment: Experiment) -> list[Check]:

@@ -9,6 +9,7 @@ __all__ = [
     "chi2_sf",
     "f_tails",
     "gamma_mean_sf",
+    "holm",
     "kolmogorov_sf",
     "noncentral_chi2_sf",
     "normal_isf",
@@ -88,3 +89,12 @@ def student_isf(probability, freedom):
     freedom = np.asarray(freedom, float)
     few = -scipy.special.stdtrit(np.where(np.isinf(freedom), 1.0, freedom), probability)
     return np.where(np.isinf(freedom), normal_isf(probability), few)
+
+
+def holm(p_values):
+    """Return p-values (n,) with all n questions allowed for (Holm, Scandinavian Journal of Statistics 6, 1979)."""
+    order = np.argsort(p_values)
+    adjusted = np.ones(len(order))
+    stepped = np.asarray(p_values, float)[order] * np.arange(len(order), 0, -1)
+    adjusted[order] = np.maximum.accumulate(np.minimum(stepped, 1.0))
+    return adjusted

@@ -1,0 +1,539 @@
+"""What moved between calibrations of one unit: each number, each kind together, and what it does to the output.
+
+Calibrations are put on one footing (`jaximu.acceptance.epochs`); what all of them determine is compared. Recordings are
+independent, so the covariance of n calibrations is block diagonal, but for gravity's error, which those share that
+state the same gravity: it drops out of their differences. χ² of values being the same, of every number, every kind and
+all together; every number's p-value with all of them allowed for (Holm). Over dates each number has a line, whose slope
+is its drift (`jaximu.acceptance.trend`), and which says when a limit's guard band is reached.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import date, timedelta
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from jaximu.acceptance.epochs import Epoch, epochs_of, owner_of, require_apart
+from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits
+from jaximu.acceptance.quantities import output_stimulus
+from jaximu.acceptance.trend import Line, Sameness, sameness
+from jaximu.acceptance.words import si_unit
+from jaximu.calibration import Calibration
+from jaximu.calibration.calibration import require_calibration
+from jaximu.estimation.problem import names_of
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import holm
+from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.page import Result
+from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import listed
+from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES, SENSOR_UNITS, STANDARD_GRAVITY
+from jaximu.model.effects import CATALOGUE
+from jaximu.model.stimulus import Stimulus
+
+__all__ = ["RATE", "Course", "LimitReached", "OutputChange", "UnitHistory", "compare"]
+
+SCHEMA = "jaximu.compare/1"
+RATE = float(np.radians(250.0))
+"""Angular rate, rad/s, up to which a gyroscope's output is compared unless another is stated; as exports have it."""
+_YEAR = 365.25  # days
+
+
+@dataclass(frozen=True)
+class Course:
+    """One number through all calibrations, in SI.
+
+    values, sigmas: (n,) with all uncertainty. difference, sigma: last − first, without what both share. tested: False
+    for a gyroscope's bias, another after every power-on. p_value: of one and the same value in all; adjusted: with all
+    numbers that are tested allowed for. line: over time.
+    """
+
+    name: str
+    unit: str
+    values: tuple[float, ...]
+    sigmas: tuple[float, ...]
+    difference: float
+    sigma: float
+    p_value: float
+    line: Line
+    tested: bool = True
+    adjusted: float = 1.0
+    moved: bool = False
+
+    @property
+    def z(self) -> float:
+        """The difference in standard deviations."""
+        return self.difference / self.sigma
+
+    def document(self, per: str) -> dict[str, Any]:
+        """Return it as JSON has it; `per`: unit of time."""
+        return {
+            "name": self.name,
+            "unit": self.unit,
+            "values": list(self.values),
+            "sigmas": list(self.sigmas),
+            "difference": self.difference,
+            "sigma": self.sigma,
+            "z": self.z,
+            "p_value": self.p_value,
+            "p_value_all_allowed_for": self.adjusted if self.tested else None,
+            "moved": self.moved,
+            "tested": self.tested,
+            "drift": self.line.document() | {"unit": f"{self.unit} per {per}"},
+        }
+
+
+@dataclass(frozen=True)
+class OutputChange:
+    """What the first calibration makes of the output of the unit as the last has it, less the truth; SI.
+
+    worst, sigma: largest in any direction at an input of `over`, and its uncertainty along it; rms: over directions;
+    expected: what the uncertainty of both alone makes of the rms.
+    """
+
+    worst: float
+    sigma: float
+    rms: float
+    expected: float
+    over: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class LimitReached:
+    """After how long since the last calibration a number is within the guard band of a limit; None: it never is."""
+
+    name: str
+    limit: Limit
+    after: float | None
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class UnitHistory(Result, Document, page="history"):
+    """Calibrations of one unit in order, and what moved.
+
+    times: (n,) since the last, in `per` ("year", or "step" where dates are not known). dates: of each, None where not
+    known. together: χ² of each kind of number, and "all" of those that are tested. output: by triad. left_out: what was
+    not compared, and why, in sentences. level: rate of false alarms over all numbers together.
+    """
+
+    files: tuple[str, ...]
+    times: FloatArray
+    per: str
+    dates: tuple[date | None, ...]
+    temperatures: tuple[float | None, ...]
+    courses: tuple[Course, ...]
+    together: dict[str, Sameness]
+    output: dict[str, OutputChange]
+    limits: tuple[LimitReached, ...] = ()
+    limits_file: str = ""
+    left_out: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    level: float = 0.05
+
+    @property
+    def moved(self) -> tuple[Course, ...]:
+        """The numbers that moved, the surest first."""
+        return tuple(sorted((course for course in self.courses if course.moved), key=lambda course: course.p_value))
+
+    @property
+    def verdict(self) -> str:
+        """`moved` where any number did or all together did; `same` where nothing shows."""
+        return "moved" if self.moved or self.together["all"].p_value < self.level else "same"
+
+    @property
+    def interval(self) -> float | None:
+        """The time until the first limit's guard band is reached, None where none ever is or none was stated."""
+        return min((limit.after for limit in self.limits if limit.after is not None), default=None)
+
+    def due(self, after: float) -> date | None:
+        """Return the date a time after the last calibration, None where dates are not known or it is beyond them."""
+        last = self.dates[-1]
+        try:
+            return None if last is None or self.per != "year" else last + timedelta(days=_YEAR * after)
+        except OverflowError:
+            return None
+
+    def document(self) -> dict[str, Any]:
+        """Return the comparison as the JSON document of schema `jaximu.compare/1`."""
+
+        def reached(limit: LimitReached) -> dict[str, Any]:
+            low, high = (end if np.isfinite(end) else None for end in (limit.limit.low, limit.limit.high))
+            due = None if limit.after is None else self.due(limit.after)
+            return {
+                "name": limit.name,
+                "low": low,
+                "high": high,
+                "unit": limit.limit.unit,
+                "after": limit.after,
+                "date": due and due.isoformat(),
+            }
+
+        columns = zip(self.files, self.times.tolist(), self.dates, self.temperatures, strict=True)
+        return {
+            "schema": SCHEMA,
+            "verdict": self.verdict,
+            "calibrations": [
+                {"file": file, "time": time, "date": day and day.isoformat(), "temperature": temperature}
+                for file, time, day, temperature in columns
+            ],
+            "time_unit": self.per,
+            "level": self.level,
+            "together": {name: test.document() for name, test in self.together.items()},
+            "moved": [course.name for course in self.moved],
+            "parameters": [course.document(self.per) for course in self.courses],
+            "output": {name: vars(change) for name, change in self.output.items()},
+            "limits": {
+                "file": self.limits_file or None,
+                "calibration_interval": self.interval,
+                "items": [reached(limit) for limit in self.limits],
+            },
+            "not_compared": list(self.left_out),
+            "notes": list(self.notes),
+            "software": SOFTWARE,
+        }
+
+
+def compare(
+    *calibrations: Calibration,
+    dates: Sequence[str | date] | None = None,
+    limits: Limits | None = None,
+    rate: float = RATE,
+    level: float = 0.05,
+    files: Sequence[str] = (),
+) -> UnitHistory:
+    """Return what moved between two calibrations of a unit, or over its history.
+
+    **Arguments:**
+
+    - `dates`: of each calibration, as "2026-03-04"; those that calibrations state (`trace`) otherwise. Without dates
+      they are a step apart, in the order given.
+    - `limits`: as `read_limits` reads them; of each the time is worked out until its guard band is reached.
+    - `rate`: angular rate up to which the gyroscope's output is compared, rad/s; the accelerometer's is at 1 g.
+    - `level`: rate of false alarms over all numbers together.
+    - `files`: what the calibrations are called.
+
+    Raises `InputError` for fewer than two calibrations, one given twice, or dates that do not fit them;
+    `NotPossibleError` where two rest on one recording or nothing can be compared.
+    """
+    require_float64()
+    for calibration in calibrations:
+        require_calibration(calibration)
+    if len(calibrations) < 2:
+        raise InputError("a comparison takes two calibrations of the unit or more.")
+    if not 0 < level < 1 or not 0 < rate < np.inf:
+        raise InputError("the level lies between 0 and 1, and the rate is a number of rad/s above 0.")
+    files = tuple(files) or tuple(f"calibration {number}" for number in range(1, len(calibrations) + 1))
+    require_apart(calibrations, files)
+    order, days, times, per, notes = _in_order(calibrations, files, dates)
+    ordered, files = [calibrations[place] for place in order], tuple(files[place] for place in order)
+    epochs = epochs_of(ordered, files, {} if limits is None else limits.nominal)
+    names, left_out = _comparable(epochs)
+    covariance = _covariance(epochs, names)
+    courses = _courses(epochs, names, covariance, times, level)
+    values = np.array([course.values for course in courses]).T
+    together = _together(courses, values, covariance)
+    output = {}
+    for owner in dict.fromkeys(map(owner_of, names)):
+        change = _output(epochs[0], epochs[-1], owner, rate, names)
+        if isinstance(change, str):
+            left_out.append(change)
+        else:
+            output[owner] = change
+    reached, unknown = _limits_reached(courses, limits)
+    return UnitHistory(
+        files,
+        times,
+        per,
+        days,
+        tuple(epoch.temperature for epoch in epochs),
+        courses,
+        together,
+        output,
+        reached,
+        "" if limits is None else limits.file,
+        tuple(left_out + unknown),
+        (*notes, *_notes(epochs)),
+        level,
+    )
+
+
+def _in_order(
+    calibrations: Sequence[Calibration], files: Sequence[str], stated: Sequence[str | date] | None
+) -> tuple[list[int], tuple[date | None, ...], FloatArray, str, list[str]]:
+    """Return the order in time, dates and times since the last in it, their unit, and notes."""
+    count = len(calibrations)
+    if stated is not None and len(stated) != count:
+        raise InputError(f"{len(stated)} dates for {count} calibrations: state one for each, in their order.")
+    texts = stated or [(calibration.trace or {}).get("date") for calibration in calibrations]
+    try:
+        days = [None if text is None else date.fromisoformat(str(text)[:10]) for text in texts]
+    except ValueError as error:
+        raise InputError(f"{error}: a date is written as 2026-03-04.") from None
+    known = [day for day in days if day is not None]
+    if len(known) == count and len(set(known)) > 1:
+        order = sorted(range(count), key=lambda place: known[place])
+        times = np.array([(known[place] - max(known)).days / _YEAR for place in order])
+        return order, tuple(known[place] for place in order), times, "year", []
+    without = [file for file, day in zip(files, days, strict=True) if day is None]
+    why = f"no date is known of {listed(without)}" if without else "all are of one day"
+    note = f"{why}: calibrations are taken in the order given, a step apart; --dates YYYY-MM-DD,… states dates."
+    return list(range(count)), tuple(days), np.arange(1.0 - count, 1.0), "step", [note]
+
+
+# --- what is compared -------------------------------------------------------------------------------------------------
+
+_VECTORS = {*SENSOR_QUANTITIES.values(), "angular_acceleration"}
+
+
+def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
+    """Return the quantities that all calibrations determine, and what is left out, in sentences.
+
+    Raises `NotPossibleError` where there is none.
+    """
+    reasons = [_apart(epochs[0], epoch) for epoch in epochs[1:]]
+    apart = {owner: reason for found_apart in reasons for owner, reason in found_apart.items()}
+    everything = list(dict.fromkeys(name for epoch in epochs for name in epoch.quantities))
+    names, left_out = [], {}
+    for name in everything:
+        stem, owner = name.partition("[")[0], owner_of(name)
+        lacking = [epoch.file for epoch in epochs if name not in epoch.quantities]
+        unless = [epoch.quantities[name].unless for epoch in epochs if name in epoch.quantities]
+        if owner in apart:
+            left_out[owner] = apart[owner]
+        elif lacking:
+            left_out[stem if stem in CATALOGUE else owner] = f"{listed(lacking)} holds none"
+        elif all(text == "fixed" for text in unless):
+            continue  # by convention, or of a data sheet
+        elif any(unless):
+            texts = [f"{epoch.file} holds it fixed" for epoch, t in zip(epochs, unless, strict=True) if t == "fixed"]
+            left_out[name] = (texts + [text for text in unless if text and text != "fixed"])[0]
+        elif f"{owner} gain" in apart and name.startswith((f"{owner}.scale", f"{owner}.misalignment")):
+            left_out[f"{owner} gain"] = apart[f"{owner} gain"]
+        elif stem in CATALOGUE and _VECTORS & set(CATALOGUE[stem].needs) and any(epoch.turned for epoch in epochs):
+            left_out[stem] = "its axes are a set-up's in one calibration"
+        else:
+            names.append(name)
+    sentences = [f"{what} is not compared: {why}." for what, why in left_out.items()]
+    if not names:
+        raise NotPossibleError(f"these calibrations have nothing in common to compare. {' '.join(sentences)}".strip())
+    return names, sentences
+
+
+def _apart(first: Epoch, other: Epoch) -> dict[str, str]:
+    """Return why triads, or their gains, of two calibrations are not of one kind."""
+    reasons: dict[str, str] = {}
+    triads, others = first.calibration.triads(), other.calibration.triads()
+    readings = first.calibration.reading, other.calibration.reading
+    for owner in triads.keys() & others.keys():
+        units = triads[owner].output_unit, others[owner].output_unit
+        if units[0] != units[1]:
+            reasons[owner] = f"{first.file} has it in {units[0]}, {other.file} in {units[1]}"
+        elif readings[0] is not None:
+            try:
+                readings[0].require_alike(readings[1], other.file, (owner,))
+            except InputError:
+                reasons[owner] = (
+                    f"the logs of {first.file} and {other.file} were read in other axes or scales of counts"
+                )
+    if ("accelerometer" in triads) != ("accelerometer" in others):
+        reasons["gyroscope gain"] = "its axes are the accelerometer's, which one calibration lacks"
+    return reasons
+
+
+def _covariance(epochs: Sequence[Epoch], names: Sequence[str]) -> FloatArray:
+    """Return the covariance (n q, n q) of quantities in all calibrations, with what gravity's error makes of it."""
+    size = len(names)
+    covariance, by_gravity = np.zeros((len(epochs) * size,) * 2), []
+    for place, epoch in enumerate(epochs):
+        slope = np.array([epoch.quantities[name].slope for name in names])
+        rows = slice(place * size, (place + 1) * size)
+        covariance[rows, rows] = slope @ epoch.covariance @ slope.T
+        by_gravity.append(slope @ epoch.by_gravity)
+    for gravity in {epoch.gravity for epoch in epochs}:
+        shared = np.concatenate(
+            [part * (epoch.gravity == gravity) for epoch, part in zip(epochs, by_gravity, strict=True)]
+        )
+        covariance += np.outer(shared, shared)
+    return covariance
+
+
+def _courses(
+    epochs: Sequence[Epoch], names: Sequence[str], covariance: FloatArray, times: FloatArray, level: float
+) -> tuple[Course, ...]:
+    courses = []
+    for place, name in enumerate(names):
+        values = np.array([epoch.quantities[name].value for epoch in epochs])
+        part = covariance[place :: len(names), place :: len(names)]
+        variance = part[0, 0] + part[-1, -1] - 2 * part[0, -1]
+        courses.append(
+            Course(
+                name,
+                _unit(name, epochs[0].calibration),
+                tuple(values.tolist()),
+                tuple(epoch.sigma(name) for epoch in epochs),
+                float(values[-1] - values[0]),
+                float(np.sqrt(variance)),
+                sameness(values[:, None], part).p_value,
+                Line.through(times, values, part),
+                not name.startswith("gyroscope.bias"),
+            )
+        )
+    tested = [place for place, course in enumerate(courses) if course.tested]
+    for place, adjusted in zip(tested, holm([courses[place].p_value for place in tested]).tolist(), strict=True):
+        courses[place] = replace(courses[place], adjusted=adjusted, moved=adjusted < level)
+    return tuple(courses)
+
+
+def _unit(name: str, calibration: Calibration) -> str:
+    stem = name.partition("[")[0]
+    if stem not in CATALOGUE:
+        return si_unit(name)
+    return CATALOGUE[stem].coefficient_unit(calibration.triads()[owner_of(name)].output_unit)
+
+
+def _kind(name: str) -> str:
+    """Return which numbers one is tested with: a triad's bias, its gain, or effects."""
+    stem = name.partition("[")[0]
+    if stem in CATALOGUE:
+        return "effects"
+    owner, _, part = stem.partition(".")
+    return f"{owner} {'bias' if part == 'bias' else 'gain'}"
+
+
+def _together(courses: Sequence[Course], values: FloatArray, covariance: FloatArray) -> dict[str, Sameness]:
+    """Return χ² of each kind of number, and of all that are tested."""
+    count, size = values.shape
+
+    def test(chosen: list[int]) -> Sameness:
+        rows = [epoch * size + column for epoch in range(count) for column in chosen]
+        return sameness(values[:, chosen], covariance[np.ix_(rows, rows)])
+
+    kinds = [_kind(course.name) for course in courses]
+    groups = {kind: [place for place, other in enumerate(kinds) if other == kind] for kind in dict.fromkeys(kinds)}
+    tested = [place for place, course in enumerate(courses) if course.tested]
+    if tested:
+        groups["all"] = tested
+    return {name: test(chosen) for name, chosen in groups.items()} | ({} if tested else {"all": Sameness(0.0, 0, 1.0)})
+
+
+# --- the output -------------------------------------------------------------------------------------------------------
+
+
+def _output(first: Epoch, last: Epoch, owner: str, rate: float, names: Sequence[str]) -> OutputChange | str:
+    """Return what the change does to a triad's corrected output, or why that is not known."""
+    if owner not in INERTIAL_QUANTITIES:
+        return f"the {owner}'s output is not compared."
+    needed = [
+        name
+        for epoch in (first, last)
+        for name, quantity in epoch.quantities.items()
+        if name.startswith(f"{owner}.") and quantity.unless != "fixed"
+    ]
+    if missing := [name for name in needed if name not in names]:
+        return f"the {owner}'s output is not compared: {missing[0]} is not."
+    over = STANDARD_GRAVITY if owner == "accelerometer" else rate
+    unit, quantity = first.calibration.imu, SENSOR_QUANTITIES[owner]
+    limit = Limit(owner, owner, "output", (), -np.inf, np.inf, SENSOR_UNITS[owner], over=over)
+    directions = getattr(output_stimulus(limit, unit.with_effects()), quantity)
+    celsius = np.full(len(directions), unit.triads()[owner].temperature_reference)
+    stimulus = Stimulus(**{quantity: directions, "temperature": celsius})
+    flats, restores = zip(*(ravel_pytree(epoch.calibration.imu) for epoch in (first, last)), strict=True)
+
+    def error(*numbers):
+        triads = []
+        for flat, restore in zip(numbers, restores, strict=True):
+            triad = restore(flat).triads()[owner]
+            effects = tuple(effect for effect in triad.effects if effect.scope == "device")
+            bias = jnp.zeros(3) if owner == "gyroscope" else triad.bias  # another after every power-on
+            triads.append(replace(triad, effects=effects, bias=bias))
+        return triads[0].recover(triads[1].respond(stimulus), stimulus) - directions
+
+    try:
+        values = np.asarray(error(*flats))
+        slopes = [np.asarray(slope) for slope in jax.jacfwd(error, (0, 1))(*flats)]
+    except InputError as problem:
+        return f"the {owner}'s output is not compared: {problem}"
+    spread, common = np.zeros((len(values), 3, 3)), []
+    for epoch, slope in zip((first, last), slopes, strict=True):
+        every = names_of(epoch.calibration.imu)
+        free = slope[..., [every.index(name) for name in epoch.calibration.names]]
+        spread += np.einsum("nip,pq,njq->nij", free, epoch.covariance, free)
+        common.append(free @ epoch.by_gravity)
+    for shift in [common[0] + common[1]] if first.gravity == last.gravity else common:
+        spread += shift[:, :, None] * shift[:, None, :]
+    length = np.linalg.norm(values, axis=1)
+    worst = int(np.argmax(length))
+    along = values[worst] / max(length[worst], 1e-300)
+    return OutputChange(
+        float(length[worst]),
+        float(np.sqrt(along @ spread[worst] @ along)),
+        float(np.sqrt(np.mean(length**2))),
+        float(np.sqrt(np.mean(np.trace(spread, axis1=1, axis2=2)))),
+        over,
+        SENSOR_UNITS[owner],
+    )
+
+
+# --- limits and words -------------------------------------------------------------------------------------------------
+
+
+def _limits_reached(courses: Sequence[Course], limits: Limits | None) -> tuple[tuple[LimitReached, ...], list[str]]:
+    """Return when each limit's guard band is reached, and which limits cannot be followed, in sentences."""
+    if limits is None:
+        return (), []
+    reached, unknown = [], []
+    for limit in limits.limits:
+        followed = [course for course in courses if limits.applies(limit, course.name)]
+        for course in followed:
+            multiple = float(limits.rule.multiple(course.line.freedom))
+            reached.append(LimitReached(course.name, limit, course.line.until(limit.low, limit.high, multiple)))
+        if not followed:
+            of_noise = limit.part in (*OF_ONE_UNIT, *OUTPUTS)
+            why = "limits of parameters alone are followed over time" if of_noise else "no such number was compared"
+            unknown.append(f"{limit.key} is not followed: {why}.")
+    return tuple(reached), unknown
+
+
+def _notes(epochs: Sequence[Epoch]) -> list[str]:
+    """Return what else a reader should know of the comparison."""
+    notes = []
+    serials = {str((epoch.calibration.trace or {}).get("serial", "")) for epoch in epochs} - {""}
+    if len(serials) > 1:
+        notes.append(f"the calibrations state different serial numbers, {listed(sorted(serials))}: is it one unit?")
+    if any(epoch.turned for epoch in epochs):
+        notes.append(
+            "axes of a set-up were turned to the accelerometer's own, so that the unit may sit another way each time."
+        )
+    if all("accelerometer" not in epoch.calibration.triads() for epoch in epochs):
+        notes.append("without an accelerometer axes are the set-up's: a unit that sits turned has other misalignments.")
+    effects = [
+        {e.name for e in epoch.calibration.imu.all_effects().values() if e.scope == "device"} for epoch in epochs
+    ]
+    if odd := sorted(set.union(*effects) - set.intersection(*effects)):
+        notes.append(
+            f"not all calibrations have {listed(odd)}: gain and bias fitted without it hold a part of it, and differ by "
+            "that."
+        )
+    stated = {epoch.gravity for epoch in epochs}
+    if len(stated) < len(epochs) and any(epoch.by_gravity.any() for epoch in epochs):
+        sigma = max(gravity.sigma / gravity.value for gravity in stated)
+        notes.append(
+            "gravity's error is common to calibrations that state the same gravity; were they made at different "
+            f"places, all scales of the accelerometer might differ by {100 * 2 * np.sqrt(2) * sigma:.2g} %."
+        )
+    known = [epoch.temperature for epoch in epochs if epoch.temperature is not None]
+    references = {triad.temperature_reference for epoch in epochs for triad in epoch.calibration.triads().values()}
+    if len(known) == len(epochs) and len(references) == 1 and max(known) > min(known):
+        notes.append(
+            f"the recordings were at {min(known):.1f} to {max(known):.1f} °C: what follows temperature looks like "
+            "movement."
+        )
+    return notes
