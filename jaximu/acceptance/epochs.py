@@ -34,7 +34,7 @@ Scales = Mapping[str, tuple[FloatArray, FloatArray]]
 
 
 class Quantity(NamedTuple):
-    """A quantity of one calibration: its value in SI, its slope (p,) by the free numbers, and why it is not compared."""
+    """A quantity of a calibration: its value in SI, its slope (p,) by the free numbers, and why it is not compared."""
 
     value: float
     slope: FloatArray
@@ -67,10 +67,10 @@ class Epoch:
         temperature = self.calibration.data.get("temperature")
         return None if temperature is None else float(temperature)
 
-    def sigma(self, name: str) -> float:
-        """Return the standard uncertainty of a quantity, gravity's part included."""
+    def sigma(self, name: str, gravity: bool = True) -> float:
+        """Return the standard uncertainty of a quantity, with gravity's part or without."""
         slope = self.quantities[name].slope
-        return float(np.sqrt(slope @ self.covariance @ slope + (slope @ self.by_gravity) ** 2))
+        return float(np.sqrt(slope @ self.covariance @ slope + gravity * (slope @ self.by_gravity) ** 2))
 
 
 def owner_of(name: str) -> str:
@@ -80,7 +80,7 @@ def owner_of(name: str) -> str:
 
 
 def in_own_axes(calibration: Calibration) -> tuple[Calibration, bool]:
-    """Return a calibration in the axes in which the accelerometer's gain is lower triangular, and whether it was turned.
+    """Return a calibration in axes in which the accelerometer's gain is lower triangular, and whether it was turned.
 
     One without an accelerometer stays as it is. Raises `InputError` for a gain that no rotation makes so.
     """

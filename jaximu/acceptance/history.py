@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaximu.acceptance.epochs import Epoch, epochs_of, owner_of, require_apart
+from jaximu.acceptance.epochs import Epoch, Scales, epochs_of, owner_of, require_apart
 from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits
 from jaximu.acceptance.quantities import output_stimulus
 from jaximu.acceptance.trend import Line, Sameness, sameness
@@ -50,15 +50,17 @@ _YEAR = 365.25  # days
 class Course:
     """One number through all calibrations, in SI.
 
-    values, sigmas: (n,) with all uncertainty. difference, sigma: last − first, without what both share. tested: False
-    for a gyroscope's bias, another after every power-on. p_value: of one and the same value in all; adjusted: with all
-    numbers that are tested allowed for. line: over time.
+    values, sigmas: (n,) with all uncertainty. apart: (n,) the same without an error of gravity that all share.
+    difference, sigma: last − first, without what both share. tested: False for a gyroscope's bias, another after every
+    power-on. p_value: of one and the same value in all; adjusted: with all numbers that are tested allowed for. line:
+    over time.
     """
 
     name: str
     unit: str
     values: tuple[float, ...]
     sigmas: tuple[float, ...]
+    apart: tuple[float, ...]
     difference: float
     sigma: float
     p_value: float
@@ -121,7 +123,8 @@ class UnitHistory(Result, Document, page="history"):
 
     times: (n,) since the last, in `per` ("year", or "step" where dates are not known). dates: of each, None where not
     known. together: χ² of each kind of number, and "all" of those that are tested. output: by triad. left_out: what was
-    not compared, and why, in sentences. level: rate of false alarms over all numbers together.
+    not compared, and why, in sentences. level: rate of false alarms where nothing moved, half of it for each number by
+    itself (all allowed for), half for all together.
     """
 
     files: tuple[str, ...]
@@ -146,7 +149,7 @@ class UnitHistory(Result, Document, page="history"):
     @property
     def verdict(self) -> str:
         """`moved` where any number did or all together did; `same` where nothing shows."""
-        return "moved" if self.moved or self.together["all"].p_value < self.level else "same"
+        return "moved" if self.moved or self.together["all"].p_value < self.level / 2 else "same"
 
     @property
     def interval(self) -> float | None:
@@ -217,7 +220,7 @@ def compare(
       they are a step apart, in the order given.
     - `limits`: as `read_limits` reads them; of each the time is worked out until its guard band is reached.
     - `rate`: angular rate up to which the gyroscope's output is compared, rad/s; the accelerometer's is at 1 g.
-    - `level`: rate of false alarms over all numbers together.
+    - `level`: rate of false alarms where nothing moved.
     - `files`: what the calibrations are called.
 
     Raises `InputError` for fewer than two calibrations, one given twice, or dates that do not fit them;
@@ -247,7 +250,7 @@ def compare(
             left_out.append(change)
         else:
             output[owner] = change
-    reached, unknown = _limits_reached(courses, limits)
+    reached, unknown = _limits_reached(courses, limits, epochs[0].calibration)
     return UnitHistory(
         files,
         times,
@@ -260,7 +263,7 @@ def compare(
         reached,
         "" if limits is None else limits.file,
         tuple(left_out + unknown),
-        (*notes, *_notes(epochs)),
+        (*notes, *_notes(epochs, {} if limits is None else limits.nominal)),
         level,
     )
 
@@ -283,7 +286,8 @@ def _in_order(
         times = np.array([(known[place] - max(known)).days / _YEAR for place in order])
         return order, tuple(known[place] for place in order), times, "year", []
     without = [file for file, day in zip(files, days, strict=True) if day is None]
-    why = f"no date is known of {listed(without)}" if without else "all are of one day"
+    whose = "any" if len(without) == count else listed(without)
+    why = f"no date is known of {whose}" if without else "all are of one day"
     note = f"{why}: calibrations are taken in the order given, a step apart; --dates YYYY-MM-DD,… states dates."
     return list(range(count)), tuple(days), np.arange(1.0 - count, 1.0), "step", [note]
 
@@ -379,6 +383,7 @@ def _courses(
                 _unit(name, epochs[0].calibration),
                 tuple(values.tolist()),
                 tuple(epoch.sigma(name) for epoch in epochs),
+                tuple(epoch.sigma(name, len({other.gravity for other in epochs}) > 1) for epoch in epochs),
                 float(values[-1] - values[0]),
                 float(np.sqrt(variance)),
                 sameness(values[:, None], part).p_value,
@@ -388,7 +393,7 @@ def _courses(
         )
     tested = [place for place, course in enumerate(courses) if course.tested]
     for place, adjusted in zip(tested, holm([courses[place].p_value for place in tested]).tolist(), strict=True):
-        courses[place] = replace(courses[place], adjusted=adjusted, moved=adjusted < level)
+        courses[place] = replace(courses[place], adjusted=adjusted, moved=adjusted < level / 2)
     return tuple(courses)
 
 
@@ -485,26 +490,40 @@ def _output(first: Epoch, last: Epoch, owner: str, rate: float, names: Sequence[
 # --- limits and words -------------------------------------------------------------------------------------------------
 
 
-def _limits_reached(courses: Sequence[Course], limits: Limits | None) -> tuple[tuple[LimitReached, ...], list[str]]:
+def _limits_reached(
+    courses: Sequence[Course], limits: Limits | None, first: Calibration
+) -> tuple[tuple[LimitReached, ...], list[str]]:
     """Return when each limit's guard band is reached, and which limits cannot be followed, in sentences."""
     if limits is None:
         return (), []
     reached, unknown = [], []
     for limit in limits.limits:
+        triad = first.triads().get(limit.owner)
         followed = [course for course in courses if limits.applies(limit, course.name)]
-        for course in followed:
-            multiple = float(limits.rule.multiple(course.line.freedom))
-            reached.append(LimitReached(course.name, limit, course.line.until(limit.low, limit.high, multiple)))
-        if not followed:
-            of_noise = limit.part in (*OF_ONE_UNIT, *OUTPUTS)
-            why = "limits of parameters alone are followed over time" if of_noise else "no such number was compared"
-            unknown.append(f"{limit.key} is not followed: {why}.")
+        if limit.part in (*OF_ONE_UNIT, *OUTPUTS):
+            unknown.append(f"{limit.key} is not followed: limits of parameters alone are followed over time.")
+        elif triad is None or not followed:
+            unknown.append(f"{limit.key} is not followed: no such number was compared.")
+        elif triad.output_unit == "count" and (limit.part in CATALOGUE or limit.owner not in limits.nominal):
+            unknown.append(
+                f"{limit.key} is not followed: the {limit.owner} was logged in counts; limit its bias, scale or "
+                "misalignment, and state its nominal scale below [nominal]."
+            )
+        else:
+            for course in followed:
+                multiple = float(limits.rule.multiple(course.line.freedom))
+                reached.append(LimitReached(course.name, limit, course.line.until(limit.low, limit.high, multiple)))
     return tuple(reached), unknown
 
 
-def _notes(epochs: Sequence[Epoch]) -> list[str]:
+def _notes(epochs: Sequence[Epoch], nominal: Scales) -> list[str]:
     """Return what else a reader should know of the comparison."""
-    notes = []
+    triads = epochs[0].calibration.triads().items()
+    notes = [
+        f"the {name} was logged in counts: its scale and bias are relative to the first calibration's."
+        for name, triad in triads
+        if triad.output_unit == "count" and name not in nominal
+    ]
     serials = {str((epoch.calibration.trace or {}).get("serial", "")) for epoch in epochs} - {""}
     if len(serials) > 1:
         notes.append(f"the calibrations state different serial numbers, {listed(sorted(serials))}: is it one unit?")
@@ -519,8 +538,7 @@ def _notes(epochs: Sequence[Epoch]) -> list[str]:
     ]
     if odd := sorted(set.union(*effects) - set.intersection(*effects)):
         notes.append(
-            f"not all calibrations have {listed(odd)}: gain and bias fitted without it hold a part of it, and differ by "
-            "that."
+            f"not all calibrations have {listed(odd)}: gain and bias that were fitted without it hold a part of it."
         )
     stated = {epoch.gravity for epoch in epochs}
     if len(stated) < len(epochs) and any(epoch.by_gravity.any() for epoch in epochs):

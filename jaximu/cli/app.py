@@ -26,6 +26,7 @@ VERBS = (
     "record",
     "diagnose",
     "check",
+    "compare",
     "compensate",
     "allan",
     "effects",
@@ -48,7 +49,7 @@ VERBS = (
 GROUPS = {
     "Inspect": "info effects",
     "Calibrate": "calibrate record reference filter array magnetometer compensate export",
-    "Diagnose": "diagnose check allan consequences",
+    "Diagnose": "diagnose check compare allan consequences",
     "Equipment": "turntable budget",
     "Temperature": "thermal",
     "Fleet": "fleet accept verify",

@@ -34,6 +34,7 @@ __all__ = [
     "AXES",
     "BEFORE",
     "FLAGGED",
+    "GAPS",
     "LEAST_SHARE",
     "OTHERS",
     "PALETTE",

@@ -1,0 +1,82 @@
+"""`jaximu compare`: what moved between calibrations of a unit, and how it drifts over its history."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from jaximu.cli import options
+from jaximu.cli.messages import progress
+from jaximu.cli.options import option
+from jaximu.ground.errors import InputError
+
+__all__ = ["run"]
+
+
+def run(
+    calibrations: Annotated[
+        tuple[Path, ...],
+        Positional,
+        option("CALIBRATION CALIBRATION...", "Two calibration.json of a unit, or more.", name="calibrations"),
+    ],
+    /,
+    *,
+    dates: Annotated[
+        str | None,
+        option(
+            "DATES",
+            "Date of each, in their order: 2025-03-04,2026-03-02; default: those they state, else a step apart.",
+        ),
+    ] = None,
+    limits: Annotated[
+        Path | None, option("LIMITS.toml", "Limits, as for jaximu accept: when is each reached at the drift seen?")
+    ] = None,
+    rate: Annotated[str, option("TEXT", "Compare the gyroscope's output up to this rate.")] = "250 deg/s",
+    level: Annotated[float, option("P", "Rate of false alarms, all numbers together.")] = 0.05,
+    fail_on: Annotated[
+        Literal["never", "moved"], arg(help="Whether numbers that moved end with exit status 1, for scripts.")
+    ] = "never",
+    results: options.Output = options.RESULTS,
+) -> None:
+    """Compare calibrations of a unit: what moved, what that does to the output, how each number drifts.
+
+    DIR receives compare.json, report.html and pictures.
+
+    Examples:
+      jaximu compare old/calibration.json new/calibration.json
+      jaximu compare 2024.json 2025.json 2026.json --limits limits.toml -o history
+      jaximu compare a.json b.json c.json --dates 2024-03-01,2025-03-04,2026-03-02
+
+    """
+    if len(calibrations) < 2:
+        raise InputError("name two calibrations of the unit or more: jaximu compare OLD.json NEW.json.")
+    options.require_files(*calibrations, limits)
+    for place, path in enumerate(calibrations):
+        if any(path.samefile(other) for other in calibrations[:place]):
+            raise InputError(f"{path} is given twice: name different calibrations of the unit.")
+    if not 0 < level < 1:
+        raise InputError(f"--level: {level:g} is not a probability between 0 and 1.")
+    results.prepare()
+    from jaximu.acceptance.history import compare
+    from jaximu.calibration import load_calibration
+    from jaximu.cli.accept import limits_of
+    from jaximu.model.data_sheet import SI_UNITS, parse_quantity
+
+    fastest = parse_quantity(rate, SI_UNITS["angular_rate"]["B"], "--rate")
+    if not 0 < fastest < math.inf:
+        raise InputError(f"--rate: {rate!r} is not a rate above zero.")
+    with progress("comparing"):
+        history = compare(
+            *map(load_calibration, calibrations),
+            dates=None if dates is None else [text.strip() for text in dates.split(",")],
+            limits=None if limits is None else limits_of(limits, None, None),
+            rate=fastest,
+            level=level,
+            files=[str(path) for path in calibrations],
+        )
+    results.present(history.summary, "compare.json, report.html and pictures", compare=history)
+    if fail_on == "moved" and history.verdict == "moved":
+        raise SystemExit(1)

@@ -1,0 +1,314 @@
+"""The page of what moved between calibrations: numbers in their uncertainties, over time, and what the output does."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaximu.acceptance.history import Course, LimitReached, UnitHistory
+from jaximu.acceptance.words import between, in_shown_unit, spoken
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import student_isf
+from jaximu.ground.page import Page, Part, Picture, Statement, Table
+from jaximu.ground.quantities import Z95, counted, number, probability, sentence, size, with_interval
+from jaximu.report import figures
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["page_of"]
+
+_DRAWN = 4
+"""Numbers that are drawn over time and temperature: those whose change is surest."""
+
+
+def page_of(history: UnitHistory) -> Page:
+    """Return what moved, in uncertainties and in the output, each number's drift, and when limits are reached."""
+    value, meaning = _number(history)
+    return Page(
+        f"What moved over {counted(len(history.files), 'calibration')} of a unit?",
+        tuple(_verdict(history)),
+        value,
+        meaning,
+        tuple(_first(history)),
+        partial(_rest, history),
+        [sentence(note) for note in (*history.notes, *history.left_out)],
+        _next(history),
+        caution=history.verdict == "moved",
+    )
+
+
+# --- words ------------------------------------------------------------------------------------------------------------
+
+
+def _amount(course: Course, value: float, sigma: float, sign: bool = True) -> str:
+    """Return an amount of a number with its 95 % interval, in the unit in which its kind is shown."""
+    shown, factor = in_shown_unit(course.unit)
+    return with_interval(factor * value, factor * sigma, shown, sign)
+
+
+def _drift(history: UnitHistory, course: Course) -> str:
+    return f"{_amount(course, course.line.slope, course.line.half / Z95)}/{history.per}"
+
+
+def _duration(history: UnitHistory, time: float) -> str:
+    """Return a time ahead in years, or steps, and the date then."""
+    due = history.due(time)
+    return _time(time, history.per) + (f" ({due.isoformat()})" if due else "")
+
+
+def _time(time: float, per: str) -> str:
+    """Return a time with its unit, in two digits."""
+    return f"{number(time, 2)} {per}s"
+
+
+def _verdict(history: UnitHistory) -> Iterator[str]:
+    """Yield what moved, then the drift that is surest and when the unit is due."""
+    test, moved = history.together["all"], history.moved
+    ratio = (
+        f"χ² {number(test.statistic)} of {counted(test.freedom, 'degree')} of freedom, p {probability(test.p_value)}"
+    )
+    tested = sum(course.tested for course in history.courses)
+    if moved:
+        words = [
+            f"{spoken(course.name)} by {_amount(course, course.difference, course.sigma)} ({abs(course.z):.1f} σ)"
+            for course in moved[:3]
+        ]
+        rest = f"; and {len(moved) - 3} more" if len(moved) > 3 else ""
+        yield f"{len(moved)} of {tested} numbers moved: {'; '.join(words)}{rest}. All together: {ratio}."
+    elif history.verdict == "moved":
+        yield f"All numbers together differ by more than their uncertainty ({ratio}), but no single one stands out."
+    else:
+        yield f"Nothing moved: all differences are within their uncertainty ({ratio})."
+    if history.limits:
+        yield _due(history)
+
+
+def _due(history: UnitHistory) -> str:
+    """Say when the first limit's guard band is reached."""
+    if history.interval is None:
+        return "At the drift seen, no limit is ever reached."
+    first = next(limit for limit in history.limits if limit.after == history.interval)
+    if not first.after:
+        return f"{sentence(spoken(first.name))} is already within the guard band of its limit: calibrate now."
+    return (
+        f"Calibrate again within {_duration(history, first.after)}: {spoken(first.name)} may then reach its limit, "
+        f"{between(first.limit.low, first.limit.high, first.limit.unit, first.limit.stated)}."
+    )
+
+
+def _number(history: UnitHistory) -> tuple[str, str]:
+    """Return the time until a limit is reached where limits are held, else the output's error, else the p-value."""
+    if history.interval is not None:
+        return _time(history.interval, history.per), "until the first limit's guard band is reached"
+    for owner, change in history.output.items():
+        meaning = (
+            f"largest error of the {owner}, up to {size(change.over, change.unit)}, with the first calibration on the "
+            "unit as it is in the last, 95 % interval"
+        )
+        return with_interval(change.worst, change.sigma, change.unit), meaning
+    return f"p {probability(history.together['all'].p_value)}", "probability of differences as large if nothing moved"
+
+
+def _next(history: UnitHistory) -> str:
+    last = shlex.quote(history.files[-1])
+    if not history.limits:
+        names = " ".join(shlex.quote(file) for file in history.files)
+        return f"`jaximu compare {names} --limits LIMITS.toml` works out when limits are reached."
+    return (
+        f"`jaximu accept {last} --limits {shlex.quote(history.limits_file)}` holds the last calibration to the limits."
+    )
+
+
+# --- parts ------------------------------------------------------------------------------------------------------------
+
+
+def _first(history: UnitHistory) -> Iterator[Part]:
+    yield _pictured_over_time(history) if len(history.files) > 2 else _pictured_changes(history)
+    yield _numbers_table(history)
+    yield _together_table(history)
+    for owner, change in history.output.items():
+        zeroed = ", its bias re-zeroed" if owner == "gyroscope" else ""
+        yield Statement(
+            f"{sentence(owner)} output",
+            f"With the first calibration, corrected output of the unit as it is in the last is off by "
+            f"{with_interval(change.worst, change.sigma, change.unit)} at worst (95 %) and "
+            f"{size(change.rms, change.unit)} rms over all directions, at {size(change.over, change.unit)}{zeroed}. "
+            f"The uncertainty of both calibrations alone makes {size(change.expected, change.unit)} rms.",
+        )
+    if history.limits:
+        yield _limits_table(history)
+
+
+def _rest(history: UnitHistory) -> Iterator[Part]:
+    if len(history.files) > 2:
+        yield _pictured_changes(history)
+    known = [temperature for temperature in history.temperatures if temperature is not None]
+    if len(known) == len(history.files) and max(known) > min(known):
+        yield Picture(
+            "temperature",
+            partial(_temperature_figure, history),
+            "The numbers that changed most surely, over the temperatures of their recordings",
+            "The same numbers over the temperature of their recordings: what follows it has not aged.",
+        )
+    headers = ("calibration", "date", f"time [{history.per}s]", "temperature")
+    columns = zip(history.files, history.dates, history.times, history.temperatures, strict=True)
+    rows = [
+        (file, day.isoformat() if day else "", f"{time:.2f}".replace("-", "−"), "" if t is None else f"{t:.1f} °C")
+        for file, day, time, t in columns
+    ]
+    yield Table(headers, rows, "In the order of time, counted from the last.")
+
+
+def _numbers_table(history: UnitHistory) -> Table:
+    """Return each number's first value, its change, and its drift, the surest first."""
+    straight = len(history.files) > 2
+    over_time = straight or history.per == "year"  # a difference over one step is its own drift
+    headers = ["number", "first ± 95 %", "last − first ± 95 %", "σ", "p, all allowed for"]
+    headers += [f"drift per {history.per}"] * over_time + ["p, straight"] * straight
+    courses = sorted(history.courses, key=lambda course: (not course.moved, not course.tested, course.p_value))
+    rows = []
+    for course in courses:
+        p_value = probability(course.adjusted).removeprefix("= ") if course.tested else "differs after every power-on"
+        row = [
+            spoken(course.name),
+            _amount(course, course.values[0], course.sigmas[0], False),
+            _amount(course, course.difference, course.sigma),
+            f"{abs(course.z):.1f}",
+            p_value,
+        ]
+        row += [_amount(course, course.line.slope, course.line.half / Z95)] * over_time
+        rows.append(row + [probability(course.line.p_value).removeprefix("= ")] * straight)
+    caption = (
+        f"p: of no change in all {len(history.files)} calibrations, with all numbers allowed for (Holm). Moved is "
+        f"below {history.level / 2:g}: half the rate of false alarms, the other half is for all numbers together"
+    )
+    if over_time:
+        caption += ". Drift: of the line through all values, ± 95 %"
+    if straight:
+        caption += "; p, straight: of scatter as large about it; below 0.05 the interval is widened by that scatter"
+    moved = range(len(history.moved))
+    return Table(tuple(headers), rows, f"{caption}.", moved, brief=max(6, len(moved)))
+
+
+def _together_table(history: UnitHistory) -> Table:
+    rows = [
+        (
+            "all, without gyroscope bias" if name == "all" else name,
+            number(test.statistic),
+            str(test.freedom),
+            probability(test.p_value).removeprefix("= "),
+        )
+        for name, test in history.together.items()
+    ]
+    caption = "Jointly, with all correlations: χ² of no change."
+    marked = [len(rows) - 1] if history.together["all"].p_value < history.level / 2 else []
+    return Table(("together", "χ²", "degrees of freedom", "p"), rows, caption, marked)
+
+
+def _limits_table(history: UnitHistory) -> Table:
+    """Return each limit, where its number is and drifts, and when its guard band is reached, the first first."""
+    courses = {course.name: course for course in history.courses}
+
+    def row(reached: LimitReached) -> tuple[str, ...]:
+        course, limit = courses[reached.name], reached.limit
+        after = "never, at this drift" if reached.after is None else _duration(history, reached.after)
+        level = _amount(course, course.line.level, float(np.sqrt(course.line.covariance[0, 0])))
+        bounds = between(limit.low, limit.high, limit.unit, limit.stated)
+        return spoken(reached.name), bounds, level, _drift(history, course), after
+
+    ordered = sorted(history.limits, key=lambda limit: np.inf if limit.after is None else limit.after)
+    headers = ("limit on", "bounds", "now ± 95 %", "drift ± 95 %", "guard band reached after")
+    caption = (
+        "The time from the last calibration until the line, with its uncertainty and the guard band of the decision "
+        "rule, leaves the bounds: the calibration interval is the shortest. It assumes that the drift goes on."
+    )
+    return Table(headers, [row(reached) for reached in ordered], caption, [0] * bool(ordered), brief=6)
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def _pictured_changes(history: UnitHistory) -> Picture:
+    return Picture(
+        "changes",
+        partial(_changes_figure, history),
+        "Change of every number from the first calibration to the last, in standard deviations",
+        "Last calibration less the first, in standard deviations of that difference. Within the grey band a single "
+        "number has not changed (95 %). Orange: moved, with all numbers allowed for; grey: not tested.",
+    )
+
+
+def _pictured_over_time(history: UnitHistory) -> Picture:
+    return Picture(
+        "history",
+        partial(_history_figure, history),
+        "The numbers that changed most surely, over time, with their drift",
+        "The numbers whose change is surest, with their 95 % intervals, without an error of gravity that all share. "
+        "The line is the drift, with its 95 % band.",
+    )
+
+
+def _changes_figure(history: UnitHistory) -> Figure:
+    rows = history.courses[::-1]
+    figure = figures.new_figure(1.0 + 0.17 * len(rows))
+    panel = figure.subplots(1, 1)
+    panel.axvspan(-Z95, Z95, color=figures.GAPS[1], linewidth=0)
+    for row, course in enumerate(rows):
+        colour = figures.FLAGGED if course.moved else figures.AFTER if course.tested else figures.BEFORE
+        panel.plot(course.z, row, "o", color=colour, markersize=5)
+    panel.axvline(0.0, color="0.5", linewidth=0.8)
+    figures.dressed(panel, "last − first", xlabel="standard deviations of the difference")
+    panel.set_yticks(range(len(rows)), [spoken(course.name) for course in rows], fontsize=8)
+    return figure
+
+
+def _surest(history: UnitHistory) -> list[Course]:
+    return sorted(history.courses, key=lambda course: (not course.tested, course.p_value))[:_DRAWN]
+
+
+def _panels(courses: list[Course]) -> tuple[Figure, list[Axes]]:
+    figure = figures.new_figure(0.8 + 1.7 * len(courses))
+    return figure, figure.subplots(len(courses), 1, sharex=True, squeeze=False)[:, 0].tolist()
+
+
+def _points(panel: Axes, course: Course, at: FloatArray) -> tuple[float, str]:
+    """Draw a number's values with their intervals; return the factor to its unit, and the unit."""
+    shown, factor = in_shown_unit(course.unit)
+    half = factor * Z95 * np.array(course.apart)
+    panel.errorbar(at, factor * np.array(course.values), half, fmt="o", color=figures.FLAGGED, markersize=4, zorder=3)
+    figures.dressed(panel, spoken(course.name))
+    panel.set_ylabel(shown, fontsize=8)
+    return factor, shown
+
+
+def _history_figure(history: UnitHistory) -> Figure:
+    courses = _surest(history)
+    figure, panels = _panels(courses)
+    last = history.dates[-1]
+    origin = 0.0 if last is None or history.per != "year" else last.year + (last.timetuple().tm_yday - 1) / 365.25
+    for panel, course in zip(panels, courses, strict=True):
+        factor, _ = _points(panel, course, history.times + origin)
+        line, ahead = course.line, np.linspace(history.times[0], 0.0, 100)
+        shared = course.sigmas[-1] ** 2 - course.apart[-1] ** 2
+        variance = line.covariance[0, 0] - shared + (2 * line.covariance[0, 1] + line.covariance[1, 1] * ahead) * ahead
+        half = float(student_isf(0.025, line.freedom)) * np.sqrt(np.maximum(variance, 0.0))
+        level = line.level + line.slope * ahead
+        figures.band(panel, ahead + origin, factor * level, factor * half, figures.AFTER)
+    panels[-1].set_xlabel("year" if origin else "steps before the last", fontsize=8)
+    panels[-1].ticklabel_format(axis="x", useOffset=False)
+    return figure
+
+
+def _temperature_figure(history: UnitHistory) -> Figure:
+    courses = _surest(history)
+    figure, panels = _panels(courses)
+    for panel, course in zip(panels, courses, strict=True):
+        _points(panel, course, np.array(history.temperatures, float))
+    panels[-1].set_xlabel("temperature [°C]", fontsize=8)
+    return figure
