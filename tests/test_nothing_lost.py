@@ -373,6 +373,8 @@ def test_every_verb_takes_or_refuses_every_calibration(kind, calibrations, folde
     limits += ['"navigation.position" = { within = "100 m", after = "60 s" }']
     (tmp_path / "limits.toml").write_text("\n".join(["[limits]", *limits]))
     assert sound("accept", path, "--limits", tmp_path / "limits.toml", "-o", tmp_path / "accept")[0] in (0, 3, 4)
+    for other in calibrations.values():  # with itself: refused
+        sound("compare", path, other, "--limits", tmp_path / "limits.toml", "-o", tmp_path / "compare")
     for log in logs[:2]:
         sound("check", path, log)
     for log in logs:
@@ -411,6 +413,7 @@ magnetometer LOG --mag-log X; magnetometer LOG --calibration X; magnetometer LOG
 thermal LOG --calibration X; export X --to px4; export CALIBRATION --to kalibr --noise X; consequences X
 consequences CALIBRATION --path X; consequences CALIBRATION --noise X; accept X --limits LIMITS
 accept CALIBRATION --limits X; accept CALIBRATION --limits LIMITS --noise X; verify X; simulate X -o OUT
+compare X CALIBRATION; compare CALIBRATION X
 record --from X -o OUT; fleet LOG -o X
 """
 

@@ -286,8 +286,8 @@ def _in_order(
         times = np.array([(known[place] - max(known)).days / _YEAR for place in order])
         return order, tuple(known[place] for place in order), times, "year", []
     without = [file for file, day in zip(files, days, strict=True) if day is None]
-    whose = "any" if len(without) == count else listed(without)
-    why = f"no date is known of {whose}" if without else "all are of one day"
+    whose = f" of {listed(without)}" if 0 < len(without) < count else ""
+    why = f"no date is known{whose}" if without else "all are of one day"
     note = f"{why}: calibrations are taken in the order given, a step apart; --dates YYYY-MM-DD,… states dates."
     return list(range(count)), tuple(days), np.arange(1.0 - count, 1.0), "step", [note]
 
@@ -318,7 +318,9 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
             continue  # by convention, or of a data sheet
         elif any(unless):
             texts = [f"{epoch.file} holds it fixed" for epoch, t in zip(epochs, unless, strict=True) if t == "fixed"]
-            left_out[name] = (texts + [text for text in unless if text and text != "fixed"])[0]
+            left_out[stem if stem in CATALOGUE else name] = (
+                texts + [text for text in unless if text and text != "fixed"]
+            )[0]
         elif f"{owner} gain" in apart and name.startswith((f"{owner}.scale", f"{owner}.misalignment")):
             left_out[f"{owner} gain"] = apart[f"{owner} gain"]
         elif stem in CATALOGUE and _VECTORS & set(CATALOGUE[stem].needs) and any(epoch.turned for epoch in epochs):
