@@ -12,7 +12,7 @@ import jaximu
 import jaximu.report
 from jaximu.acceptance.epochs import in_own_axes
 from jaximu.acceptance.limits import read_limits
-from jaximu.acceptance.trend import Line, sameness
+from jaximu.acceptance.trend import StraightLine, sameness
 from jaximu.calibration import Calibration
 from jaximu.cli.app import main
 from jaximu.estimation.problem import Name, flatten, names_of, unflatten, without_equipment
@@ -85,7 +85,7 @@ def test_the_drift_lies_in_its_interval_as_often_as_it_says(times, scatter):
     hits = 0
     for _ in range(400):
         values = 3.0 + 0.7 * times + np.hypot(sigma, scatter) * random.normal(size=len(times))
-        line = Line.through(times - times[-1], values, np.diag(sigma**2))
+        line = StraightLine.through(times - times[-1], values, np.diag(sigma**2))
         hits += abs(line.slope - 0.7) < line.half
     assert hits / 400 > 0.95 or within(hits, 400, 0.95)
     assert scatter or hits < 400
@@ -93,7 +93,7 @@ def test_the_drift_lies_in_its_interval_as_often_as_it_says(times, scatter):
 
 def test_a_line_is_that_of_weighted_least_squares():
     times, values, sigma = np.array([-3.0, -2.0, 0.0]), np.array([1.0, 2.0, 2.5]), np.array([1.0, 2.0, 0.5])
-    line = Line.through(times, values, np.diag(sigma**2))
+    line = StraightLine.through(times, values, np.diag(sigma**2))
     (slope, level), covariance = np.polyfit(times, values, 1, w=1 / sigma, cov="unscaled")
     assert (line.slope, line.level) == pytest.approx((slope, level))
     assert line.sigma == pytest.approx(np.sqrt(covariance[0, 0]))
@@ -103,7 +103,7 @@ def test_a_line_is_that_of_weighted_least_squares():
 @pytest.mark.parametrize("multiple", [0.0, 1.645, 6.3])
 @pytest.mark.parametrize("values", [(0.0, 1.0, 2.0), (2.0, 1.0, 0.1), (0.0, 0.1, 0.0)])
 def test_the_guard_band_is_reached_when_it_says(values, multiple):
-    line = Line.through(np.array([-2.0, -1.0, 0.0]), np.array(values), np.diag([0.01, 0.02, 0.01]))
+    line = StraightLine.through(np.array([-2.0, -1.0, 0.0]), np.array(values), np.diag([0.01, 0.02, 0.01]))
     after = line.until(-7.0, 5.0, multiple)
     ahead = np.linspace(0, 1000, 200001)
     sigma = np.sqrt(line.covariance[0, 0] + 2 * line.covariance[0, 1] * ahead + line.covariance[1, 1] * ahead**2)
@@ -137,7 +137,7 @@ def test_what_moved_is_named_and_gravity_that_both_share_hides_nothing():
     scaled = np.diag([1.0, 1.0007, 1.0]) @ other.accelerometer.gain  # half of gravity's uncertainty
     other = replace(other, accelerometer=replace(other.accelerometer, gain=scaled))
     history = jaximu.compare(calibration(unit()), calibration(other))
-    assert [course.name for course in history.moved] == ["accelerometer.scale[1]"]
+    assert [movement.name for movement in history.moved] == ["accelerometer.scale[1]"]
     assert history.verdict == "moved"
     assert history.moved[0].difference == pytest.approx(0.99 * 0.0007)
     assert history.output["accelerometer"].worst == pytest.approx(0.0007 * 9.80665, rel=0.02)
@@ -194,8 +194,8 @@ def test_a_history_has_a_drift_and_a_calibration_interval(tmp_path):
     shuffled = [histories[k] for k in (2, 0, 3, 1)]
     history = jaximu.compare(*shuffled, limits=read_limits(path), files=["c", "a", "d", "b"])
     assert history.files == ("a", "b", "c", "d") and history.per == "year"
-    course = next(course for course in history.courses if course.name == "accelerometer.bias[0]")
-    assert course.moved and abs(course.line.slope - 0.02 / 1.01) < course.line.half < 0.003
+    movement = next(movement for movement in history.movements if movement.name == "accelerometer.bias[0]")
+    assert movement.moved and abs(movement.line.slope - 0.02 / 1.01) < movement.line.half < 0.003
     reached = {limit.name: limit.after for limit in history.limits}
     now = (0.05 + 3 * 0.02) / 1.01
     assert reached["accelerometer.bias[0]"] == pytest.approx((0.2 - now) / 0.0198, rel=0.1)
@@ -209,7 +209,7 @@ def test_a_history_has_a_drift_and_a_calibration_interval(tmp_path):
 
 def test_names_are_those_of_limits():
     history = jaximu.compare(calibration(unit()), calibration(unit(bias=1e-4)))
-    assert Name("accelerometer", "bias", (0,)) in {course.name for course in history.courses}
+    assert Name("accelerometer", "bias", (0,)) in {movement.name for movement in history.movements}
     assert history.per == "step" and "no date is known" in history.notes[0]
 
 
@@ -251,10 +251,10 @@ def only(owner, imu):
 def test_what_both_have_is_compared_and_the_rest_named():
     whole = calibration(unit(bias=1e-4))
     history = jaximu.compare(only("accelerometer", unit()), whole)
-    assert set(history.output) == {"accelerometer"} and len(history.courses) == 9
+    assert set(history.output) == {"accelerometer"} and len(history.movements) == 9
     assert any("gyroscope is not compared" in text for text in history.left_out)
     gyroscope = jaximu.compare(only("gyroscope", unit()), whole)
-    assert {course.name.partition("[")[0] for course in gyroscope.courses} == {"gyroscope.bias"}
+    assert {movement.name.partition("[")[0] for movement in gyroscope.movements} == {"gyroscope.bias"}
     assert any("axes are the accelerometer's" in text for text in gyroscope.left_out)
     assert "gyroscope" not in gyroscope.output
     with pytest.raises(jaximu.NotPossibleError, match="nothing in common"):
@@ -266,7 +266,7 @@ def test_other_units_of_output_are_not_compared():
     scaled = Triad(100 * imu.accelerometer.gain, imu.accelerometer.bias, output_unit="count")
     history = jaximu.compare(calibration(imu), calibration(replace(imu, accelerometer=scaled)))
     assert any("m/s^2, calibration 2 in count" in text for text in history.left_out)
-    assert all(course.name.startswith("gyroscope") for course in history.courses)
+    assert all(movement.name.startswith("gyroscope") for movement in history.movements)
 
 
 def thermal(slope, reference, bias, random=None):
@@ -311,9 +311,10 @@ def test_a_bias_at_another_temperature_has_the_uncertainty_of_both():
 def test_effects_are_compared_where_axes_are_alike():
     history = jaximu.compare(thermal(2e-3, 20.0, 0.01), thermal(9e-3, 20.0, 0.01))
     assert history.together["effects"].freedom == 3
-    assert {course.name for course in history.moved} == {f"accel.temperature[{axis}]" for axis in range(3)}
+    assert {movement.name for movement in history.moved} == {f"accel.temperature[{axis}]" for axis in range(3)}
     assert (
-        history.courses[-1].unit == "rad/s" or "K" in {c.name: c.unit for c in history.courses}["accel.temperature[0]"]
+        history.movements[-1].unit == "rad/s"
+        or "K" in {c.name: c.unit for c in history.movements}["accel.temperature[0]"]
     )
     history = jaximu.compare(thermal(2e-3, 20.0, 0.01), calibration(unit(), data={"temperature": 20.0}))
     assert any("not all calibrations have accel.temperature" in note for note in history.notes)
@@ -403,4 +404,4 @@ def test_a_measured_unit_over_its_sessions(data_folder, tmp_path):
         paths.append(jaximu.calibrate(recording))
     history = jaximu.compare(*paths)
     assert history.together["accelerometer gain"].p_value > 1e-6
-    assert all(abs(course.difference) < 0.05 for course in history.courses if "bias" not in course.name)
+    assert all(abs(movement.difference) < 0.05 for movement in history.movements if "bias" not in movement.name)

@@ -33,7 +33,7 @@ Scales = Mapping[str, tuple[FloatArray, FloatArray]]
 """By triad in counts, counts per SI unit (3,) and counts at zero input (3,)."""
 
 
-class Quantity(NamedTuple):
+class Measurand(NamedTuple):
     """A quantity of a calibration: its value in SI, its slope (p,) by the free numbers, and why it is not compared."""
 
     value: float
@@ -54,7 +54,7 @@ class Epoch:
     turned: bool
     covariance: FloatArray
     by_gravity: FloatArray
-    quantities: dict[str, Quantity]
+    quantities: dict[str, Measurand]
 
     @property
     def gravity(self) -> LocalGravity:
@@ -146,7 +146,7 @@ def _epoch(calibration: Calibration, reasons: Mapping[str, str], file: str, turn
             unless = "fixed"
         elif not measured.determined[0, column]:
             unless = f"{file} does not determine it"
-        quantities[name] = Quantity(float(measured.value[0, column]), measured.slope[0, column], unless)
+        quantities[name] = Measurand(float(measured.value[0, column]), measured.slope[0, column], unless)
     return Epoch(file, calibration, turned, covariance - np.outer(by_gravity, by_gravity), by_gravity, quantities)
 
 
@@ -164,14 +164,14 @@ def _temperature(calibrations: Sequence[Calibration], files: Sequence[str]) -> f
     thermal = [_thermal(calibration) for calibration in calibrations]
     if not any(thermal):
         return None
-    constant = [place for place, owners in enumerate(thermal) if not owners]
+    constant = [index for index, owners in enumerate(thermal) if not owners]
     if not constant:
         chosen = calibrations[0].triads()[min(thermal[0])]
         return chosen.temperature_reference
-    for place in constant:
-        if "temperature" not in calibrations[place].data:
+    for index in constant:
+        if "temperature" not in calibrations[index].data:
             raise NotPossibleError(
-                f"{files[place]} holds at one temperature, which its recording did not state, and another of these "
+                f"{files[index]} holds at one temperature, which its recording did not state, and another of these "
                 "calibrations over temperature: they cannot be compared. Record the unit with its temperature, and "
                 "calibrate again."
             )
@@ -192,7 +192,10 @@ def _at_temperature(calibration: Calibration, celsius: float | None) -> tuple[Ca
         reasons |= {triad.effects[row].name: f"one counts it from {reference:g} °C, another not" for row in rows}
         still = [row for row in rows if SENSOR_QUANTITIES[owner] not in triad.effects[row].needs]
         if still != rows:
-            reasons |= {f"{owner}.{part}": f"one holds it at {reference:g} °C, another not" for part in _GAINS}
+            reasons |= {
+                f"{owner}.{part}": f"one holds it at {reference:g} °C, another not"
+                for part in ("scale", "misalignment")
+            }
         rows, effects = still, [triad.effects[row] for row in still]
         (there, here), (slope, origin) = steady(effects, [celsius, reference], 0.0, reference)
         alone = [name for name in effect_numbers(calibration.imu.with_effects(*effects))[0] if name.effect is not None]
@@ -202,8 +205,8 @@ def _at_temperature(calibration: Calibration, celsius: float | None) -> tuple[Ca
             for axis in range(3):
                 bias = Name(owner, "bias", (axis,))
                 if number in calibration.names and bias in calibration.names:
-                    place = calibration.names.index(bias), calibration.names.index(number)
-                    shift[place] = (slope - origin)[axis, column]
+                    index = calibration.names.index(bias), calibration.names.index(number)
+                    shift[index] = (slope - origin)[axis, column]
         changed = replace(triad, bias=np.asarray(triad.bias) + there - here, temperature_reference=celsius)
         calibration = replace(
             calibration,
@@ -211,9 +214,6 @@ def _at_temperature(calibration: Calibration, celsius: float | None) -> tuple[Ca
             covariance=shift @ calibration.covariance @ shift.T,
         )
     return calibration, reasons
-
-
-_GAINS = ("scale", "misalignment")
 
 
 def require_apart(calibrations: Sequence[Calibration], files: Sequence[str]) -> None:

@@ -22,7 +22,7 @@ from jax.flatten_util import ravel_pytree
 from jaximu.acceptance.epochs import Epoch, Scales, epochs_of, owner_of, require_apart
 from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits
 from jaximu.acceptance.quantities import output_stimulus
-from jaximu.acceptance.trend import Line, Sameness, sameness
+from jaximu.acceptance.trend import Sameness, StraightLine, sameness
 from jaximu.acceptance.words import si_unit
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import require_calibration
@@ -38,7 +38,7 @@ from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES, SENSOR_U
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["RATE", "Course", "LimitReached", "OutputChange", "UnitHistory", "compare"]
+__all__ = ["RATE", "LimitReached", "Movement", "OutputChange", "UnitHistory", "compare"]
 
 SCHEMA = "jaximu.compare/1"
 RATE = float(np.radians(250.0))
@@ -47,7 +47,7 @@ _YEAR = 365.25  # days
 
 
 @dataclass(frozen=True)
-class Course:
+class Movement:
     """One number through all calibrations, in SI.
 
     values, sigmas: (n,) with all uncertainty. apart: (n,) the same without an error of gravity that all share.
@@ -64,7 +64,7 @@ class Course:
     difference: float
     sigma: float
     p_value: float
-    line: Line
+    line: StraightLine
     tested: bool = True
     adjusted: float = 1.0
     moved: bool = False
@@ -132,7 +132,7 @@ class UnitHistory(Result, Document, page="history"):
     per: str
     dates: tuple[date | None, ...]
     temperatures: tuple[float | None, ...]
-    courses: tuple[Course, ...]
+    movements: tuple[Movement, ...]
     together: dict[str, Sameness]
     output: dict[str, OutputChange]
     limits: tuple[LimitReached, ...] = ()
@@ -142,9 +142,11 @@ class UnitHistory(Result, Document, page="history"):
     level: float = 0.05
 
     @property
-    def moved(self) -> tuple[Course, ...]:
+    def moved(self) -> tuple[Movement, ...]:
         """The numbers that moved, the surest first."""
-        return tuple(sorted((course for course in self.courses if course.moved), key=lambda course: course.p_value))
+        return tuple(
+            sorted((movement for movement in self.movements if movement.moved), key=lambda movement: movement.p_value)
+        )
 
     @property
     def verdict(self) -> str:
@@ -190,8 +192,8 @@ class UnitHistory(Result, Document, page="history"):
             "time_unit": self.per,
             "level": self.level,
             "together": {name: test.document() for name, test in self.together.items()},
-            "moved": [course.name for course in self.moved],
-            "parameters": [course.document(self.per) for course in self.courses],
+            "moved": [movement.name for movement in self.moved],
+            "parameters": [movement.document(self.per) for movement in self.movements],
             "output": {name: vars(change) for name, change in self.output.items()},
             "limits": {
                 "file": self.limits_file or None,
@@ -236,33 +238,27 @@ def compare(
     files = tuple(files) or tuple(f"calibration {number}" for number in range(1, len(calibrations) + 1))
     require_apart(calibrations, files)
     order, days, times, per, notes = _in_order(calibrations, files, dates)
-    ordered, files = [calibrations[place] for place in order], tuple(files[place] for place in order)
+    ordered, files = [calibrations[index] for index in order], tuple(files[index] for index in order)
     epochs = epochs_of(ordered, files, {} if limits is None else limits.nominal)
     names, left_out = _comparable(epochs)
     covariance = _covariance(epochs, names)
-    courses = _courses(epochs, names, covariance, times, level)
-    values = np.array([course.values for course in courses]).T
-    together = _together(courses, values, covariance)
-    output = {}
-    for owner in dict.fromkeys(map(owner_of, names)):
-        change = _output(epochs[0], epochs[-1], owner, rate, names)
-        if isinstance(change, str):
-            left_out.append(change)
-        else:
-            output[owner] = change
-    reached, unknown = _limits_reached(courses, limits, epochs[0].calibration)
+    movements = _courses(epochs, names, covariance, times, level)
+    values = np.array([movement.values for movement in movements]).T
+    together = _together(movements, values, covariance)
+    output, silent = _outputs(epochs[0], epochs[-1], names, rate)
+    reached, unknown = _limits_reached(movements, limits, epochs[0].calibration)
     return UnitHistory(
         files,
         times,
         per,
         days,
         tuple(epoch.temperature for epoch in epochs),
-        courses,
+        movements,
         together,
         output,
         reached,
         "" if limits is None else limits.file,
-        tuple(left_out + unknown),
+        (*left_out, *silent, *unknown),
         (*notes, *_notes(epochs, {} if limits is None else limits.nominal)),
         level,
     )
@@ -282,9 +278,9 @@ def _in_order(
         raise InputError(f"{error}: a date is written as 2026-03-04.") from None
     known = [day for day in days if day is not None]
     if len(known) == count and len(set(known)) > 1:
-        order = sorted(range(count), key=lambda place: known[place])
-        times = np.array([(known[place] - max(known)).days / _YEAR for place in order])
-        return order, tuple(known[place] for place in order), times, "year", []
+        order = sorted(range(count), key=lambda index: known[index])
+        times = np.array([(known[index] - max(known)).days / _YEAR for index in order])
+        return order, tuple(known[index] for index in order), times, "year", []
     without = [file for file, day in zip(files, days, strict=True) if day is None]
     whose = f" of {listed(without)}" if 0 < len(without) < count else ""
     why = f"no date is known{whose}" if without else "all are of one day"
@@ -294,16 +290,15 @@ def _in_order(
 
 # --- what is compared -------------------------------------------------------------------------------------------------
 
-_VECTORS = {*SENSOR_QUANTITIES.values(), "angular_acceleration"}
-
 
 def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
     """Return the quantities that all calibrations determine, and what is left out, in sentences.
 
     Raises `NotPossibleError` where there is none.
     """
+    vectors = {*SENSOR_QUANTITIES.values(), "angular_acceleration"}
     reasons = [_apart(epochs[0], epoch) for epoch in epochs[1:]]
-    apart = {owner: reason for found_apart in reasons for owner, reason in found_apart.items()}
+    apart = {owner: reason for part in reasons for owner, reason in part.items()}
     everything = list(dict.fromkeys(name for epoch in epochs for name in epoch.quantities))
     names, left_out = [], {}
     for name in everything:
@@ -323,7 +318,7 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
             )[0]
         elif f"{owner} gain" in apart and name.startswith((f"{owner}.scale", f"{owner}.misalignment")):
             left_out[f"{owner} gain"] = apart[f"{owner} gain"]
-        elif stem in CATALOGUE and _VECTORS & set(CATALOGUE[stem].needs) and any(epoch.turned for epoch in epochs):
+        elif stem in CATALOGUE and vectors & set(CATALOGUE[stem].needs) and any(epoch.turned for epoch in epochs):
             left_out[stem] = "its axes are a set-up's in one calibration"
         else:
             names.append(name)
@@ -358,9 +353,9 @@ def _covariance(epochs: Sequence[Epoch], names: Sequence[str]) -> FloatArray:
     """Return the covariance (n q, n q) of quantities in all calibrations, with what gravity's error makes of it."""
     size = len(names)
     covariance, by_gravity = np.zeros((len(epochs) * size,) * 2), []
-    for place, epoch in enumerate(epochs):
+    for index, epoch in enumerate(epochs):
         slope = np.array([epoch.quantities[name].slope for name in names])
-        rows = slice(place * size, (place + 1) * size)
+        rows = slice(index * size, (index + 1) * size)
         covariance[rows, rows] = slope @ epoch.covariance @ slope.T
         by_gravity.append(slope @ epoch.by_gravity)
     for gravity in {epoch.gravity for epoch in epochs}:
@@ -373,14 +368,14 @@ def _covariance(epochs: Sequence[Epoch], names: Sequence[str]) -> FloatArray:
 
 def _courses(
     epochs: Sequence[Epoch], names: Sequence[str], covariance: FloatArray, times: FloatArray, level: float
-) -> tuple[Course, ...]:
-    courses = []
-    for place, name in enumerate(names):
+) -> tuple[Movement, ...]:
+    movements = []
+    for index, name in enumerate(names):
         values = np.array([epoch.quantities[name].value for epoch in epochs])
-        part = covariance[place :: len(names), place :: len(names)]
+        part = covariance[index :: len(names), index :: len(names)]
         variance = part[0, 0] + part[-1, -1] - 2 * part[0, -1]
-        courses.append(
-            Course(
+        movements.append(
+            Movement(
                 name,
                 _unit(name, epochs[0].calibration),
                 tuple(values.tolist()),
@@ -389,14 +384,14 @@ def _courses(
                 float(values[-1] - values[0]),
                 float(np.sqrt(variance)),
                 sameness(values[:, None], part).p_value,
-                Line.through(times, values, part),
+                StraightLine.through(times, values, part),
                 not name.startswith("gyroscope.bias"),
             )
         )
-    tested = [place for place, course in enumerate(courses) if course.tested]
-    for place, adjusted in zip(tested, holm([courses[place].p_value for place in tested]).tolist(), strict=True):
-        courses[place] = replace(courses[place], adjusted=adjusted, moved=adjusted < level / 2)
-    return tuple(courses)
+    tested = [index for index, movement in enumerate(movements) if movement.tested]
+    for index, adjusted in zip(tested, holm([movements[index].p_value for index in tested]).tolist(), strict=True):
+        movements[index] = replace(movements[index], adjusted=adjusted, moved=adjusted < level / 2)
+    return tuple(movements)
 
 
 def _unit(name: str, calibration: Calibration) -> str:
@@ -415,7 +410,7 @@ def _kind(name: str) -> str:
     return f"{owner} {'bias' if part == 'bias' else 'gain'}"
 
 
-def _together(courses: Sequence[Course], values: FloatArray, covariance: FloatArray) -> dict[str, Sameness]:
+def _together(movements: Sequence[Movement], values: FloatArray, covariance: FloatArray) -> dict[str, Sameness]:
     """Return χ² of each kind of number, and of all that are tested."""
     count, size = values.shape
 
@@ -423,9 +418,9 @@ def _together(courses: Sequence[Course], values: FloatArray, covariance: FloatAr
         rows = [epoch * size + column for epoch in range(count) for column in chosen]
         return sameness(values[:, chosen], covariance[np.ix_(rows, rows)])
 
-    kinds = [_kind(course.name) for course in courses]
-    groups = {kind: [place for place, other in enumerate(kinds) if other == kind] for kind in dict.fromkeys(kinds)}
-    tested = [place for place, course in enumerate(courses) if course.tested]
+    kinds = [_kind(movement.name) for movement in movements]
+    groups = {kind: [index for index, other in enumerate(kinds) if other == kind] for kind in dict.fromkeys(kinds)}
+    tested = [index for index, movement in enumerate(movements) if movement.tested]
     if tested:
         groups["all"] = tested
     return {name: test(chosen) for name, chosen in groups.items()} | ({} if tested else {"all": Sameness(0.0, 0, 1.0)})
@@ -434,19 +429,31 @@ def _together(courses: Sequence[Course], values: FloatArray, covariance: FloatAr
 # --- the output -------------------------------------------------------------------------------------------------------
 
 
-def _output(first: Epoch, last: Epoch, owner: str, rate: float, names: Sequence[str]) -> OutputChange | str:
-    """Return what the change does to a triad's corrected output, or why that is not known."""
-    if owner not in INERTIAL_QUANTITIES:
-        return f"the {owner}'s output is not compared."
-    needed = [
-        name
-        for epoch in (first, last)
-        for name, quantity in epoch.quantities.items()
-        if name.startswith(f"{owner}.") and quantity.unless != "fixed"
-    ]
-    if missing := [name for name in needed if name not in names]:
-        return f"the {owner}'s output is not compared: {missing[0]} is not."
-    over = STANDARD_GRAVITY if owner == "accelerometer" else rate
+def _outputs(first: Epoch, last: Epoch, names: Sequence[str], rate: float) -> tuple[dict[str, OutputChange], list[str]]:
+    """Return what the change does to each triad's corrected output, and why that is not known of others."""
+    changes, silent = {}, []
+    for owner in dict.fromkeys(map(owner_of, names)):
+        needed = [
+            name
+            for epoch in (first, last)
+            for name, quantity in epoch.quantities.items()
+            if name.startswith(f"{owner}.") and quantity.unless != "fixed"
+        ]
+        try:
+            if missing := [name for name in needed if name not in names]:
+                raise InputError(f"{missing[0]} is not.")
+            if owner in INERTIAL_QUANTITIES:
+                changes[owner] = _output(first, last, owner, STANDARD_GRAVITY if owner == "accelerometer" else rate)
+        except InputError as problem:
+            silent.append(f"the {owner}'s output is not compared: {problem}")
+    return changes, silent
+
+
+def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
+    """Return what the change does to a triad's corrected output up to an input of `over`.
+
+    Raises `InputError` where an effect needs what is not known of the input.
+    """
     unit, quantity = first.calibration.imu, SENSOR_QUANTITIES[owner]
     limit = Limit(owner, owner, "output", (), -np.inf, np.inf, SENSOR_UNITS[owner], over=over)
     directions = getattr(output_stimulus(limit, unit.with_effects()), quantity)
@@ -463,22 +470,18 @@ def _output(first: Epoch, last: Epoch, owner: str, rate: float, names: Sequence[
             triads.append(replace(triad, effects=effects, bias=bias))
         return triads[0].recover(triads[1].respond(stimulus), stimulus) - directions
 
-    try:
-        values = np.asarray(error(*flats))
-        slopes = [np.asarray(slope) for slope in jax.jacfwd(error, (0, 1))(*flats)]
-    except InputError as problem:
-        return f"the {owner}'s output is not compared: {problem}"
+    values, slopes = np.asarray(error(*flats)), jax.jacfwd(error, (0, 1))(*flats)
     spread, common = np.zeros((len(values), 3, 3)), []
     for epoch, slope in zip((first, last), slopes, strict=True):
         every = names_of(epoch.calibration.imu)
-        free = slope[..., [every.index(name) for name in epoch.calibration.names]]
+        free = np.asarray(slope)[..., [every.index(name) for name in epoch.calibration.names]]
         spread += np.einsum("nip,pq,njq->nij", free, epoch.covariance, free)
         common.append(free @ epoch.by_gravity)
     for shift in [common[0] + common[1]] if first.gravity == last.gravity else common:
         spread += shift[:, :, None] * shift[:, None, :]
     length = np.linalg.norm(values, axis=1)
     worst = int(np.argmax(length))
-    along = values[worst] / max(length[worst], 1e-300)
+    along = values[worst] / (length[worst] or 1.0)
     return OutputChange(
         float(length[worst]),
         float(np.sqrt(along @ spread[worst] @ along)),
@@ -493,7 +496,7 @@ def _output(first: Epoch, last: Epoch, owner: str, rate: float, names: Sequence[
 
 
 def _limits_reached(
-    courses: Sequence[Course], limits: Limits | None, first: Calibration
+    movements: Sequence[Movement], limits: Limits | None, first: Calibration
 ) -> tuple[tuple[LimitReached, ...], list[str]]:
     """Return when each limit's guard band is reached, and which limits cannot be followed, in sentences."""
     if limits is None:
@@ -501,7 +504,7 @@ def _limits_reached(
     reached, unknown = [], []
     for limit in limits.limits:
         triad = first.triads().get(limit.owner)
-        followed = [course for course in courses if limits.applies(limit, course.name)]
+        followed = [movement for movement in movements if limits.applies(limit, movement.name)]
         if limit.part in (*OF_ONE_UNIT, *OUTPUTS):
             unknown.append(f"{limit.key} is not followed: limits of parameters alone are followed over time.")
         elif triad is None or not followed:
@@ -512,9 +515,9 @@ def _limits_reached(
                 "misalignment, and state its nominal scale below [nominal]."
             )
         else:
-            for course in followed:
-                multiple = float(limits.rule.multiple(course.line.freedom))
-                reached.append(LimitReached(course.name, limit, course.line.until(limit.low, limit.high, multiple)))
+            for movement in followed:
+                multiple = float(limits.rule.multiple(movement.line.freedom))
+                reached.append(LimitReached(movement.name, limit, movement.line.until(limit.low, limit.high, multiple)))
     return tuple(reached), unknown
 
 

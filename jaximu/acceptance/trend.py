@@ -17,7 +17,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, student_cdf, student_isf
 
-__all__ = ["Line", "Sameness", "sameness"]
+__all__ = ["Sameness", "StraightLine", "sameness"]
 
 _ROUNDING = 1e-12
 """Of the largest eigenvalue of a correlation matrix: what is below it is no direction of its own."""
@@ -57,7 +57,7 @@ def sameness(values: FloatArray, covariance: FloatArray) -> Sameness:
 
 
 @dataclass(frozen=True)
-class Line:
+class StraightLine:
     """The line through values over time, from the last of them on: level + slope · (time − last).
 
     covariance (2, 2): of level and slope, scatter included. scatter: τ, of values about the line beyond their stated
@@ -75,7 +75,7 @@ class Line:
     p_value: float
 
     @classmethod
-    def through(cls, times: FloatArray, values: FloatArray, covariance: FloatArray) -> Line:
+    def through(cls, times: FloatArray, values: FloatArray, covariance: FloatArray) -> StraightLine:
         """Fit values (n,) with their covariance (n, n) at times (n,), not all alike, the last of them last."""
         columns = np.stack([np.ones(len(times)), times - times[-1]], axis=1)
         contrasts, left = _contrasts(columns), len(times) - 2
@@ -144,4 +144,6 @@ def _excess(squares: FloatArray, roots: FloatArray, left: int) -> float:
     """Return τ² at which Σ z²/(λ + τ²) is its degrees of freedom; it is above them at zero."""
     from scipy.optimize import brentq
 
-    return float(brentq(lambda excess: np.sum(squares / (roots + excess)) - left, 0.0, float(squares.sum()) / left))
+    most = float(squares.sum()) / left
+    excess: Any = brentq(lambda excess: np.sum(squares / (roots + excess)) - left, 0.0, most)
+    return float(excess)

@@ -54,8 +54,8 @@ def run(
     if len(calibrations) < 2:
         raise InputError("name two calibrations of the unit or more: jaximu compare OLD.json NEW.json.")
     options.require_files(*calibrations, limits)
-    for place, path in enumerate(calibrations):
-        if any(path.samefile(other) for other in calibrations[:place]):
+    for index, path in enumerate(calibrations):
+        if any(path.samefile(other) for other in calibrations[:index]):
             raise InputError(f"{path} is given twice: name different calibrations of the unit.")
     if not 0 < level < 1:
         raise InputError(f"--level: {level:g} is not a probability between 0 and 1.")

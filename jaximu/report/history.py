@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaximu.acceptance.history import Course, LimitReached, UnitHistory
+from jaximu.acceptance.history import LimitReached, Movement, UnitHistory
 from jaximu.acceptance.words import between, in_shown_unit, spoken
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import student_isf
@@ -46,14 +46,14 @@ def page_of(history: UnitHistory) -> Page:
 # --- words ------------------------------------------------------------------------------------------------------------
 
 
-def _amount(course: Course, value: float, sigma: float, sign: bool = True) -> str:
+def _amount(movement: Movement, value: float, sigma: float, sign: bool = True) -> str:
     """Return an amount of a number with its 95 % interval, in the unit in which its kind is shown."""
-    shown, factor = in_shown_unit(course.unit)
+    shown, factor = in_shown_unit(movement.unit)
     return with_interval(factor * value, factor * sigma, shown, sign)
 
 
-def _drift(history: UnitHistory, course: Course) -> str:
-    return f"{_amount(course, course.line.slope, course.line.half / Z95)}/{history.per}"
+def _drift(history: UnitHistory, movement: Movement) -> str:
+    return f"{_amount(movement, movement.line.slope, movement.line.half / Z95)}/{history.per}"
 
 
 def _duration(history: UnitHistory, time: float) -> str:
@@ -73,12 +73,9 @@ def _verdict(history: UnitHistory) -> Iterator[str]:
     ratio = (
         f"χ² {number(test.statistic)} of {counted(test.freedom, 'degree')} of freedom, p {probability(test.p_value)}"
     )
-    tested = sum(course.tested for course in history.courses)
+    tested = sum(movement.tested for movement in history.movements)
     if moved:
-        words = [
-            f"{spoken(course.name)} by {_amount(course, course.difference, course.sigma)} ({abs(course.z):.1f} σ)"
-            for course in moved[:3]
-        ]
+        words = [f"{spoken(m.name)} by {_amount(m, m.difference, m.sigma)} ({abs(m.z):.1f} σ)" for m in moved[:3]]
         rest = f"; and {len(moved) - 3} more" if len(moved) > 3 else ""
         yield f"{len(moved)} of {tested} numbers moved: {'; '.join(words)}{rest}. All together: {ratio}."
     elif history.verdict == "moved":
@@ -171,19 +168,23 @@ def _numbers_table(history: UnitHistory) -> Table:
     over_time = straight or history.per == "year"  # a difference over one step is its own drift
     headers = ["number", "first ± 95 %", "last − first ± 95 %", "σ", "p, all allowed for"]
     headers += [f"drift per {history.per}"] * over_time + ["p, straight"] * straight
-    courses = sorted(history.courses, key=lambda course: (not course.moved, not course.tested, course.p_value))
+    movements = sorted(
+        history.movements, key=lambda movement: (not movement.moved, not movement.tested, movement.p_value)
+    )
     rows = []
-    for course in courses:
-        p_value = probability(course.adjusted).removeprefix("= ") if course.tested else "differs after every power-on"
+    for movement in movements:
+        p_value = (
+            probability(movement.adjusted).removeprefix("= ") if movement.tested else "differs after every power-on"
+        )
         row = [
-            spoken(course.name),
-            _amount(course, course.values[0], course.sigmas[0], False),
-            _amount(course, course.difference, course.sigma),
-            f"{abs(course.z):.1f}",
+            spoken(movement.name),
+            _amount(movement, movement.values[0], movement.sigmas[0], False),
+            _amount(movement, movement.difference, movement.sigma),
+            f"{abs(movement.z):.1f}",
             p_value,
         ]
-        row += [_amount(course, course.line.slope, course.line.half / Z95)] * over_time
-        rows.append(row + [probability(course.line.p_value).removeprefix("= ")] * straight)
+        row += [_amount(movement, movement.line.slope, movement.line.half / Z95)] * over_time
+        rows.append(row + [probability(movement.line.p_value).removeprefix("= ")] * straight)
     caption = (
         f"p: of no change in all {len(history.files)} calibrations, with all numbers allowed for (Holm). Moved is "
         f"below {history.level / 2:g}: half the rate of false alarms, the other half is for all numbers together"
@@ -213,14 +214,14 @@ def _together_table(history: UnitHistory) -> Table:
 
 def _limits_table(history: UnitHistory) -> Table:
     """Return each limit, where its number is and drifts, and when its guard band is reached, the first first."""
-    courses = {course.name: course for course in history.courses}
+    movements = {movement.name: movement for movement in history.movements}
 
     def row(reached: LimitReached) -> tuple[str, ...]:
-        course, limit = courses[reached.name], reached.limit
+        movement, limit = movements[reached.name], reached.limit
         after = "never, at this drift" if reached.after is None else _duration(history, reached.after)
-        level = _amount(course, course.line.level, float(np.sqrt(course.line.covariance[0, 0])))
+        level = _amount(movement, movement.line.level, float(np.sqrt(movement.line.covariance[0, 0])))
         bounds = between(limit.low, limit.high, limit.unit, limit.stated)
-        return spoken(reached.name), bounds, level, _drift(history, course), after
+        return spoken(reached.name), bounds, level, _drift(history, movement), after
 
     ordered = sorted(history.limits, key=lambda limit: np.inf if limit.after is None else limit.after)
     headers = ("limit on", "bounds", "now ± 95 %", "drift ± 95 %", "guard band reached after")
@@ -255,47 +256,47 @@ def _pictured_over_time(history: UnitHistory) -> Picture:
 
 
 def _changes_figure(history: UnitHistory) -> Figure:
-    rows = history.courses[::-1]
+    rows = history.movements[::-1]
     figure = figures.new_figure(1.0 + 0.17 * len(rows))
     panel = figure.subplots(1, 1)
     panel.axvspan(-Z95, Z95, color=figures.GAPS[1], linewidth=0)
-    for row, course in enumerate(rows):
-        colour = figures.FLAGGED if course.moved else figures.AFTER if course.tested else figures.BEFORE
-        panel.plot(course.z, row, "o", color=colour, markersize=5)
+    for row, movement in enumerate(rows):
+        colour = figures.FLAGGED if movement.moved else figures.AFTER if movement.tested else figures.BEFORE
+        panel.plot(movement.z, row, "o", color=colour, markersize=5)
     panel.axvline(0.0, color="0.5", linewidth=0.8)
     figures.dressed(panel, "last − first", xlabel="standard deviations of the difference")
-    panel.set_yticks(range(len(rows)), [spoken(course.name) for course in rows], fontsize=8)
+    panel.set_yticks(range(len(rows)), [spoken(movement.name) for movement in rows], fontsize=8)
     return figure
 
 
-def _surest(history: UnitHistory) -> list[Course]:
-    return sorted(history.courses, key=lambda course: (not course.tested, course.p_value))[:_DRAWN]
+def _surest(history: UnitHistory) -> list[Movement]:
+    return sorted(history.movements, key=lambda movement: (not movement.tested, movement.p_value))[:_DRAWN]
 
 
-def _panels(courses: list[Course]) -> tuple[Figure, list[Axes]]:
-    figure = figures.new_figure(0.8 + 1.7 * len(courses))
-    return figure, figure.subplots(len(courses), 1, sharex=True, squeeze=False)[:, 0].tolist()
+def _panels(movements: list[Movement]) -> tuple[Figure, list[Axes]]:
+    figure = figures.new_figure(0.8 + 1.7 * len(movements))
+    return figure, figure.subplots(len(movements), 1, sharex=True, squeeze=False)[:, 0].tolist()
 
 
-def _points(panel: Axes, course: Course, at: FloatArray) -> tuple[float, str]:
+def _points(panel: Axes, movement: Movement, at: FloatArray) -> tuple[float, str]:
     """Draw a number's values with their intervals; return the factor to its unit, and the unit."""
-    shown, factor = in_shown_unit(course.unit)
-    half = factor * Z95 * np.array(course.apart)
-    panel.errorbar(at, factor * np.array(course.values), half, fmt="o", color=figures.FLAGGED, markersize=4, zorder=3)
-    figures.dressed(panel, spoken(course.name))
+    shown, factor = in_shown_unit(movement.unit)
+    half = factor * Z95 * np.array(movement.apart)
+    panel.errorbar(at, factor * np.array(movement.values), half, fmt="o", color=figures.FLAGGED, markersize=4, zorder=3)
+    figures.dressed(panel, spoken(movement.name))
     panel.set_ylabel(shown, fontsize=8)
     return factor, shown
 
 
 def _history_figure(history: UnitHistory) -> Figure:
-    courses = _surest(history)
-    figure, panels = _panels(courses)
+    movements = _surest(history)
+    figure, panels = _panels(movements)
     last = history.dates[-1]
     origin = 0.0 if last is None or history.per != "year" else last.year + (last.timetuple().tm_yday - 1) / 365.25
-    for panel, course in zip(panels, courses, strict=True):
-        factor, _ = _points(panel, course, history.times + origin)
-        line, ahead = course.line, np.linspace(history.times[0], 0.0, 100)
-        shared = course.sigmas[-1] ** 2 - course.apart[-1] ** 2
+    for panel, movement in zip(panels, movements, strict=True):
+        factor, _ = _points(panel, movement, history.times + origin)
+        line, ahead = movement.line, np.linspace(history.times[0], 0.0, 100)
+        shared = movement.sigmas[-1] ** 2 - movement.apart[-1] ** 2
         variance = line.covariance[0, 0] - shared + (2 * line.covariance[0, 1] + line.covariance[1, 1] * ahead) * ahead
         half = float(student_isf(0.025, line.freedom)) * np.sqrt(np.maximum(variance, 0.0))
         level = line.level + line.slope * ahead
@@ -306,9 +307,9 @@ def _history_figure(history: UnitHistory) -> Figure:
 
 
 def _temperature_figure(history: UnitHistory) -> Figure:
-    courses = _surest(history)
-    figure, panels = _panels(courses)
-    for panel, course in zip(panels, courses, strict=True):
-        _points(panel, course, np.array(history.temperatures, float))
+    movements = _surest(history)
+    figure, panels = _panels(movements)
+    for panel, movement in zip(panels, movements, strict=True):
+        _points(panel, movement, np.array(history.temperatures, float))
     panels[-1].set_xlabel("temperature [°C]", fontsize=8)
     return figure
