@@ -293,6 +293,7 @@ def test_over_temperature_biases_are_compared_at_one():
     imu = replace(constant.imu, accelerometer=replace(constant.imu.accelerometer, bias=np.full(3, 0.03)))
     history = jaximu.compare(thermal(2e-3, 20.0, 0.01), replace(constant, imu=imu))
     assert history.together["accelerometer bias"].statistic < 1e-9
+    assert history.output["accelerometer"].worst < 1e-9
     with pytest.raises(jaximu.NotPossibleError, match="holds at one temperature"):
         jaximu.compare(thermal(2e-3, 20.0, 0.01), calibration(unit()))
 

@@ -27,7 +27,7 @@ from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.model.conventions import lower_triangular_frame
 from jaximu.model.effects import CATALOGUE
 
-__all__ = ["Epoch", "Scales", "epochs_of", "in_own_axes", "owner_of", "require_apart"]
+__all__ = ["Epoch", "Scales", "epochs_of", "in_own_axes", "over_temperature", "owner_of", "require_apart"]
 
 Scales = Mapping[str, tuple[FloatArray, FloatArray]]
 """By triad in counts, counts per SI unit (3,) and counts at zero input (3,)."""
@@ -115,11 +115,11 @@ def epochs_of(calibrations: Sequence[Calibration], files: Sequence[str], nominal
     Raises `NotPossibleError` where they hold at temperatures that cannot be brought together.
     """
     pairs = [in_own_axes(calibration) for calibration in calibrations]
-    common = _temperature([calibration for calibration, _ in pairs], files)
+    common = _temperatures([calibration for calibration, _ in pairs], files)
     first = pairs[0][0].triads()
     scales = {name: (np.diagonal(triad.gain), np.asarray(triad.bias)) for name, triad in first.items()} | dict(nominal)
     return [
-        _epoch(*_at_temperature(calibration, common), file, turned, scales)
+        _epoch(*_at_temperatures(calibration, common), file, turned, scales)
         for (calibration, turned), file in zip(pairs, files, strict=True)
     ]
 
@@ -153,39 +153,38 @@ def _epoch(calibration: Calibration, reasons: Mapping[str, str], file: str, turn
 # --- temperature ------------------------------------------------------------------------------------------------------
 
 
-def _thermal(calibration: Calibration) -> set[str]:
+def over_temperature(calibration: Calibration) -> set[str]:
     """Return the triads that have an effect of temperature."""
     triads = calibration.triads().items()
     return {name for name, triad in triads if any("temperature" in effect.needs for effect in triad.effects)}
 
 
-def _temperature(calibrations: Sequence[Calibration], files: Sequence[str]) -> float | None:
-    """Return the temperature, °C, at which calibrations are compared; None where each holds where it was made."""
-    thermal = [_thermal(calibration) for calibration in calibrations]
-    if not any(thermal):
-        return None
-    constant = [index for index, owners in enumerate(thermal) if not owners]
-    if not constant:
-        chosen = calibrations[0].triads()[min(thermal[0])]
-        return chosen.temperature_reference
-    for index in constant:
-        if "temperature" not in calibrations[index].data:
-            raise NotPossibleError(
-                f"{files[index]} holds at one temperature, which its recording did not state, and another of these "
-                "calibrations over temperature: they cannot be compared. Record the unit with its temperature, and "
-                "calibrate again."
-            )
-    return float(calibrations[constant[0]].data["temperature"])
+def _temperatures(calibrations: Sequence[Calibration], files: Sequence[str]) -> dict[str, float]:
+    """Return the temperature, °C, at which triads are compared of which one holds over temperature."""
+    common = {}
+    for owner in sorted(set.union(*map(over_temperature, calibrations))):
+        holders = [pair for pair in zip(calibrations, files, strict=True) if owner in pair[0].triads()]
+        constant = [pair for pair in holders if owner not in over_temperature(pair[0])]
+        for calibration, file in constant:
+            if "temperature" not in calibration.data:
+                raise NotPossibleError(
+                    f"{file} holds at one temperature, which its recording did not state, and another of these "
+                    "calibrations over temperature: they cannot be compared. Record the unit with its temperature, and "
+                    "calibrate again."
+                )
+        first = holders[0][0].triads()[owner].temperature_reference
+        common[owner] = float(constant[0][0].data["temperature"]) if constant else first
+    return common
 
 
-def _at_temperature(calibration: Calibration, celsius: float | None) -> tuple[Calibration, dict[str, str]]:
-    """Return a calibration whose biases are those at a steady temperature, and what is not compared because of it."""
+def _at_temperatures(calibration: Calibration, common: Mapping[str, float]) -> tuple[Calibration, dict[str, str]]:
+    """Return a calibration whose biases are those at steady temperatures, and what is not compared because of it."""
     reasons: dict[str, str] = {}
-    for owner in sorted(_thermal(calibration)):
-        triad = calibration.triads()[owner]
-        reference = triad.temperature_reference
-        if celsius is None or reference == celsius:
+    for owner, celsius in common.items():
+        triad = calibration.triads().get(owner)
+        if triad is None or triad.temperature_reference == celsius:
             continue
+        reference = triad.temperature_reference
         from jaximu.calibration.thermal import steady
 
         rows = [row for row, effect in enumerate(triad.effects) if "temperature" in effect.needs]

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaximu.acceptance.epochs import Epoch, Scales, epochs_of, owner_of, require_apart
+from jaximu.acceptance.epochs import Epoch, Scales, epochs_of, over_temperature, owner_of, require_apart
 from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits
 from jaximu.acceptance.quantities import output_stimulus
 from jaximu.acceptance.trend import Sameness, StraightLine, sameness
@@ -35,7 +35,7 @@ from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES, SENSOR_UNITS, STANDARD_GRAVITY
-from jaximu.model.effects import CATALOGUE
+from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.stimulus import Stimulus
 
 __all__ = ["RATE", "LimitReached", "Movement", "OutputChange", "UnitHistory", "compare"]
@@ -296,7 +296,6 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
 
     Raises `NotPossibleError` where there is none.
     """
-    vectors = {*SENSOR_QUANTITIES.values(), "angular_acceleration"}
     reasons = [_apart(epochs[0], epoch) for epoch in epochs[1:]]
     apart = {owner: reason for part in reasons for owner, reason in part.items()}
     everything = list(dict.fromkeys(name for epoch in epochs for name in epoch.quantities))
@@ -318,7 +317,7 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
             )[0]
         elif f"{owner} gain" in apart and name.startswith((f"{owner}.scale", f"{owner}.misalignment")):
             left_out[f"{owner} gain"] = apart[f"{owner} gain"]
-        elif stem in CATALOGUE and vectors & set(CATALOGUE[stem].needs) and any(epoch.turned for epoch in epochs):
+        elif stem in CATALOGUE and _has_axes(CATALOGUE[stem]) and any(epoch.turned for epoch in epochs):
             left_out[stem] = "its axes are a set-up's in one calibration"
         else:
             names.append(name)
@@ -326,6 +325,11 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
     if not names:
         raise NotPossibleError(f"these calibrations have nothing in common to compare. {' '.join(sentences)}".strip())
     return names, sentences
+
+
+def _has_axes(effect: Effect | type[Effect]) -> bool:
+    """Whether an effect's coefficients belong to axes of the body: it takes in a vector."""
+    return bool({*SENSOR_QUANTITIES.values(), "angular_acceleration"} & set(effect.needs))
 
 
 def _apart(first: Epoch, other: Epoch) -> dict[str, str]:
@@ -442,6 +446,9 @@ def _outputs(first: Epoch, last: Epoch, names: Sequence[str], rate: float) -> tu
         try:
             if missing := [name for name in needed if name not in names]:
                 raise InputError(f"{missing[0]} is not.")
+            effects = [effect for epoch in (first, last) for effect in epoch.calibration.imu.triads()[owner].effects]
+            if (first.turned or last.turned) and any(map(_has_axes, effects)):
+                raise InputError("an effect's axes are a set-up's in one calibration.")
             if owner in INERTIAL_QUANTITIES:
                 changes[owner] = _output(first, last, owner, STANDARD_GRAVITY if owner == "accelerometer" else rate)
         except InputError as problem:
@@ -553,8 +560,8 @@ def _notes(epochs: Sequence[Epoch], nominal: Scales) -> list[str]:
             f"places, all scales of the accelerometer might differ by {100 * 2 * np.sqrt(2) * sigma:.2g} %."
         )
     known = [epoch.temperature for epoch in epochs if epoch.temperature is not None]
-    references = {triad.temperature_reference for epoch in epochs for triad in epoch.calibration.triads().values()}
-    if len(known) == len(epochs) and len(references) == 1 and max(known) > min(known):
+    constant = not any(over_temperature(epoch.calibration) for epoch in epochs)
+    if constant and len(known) == len(epochs) and max(known) > min(known):
         notes.append(
             f"the recordings were at {min(known):.1f} to {max(known):.1f} °C: what follows temperature looks like "
             "movement."

@@ -85,7 +85,7 @@ class StraightLine:
         p_value = float(chi2_sf(statistic, left)) if left else 1.0
         variance = _excess(squares, roots, left) if p_value < _DOUBT else 0.0
         weights = np.linalg.inv(covariance + variance * np.eye(len(times)))
-        spread = np.linalg.inv(columns.T @ weights @ columns)
+        spread = np.asarray(np.linalg.inv(columns.T @ weights @ columns), float)
         level, slope = (spread @ columns.T @ weights @ values).tolist()
         freedom = left if variance else np.inf
         return cls(level, slope, spread, float(np.sqrt(variance)), freedom, statistic, left, p_value)

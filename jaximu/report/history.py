@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.acceptance.history import LimitReached, Movement, UnitHistory
 from jaximu.acceptance.words import between, in_shown_unit, spoken
-from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import student_isf
 from jaximu.ground.page import Page, Part, Picture, Statement, Table
 from jaximu.ground.quantities import Z95, counted, number, probability, sentence, size, with_interval
@@ -278,7 +278,7 @@ def _panels(movements: list[Movement]) -> tuple[Figure, list[Axes]]:
     return figure, figure.subplots(len(movements), 1, sharex=True, squeeze=False)[:, 0].tolist()
 
 
-def _points(panel: Axes, movement: Movement, at: FloatArray) -> tuple[float, str]:
+def _points(panel: Axes, movement: Movement, at: NDArray[Any]) -> tuple[float, str]:
     """Draw a number's values with their intervals; return the factor to its unit, and the unit."""
     shown, factor = in_shown_unit(movement.unit)
     half = factor * Z95 * np.array(movement.apart)
@@ -291,18 +291,18 @@ def _points(panel: Axes, movement: Movement, at: FloatArray) -> tuple[float, str
 def _history_figure(history: UnitHistory) -> Figure:
     movements = _surest(history)
     figure, panels = _panels(movements)
-    last = history.dates[-1]
-    origin = 0.0 if last is None or history.per != "year" else last.year + (last.timetuple().tm_yday - 1) / 365.25
+    dated = history.per == "year"
+    at = np.array(history.dates, "datetime64[D]") if dated else history.times
     for panel, movement in zip(panels, movements, strict=True):
-        factor, _ = _points(panel, movement, history.times + origin)
+        factor, _ = _points(panel, movement, at)
         line, ahead = movement.line, np.linspace(history.times[0], 0.0, 100)
         shared = movement.sigmas[-1] ** 2 - movement.apart[-1] ** 2
         variance = line.covariance[0, 0] - shared + (2 * line.covariance[0, 1] + line.covariance[1, 1] * ahead) * ahead
         half = float(student_isf(0.025, line.freedom)) * np.sqrt(np.maximum(variance, 0.0))
         level = line.level + line.slope * ahead
-        figures.band(panel, ahead + origin, factor * level, factor * half, figures.AFTER)
-    panels[-1].set_xlabel("year" if origin else "steps before the last", fontsize=8)
-    panels[-1].ticklabel_format(axis="x", useOffset=False)
+        days = (history.times[-1] - ahead) / np.ptp(history.times) * (at[-1] - at[0])
+        figures.band(panel, at[-1] - days, factor * level, factor * half, figures.AFTER)
+    panels[-1].set_xlabel("" if dated else "steps before the last", fontsize=8)
     return figure
 
 
