@@ -145,7 +145,7 @@ def _epoch(calibration: Calibration, reasons: Mapping[str, str], file: str, turn
         if measured.fixed[column]:
             unless = "fixed"
         elif not measured.determined[0, column]:
-            unless = f"{file} does not determine it"
+            unless = f"{file} does not determine all of that"
         quantities[name] = Measurand(float(measured.value[0, column]), measured.slope[0, column], unless)
     return Epoch(file, calibration, turned, covariance - np.outer(by_gravity, by_gravity), by_gravity, quantities)
 

@@ -9,7 +9,7 @@ is its drift (`jaximu.acceptance.trend`), and which says when a limit's guard ba
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date, timedelta
 from typing import Any
@@ -307,24 +307,40 @@ def _comparable(epochs: Sequence[Epoch]) -> tuple[list[str], list[str]]:
         if owner in apart:
             left_out[owner] = apart[owner]
         elif lacking:
-            left_out[stem if stem in CATALOGUE else owner] = f"{listed(lacking)} holds none"
+            left_out[stem if stem in CATALOGUE else owner] = (
+                f"{listed(lacking)} {'holds' if len(lacking) == 1 else 'hold'} none"
+            )
         elif all(text == "fixed" for text in unless):
             continue  # by convention, or of a data sheet
         elif any(unless):
-            texts = [f"{epoch.file} holds it fixed" for epoch, t in zip(epochs, unless, strict=True) if t == "fixed"]
+            texts = [
+                f"{epoch.file} holds a data sheet's value or zero"
+                for epoch, t in zip(epochs, unless, strict=True)
+                if t == "fixed"
+            ]
             left_out[stem if stem in CATALOGUE else name] = (
                 texts + [text for text in unless if text and text != "fixed"]
             )[0]
-        elif f"{owner} gain" in apart and name.startswith((f"{owner}.scale", f"{owner}.misalignment")):
-            left_out[f"{owner} gain"] = apart[f"{owner} gain"]
+        elif _kind(name) in apart:
+            left_out[name] = apart[_kind(name)]
         elif stem in CATALOGUE and _has_axes(CATALOGUE[stem]) and any(epoch.turned for epoch in epochs):
             left_out[stem] = "its axes are a set-up's in one calibration"
         else:
             names.append(name)
-    sentences = [f"{what} is not compared: {why}." for what, why in left_out.items()]
+    sentences = _not_compared(left_out, names)
     if not names:
         raise NotPossibleError(f"these calibrations have nothing in common to compare. {' '.join(sentences)}".strip())
     return names, sentences
+
+
+def _not_compared(left_out: Mapping[str, str], names: Sequence[str]) -> list[str]:
+    """Return what is left out in sentences, one for each reason; axes stand together where none is compared."""
+    stems = {name.partition("[")[0] for name in names}
+    by_reason: dict[str, dict[str, None]] = {}
+    for what, why in left_out.items():
+        stem = what.partition("[")[0]
+        by_reason.setdefault(why, {})[what if stem in stems else stem] = None
+    return [f"not compared: {listed([*whats])}, because {why}." for why, whats in by_reason.items()]
 
 
 def _has_axes(effect: Effect | type[Effect]) -> bool:
@@ -445,14 +461,14 @@ def _outputs(first: Epoch, last: Epoch, names: Sequence[str], rate: float) -> tu
         ]
         try:
             if missing := [name for name in needed if name not in names]:
-                raise InputError(f"{missing[0]} is not.")
+                raise InputError(f"{missing[0]} is not known in both.")
             effects = [effect for epoch in (first, last) for effect in epoch.calibration.imu.triads()[owner].effects]
             if (first.turned or last.turned) and any(map(_has_axes, effects)):
                 raise InputError("an effect's axes are a set-up's in one calibration.")
             if owner in INERTIAL_QUANTITIES:
                 changes[owner] = _output(first, last, owner, STANDARD_GRAVITY if owner == "accelerometer" else rate)
         except InputError as problem:
-            silent.append(f"the {owner}'s output is not compared: {problem}")
+            silent.append(f"not compared: the output of the {owner}, because {problem}")
     return changes, silent
 
 
