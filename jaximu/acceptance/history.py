@@ -26,7 +26,8 @@ from jaximu.acceptance.trend import Sameness, StraightLine, sameness
 from jaximu.acceptance.words import si_unit
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import require_calibration
-from jaximu.estimation.problem import names_of
+from jaximu.estimation.problem import flatten, names_of
+from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import holm
 from jaximu.ground.document import SOFTWARE, Document
@@ -36,6 +37,7 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES, SENSOR_UNITS, STANDARD_GRAVITY
 from jaximu.model.effects import CATALOGUE, Effect
+from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 
 __all__ = ["RATE", "LimitReached", "Movement", "OutputChange", "UnitHistory", "compare"]
@@ -482,18 +484,19 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
     directions = getattr(output_stimulus(limit, unit.with_effects()), quantity)
     celsius = np.full(len(directions), unit.triads()[owner].temperature_reference)
     stimulus = Stimulus(**{quantity: directions, "temperature": celsius})
-    flats, restores = zip(*(ravel_pytree(epoch.calibration.imu) for epoch in (first, last)), strict=True)
+    models = [epoch.calibration.imu for epoch in (first, last)]
 
-    def error(*numbers):
-        triads = []
-        for flat, restore in zip(numbers, restores, strict=True):
-            triad = restore(flat).triads()[owner]
-            effects = tuple(effect for effect in triad.effects if effect.scope == "device")
-            bias = jnp.zeros(3) if owner == "gyroscope" else triad.bias  # another after every power-on
-            triads.append(replace(triad, effects=effects, bias=bias))
-        return triads[0].recover(triads[1].respond(stimulus), stimulus) - directions
+    def both(flats, models, stimulus):
+        """Return the error (points, 3) and its slopes (points, 3, m) by all numbers of each calibration."""
 
-    values, slopes = np.asarray(error(*flats)), jax.jacfwd(error, (0, 1))(*flats)
+        def error(before, after):
+            restored = ravel_pytree(models[0])[1](before), ravel_pytree(models[1])[1](after)
+            return _error(*restored, stimulus, owner)
+
+        return error(*flats), jax.jacfwd(error, (0, 1))(*flats)
+
+    values, slopes = stored.call(both, f"compare {owner}", [flatten(model) for model in models], models, stimulus)
+    values = np.asarray(values)
     spread, common = np.zeros((len(values), 3, 3)), []
     for epoch, slope in zip((first, last), slopes, strict=True):
         every = names_of(epoch.calibration.imu)
@@ -513,6 +516,16 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
         over,
         SENSOR_UNITS[owner],
     )
+
+
+def _error(first: Imu, last: Imu, stimulus: Stimulus, owner: str) -> Any:
+    """Return what a triad of the first makes of an input that the last puts out, less that input."""
+    triads = []
+    for triad in (first.triads()[owner], last.triads()[owner]):
+        effects = tuple(effect for effect in triad.effects if effect.scope == "device")
+        bias = jnp.zeros(3) if owner == "gyroscope" else triad.bias  # another after every power-on
+        triads.append(replace(triad, effects=effects, bias=bias))
+    return triads[0].recover(triads[1].respond(stimulus), stimulus) - getattr(stimulus, SENSOR_QUANTITIES[owner])
 
 
 # --- limits and words -------------------------------------------------------------------------------------------------
