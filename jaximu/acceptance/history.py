@@ -286,7 +286,7 @@ def _in_order(
     without = [file for file, day in zip(files, days, strict=True) if day is None]
     whose = f" of {listed(without)}" if 0 < len(without) < count else ""
     why = f"no date is known{whose}" if without else "all are of one day"
-    note = f"{why}: calibrations are taken in the order given, a step apart; --dates YYYY-MM-DD,… states dates."
+    note = f"{why}: calibrations are taken in the order given, a step apart; state them with --dates."
     return list(range(count)), tuple(days), np.arange(1.0 - count, 1.0), "step", [note]
 
 
@@ -565,6 +565,8 @@ def _notes(epochs: Sequence[Epoch], nominal: Scales) -> list[str]:
         for name, triad in triads
         if triad.output_unit == "count" and name not in nominal
     ]
+    if len(epochs) == 2:
+        notes.append("two calibrations cannot distinguish a steady drift from a single jump.")
     serials = {str((epoch.calibration.trace or {}).get("serial", "")) for epoch in epochs} - {""}
     if len(serials) > 1:
         notes.append(f"the calibrations state different serial numbers, {listed(sorted(serials))}: is it one unit?")

@@ -49,7 +49,8 @@ def page_of(history: UnitHistory) -> Page:
 def _amount(movement: Movement, value: float, sigma: float, sign: bool = True) -> str:
     """Return an amount of a number with its 95 % interval, in the unit in which its kind is shown."""
     shown, factor = in_shown_unit(movement.unit)
-    return with_interval(factor * value, factor * sigma, shown, sign)
+    unit = movement.unit if factor == 1.0 else shown  # an effect's is read with the prefix that suits it
+    return with_interval(factor * value, factor * sigma, unit, sign)
 
 
 def _drift(history: UnitHistory, movement: Movement) -> str:
