@@ -133,7 +133,7 @@ def _epoch(calibration: Calibration, reasons: Mapping[str, str], file: str, turn
     by_gravity = np.where(scaled, values, 0.0) * gravity.sigma / gravity.value
     covariance, scale = calibration.covariance, np.sqrt(np.diagonal(calibration.covariance))
     scale = np.where(scale > 0, scale, 1.0)
-    inverse = np.linalg.pinv(covariance / scale[:, None] / scale, rcond=1e-13, hermitian=True)
+    inverse = np.linalg.pinv(covariance / scale[:, None] / scale, hermitian=True)
     held = (by_gravity / scale) @ inverse @ (by_gravity / scale) < 1  # C − s sᵀ > 0
     by_gravity = by_gravity if held else np.zeros(len(values))
     quantities = {}

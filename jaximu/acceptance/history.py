@@ -236,7 +236,7 @@ def compare(
     if len(calibrations) < 2:
         raise InputError("a comparison takes two calibrations of the unit or more.")
     if not 0 < level < 1 or not 0 < rate < np.inf:
-        raise InputError("the level lies between 0 and 1, and the rate is a number of rad/s above 0.")
+        raise InputError(f"the level, {level:g}, must lie between 0 and 1, and the rate, {rate:g} rad/s, above 0.")
     files = tuple(files) or tuple(f"calibration {number}" for number in range(1, len(calibrations) + 1))
     require_apart(calibrations, files)
     order, days, times, per, notes = _in_order(calibrations, files, dates)

@@ -285,7 +285,7 @@ def _points(panel: Axes, movement: Movement, at: NDArray[Any]) -> tuple[float, s
     half = factor * Z95 * np.array(movement.apart)
     panel.errorbar(at, factor * np.array(movement.values), half, fmt="o", color=figures.FLAGGED, markersize=4, zorder=3)
     figures.dressed(panel, spoken(movement.name))
-    panel.set_ylabel(shown, fontsize=8)
+    panel.set_ylabel(shown)
     return factor, shown
 
 
@@ -303,7 +303,7 @@ def _history_figure(history: UnitHistory) -> Figure:
         level = line.level + line.slope * ahead
         days = (history.times[-1] - ahead) / np.ptp(history.times) * (at[-1] - at[0])
         figures.band(panel, at[-1] - days, factor * level, factor * half, figures.AFTER)
-    panels[-1].set_xlabel("" if dated else "steps before the last", fontsize=8)
+    panels[-1].set_xlabel("" if dated else "steps before the last")
     return figure
 
 
@@ -312,5 +312,5 @@ def _temperature_figure(history: UnitHistory) -> Figure:
     figure, panels = _panels(movements)
     for panel, movement in zip(panels, movements, strict=True):
         _points(panel, movement, np.array(history.temperatures, float))
-    panels[-1].set_xlabel("temperature [°C]", fontsize=8)
+    panels[-1].set_xlabel("temperature [°C]")
     return figure
