@@ -342,6 +342,11 @@ def test_the_document_and_the_page_say_the_same(tmp_path):
     }  # fmt: skip
 
 
+def test_what_came_back_is_said_to_have_been_away():
+    there_and_back = jaximu.compare(calibration(unit()), calibration(unit(0.1)), calibration(unit(1e-4)))
+    assert "accelerometer bias x in between and back (p " in str(there_and_back.summary())
+
+
 # --- from logs to the answer ------------------------------------------------------------------------------------------
 
 

@@ -69,14 +69,14 @@ def _time(time: float, per: str) -> str:
 
 
 def _verdict(history: UnitHistory) -> Iterator[str]:
-    """Yield what moved, then the drift that is surest and when the unit is due."""
+    """Yield what moved, and when the unit is due again."""
     test, moved = history.together["all"], history.moved
     ratio = (
         f"χ² {number(test.statistic)} of {counted(test.freedom, 'degree')} of freedom, p {probability(test.p_value)}"
     )
     tested = sum(movement.tested for movement in history.movements)
     if moved:
-        words = [f"{spoken(m.name)} by {_amount(m, m.difference, m.sigma)} ({abs(m.z):.1f} σ)" for m in moved[:3]]
+        words = [_words(movement) for movement in moved[:3]]
         rest = f"; and {len(moved) - 3} more" if len(moved) > 3 else ""
         yield f"{len(moved)} of {tested} numbers moved: {'; '.join(words)}{rest}. All together: {ratio}."
     elif history.verdict == "moved":
@@ -85,6 +85,14 @@ def _verdict(history: UnitHistory) -> Iterator[str]:
         yield f"Nothing moved: all differences are within their uncertainty ({ratio})."
     if history.limits:
         yield _due(history)
+
+
+def _words(movement: Movement) -> str:
+    """Say how far a number moved, or that it did so in between and came back."""
+    if abs(movement.z) < Z95:
+        return f"{spoken(movement.name)} in between and back (p {probability(movement.adjusted)})"
+    amount = _amount(movement, movement.difference, movement.sigma)
+    return f"{spoken(movement.name)} by {amount} ({abs(movement.z):.1f} σ)"
 
 
 def _due(history: UnitHistory) -> str:
