@@ -106,14 +106,14 @@ class Evidence:
         self.jacobian = jacobian
         u, s, _ = np.linalg.svd(jacobian, full_matrices=False)
         self._base = u[:, s > 1e-10 * s[0]]
-        self.residual = self._off_base(residual)
+        self.residual = self.off_base(residual)
         self.freedom = len(residual) - self._base.shape[1]
         """Dimensions that the base parameters leave."""
         raw = (
             [np.concatenate([block.columns for block in blocks], axis=1)] if blocks else [np.zeros((len(residual), 0))]
         )
         self._edges = np.cumsum([0, *(block.columns.shape[1] for block in blocks)])
-        self.columns = self._off_base(raw[0])
+        self.columns = self.off_base(raw[0])
         self._reach = np.linalg.norm(raw[0], axis=0)
         self._gram = self.columns.T @ self.columns
         self._product = self.columns.T @ self.residual
@@ -123,7 +123,8 @@ class Evidence:
         """The pseudo-inverse (p, n) of the Jacobian."""
         return np.asarray(scipy.linalg.pinv(self.jacobian))
 
-    def _off_base(self, values: FloatArray) -> FloatArray:
+    def off_base(self, values: FloatArray) -> FloatArray:
+        """Return whitened conditions (n, …) without what the base parameters can imitate."""
         return values - self._base @ (self._base.T @ values)
 
     def place(self, block: int) -> slice:
@@ -220,7 +221,7 @@ class Evidence:
         drawn = self._noise
         if drawn is None:
             drawn = np.random.default_rng(20260101).standard_normal((len(self.residual), DRAWS))
-        noise = self._off_base(drawn)
+        noise = self.off_base(drawn)
         product = self.columns.T @ noise
         smallest, guard = np.ones(DRAWS), np.ones(DRAWS)
         left = self.freedom - self._spanned.shape[1]

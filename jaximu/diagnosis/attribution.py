@@ -1,0 +1,659 @@
+"""Whose fault a finding is: a unit's, a session's or the board's, from recordings of several units in several sessions.
+
+Every recording is diagnosed by itself. Of each effect that one of them names, all give an estimate beside the others
+that are attributed. The estimates β of unit u in session s are split as β_us = m + a_u + c_s + e_us: one value of the
+board, one of each unit, one of each session, and what scatters from recording to recording. Each part is normally
+distributed with a variance of its own (Searle, Casella and McCulloch, Variance Components, 1992, ch. 6); a part is
+there if the likelihood gains enough by it.
+
+A time course that is common to all units of a session is the first principal component of their rates at rest. It is
+compared with what drift as large and as slow in each unit, but independent, has in common by chance.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+import scipy
+
+from jaximu.data.drift import restricted_likelihood
+from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
+from jaximu.diagnosis.evidence import Evidence
+from jaximu.diagnosis.improvement import cross_validated
+from jaximu.estimation.leave_out import orthonormal
+from jaximu.estimation.track import TRIADS
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_sf
+from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.page import Result
+from jaximu.ground.quantities import counted, listed
+from jaximu.ground.units import SENSOR_UNITS
+from jaximu.mistakes.titles import effect_title
+from jaximu.model.effects import CATALOGUE
+from jaximu.recordings.recording import Recording, recordings_of
+
+__all__ = [
+    "COMMON_DRIFT",
+    "Attributed",
+    "Attribution",
+    "BoardRecording",
+    "CommonDrift",
+    "Part",
+    "attribute",
+    "places_of",
+    "split",
+]
+
+COMMON_DRIFT = "session.common_drift"
+
+DRAWS = 1000
+"""Draws of drift that is independent from unit to unit."""
+_SEED = 20260101
+_FEWEST = 6
+"""Rests at the same time that a time course is looked for in: orientation and a constant take four of them."""
+_SEEN = 1e-4
+"""Share of an effect's reach that must be left of a direction for it to be estimated."""
+_WIDE = 8.0
+"""Spread of the logarithm of a part's variance, in squares of usual sizes, beforehand: next to nothing is known."""
+
+
+@dataclass(frozen=True)
+class Rests:
+    """The rates at rest that a fit leaves, and how the conditions react to outputs that are off in single poses.
+
+    times (o,): middles of the poses, s. up (o, 3): direction of specific force. unwhiten (3 o, n): from whitened
+    conditions to rates, rad/s. reaction: by triad, whitened conditions (n, o, 3) by outputs.
+    """
+
+    times: FloatArray
+    up: FloatArray
+    unwhiten: FloatArray
+    reaction: Mapping[str, FloatArray]
+
+    def rates(self, whitened: FloatArray) -> FloatArray:
+        """Return rates at rest (o, 3, k), rad/s, of whitened conditions (n, k)."""
+        return (self.unwhiten @ whitened).reshape(len(self.times), 3, -1)
+
+    def columns(self, triad: str, curves: FloatArray) -> FloatArray:
+        """Return how the whitened conditions (n, 3 k) react to curves (o, k) in each axis of a triad."""
+        columns = np.einsum("noi,ok->nki", self.reaction[triad], curves)
+        return columns.reshape(len(columns), -1)
+
+    def off_orientation(self, rates: FloatArray) -> FloatArray:
+        """Return rates (o, …) without what follows orientation, a constant included."""
+        basis = orthonormal(np.concatenate([np.ones((len(self.times), 1)), self.up], axis=1))
+        return rates - np.tensordot(basis, np.tensordot(basis, rates, (0, 0)), 1)
+
+
+@dataclass(frozen=True)
+class BoardRecording:
+    """A recording of one unit in one session: what its diagnosis says, and the evidence that estimates come from.
+
+    diagnosis: the document. named: the effects that it names. chi2_heldout: per condition, on parts left out, with the
+    effects in the model. alone: the verdict before a time course common to the session was taken off.
+    """
+
+    file: str
+    unit: str
+    session: str
+    diagnosis: dict[str, Any]
+    named: tuple[Named, ...]
+    chi2_heldout: float
+    evidence: Evidence
+    rests: Rests
+    alone: str
+
+    @classmethod
+    def of(cls, file: str, unit: str, session: str, diagnosis: Diagnosis) -> BoardRecording:
+        """Return what is kept of a diagnosis."""
+        experiment, base = diagnosis.experiment, diagnosis.base
+        gain = diagnosis.gain or cross_validated(experiment, base)
+        held = gain.after if diagnosis.gain is not None else gain.before
+        observed = experiment.data.observed(base.imu, base.linear.details)
+        real, used = experiment.real, experiment.used
+        rest = real.of_kind("static_gyroscope")
+        poses = np.eye(len(observed.share))
+        reaction = {
+            name: (base.weights @ observed.react(name, poses)[used]).reshape(len(base.weights), len(poses), 3)
+            for name in TRIADS
+        }
+        unwhiten = np.linalg.inv(base.weights)[rest] * real.to_si[rest, None]
+        times = real.spans[real.first[rest][::3]].mean(axis=1)
+        assert observed.up is not None
+        rests = Rests(times, observed.up, unwhiten, reaction)
+        return cls(
+            file,
+            unit,
+            session,
+            diagnosis.document(),
+            diagnosis.named,
+            held.chi_squared / held.count,
+            base.evidence,
+            rests,
+            diagnosis.verdict,
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return the recording as `diagnosis.json` has it."""
+        return {
+            "file": self.file,
+            "unit": self.unit,
+            "session": self.session,
+            "verdict": self.diagnosis["verdict"],
+            "verdict_alone": self.alone,
+            "effects": self.diagnosis["effects"],
+            "chi2_heldout": self.chi2_heldout,
+        }
+
+    def block(self, name: str, inner: Mapping[str, float]) -> int | None:
+        """Return the question for an effect, at inner parameters closest to these; None where it cannot be asked."""
+        blocks = self.evidence.blocks
+        mine = [k for k, block in enumerate(blocks) if block.kind == "effect" and block.name == name]
+
+        def distance(k: int) -> float:
+            return sum(abs(np.log(max(blocks[k].inner[key], 1e-9) / max(inner[key], 1e-9))) for key in inner)
+
+        return min(mine, key=distance, default=None)
+
+    def estimate(self, name: str, inner: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
+        """Return a whitened estimate of an effect's coefficients β, in units of their sizes: z (k,), X (k, q).
+
+        z ~ N(X β, 1), beside the other effects that the recording names, whose coefficients are free.
+        """
+        evidence, block = self.evidence, self.block(name, inner)
+        if block is None:
+            return np.zeros(0), np.zeros((0, CATALOGUE[name].size))
+        known = {
+            effect.name: {key: float(getattr(effect.effect, key)) for key in effect.effect.inner}
+            for effect in self.named
+        }
+        beside = [self.block(other, at) for other, at in known.items() if other != name]
+        beside = [other for other in beside if other is not None]
+        others = evidence.columns[:, evidence.span(beside)]
+        columns = evidence.columns[:, evidence.place(block)]
+        basis = orthonormal(others)
+        left = columns - basis @ (basis.T @ columns)
+        u, s, v = np.linalg.svd(left, full_matrices=False)
+        kept = s > _SEEN * np.max(np.linalg.norm(columns, axis=0), initial=1e-300)
+        return u[:, kept].T @ evidence.residual, s[kept, None] * v[kept]
+
+
+@dataclass(frozen=True)
+class Part:
+    """What of an effect belongs to units, to sessions or to the board.
+
+    values: by unit or session (of the board: one), the coefficients (q,), each in units of its size in the triad, as
+    estimated with the part's variance. level: the units or sessions in which it is. share: of the squares of all
+    estimates, weighted with their information. p_value: that the other parts and scatter do without it.
+    """
+
+    belongs_to: str
+    values: dict[str, FloatArray]
+    level: tuple[str, ...]
+    share: float
+    p_value: float
+
+
+def split(
+    estimates: Sequence[tuple[FloatArray, FloatArray]],
+    units: Sequence[str],
+    sessions: Sequence[str],
+    level: float,
+) -> list[Part]:
+    """Split estimates of an effect, one of each recording, into parts of the board, of units and of sessions.
+
+    **Arguments:** `estimates`: whitened, as `BoardRecording.estimate` returns them; `units`, `sessions`: of each;
+    `level`: of a part that is not there, tried beside scatter of each recording by itself.
+
+    **Returns:** the parts that the likelihood gains enough by, in the order in which they were taken in. A variance
+    that is zero lies at its bound, so twice the gain is half the time zero, and else χ² with one degree of freedom
+    (Self and Liang, Journal of the American Statistical Association 82, 1987).
+    """
+    seen = np.concatenate([z for z, _ in estimates])
+    rows = scipy.linalg.block_diag(*(x for _, x in estimates))
+    groups = {"board": [""] * len(units), "unit": list(units), "session": list(sessions)}
+    size = estimates[0][1].shape[1]
+    columns = {"scatter": {str(k): rows[:, size * k : size * (k + 1)] for k in range(len(estimates))}}
+    for kind, labels in groups.items():
+        whole = rows.reshape(len(rows), len(estimates), size)
+        columns[kind] = {
+            label: whole[:, [own == label for own in labels]].sum(axis=1) for label in dict.fromkeys(labels)
+        }
+    shapes = {kind: sum(part @ part.T for part in parts.values()) for kind, parts in columns.items()}
+
+    def likeliest(kinds: Sequence[str]) -> tuple[float, FloatArray]:
+        """Return the logarithm of the likelihood and the variances of parts."""
+        components = np.stack([shapes[kind] for kind in kinds])
+        wide = np.zeros(len(kinds)), np.full(len(kinds), _WIDE)
+        variances = np.exp(
+            restricted_likelihood(seen, np.zeros((len(seen), 0)), np.eye(len(seen)), components, *wide)[0]
+        )
+        root = np.linalg.cholesky(np.eye(len(seen)) + np.tensordot(variances, components, 1))
+        white = np.linalg.solve(root, seen)
+        return -0.5 * float(white @ white) - float(np.sum(np.log(np.diag(root)))), variances
+
+    chosen, p_values = ["scatter"], {}
+    (best, variances), several = likeliest(chosen), [kind for kind in groups if len(columns[kind]) < len(estimates)]
+    while others := [kind for kind in several if kind not in chosen]:
+        tried = {kind: likeliest([*chosen, kind]) for kind in others}
+        kind = max(tried, key=lambda kind: tried[kind][0])
+        p_value = len(several) * 0.5 * float(chi2_sf(max(2 * (tried[kind][0] - best), 0.0), 1))
+        if p_value >= level:
+            break
+        chosen, p_values[kind], (best, variances) = [*chosen, kind], p_value, tried[kind]
+    covariance = np.eye(len(seen)) + sum(v * shapes[kind] for v, kind in zip(variances, chosen, strict=True))
+    sizes = dict(zip(chosen, variances, strict=True))
+    return [_part(kind, columns[kind], sizes[kind], covariance, seen, p_values[kind], level) for kind in chosen[1:]]
+
+
+def _part(
+    kind: str,
+    columns: Mapping[str, FloatArray],
+    variance: float,
+    covariance: FloatArray,
+    seen: FloatArray,
+    p_value: float,
+    level: float,
+) -> Part:
+    """Return a part with the values of its groups, and in which groups it stands out beside all others."""
+    pulled = np.linalg.solve(covariance, seen)
+    values = {label: variance * part.T @ pulled for label, part in columns.items()}
+    left = seen - sum(part @ values[label] for label, part in columns.items())
+    there = []
+    for label, part in columns.items():
+        others = covariance - variance * part @ part.T
+        information = part.T @ np.linalg.solve(others, part)
+        score = part.T @ np.linalg.solve(others, seen)
+        root = orthonormal(information)
+        statistic = float(score @ np.linalg.pinv(information, hermitian=True) @ score)
+        if len(columns) * chi2_sf(statistic, root.shape[1]) < level:
+            there.append(label)
+    share = 1 - float(left @ left) / max(float(seen @ seen), 1e-300)
+    return Part(kind, values, tuple(there or columns), min(max(share, 0.0), 1.0), min(p_value, 1.0))
+
+
+@dataclass(frozen=True)
+class CommonDrift:
+    """A time course that the rates at rest of all units of a session have in common, beside what follows orientation.
+
+    times (o,): s, on the clock of the recordings. curve (o,): rad/s, in a usual axis; what orientation could imitate of
+    it is as smooth as can be. share: of the variance of all axes. common: the same, each axis in units of its standard
+    deviation. chance: the median of that where drift is independent, as large and as slow in each axis as it is there.
+    p_value: that it then has as much in common. loadings: by unit, what its axes (3,) do in multiples of the curve.
+    axes (k, o): the drift of each axis that has a part in it, in multiples of its part, rad/s.
+    """
+
+    session: str
+    times: FloatArray
+    curve: FloatArray
+    share: float
+    common: float
+    chance: float
+    p_value: float
+    loadings: dict[str, FloatArray]
+    axes: FloatArray
+
+    @classmethod
+    def of(cls, parts: Sequence[BoardRecording], draws: int = DRAWS) -> CommonDrift:
+        """Return what recordings of a session have most in common in time, whether by chance or not.
+
+        `draws`: of independent drift, for chance and p-value. Raises `NotPossibleError` where they share no time.
+        """
+        times = _common_times(parts)
+        random = np.random.default_rng(_SEED)
+        rates = np.concatenate([_rates(part, times, random, draws) for part in parts], axis=2)
+        courses, shares = _principal(rates)
+        loadings = courses[0] @ rates[0]
+        usual = float(np.sqrt(np.mean(loadings**2))) * (np.sign(courses[0][0]) or 1.0)
+        rests = parts[0].rests
+        up = np.stack([np.interp(times, rests.times, axis) for axis in rests.up.T], axis=1)
+        pace = 1 / np.sqrt(np.diff(times))
+        steep = np.linalg.lstsq(pace[:, None] * np.diff(up, axis=0), pace * np.diff(courses[0]), rcond=None)[0]
+        curve = usual * (courses[0] - up @ steep)
+        return cls(
+            parts[0].session,
+            times,
+            curve - curve.mean(),
+            float(np.sum(loadings**2) / np.sum(rates[0] ** 2)),
+            float(shares[0]),
+            float(np.median(shares[1:])) if draws else 0.0,
+            float(np.mean(shares >= shares[0])),
+            {part.unit: row / usual for part, row in zip(parts, loadings.reshape(-1, 3), strict=True)},
+            usual * (rates[0] / loadings).T[np.abs(loadings) > abs(usual) / 2] - usual * (up @ steep),
+        )
+
+    @property
+    def size(self) -> float:
+        """By how much the rate of a usual axis changes, rad/s."""
+        return float(np.ptp(self.curve))
+
+    def taken_off(self, recording: Recording, part: BoardRecording) -> Recording:
+        """Return a recording without the curve, in each axis as large as the recording shows it.
+
+        **Arguments:** `part`: the recording as it was diagnosed, which is no part of the curve.
+        """
+        rests, off_base = part.rests, part.evidence.off_base
+        curve = np.interp(rests.times, self.times, self.curve)[:, None]
+        questions = [rests.columns(triad, curve) for triad in TRIADS]
+        columns = off_base(np.concatenate([*questions, rests.columns("gyroscope", rests.up)], axis=1))
+        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        amounts = np.linalg.lstsq(columns / size, part.evidence.residual, rcond=_SEEN)[0] / size
+        changed = {}
+        for triad, amount in zip(TRIADS, amounts[:6].reshape(2, 3), strict=True):
+            signal = recording.signals[triad]
+            course = np.interp(signal.time, self.times, self.curve)
+            changed[triad] = replace(signal, values=signal.values - course[:, None] * amount)
+        return replace(recording, **changed)
+
+
+def _common_times(parts: Sequence[BoardRecording]) -> FloatArray:
+    """Return the middles of the rests (o,) of the recording with the fewest, where all recordings go on."""
+    first = max(part.rests.times[0] for part in parts)
+    last = min(part.rests.times[-1] for part in parts)
+    shortest = min((part.rests.times for part in parts), key=len)
+    times = shortest[(shortest >= first) & (shortest <= last)]
+    if len(times) < _FEWEST:
+        raise NotPossibleError(
+            f"session {parts[0].session}: its recordings have {len(times)} rests at the same time by their clocks; a "
+            "time course that units have in common needs one clock for all units of a session."
+        )
+    return times
+
+
+def _rates(part: BoardRecording, times: FloatArray, random: np.random.Generator, draws: int) -> FloatArray:
+    """Return rates at rest (1 + draws, o, 3) less what follows orientation: as measured, and as the noise draws them.
+
+    That noise holds drift as the recording shows it, each axis by itself.
+    """
+    evidence, rests = part.evidence, part.rests
+    noise = evidence.off_base(random.standard_normal((len(evidence.residual), draws)))
+    values = rests.off_orientation(rests.rates(np.concatenate([evidence.residual[:, None], noise], axis=1)))
+    onto = np.stack([np.interp(times, rests.times, pose) for pose in np.eye(len(values))], axis=1)
+    values = np.einsum("to,oik->kti", onto, values)
+    return values - values.mean(axis=1, keepdims=True)
+
+
+def _principal(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the first principal component (..., t), of length one, of axes (..., t, k), and its share of variance."""
+    scaled = values / np.maximum(np.std(values, axis=-2, keepdims=True), 1e-300)
+    u, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    return u[..., :, 0], s[..., 0] ** 2 / np.sum(s**2, axis=-1)
+
+
+@dataclass(frozen=True)
+class Attributed:
+    """A finding, and what it belongs to: "unit", "session" or "board".
+
+    values: by unit or session, coefficients in SI where an effect has them, in `unit`; the board's have no name.
+    """
+
+    name: str
+    belongs_to: str
+    units: tuple[str, ...]
+    sessions: tuple[str, ...]
+    share: float
+    p_value: float
+    values: dict[str, list[float]] = field(default_factory=dict)
+    unit: str = ""
+
+    def document(self) -> dict[str, Any]:
+        """Return the finding as `diagnosis.json` has it."""
+        return {**vars(self), "units": list(self.units), "sessions": list(self.sessions)}
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Attribution(Result, Document, page="attribution"):
+    """What belongs to units, to sessions and to the board, from recordings of several units in several sessions.
+
+    recordings: as diagnosed, a time course common to their session taken off. findings: what they belong to. drifts:
+    by session, what its units have in common in time. single: effects that show in single recordings alone, by name,
+    and the files.
+    """
+
+    recordings: tuple[BoardRecording, ...]
+    findings: tuple[Attributed, ...]
+    drifts: tuple[CommonDrift, ...]
+    single: dict[str, list[str]]
+    latitude: float | None
+
+    @property
+    def units(self) -> list[str]:
+        """The units, by name."""
+        return _in_order(part.unit for part in self.recordings)
+
+    @property
+    def sessions(self) -> list[str]:
+        """The sessions, by name."""
+        return _in_order(part.session for part in self.recordings)
+
+    @property
+    def verdict(self) -> str:
+        """The board's: "unexplained" where a recording is, "effects" where something was named, or "adequate"."""
+        verdicts = {part.diagnosis["verdict"] for part in self.recordings}
+        if "unexplained" in verdicts:
+            return "unexplained"
+        return "effects" if "effects" in verdicts or self.findings else "adequate"
+
+    def document(self) -> dict[str, Any]:
+        """Return the board's diagnosis as a document of schema `jaximu.diagnosis/1`.
+
+        Of effects, checks and what could hide it keeps the most striking recording's, by name.
+        """
+        documents = [part.diagnosis for part in self.recordings]
+        limits = [(name, limit) for document in documents for name, limit in document["detection_limits"].items()]
+        blind = set.intersection(*(set(document["not_observable"]) for document in documents))
+        return {
+            "schema": documents[0]["schema"],
+            "verdict": self.verdict,
+            "effects": _by_name(documents, "effects", lambda effect: effect["p_value"]),
+            "preflight": [
+                finding | {"file": part.file} for part in self.recordings for finding in part.diagnosis["preflight"]
+            ],
+            "detection_limits": dict(sorted(limits, key=lambda entry: entry[1]["value"])),
+            "hidden": _by_name(documents, "hidden", lambda cause: -cause["limit"]),
+            "not_observable": {name: documents[0]["not_observable"][name] for name in sorted(blind)},
+            "checks": _by_name(documents, "checks", lambda check: check["adjusted"]),
+            "suggestion": self.suggestion,
+            "next": [],
+            "p_value": min(1.0, len(documents) * min(document["p_value"] for document in documents)),
+            "noise_scale": max(document["noise_scale"] for document in documents),
+            "notes": self.notes,
+            "shape": None,
+            "learned": None,
+            "data": {"files": [file for document in documents for file in document["data"]["files"]]},
+            "software": SOFTWARE,
+            "recordings": [part.document() for part in self.recordings],
+            "attribution": [finding.document() for finding in self.findings],
+            "common_drift": [
+                {
+                    "session": drift.session,
+                    "times": drift.times.tolist(),
+                    "rate": drift.curve.tolist(),
+                    "share": drift.share,
+                    "common": drift.common,
+                    "common_by_chance": drift.chance,
+                    "p_value": drift.p_value,
+                    "loadings": {unit: row.tolist() for unit, row in drift.loadings.items()},
+                }
+                for drift in self.drifts
+            ],
+        }
+
+    @property
+    def common(self) -> list[CommonDrift]:
+        """The time courses that are more than chance."""
+        there = {session for finding in self.findings if finding.name == COMMON_DRIFT for session in finding.sessions}
+        return [drift for drift in self.drifts if drift.session in there]
+
+    @property
+    def suggestion(self) -> str:
+        """What to do next."""
+        if self.common:
+            return (
+                "Log the temperature and the supply of the board with the next session: if the common time course "
+                "follows one of them, it can be compensated. It is no part of any unit's calibration."
+            )
+        if any(finding.belongs_to == "unit" for finding in self.findings):
+            return (
+                "Run `jaximu diagnose` on all recordings of a unit with an effect: it writes the extended calibration."
+            )
+        return ""
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader should know beside the verdict."""
+        return [
+            f"{effect_title(name)} shows in {listed(files)} alone: it repeats neither over sessions nor over units."
+            for name, files in self.single.items()
+        ]
+
+
+def _by_name(documents: Sequence[dict[str, Any]], key: str, rank: Callable[[dict[str, Any]], float]) -> list[dict]:
+    """Return of all recordings' entries of a list the first of each name, in order of rank."""
+    entries: dict[str, dict[str, Any]] = {}
+    for entry in sorted((entry for document in documents for entry in document[key]), key=rank):
+        entries.setdefault(entry["name"], entry)
+    return list(entries.values())
+
+
+def _in_order(names: Iterable[str]) -> list[str]:
+    """Return names without repetition, numbers by size."""
+    return sorted(dict.fromkeys(names), key=lambda name: (not name.isdigit(), len(name) * name.isdigit(), name))
+
+
+def places_of(files: Sequence[str], pattern: str) -> list[tuple[str, str]]:
+    """Return the unit and the session of each file, as a pattern of file names or folders has them.
+
+    **Arguments:** `pattern`: such as "unit{unit}_session{session}" or "{unit}/{session}", of the file's name, its
+    suffix left out or not, or of its folders.
+
+    Raises `InputError` for a pattern without both fields, a file that it does not fit, and two files of one place.
+    """
+    names = re.findall(r"\{(.*?)\}", pattern)
+    if sorted(names) != ["session", "unit"]:
+        raise InputError(
+            f"--by {pattern!r}: a pattern names {{unit}} and {{session}} once each, such as "
+            "'unit{unit}_session{session}'."
+        )
+    parts = re.split(r"(\{(?:unit|session)\})", pattern)
+    fields = {f"{{{name}}}": f"(?P<{name}>[^/]+?)" for name in names}
+    shape = re.compile("(?:.*/)?" + "".join(fields.get(part) or re.escape(part) for part in parts) + r"(?:\.[^/]*)?")
+    places: dict[tuple[str, str], str] = {}
+    strangers = []
+    for file in files:
+        path = PurePath(file)
+        match = next(filter(None, (shape.fullmatch(folder.as_posix()) for folder in (path, *path.parents))), None)
+        if match is None:
+            strangers.append(file)
+            continue
+        place = match["unit"], match["session"]
+        if place in places:
+            raise InputError(
+                f"--by {pattern!r}: {places[place]} and {file} are both unit {place[0]} in session {place[1]}. Leave "
+                "one out, or let the pattern tell them apart."
+            )
+        places[place] = file
+    if strangers:
+        more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
+        raise InputError(
+            f"--by {pattern!r} does not fit {strangers[0]}{more}: it is to fit the name or folder of every LOG."
+        )
+    units, sessions = ({place[k] for place in places} for k in (0, 1))
+    if len(units) < 2 or len(sessions) < 2:
+        raise NotPossibleError(
+            f"--by needs two units and two sessions or more to tell them apart, found {counted(len(units), 'unit')} in "
+            f"{counted(len(sessions), 'session')}: record the others, or diagnose the recordings without --by."
+        )
+    return list(places)
+
+
+def attribute(
+    recordings: Sequence[Recording],
+    pattern: str,
+    gravity: Gravity = STANDARD,
+    *,
+    level: float = 0.05,
+    report: Callable[[str], None] = lambda text: None,
+    **options: Any,
+) -> Attribution:
+    """Diagnose recordings of several units in several sessions, and split what is named by what it belongs to.
+
+    A time course that all units of a session have in common is taken off its recordings, as the other units show it,
+    and they are diagnosed again. **Arguments:** `pattern`: of their files, see `places_of`; `level`: of all
+    attributions together where nothing belongs to anything; `report`: is given each step in words; `options`: as for
+    [`jaximu.diagnose`][].
+
+    Raises `InputError` and `NotPossibleError` as `places_of` and `jaximu.diagnose` do.
+    """
+    recordings, gravity = recordings_of(list(recordings)), as_gravity(gravity)
+    files = [recording.name for recording in recordings]
+    places = places_of(files, pattern)
+
+    def diagnosed(index: int, recording: Recording, what: str) -> BoardRecording:
+        unit, session = places[index]
+        report(f"unit {unit} in session {session}{what}, {index + 1} of {len(recordings)}")
+        diagnosis = diagnose(recording, gravity, level=level, **options)
+        return BoardRecording.of(files[index], unit, session, diagnosis)
+
+    parts = [diagnosed(index, recording, "") for index, recording in enumerate(recordings)]
+    sessions = {
+        session: [p for p in parts if p.session == session] for session in dict.fromkeys(p.session for p in parts)
+    }
+    together = [members for members in sessions.values() if len(members) > 1]
+    drifts = [CommonDrift.of(members) for members in together]
+    common = [drift for drift in drifts if drift.p_value * len(drifts) < level]
+    for index, part in enumerate(parts):
+        if part.session in [drift.session for drift in common]:
+            others = [other for other in sessions[part.session] if other is not part]
+            without = CommonDrift.of(others, 0).taken_off(recordings[index], part)
+            again = diagnosed(index, without, ", the common drift taken off")
+            parts[index] = replace(again, alone=part.diagnosis["verdict"])
+    findings = [_of_drift(drift) for drift in common]
+    split_up, single = attributed(parts, level)
+    return Attribution(tuple(parts), (*findings, *split_up), tuple(drifts), single, gravity.latitude)
+
+
+def _of_drift(drift: CommonDrift) -> Attributed:
+    """Return a common time course as a finding of its session."""
+    return Attributed(COMMON_DRIFT, "session", tuple(drift.loadings), (drift.session,), drift.share, drift.p_value)
+
+
+def attributed(parts: Sequence[BoardRecording], level: float) -> tuple[list[Attributed], dict[str, list[str]]]:
+    """Return what each effect that a recording names belongs to, and the files of those that belong to nothing."""
+    named = sorted((effect for part in parts for effect in part.named), key=lambda effect: effect.p_value)
+    strongest = {effect.name: effect for effect in reversed(named)}
+    findings, single = [], {}
+    for name, strong in sorted(strongest.items(), key=lambda entry: entry[1].p_value):
+        inner = {key: float(getattr(strong.effect, key)) for key in strong.effect.inner}
+        sizes = np.asarray(CATALOGUE[name](np.zeros(strong.effect.size), **inner).typical_sizes(1.0).coefficients)
+        estimates = [part.estimate(name, inner) for part in parts]
+        units, sessions = [part.unit for part in parts], [part.session for part in parts]
+        shares = split(estimates, units, sessions, level / len(strongest))
+        for share in shares:
+            mine = [
+                part
+                for part in parts
+                if {"unit": part.unit, "session": part.session}.get(share.belongs_to, "") in share.level
+            ]
+            findings.append(
+                Attributed(
+                    name,
+                    share.belongs_to,
+                    tuple(_in_order(part.unit for part in mine)),
+                    tuple(_in_order(part.session for part in mine)),
+                    share.share,
+                    share.p_value,
+                    {label: (values * sizes).tolist() for label, values in share.values.items()},
+                    CATALOGUE[name].coefficient_unit(SENSOR_UNITS.get(strong.triad, "")),
+                )
+            )
+        if not shares:
+            single[name] = [part.file for part in parts if name in [effect.name for effect in part.named]]
+    return findings, single
