@@ -23,7 +23,8 @@ import scipy
 
 from jaximu.data.drift import restricted_likelihood
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
-from jaximu.diagnosis.evidence import Evidence
+from jaximu.diagnosis.drift import DRAWS
+from jaximu.diagnosis.evidence import BLIND, FEWEST_DIMENSIONS, Evidence
 from jaximu.diagnosis.improvement import cross_validated
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.estimation.track import TRIADS
@@ -53,13 +54,6 @@ __all__ = [
 
 COMMON_DRIFT = "session.common_drift"
 
-DRAWS = 1000
-"""Draws of drift that is independent from unit to unit."""
-_SEED = 20260101
-_FEWEST = 6
-"""Rests at the same time that a time course is looked for in: orientation and a constant take four of them."""
-_SEEN = 1e-4
-"""Share of an effect's reach that must be left of a direction for it to be estimated."""
 _WIDE = 8.0
 """Spread of the logarithm of a part's variance, in squares of usual sizes, beforehand: next to nothing is known."""
 
@@ -181,7 +175,7 @@ class BoardRecording:
         basis = orthonormal(others)
         left = columns - basis @ (basis.T @ columns)
         u, s, v = np.linalg.svd(left, full_matrices=False)
-        kept = s > _SEEN * np.max(np.linalg.norm(columns, axis=0), initial=1e-300)
+        kept = s > BLIND * np.max(np.linalg.norm(columns, axis=0), initial=1e-300)
         return u[:, kept].T @ evidence.residual, s[kept, None] * v[kept]
 
 
@@ -216,16 +210,14 @@ def split(
     that is zero lies at its bound, so twice the gain is half the time zero, and else χ² with one degree of freedom
     (Self and Liang, Journal of the American Statistical Association 82, 1987).
     """
-    seen = np.concatenate([z for z, _ in estimates])
+    measured = np.concatenate([z for z, _ in estimates])
     rows = scipy.linalg.block_diag(*(x for _, x in estimates))
     groups = {"board": [""] * len(units), "unit": list(units), "session": list(sessions)}
     size = estimates[0][1].shape[1]
     columns = {"scatter": {str(k): rows[:, size * k : size * (k + 1)] for k in range(len(estimates))}}
     for kind, labels in groups.items():
         whole = rows.reshape(len(rows), len(estimates), size)
-        columns[kind] = {
-            label: whole[:, [own == label for own in labels]].sum(axis=1) for label in dict.fromkeys(labels)
-        }
+        columns[kind] = {label: whole[:, np.equal(labels, label)].sum(axis=1) for label in dict.fromkeys(labels)}
     shapes = {kind: sum(part @ part.T for part in parts.values()) for kind, parts in columns.items()}
 
     def likeliest(kinds: Sequence[str]) -> tuple[float, FloatArray]:
@@ -233,10 +225,10 @@ def split(
         components = np.stack([shapes[kind] for kind in kinds])
         wide = np.zeros(len(kinds)), np.full(len(kinds), _WIDE)
         variances = np.exp(
-            restricted_likelihood(seen, np.zeros((len(seen), 0)), np.eye(len(seen)), components, *wide)[0]
+            restricted_likelihood(measured, np.zeros((len(measured), 0)), np.eye(len(measured)), components, *wide)[0]
         )
-        root = np.linalg.cholesky(np.eye(len(seen)) + np.tensordot(variances, components, 1))
-        white = np.linalg.solve(root, seen)
+        root = np.linalg.cholesky(np.eye(len(measured)) + np.tensordot(variances, components, 1))
+        white = np.linalg.solve(root, measured)
         return -0.5 * float(white @ white) - float(np.sum(np.log(np.diag(root)))), variances
 
     chosen, p_values = ["scatter"], {}
@@ -248,9 +240,9 @@ def split(
         if p_value >= level:
             break
         chosen, p_values[kind], (best, variances) = [*chosen, kind], p_value, tried[kind]
-    covariance = np.eye(len(seen)) + sum(v * shapes[kind] for v, kind in zip(variances, chosen, strict=True))
+    covariance = np.eye(len(measured)) + sum(v * shapes[kind] for v, kind in zip(variances, chosen, strict=True))
     sizes = dict(zip(chosen, variances, strict=True))
-    return [_part(kind, columns[kind], sizes[kind], covariance, seen, p_values[kind], level) for kind in chosen[1:]]
+    return [_part(kind, columns[kind], sizes[kind], covariance, measured, p_values[kind], level) for kind in chosen[1:]]
 
 
 def _part(
@@ -258,24 +250,24 @@ def _part(
     columns: Mapping[str, FloatArray],
     variance: float,
     covariance: FloatArray,
-    seen: FloatArray,
+    measured: FloatArray,
     p_value: float,
     level: float,
 ) -> Part:
     """Return a part with the values of its groups, and in which groups it stands out beside all others."""
-    pulled = np.linalg.solve(covariance, seen)
+    pulled = np.linalg.solve(covariance, measured)
     values = {label: variance * part.T @ pulled for label, part in columns.items()}
-    left = seen - sum(part @ values[label] for label, part in columns.items())
+    left = measured - sum(part @ values[label] for label, part in columns.items())
     there = []
     for label, part in columns.items():
         others = covariance - variance * part @ part.T
         information = part.T @ np.linalg.solve(others, part)
-        score = part.T @ np.linalg.solve(others, seen)
+        score = part.T @ np.linalg.solve(others, measured)
         root = orthonormal(information)
         statistic = float(score @ np.linalg.pinv(information, hermitian=True) @ score)
         if len(columns) * chi2_sf(statistic, root.shape[1]) < level:
             there.append(label)
-    share = 1 - float(left @ left) / max(float(seen @ seen), 1e-300)
+    share = 1 - float(left @ left) / max(float(measured @ measured), 1e-300)
     return Part(kind, values, tuple(there or columns), min(max(share, 0.0), 1.0), min(p_value, 1.0))
 
 
@@ -307,7 +299,7 @@ class CommonDrift:
         `draws`: of independent drift, for chance and p-value. Raises `NotPossibleError` where they share no time.
         """
         times = _common_times(parts)
-        random = np.random.default_rng(_SEED)
+        random = np.random.default_rng(20260101)
         rates = np.concatenate([_rates(part, times, random, draws) for part in parts], axis=2)
         courses, shares = _principal(rates)
         loadings = courses[0] @ rates[0]
@@ -344,7 +336,7 @@ class CommonDrift:
         questions = [rests.columns(triad, curve) for triad in TRIADS]
         columns = off_base(np.concatenate([*questions, rests.columns("gyroscope", rests.up)], axis=1))
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        amounts = np.linalg.lstsq(columns / size, part.evidence.residual, rcond=_SEEN)[0] / size
+        amounts = np.linalg.lstsq(columns / size, part.evidence.residual, rcond=BLIND)[0] / size
         changed = {}
         for triad, amount in zip(TRIADS, amounts[:6].reshape(2, 3), strict=True):
             signal = recording.signals[triad]
@@ -359,7 +351,7 @@ def _common_times(parts: Sequence[BoardRecording]) -> FloatArray:
     last = min(part.rests.times[-1] for part in parts)
     shortest = min((part.rests.times for part in parts), key=len)
     times = shortest[(shortest >= first) & (shortest <= last)]
-    if len(times) < _FEWEST:
+    if len(times) < FEWEST_DIMENSIONS:
         raise NotPossibleError(
             f"session {parts[0].session}: its recordings have {len(times)} rests at the same time by their clocks; a "
             "time course that units have in common needs one clock for all units of a session."
@@ -414,13 +406,14 @@ class Attribution(Result, Document, page="attribution"):
 
     recordings: as diagnosed, a time course common to their session taken off. findings: what they belong to. drifts:
     by session, what its units have in common in time. single: effects that show in single recordings alone, by name,
-    and the files.
+    and the files. skipped: recordings that could not be diagnosed, and why.
     """
 
     recordings: tuple[BoardRecording, ...]
     findings: tuple[Attributed, ...]
     drifts: tuple[CommonDrift, ...]
     single: dict[str, list[str]]
+    skipped: dict[str, str]
     latitude: float | None
 
     @property
@@ -512,7 +505,7 @@ class Attribution(Result, Document, page="attribution"):
         return [
             f"{effect_title(name)} shows in {listed(files)} alone: it repeats neither over sessions nor over units."
             for name, files in self.single.items()
-        ]
+        ] + [f"{file} was skipped: {why}" for file, why in self.skipped.items()]
 
 
 def _by_name(documents: Sequence[dict[str, Any]], key: str, rank: Callable[[dict[str, Any]], float]) -> list[dict]:
@@ -534,7 +527,8 @@ def places_of(files: Sequence[str], pattern: str) -> list[tuple[str, str]]:
     **Arguments:** `pattern`: such as "unit{unit}_session{session}" or "{unit}/{session}", of the file's name, its
     suffix left out or not, or of its folders.
 
-    Raises `InputError` for a pattern without both fields, a file that it does not fit, and two files of one place.
+    Raises `InputError` for a pattern without both fields, a file that it does not fit, and two files of one place;
+    `NotPossibleError` for one unit or one session alone.
     """
     names = re.findall(r"\{(.*?)\}", pattern)
     if sorted(names) != ["session", "unit"]:
@@ -565,13 +559,18 @@ def places_of(files: Sequence[str], pattern: str) -> list[tuple[str, str]]:
         raise InputError(
             f"--by {pattern!r} does not fit {strangers[0]}{more}: it is to fit the name or folder of every LOG."
         )
-    units, sessions = ({place[k] for place in places} for k in (0, 1))
+    require_several(places)
+    return list(places)
+
+
+def require_several(places: Iterable[tuple[str, str]], why: str = "") -> None:
+    """Raise `NotPossibleError` unless places are of two units and two sessions; `why`: what others were skipped for."""
+    units, sessions = map(set, zip(*places, strict=True)) if (places := list(places)) else (set(), set())
     if len(units) < 2 or len(sessions) < 2:
         raise NotPossibleError(
             f"--by needs two units and two sessions or more to tell them apart, found {counted(len(units), 'unit')} in "
-            f"{counted(len(sessions), 'session')}: record the others, or diagnose the recordings without --by."
+            f"{counted(len(sessions), 'session')}: record the others, or diagnose the logs without --by. {why}".rstrip()
         )
-    return list(places)
 
 
 def attribute(
@@ -590,34 +589,41 @@ def attribute(
     attributions together where nothing belongs to anything; `report`: is given each step in words; `options`: as for
     [`jaximu.diagnose`][].
 
-    Raises `InputError` and `NotPossibleError` as `places_of` and `jaximu.diagnose` do.
+    Recordings that cannot be diagnosed are skipped. Raises `InputError` and `NotPossibleError` as `places_of` does, and
+    `InputError` as `jaximu.diagnose` does.
     """
     recordings, gravity = recordings_of(list(recordings)), as_gravity(gravity)
     files = [recording.name for recording in recordings]
     places = places_of(files, pattern)
+    skipped: dict[str, str] = {}
 
-    def diagnosed(index: int, recording: Recording, what: str) -> BoardRecording:
+    def diagnosed(index: int, recording: Recording, what: str) -> BoardRecording | None:
         unit, session = places[index]
         report(f"unit {unit} in session {session}{what}, {index + 1} of {len(recordings)}")
-        diagnosis = diagnose(recording, gravity, level=level, **options)
+        try:
+            diagnosis = diagnose(recording, gravity, level=level, **options)
+        except NotPossibleError as error:
+            skipped[files[index] + what] = str(error)
+            return None
         return BoardRecording.of(files[index], unit, session, diagnosis)
 
-    parts = [diagnosed(index, recording, "") for index, recording in enumerate(recordings)]
-    sessions = {
-        session: [p for p in parts if p.session == session] for session in dict.fromkeys(p.session for p in parts)
-    }
-    together = [members for members in sessions.values() if len(members) > 1]
-    drifts = [CommonDrift.of(members) for members in together]
+    first = {index: diagnosed(index, recording, "") for index, recording in enumerate(recordings)}
+    parts = {index: part for index, part in first.items() if part is not None}
+    require_several([(part.unit, part.session) for part in parts.values()], next(iter(skipped.values()), ""))
+    members = [[p for p in parts.values() if p.session == s] for s in _in_order(p.session for p in parts.values())]
+    together = {of[0].session: of for of in members if len(of) > 1}
+    drifts = [CommonDrift.of(of) for of in together.values()]
     common = [drift for drift in drifts if drift.p_value * len(drifts) < level]
-    for index, part in enumerate(parts):
-        if part.session in [drift.session for drift in common]:
-            others = [other for other in sessions[part.session] if other is not part]
+    warm = {drift.session for drift in common}
+    for index, part in parts.items():
+        if part.session in warm:
+            others = [other for other in together[part.session] if other is not part]
             without = CommonDrift.of(others, 0).taken_off(recordings[index], part)
-            again = diagnosed(index, without, ", the common drift taken off")
-            parts[index] = replace(again, alone=part.diagnosis["verdict"])
-    findings = [_of_drift(drift) for drift in common]
-    split_up, single = attributed(parts, level)
-    return Attribution(tuple(parts), (*findings, *split_up), tuple(drifts), single, gravity.latitude)
+            repeated = diagnosed(index, without, ", its common drift taken off")
+            parts[index] = part if repeated is None else replace(repeated, alone=part.alone)
+    split_up, single = attributed(list(parts.values()), level)
+    findings = (*map(_of_drift, common), *split_up)
+    return Attribution(tuple(parts.values()), findings, tuple(drifts), single, skipped, gravity.latitude)
 
 
 def _of_drift(drift: CommonDrift) -> Attributed:

@@ -21,9 +21,9 @@ from jaximu.diagnosis.drift import DRAWS
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
 
-__all__ = ["EffectBlock", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
+__all__ = ["BLIND", "EffectBlock", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
 
-_BLIND = 1e-4
+BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
 _LARGE = 20.0
 """Usual sizes that an effect's coefficients may have."""
@@ -145,7 +145,7 @@ class Evidence:
         """Whether the base parameters leave anything of the block that the recording reacts to."""
         columns = self.place(block)
         largest = np.max(self._reach[columns], initial=0.0)
-        return bool(largest > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > _BLIND * largest)
+        return bool(largest > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > BLIND * largest)
 
     def limit(self, blocks: Sequence[int]) -> float:
         """Return the detection limit of an effect that is asked at several places of a grid, in its own unit.
@@ -195,9 +195,9 @@ class Evidence:
         columns = self.columns[:, inside] / _safe(self._reach[inside])
         if columns.shape[1] > len(columns):
             values, vectors = np.linalg.eigh(columns @ columns.T)
-            return vectors[:, values > _BLIND**2]
+            return vectors[:, values > BLIND**2]
         values, vectors = np.linalg.eigh(columns.T @ columns)
-        keep = values > _BLIND**2
+        keep = values > BLIND**2
         return columns @ (vectors[:, keep] / np.sqrt(values[keep]))
 
     def _off_span(self, values: FloatArray) -> FloatArray:
@@ -310,7 +310,7 @@ def _roots(gram: FloatArray, lengths: FloatArray) -> tuple[FloatArray, NDArray[n
     what the estimated path is uncertain by.
     """
     values, vectors = np.linalg.eigh(_scaled(gram, lengths))
-    keep = values > _BLIND**2
+    keep = values > BLIND**2
     root = vectors / np.sqrt(np.where(keep, values, 1.0))[..., None, :] * keep[..., None, :]
     return root / _safe(lengths)[..., :, None], keep.sum(axis=-1)
 
@@ -344,7 +344,7 @@ def detection_limit(
     q = len(information)
     values = np.linalg.eigvalsh(information)
     whole = values[-1] if lengths is None else float(np.max(np.square(lengths), initial=0.0))
-    rank = int(np.sum(values > _BLIND**2 * max(whole, 0.0)))
+    rank = int(np.sum(values > BLIND**2 * max(whole, 0.0)))
     if values[-1] <= 0 or not rank:
         return float("inf")
     # whole orthogonal frames: their mean strength is that of all directions, whatever the draw
