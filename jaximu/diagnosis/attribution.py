@@ -91,7 +91,7 @@ class BoardRecording:
     """A recording of one unit in one session: what its diagnosis says, and the evidence that estimates come from.
 
     diagnosis: the document. named: the effects that it names. chi2_heldout: per condition, on parts left out, with the
-    effects in the model. alone: the verdict before a time course common to the session was taken off.
+    effects in the model. alone: the verdict with what the session has in common. without_drift: that was taken off.
     """
 
     file: str
@@ -103,6 +103,7 @@ class BoardRecording:
     evidence: Evidence
     rests: Rests
     alone: str
+    without_drift: bool = False
 
     @classmethod
     def of(cls, file: str, unit: str, session: str, diagnosis: Diagnosis) -> BoardRecording:
@@ -142,6 +143,7 @@ class BoardRecording:
             "session": self.session,
             "verdict": self.diagnosis["verdict"],
             "verdict_alone": self.alone,
+            "without_common_drift": self.without_drift,
             "effects": self.diagnosis["effects"],
             "chi2_heldout": self.chi2_heldout,
         }
@@ -585,9 +587,10 @@ def attribute(
     """Diagnose recordings of several units in several sessions, and split what is named by what it belongs to.
 
     A time course that all units of a session have in common is taken off its recordings, as the other units show it,
-    and they are diagnosed again. **Arguments:** `pattern`: of their files, see `places_of`; `level`: of all
-    attributions together where nothing belongs to anything; `report`: is given each step in words; `options`: as for
-    [`jaximu.diagnose`][].
+    and they are diagnosed again; each keeps the diagnosis that explains it with fewer effects.
+
+    **Arguments:** `pattern`: of their files, see `places_of`; `level`: of all attributions together where nothing
+    belongs to anything; `report`: is given each step in words; `options`: as for [`jaximu.diagnose`][].
 
     Recordings that cannot be diagnosed are skipped. Raises `InputError` and `NotPossibleError` as `places_of` does, and
     `InputError` as `jaximu.diagnose` does.
@@ -620,10 +623,16 @@ def attribute(
             others = [other for other in together[part.session] if other is not part]
             without = CommonDrift.of(others, 0).taken_off(recordings[index], part)
             repeated = diagnosed(index, without, ", its common drift taken off")
-            parts[index] = part if repeated is None else replace(repeated, alone=part.alone)
+            if repeated is not None:
+                parts[index] = min(replace(repeated, alone=part.alone, without_drift=True), part, key=_rank)
     split_up, single = attributed(list(parts.values()), level)
     findings = (*map(_of_drift, common), *split_up)
     return Attribution(tuple(parts.values()), findings, tuple(drifts), single, skipped, gravity.latitude)
+
+
+def _rank(part: BoardRecording) -> tuple[bool, int, float]:
+    """Return what of several diagnoses of a recording is kept by, the least: unexplained, effects, error left out."""
+    return part.diagnosis["verdict"] == "unexplained", len(part.diagnosis["effects"]), part.chi2_heldout
 
 
 def _of_drift(drift: CommonDrift) -> Attributed:

@@ -134,7 +134,10 @@ def _title(finding: Attributed) -> str:
 def _verdicts_table(attribution: Attribution) -> Table:
     """Return the verdict of each recording, units down and sessions across."""
     cells = {
-        (part.unit, part.session): f"{_short(part.diagnosis)}\nχ² {number(part.chi2_heldout, 3)}"
+        (
+            part.unit,
+            part.session,
+        ): f"{_short(part.diagnosis)}\nχ² {number(part.chi2_heldout, 3)}{' *' * part.without_drift}"
         for part in attribution.recordings
     }
     rows = [
@@ -142,7 +145,7 @@ def _verdicts_table(attribution: Attribution) -> Table:
         for unit in attribution.units
     ]
     caption = "χ² per condition on parts left out: 1 is noise and drift alone." + (
-        " The common drift was taken off, as the other units show it." if attribution.common else ""
+        " *: the common drift was taken off, as the other units show it." if attribution.common else ""
     )
     return Table(("", *(f"session {session}" for session in attribution.sessions)), rows, caption)
 
