@@ -31,8 +31,8 @@ jax.config.update("jax_enable_x64", True)
 
 UNITS, SESSIONS, SENSITIVE, DRAWS, LEVEL = 8, 3, 3, 200, 0.05
 EFFECT, EARTH = "gyro.g_sensitivity", EARTH_RATE * np.sin(np.radians(59.35)) / 9.81
-SIZES = {"g-sensitivity": 4e-4, "warm-up": 1e-3, "drift of each axis": 1e-4}
-"""rad/s per m/s²; rad/s; rad/s over the recording, of a random walk."""
+SIZES = {"g-sensitivity": 4e-4, "warm-up": 1e-3}
+"""rad/s per m/s²; rad/s."""
 
 
 def templates():
@@ -57,13 +57,8 @@ def drawn_board(plain, seed, faults):
         times = rests.times
         course = np.exp(-times / (0.3 * times[-1])) if session == warm else np.zeros(len(times))
         for unit in range(UNITS):
-            walk = np.cumsum(
-                np.sqrt(np.diff(times, prepend=0.0) / times[-1])[:, None] * random.standard_normal((len(times), 3)),
-                axis=0,
-            )
             loading = SIZES["warm-up"] * random.uniform(0.5, 1.5, 3) * random.choice([-1, 1], 3)
-            rate = SIZES["drift of each axis"] * walk + course[:, None] * loading
-            drift = np.einsum("noi,oi->n", rests.reaction["gyroscope"], rate)
+            drift = np.einsum("noi,oi->n", rests.reaction["gyroscope"], course[:, None] * loading)
             matrix = matrices.get(unit, np.zeros(9)) + faults * EARTH * np.eye(3).ravel()
             changed = copy.copy(evidence)
             changed.residual = evidence.off_base(random.standard_normal(len(drift)) + drift) + columns @ matrix
@@ -76,14 +71,15 @@ def judged(parts, sensitive, warm):
     true = {(EFFECT, "unit", unit) for unit in sensitive}
     true |= {(EFFECT, "board", "")} if sensitive else set()
     true |= {(COMMON_DRIFT, "session", warm)} if warm is not None else set()
-    shares = split(
-        [part.estimate(EFFECT, {}) for part in parts], [p.unit for p in parts], [p.session for p in parts], LEVEL
-    )
-    reported = {(EFFECT, part.belongs_to, label) for part in shares for label in part.level}
+    reported, shared = set(), {}
     for session in {part.session for part in parts}:
         drift = CommonDrift.of([part for part in parts if part.session == session], DRAWS)
         if drift.p_value * SESSIONS < LEVEL:
             reported.add((COMMON_DRIFT, "session", session))
+            shared[session] = np.stack([drift.times, drift.curve], axis=1)
+    estimates = [part.estimate(EFFECT, {}, {}, shared.get(part.session)) for part in parts]
+    shares = split(estimates, [part.unit for part in parts], [part.session for part in parts], LEVEL)
+    reported |= {(EFFECT, part.belongs_to, label) for part in shares for label in part.values}
     return true, reported
 
 

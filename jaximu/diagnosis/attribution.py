@@ -1,10 +1,9 @@
 """Whose fault a finding is: a unit's, a session's or the board's, from recordings of several units in several sessions.
 
-Every recording is diagnosed by itself. Of each effect that one of them names, all give an estimate beside the others
-that are attributed. The estimates β of unit u in session s are split as β_us = m + a_u + c_s + e_us: one value of the
-board, one of each unit, one of each session, and what scatters from recording to recording. Each part is normally
-distributed with a variance of its own (Searle, Casella and McCulloch, Variance Components, 1992, ch. 6); a part is
-there if the likelihood gains enough by it.
+Every recording is diagnosed by itself. Of each effect that one of them names, all give an estimate. The estimates β of
+unit u in session s are split as β_us = m + a_u + c_s + e_us: a value of the board, one of each unit, one of each
+session, and what scatters from recording to recording, each normally distributed with a variance of its own (Searle,
+Casella and McCulloch, Variance Components, 1992, ch. 6). A value is there if it is significant beside the others.
 
 A time course that is common to all units of a session is the first principal component of their rates at rest. It is
 compared with what drift as large and as slow in each unit, but independent, has in common by chance.
@@ -135,6 +134,11 @@ class BoardRecording:
             diagnosis.verdict,
         )
 
+    @property
+    def place(self) -> str:
+        """Its unit and session, in words."""
+        return f"unit {self.unit} in session {self.session}"
+
     def document(self) -> dict[str, Any]:
         """Return the recording as `diagnosis.json` has it."""
         return {
@@ -158,119 +162,110 @@ class BoardRecording:
 
         return min(mine, key=distance, default=None)
 
-    def estimate(self, name: str, inner: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
+    def estimate(
+        self,
+        name: str,
+        inner: Mapping[str, float],
+        beside: Mapping[str, Mapping[str, float]],
+        shared: FloatArray | None,
+    ) -> tuple[FloatArray, FloatArray]:
         """Return a whitened estimate of an effect's coefficients β, in units of their sizes: z (k,), X (k, q).
 
-        z ~ N(X β, 1), beside the other effects that the recording names, whose coefficients are free.
+        z ~ N(X β, 1), while other effects and a time course are free: those named here, those `beside`, with their
+        inner parameters, and what the session has in common, `shared`, (t, 2) times and rates.
         """
         evidence, block = self.evidence, self.block(name, inner)
         if block is None:
             return np.zeros(0), np.zeros((0, CATALOGUE[name].size))
-        known = {
-            effect.name: {key: float(getattr(effect.effect, key)) for key in effect.effect.inner}
-            for effect in self.named
-        }
-        beside = [self.block(other, at) for other, at in known.items() if other != name]
-        beside = [other for other in beside if other is not None]
-        others = evidence.columns[:, evidence.span(beside)]
+        known = {effect.name: _inner(effect) for effect in self.named} | dict(beside)
+        blocks = [self.block(other, at) for other, at in known.items() if other != name]
+        others = [evidence.columns[:, evidence.span([other for other in blocks if other is not None])]]
+        if shared is not None:
+            curve = np.interp(self.rests.times, *shared.T)[:, None]
+            others += [evidence.off_base(self.rests.columns(triad, curve)) for triad in TRIADS]
         columns = evidence.columns[:, evidence.place(block)]
-        basis = orthonormal(others)
-        left = columns - basis @ (basis.T @ columns)
-        u, s, v = np.linalg.svd(left, full_matrices=False)
+        basis = orthonormal(np.concatenate(others, axis=1))
+        u, s, v = np.linalg.svd(columns - basis @ (basis.T @ columns), full_matrices=False)
         kept = s > BLIND * np.max(np.linalg.norm(columns, axis=0), initial=1e-300)
         return u[:, kept].T @ evidence.residual, s[kept, None] * v[kept]
+
+
+def _inner(effect: Named) -> dict[str, float]:
+    """Return an effect's inner parameters."""
+    return {key: float(getattr(effect.effect, key)) for key in effect.effect.inner}
 
 
 @dataclass(frozen=True)
 class Part:
     """What of an effect belongs to units, to sessions or to the board.
 
-    values: by unit or session (of the board: one), the coefficients (q,), each in units of its size in the triad, as
-    estimated with the part's variance. level: the units or sessions in which it is. share: of the squares of all
-    estimates, weighted with their information. p_value: that the other parts and scatter do without it.
+    values: by unit or session in which it is (of the board: one), the coefficients (q,), each in units of its size.
+    share: of the squares of all estimates, weighted with their information. p_value: of the first of them, all that
+    were tried allowed for.
     """
 
     belongs_to: str
     values: dict[str, FloatArray]
-    level: tuple[str, ...]
     share: float
     p_value: float
 
 
 def split(
-    estimates: Sequence[tuple[FloatArray, FloatArray]],
-    units: Sequence[str],
-    sessions: Sequence[str],
-    level: float,
+    estimates: Sequence[tuple[FloatArray, FloatArray]], units: Sequence[str], sessions: Sequence[str], level: float
 ) -> list[Part]:
     """Split estimates of an effect, one of each recording, into parts of the board, of units and of sessions.
 
-    **Arguments:** `estimates`: whitened, as `BoardRecording.estimate` returns them; `units`, `sessions`: of each;
-    `level`: of a part that is not there, tried beside scatter of each recording by itself.
+    A unit's part is there, or a session's or the board's, if without it the estimates scatter by more than they do
+    from recording to recording: a χ² test at the variances so far. The most significant part is taken in with a
+    variance of its own, all variances are estimated again, and the others are asked once more.
 
-    **Returns:** the parts that the likelihood gains enough by, in the order in which they were taken in. A variance
-    that is zero lies at its bound, so twice the gain is half the time zero, and else χ² with one degree of freedom
-    (Self and Liang, Journal of the American Statistical Association 82, 1987).
+    **Arguments:** `estimates`: whitened, as `BoardRecording.estimate` returns them; `units`, `sessions`: of each;
+    `level`: of all parts together where nothing repeats.
     """
     measured = np.concatenate([z for z, _ in estimates])
-    rows = scipy.linalg.block_diag(*(x for _, x in estimates))
+    rows = scipy.linalg.block_diag(*(x for _, x in estimates)).reshape(len(measured), len(estimates), -1)
     groups = {"board": [""] * len(units), "unit": list(units), "session": list(sessions)}
-    size = estimates[0][1].shape[1]
-    columns = {"scatter": {str(k): rows[:, size * k : size * (k + 1)] for k in range(len(estimates))}}
-    for kind, labels in groups.items():
-        whole = rows.reshape(len(rows), len(estimates), size)
-        columns[kind] = {label: whole[:, np.equal(labels, label)].sum(axis=1) for label in dict.fromkeys(labels)}
-    shapes = {kind: sum(part @ part.T for part in parts.values()) for kind, parts in columns.items()}
-
-    def likeliest(kinds: Sequence[str]) -> tuple[float, FloatArray]:
-        """Return the logarithm of the likelihood and the variances of parts."""
-        components = np.stack([shapes[kind] for kind in kinds])
-        wide = np.zeros(len(kinds)), np.full(len(kinds), _WIDE)
-        variances = np.exp(
-            restricted_likelihood(measured, np.zeros((len(measured), 0)), np.eye(len(measured)), components, *wide)[0]
-        )
-        root = np.linalg.cholesky(np.eye(len(measured)) + np.tensordot(variances, components, 1))
-        white = np.linalg.solve(root, measured)
-        return -0.5 * float(white @ white) - float(np.sum(np.log(np.diag(root)))), variances
-
-    chosen, p_values = ["scatter"], {}
-    (best, variances), several = likeliest(chosen), [kind for kind in groups if len(columns[kind]) < len(estimates)]
-    while others := [kind for kind in several if kind not in chosen]:
-        tried = {kind: likeliest([*chosen, kind]) for kind in others}
-        kind = max(tried, key=lambda kind: tried[kind][0])
-        p_value = len(several) * 0.5 * float(chi2_sf(max(2 * (tried[kind][0] - best), 0.0), 1))
-        if p_value >= level:
+    columns = {
+        (kind, label): rows[:, np.equal(labels, label)].sum(axis=1)
+        for kind, labels in groups.items()
+        for label in dict.fromkeys(labels)
+        if labels.count(label) > 1
+    }
+    components = [sum(rows[:, k] @ rows[:, k].T for k in range(len(estimates)))]
+    chosen: dict[tuple[str, str], float] = {}
+    while True:
+        wide = np.zeros(len(components)), np.full(len(components), _WIDE)
+        nothing, white = np.zeros((len(measured), 0)), np.eye(len(measured))
+        variances = np.exp(restricted_likelihood(measured, nothing, white, np.stack(components), *wide)[0])
+        precision = np.linalg.inv(white + np.tensordot(variances, components, 1))
+        p_values = {
+            key: _absence(part, precision, measured) * len(columns)
+            for key, part in columns.items()
+            if key not in chosen
+        }
+        best = min(p_values, key=lambda key: p_values[key], default=None)
+        if best is None or p_values[best] >= level:
             break
-        chosen, p_values[kind], (best, variances) = [*chosen, kind], p_value, tried[kind]
-    covariance = np.eye(len(measured)) + sum(v * shapes[kind] for v, kind in zip(variances, chosen, strict=True))
-    sizes = dict(zip(chosen, variances, strict=True))
-    return [_part(kind, columns[kind], sizes[kind], covariance, measured, p_values[kind], level) for kind in chosen[1:]]
+        chosen[best] = p_values[best]
+        components.append(columns[best] @ columns[best].T)
+    pulled = precision @ measured
+    values = {key: v * columns[key].T @ pulled for key, v in zip(chosen, variances[1:], strict=True)}
+    parts = []
+    for kind in dict.fromkeys(kind for kind, _ in chosen):
+        mine = {label: value for (of, label), value in values.items() if of == kind}
+        left = measured - sum(columns[kind, label] @ value for label, value in mine.items())
+        share = 1 - float(left @ left) / float(measured @ measured)
+        p_value = min(p for (of, _), p in chosen.items() if of == kind)
+        parts.append(Part(kind, mine, min(max(share, 0.0), 1.0), p_value))
+    return parts
 
 
-def _part(
-    kind: str,
-    columns: Mapping[str, FloatArray],
-    variance: float,
-    covariance: FloatArray,
-    measured: FloatArray,
-    p_value: float,
-    level: float,
-) -> Part:
-    """Return a part with the values of its groups, and in which groups it stands out beside all others."""
-    pulled = np.linalg.solve(covariance, measured)
-    values = {label: variance * part.T @ pulled for label, part in columns.items()}
-    left = measured - sum(part @ values[label] for label, part in columns.items())
-    there = []
-    for label, part in columns.items():
-        others = covariance - variance * part @ part.T
-        information = part.T @ np.linalg.solve(others, part)
-        score = part.T @ np.linalg.solve(others, measured)
-        root = orthonormal(information)
-        statistic = float(score @ np.linalg.pinv(information, hermitian=True) @ score)
-        if len(columns) * chi2_sf(statistic, root.shape[1]) < level:
-            there.append(label)
-    share = 1 - float(left @ left) / max(float(measured @ measured), 1e-300)
-    return Part(kind, values, tuple(there or columns), min(max(share, 0.0), 1.0), min(p_value, 1.0))
+def _absence(columns: FloatArray, precision: FloatArray, values: FloatArray) -> float:
+    """Return the p-value of values (n,) if nothing is added along columns (n, q)."""
+    information = columns.T @ precision @ columns
+    score = columns.T @ precision @ values
+    rank = int(np.linalg.matrix_rank(information, hermitian=True))
+    return float(chi2_sf(float(score @ np.linalg.pinv(information, hermitian=True) @ score), rank)) if rank else 1.0
 
 
 @dataclass(frozen=True)
@@ -408,7 +403,7 @@ class Attribution(Result, Document, page="attribution"):
 
     recordings: as diagnosed, a time course common to their session taken off. findings: what they belong to. drifts:
     by session, what its units have in common in time. single: effects that show in single recordings alone, by name,
-    and the files. skipped: recordings that could not be diagnosed, and why.
+    and which. skipped: recordings that could not be diagnosed, and why.
     """
 
     recordings: tuple[BoardRecording, ...]
@@ -505,8 +500,8 @@ class Attribution(Result, Document, page="attribution"):
     def notes(self) -> list[str]:
         """What a reader should know beside the verdict."""
         return [
-            f"{effect_title(name)} shows in {listed(files)} alone: it repeats neither over sessions nor over units."
-            for name, files in self.single.items()
+            f"{effect_title(name)} repeats neither over sessions nor over units; it shows in {listed(places)}."
+            for name, places in self.single.items()
         ] + [f"{file} was skipped: {why}" for file, why in self.skipped.items()]
 
 
@@ -625,7 +620,7 @@ def attribute(
             repeated = diagnosed(index, without, ", its common drift taken off")
             if repeated is not None:
                 parts[index] = min(replace(repeated, alone=part.alone, without_drift=True), part, key=_rank)
-    split_up, single = attributed(list(parts.values()), level)
+    split_up, single = attributed(list(parts.values()), common, level)
     findings = (*map(_of_drift, common), *split_up)
     return Attribution(tuple(parts.values()), findings, tuple(drifts), single, skipped, gravity.latitude)
 
@@ -640,23 +635,29 @@ def _of_drift(drift: CommonDrift) -> Attributed:
     return Attributed(COMMON_DRIFT, "session", tuple(drift.loadings), (drift.session,), drift.share, drift.p_value)
 
 
-def attributed(parts: Sequence[BoardRecording], level: float) -> tuple[list[Attributed], dict[str, list[str]]]:
-    """Return what each effect that a recording names belongs to, and the files of those that belong to nothing."""
+def attributed(
+    parts: Sequence[BoardRecording], common: Sequence[CommonDrift], level: float
+) -> tuple[list[Attributed], dict[str, list[str]]]:
+    """Return what each effect that a recording names belongs to, and where those show that belong to nothing.
+
+    The most significant one comes first; others are estimated beside it, and all beside the common time courses.
+    """
     named = sorted((effect for part in parts for effect in part.named), key=lambda effect: effect.p_value)
     strongest = {effect.name: effect for effect in reversed(named)}
-    findings, single = [], {}
+    shared = {drift.session: np.stack([drift.times, drift.curve], axis=1) for drift in common}
+    findings, single, beside = [], {}, {}
     for name, strong in sorted(strongest.items(), key=lambda entry: entry[1].p_value):
-        inner = {key: float(getattr(strong.effect, key)) for key in strong.effect.inner}
-        sizes = np.asarray(CATALOGUE[name](np.zeros(strong.effect.size), **inner).typical_sizes(1.0).coefficients)
-        estimates = [part.estimate(name, inner) for part in parts]
-        units, sessions = [part.unit for part in parts], [part.session for part in parts]
-        shares = split(estimates, units, sessions, level / len(strongest))
+        inner, kind = _inner(strong), CATALOGUE[name]
+        sizes = np.asarray(kind(np.zeros(kind.size), **inner).typical_sizes(1.0).coefficients)
+        estimates = [part.estimate(name, inner, beside, shared.get(part.session)) for part in parts]
+        owners = {
+            "board": [""] * len(parts),
+            "unit": [part.unit for part in parts],
+            "session": [part.session for part in parts],
+        }
+        shares = split(estimates, owners["unit"], owners["session"], level / len(strongest))
         for share in shares:
-            mine = [
-                part
-                for part in parts
-                if {"unit": part.unit, "session": part.session}.get(share.belongs_to, "") in share.level
-            ]
+            mine = [part for part, owner in zip(parts, owners[share.belongs_to], strict=True) if owner in share.values]
             findings.append(
                 Attributed(
                     name,
@@ -666,9 +667,11 @@ def attributed(parts: Sequence[BoardRecording], level: float) -> tuple[list[Attr
                     share.share,
                     share.p_value,
                     {label: (values * sizes).tolist() for label, values in share.values.items()},
-                    CATALOGUE[name].coefficient_unit(SENSOR_UNITS.get(strong.triad, "")),
+                    kind.coefficient_unit(SENSOR_UNITS.get(strong.triad, "")),
                 )
             )
-        if not shares:
-            single[name] = [part.file for part in parts if name in [effect.name for effect in part.named]]
+        if shares:
+            beside[name] = inner
+        else:
+            single[name] = [part.place for part in parts if name in [effect.name for effect in part.named]]
     return findings, single
