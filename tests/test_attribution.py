@@ -64,6 +64,15 @@ def test_document_and_page(attribution, tmp_path):
     assert (tmp_path / "attribution.png").is_file()
 
 
+def test_recordings_that_cannot_be_diagnosed_are_skipped_with_their_reason(monkeypatch):
+    def refuse(recording, *arguments, **options):
+        raise NotPossibleError("record twenty poses or more.")
+
+    monkeypatch.setattr("jaximu.diagnosis.attribution.diagnose", refuse)
+    with pytest.raises(NotPossibleError, match=r"0 units in 0 sessions.*record twenty poses or more"):
+        attribute(board(1, 2, 2, {}, []), PATTERN)
+
+
 def drawn(random, values, information=400.0):
     """Estimates of three numbers (units, sessions, 3), whitened, with noise."""
     estimates = []

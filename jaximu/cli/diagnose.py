@@ -75,9 +75,9 @@ def run(
         raise InputError("--thermal is for recordings at rest, --reference for poses and turns: give one of them.")
     if reference is not None and len(logs) != 1:
         raise InputError(f"--reference goes with one LOG, found {len(logs)}.")
-    if by is not None and (thermal or reference is not None or heldout is not None):
-        other = "--thermal" if thermal else "--heldout" if reference is None else "--reference"
-        raise InputError(f"--by compares recordings with each other: leave {other} out.")
+    others = {"--thermal": thermal, "--reference": reference, "--heldout": heldout}
+    if by is not None and (stated := [name for name, value in others.items() if value]):
+        raise InputError(f"--by compares recordings with each other: leave {stated[0]} out.")
     options.require_files(reference)
     from jaximu.recordings.readers import holds_attitude
 

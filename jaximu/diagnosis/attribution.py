@@ -544,13 +544,13 @@ def places_of(files: Sequence[str], pattern: str) -> list[tuple[str, str]]:
         if match is None:
             strangers.append(file)
             continue
-        place = match["unit"], match["session"]
-        if place in places:
+        owner = match["unit"], match["session"]
+        if owner in places:
             raise InputError(
-                f"--by {pattern!r}: {places[place]} and {file} are both unit {place[0]} in session {place[1]}. Leave "
+                f"--by {pattern!r}: {places[owner]} and {file} are both unit {owner[0]} in session {owner[1]}. Leave "
                 "one out, or let the pattern tell them apart."
             )
-        places[place] = file
+        places[owner] = file
     if strangers:
         more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
         raise InputError(

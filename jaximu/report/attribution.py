@@ -52,6 +52,13 @@ def _verdict(attribution: Attribution) -> Iterator[str]:
             "drift of all gyroscope axes.",
         )
     yield from texts or ["Nothing repeats over the sessions of a unit or over the units of a session."]
+    open_units = [part.unit for part in attribution.recordings if part.diagnosis["verdict"] == "unexplained"]
+    if open_units:
+        where = listed([unit for unit in attribution.units if unit in open_units])
+        yield (
+            f"{sentence(counted(len(open_units), 'recording'))} of unit{'s' * (len(set(open_units)) > 1)} {where} "
+            f"{'stay' if len(open_units) > 1 else 'stays'} unexplained."
+        )
 
 
 def _names(noun: str, names: Sequence[str], every: Sequence[str]) -> str:
