@@ -237,7 +237,7 @@ def split(
         wide = np.zeros(len(components)), np.full(len(components), _WIDE)
         nothing, white = np.zeros((len(measured), 0)), np.eye(len(measured))
         variances = np.exp(restricted_likelihood(measured, nothing, white, np.stack(components), *wide)[0])
-        precision = np.linalg.inv(white + np.tensordot(variances, components, 1))
+        precision = np.asarray(np.linalg.inv(white + np.tensordot(variances, components, 1)), np.float64)
         p_values = {
             key: _absence(part, precision, measured) * len(columns)
             for key, part in columns.items()
@@ -591,7 +591,7 @@ def attribute(
     `InputError` as `jaximu.diagnose` does.
     """
     recordings, gravity = recordings_of(list(recordings)), as_gravity(gravity)
-    files = [recording.name for recording in recordings]
+    files = [recording.sources[0].path if recording.sources else recording.name for recording in recordings]
     places = places_of(files, pattern)
     skipped: dict[str, str] = {}
 
