@@ -298,11 +298,13 @@ class CommonDrift:
         times = _common_times(parts)
         random = np.random.default_rng(20260101)
         rates = np.concatenate([_rates(part, times, random, draws) for part in parts], axis=2)
+        rests = parts[0].rests
+        up = np.stack([np.interp(times, rests.times, axis) for axis in rests.up.T], axis=1)
+        if draws:
+            rates[1:] = _as_slow(rates, times, up, random)
         courses, shares = _principal(rates)
         loadings = courses[0] @ rates[0]
         usual = float(np.sqrt(np.mean(loadings**2))) * (np.sign(courses[0][0]) or 1.0)
-        rests = parts[0].rests
-        up = np.stack([np.interp(times, rests.times, axis) for axis in rests.up.T], axis=1)
         pace = 1 / np.sqrt(np.diff(times))
         steep = np.linalg.lstsq(pace[:, None] * np.diff(up, axis=0), pace * np.diff(courses[0]), rcond=None)[0]
         curve = usual * (courses[0] - up @ steep)
@@ -362,11 +364,30 @@ def _rates(part: BoardRecording, times: FloatArray, random: np.random.Generator,
     That noise holds drift as the recording shows it, each axis by itself.
     """
     evidence, rests = part.evidence, part.rests
-    noise = evidence.off_base(random.standard_normal((len(evidence.residual), draws)))
+    noise = evidence.draws(random, draws)
     values = rests.off_orientation(rests.rates(np.concatenate([evidence.residual[:, None], noise], axis=1)))
     onto = np.stack([np.interp(times, rests.times, pose) for pose in np.eye(len(values))], axis=1)
     values = np.einsum("to,oik->kti", onto, values)
     return values - values.mean(axis=1, keepdims=True)
+
+
+def _as_slow(rates: FloatArray, times: FloatArray, up: FloatArray, random: np.random.Generator) -> FloatArray:
+    """Return the draws among rates (1 + draws, o, k), independent random walks added, as slow as the measured axes.
+
+    Drift that a recording shows is pulled towards what is usual; draws that are too quick have too little in common.
+    As slow: their autocorrelation from rest to rest is that of the measured axes, a standard error added.
+    """
+    steps = np.sqrt(np.diff(times, prepend=2 * times[0] - times[1]))[:, None]
+    walks = np.cumsum(steps * random.standard_normal(rates[1:].shape), axis=1)
+    basis = orthonormal(np.concatenate([np.ones((len(times), 1)), up], axis=1))
+    walks -= basis @ (basis.T @ walks)
+    scaled, walks = (values / np.maximum(np.std(values, axis=1, keepdims=True), 1e-300) for values in (rates, walks))
+    measured, drawn, walking = (
+        np.mean(values[:, 1:] * values[:, :-1], axis=1) for values in (scaled[:1], scaled[1:], walks)
+    )
+    wanted = np.mean(measured) + np.std(measured) / np.sqrt(measured.size)
+    slow, quick = np.mean(walking) - wanted, wanted - np.mean(drawn)
+    return scaled[1:] + np.sqrt(max(quick, 0.0) / max(slow, 1e-3)) * walks
 
 
 def _principal(values: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -127,6 +127,12 @@ class Evidence:
         """Return whitened conditions (n, …) without what the base parameters can imitate."""
         return values - self._base @ (self._base.T @ values)
 
+    def draws(self, random: np.random.Generator, count: int) -> FloatArray:
+        """Return whitened conditions (n, count) of noise alone, as uncertain as its covariance is, off the base."""
+        if self._noise is None:
+            return self.off_base(random.standard_normal((len(self.residual), count)))
+        return self.off_base(self._noise[:, random.integers(self._noise.shape[1], size=count)])
+
     def place(self, block: int) -> slice:
         """Return the columns of a block."""
         return slice(self._edges[block], self._edges[block + 1])
