@@ -88,7 +88,8 @@ def calibrate(
     - `start`: with such data, the unit where the fit starts, and the effects of their set-ups; the data sheet's values
       if left out.
     - `gravity`: local gravity; its uncertainty goes into the scales'. Where it states a latitude, the Earth's rotation
-      is in the model, its heading free (one recording, every turn between its poses usable; not with other data).
+      is in the model, its heading free (one recording, every turn between its poses usable), else its vertical part
+      alone; not with other data.
     - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
       bias, which ties poses and turns together. Otherwise noise is estimated from the scatter within poses and assumed
       white; drift only widens the uncertainty.
@@ -289,8 +290,10 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     keep_gyroscope = method != "accelerometer"
     before = residual_rms(nominal, observations, keep_gyroscope)
     sigmas, prior = dict(choices.effect_sigmas or {}), None
-    if method == "joint" and gravity.latitude is not None and _headings_known(segmentations, observations):
+    if method == "joint" and gravity.latitude is not None:
         earth, spread = GyroEarthRotation.at(gravity.latitude)
+        if not _headings_known(segmentations, observations):  # the vertical part needs none, and is all that is taken
+            spread = np.full(3, spread[2])
         if earth.name not in [effect.name for effect in chosen]:
             chosen, sigmas = [*chosen, earth], sigmas | {earth.name: spread}
     if chosen:

@@ -39,6 +39,14 @@ def run(
     thermal: Annotated[
         bool, arg(help="The unit was at rest while the temperature changed: test thermal effects only.")
     ] = False,
+    by: Annotated[
+        str | None,
+        option(
+            "PATTERN",
+            "LOGs are of several units in several sessions, as this pattern of their names or folders says, such as "
+            "'unit{unit}_session{session}': what belongs to a unit, to a session or to all of them is told apart.",
+        ),
+    ] = None,
     poses: options.Poses = options.POSES,
     repair: options.RepairFlag = False,
     fail_on: Annotated[
@@ -51,7 +59,7 @@ def run(
 
     Several LOGs are several recordings of one unit, each with its own biases: what the unit does in all of them shows
     together where one hardly shows it. DIR receives diagnosis.json, the extended calibration.json, report.html and
-    pictures.
+    pictures. With --by they are recordings of several units: DIR receives diagnosis.json and report.html.
 
     Examples:
       jaximu diagnose log.csv --static rest.csv -o results
@@ -59,6 +67,7 @@ def run(
       jaximu diagnose log.csv --heldout other.csv
       jaximu diagnose log.csv --reference tracker.csv
       jaximu diagnose oven.csv --thermal
+      jaximu diagnose logs/*.csv --by 'unit{unit}_session{session}' -o results
 
     """
     gravity = local.value()
@@ -66,6 +75,9 @@ def run(
         raise InputError("--thermal is for recordings at rest, --reference for poses and turns: give one of them.")
     if reference is not None and len(logs) != 1:
         raise InputError(f"--reference goes with one LOG, found {len(logs)}.")
+    others = {"--thermal": thermal, "--reference": reference, "--heldout": heldout}
+    if by is not None and (stated := [name for name, value in others.items() if value]):
+        raise InputError(f"--by compares recordings with each other: leave {stated[0]} out.")
     options.require_files(reference)
     from jaximu.recordings.readers import holds_attitude
 
@@ -76,8 +88,23 @@ def run(
         raise InputError("with --reference, --heldout LOG and --heldout-reference REF go together.")
     if reference is None and heldout_reference is not None:
         raise InputError("--heldout-reference goes with --reference.")
-    results.prepare(*options.INERTIAL)
+    results.prepare(*(options.INERTIAL if by is None else ()))
+    if by is not None:
+        from jaximu.diagnosis import places_of
+
+        places_of(list(map(str, logs)), by)
     recordings, known = log.read_unit(logs, gravity, noise)
+    if by is not None:
+        from jaximu.diagnosis import attribute
+
+        with progress("diagnosing", every=0.0) as report:
+            attribution = attribute(
+                recordings, by, gravity, report=report, static=known, segmentation=poses.value(), repair=repair
+            )
+        results.present(
+            attribution.summary, "diagnosis.json and report.html", {}, attribution.text, diagnosis=attribution
+        )
+        return end(attribution.verdict, fail_on)
     other = None if heldout is None else log.read(heldout, gravity)
     from jaximu.diagnosis import diagnose, diagnose_against_attitude, diagnose_thermal, diagnose_turntable
 
@@ -108,7 +135,12 @@ def run(
         with progress("looking for a recording that would separate the causes"):
             diagnosis = advised(diagnosis)
     give_diagnosis(diagnosis, results)
-    if fail_on != "never" and diagnosis.verdict in ("unexplained", fail_on):
+    end(diagnosis.verdict, fail_on)
+
+
+def end(verdict: str, fail_on: str) -> None:
+    """End with exit status 1 where a verdict is one that a script is to fail on."""
+    if fail_on != "never" and verdict in ("unexplained", fail_on):
         raise SystemExit(1)
 
 

@@ -6,6 +6,7 @@ from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.diagnosis.attitude import diagnose_against_attitude
+    from jaximu.diagnosis.attribution import COMMON_DRIFT, Attributed, Attribution, CommonDrift, attribute, places_of
     from jaximu.diagnosis.checking import check
     from jaximu.diagnosis.checks import Check
     from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose, twin_of
@@ -20,12 +21,17 @@ if TYPE_CHECKING:
     from jaximu.diagnosis.validity import Validity
 
 __all__ = [
+    "COMMON_DRIFT",
+    "Attributed",
+    "Attribution",
     "Check",
+    "CommonDrift",
     "Diagnosis",
     "MagneticDiagnosis",
     "MagneticShift",
     "Named",
     "Validity",
+    "attribute",
     "check",
     "check_magnetometer",
     "diagnose",
@@ -33,6 +39,7 @@ __all__ = [
     "diagnose_magnetometer",
     "diagnose_thermal",
     "diagnose_turntable",
+    "places_of",
     "twin_of",
 ]
 

@@ -21,9 +21,9 @@ from jaximu.diagnosis.drift import DRAWS
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
 
-__all__ = ["EffectBlock", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
+__all__ = ["BLIND", "EffectBlock", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
 
-_BLIND = 1e-4
+BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
 _LARGE = 20.0
 """Usual sizes that an effect's coefficients may have."""
@@ -106,14 +106,14 @@ class Evidence:
         self.jacobian = jacobian
         u, s, _ = np.linalg.svd(jacobian, full_matrices=False)
         self._base = u[:, s > 1e-10 * s[0]]
-        self.residual = self._off_base(residual)
+        self.residual = self.off_base(residual)
         self.freedom = len(residual) - self._base.shape[1]
         """Dimensions that the base parameters leave."""
         raw = (
             [np.concatenate([block.columns for block in blocks], axis=1)] if blocks else [np.zeros((len(residual), 0))]
         )
         self._edges = np.cumsum([0, *(block.columns.shape[1] for block in blocks)])
-        self.columns = self._off_base(raw[0])
+        self.columns = self.off_base(raw[0])
         self._reach = np.linalg.norm(raw[0], axis=0)
         self._gram = self.columns.T @ self.columns
         self._product = self.columns.T @ self.residual
@@ -123,8 +123,15 @@ class Evidence:
         """The pseudo-inverse (p, n) of the Jacobian."""
         return np.asarray(scipy.linalg.pinv(self.jacobian))
 
-    def _off_base(self, values: FloatArray) -> FloatArray:
+    def off_base(self, values: FloatArray) -> FloatArray:
+        """Return whitened conditions (n, …) without what the base parameters can imitate."""
         return values - self._base @ (self._base.T @ values)
+
+    def draws(self, random: np.random.Generator, count: int) -> FloatArray:
+        """Return whitened conditions (n, count) of noise alone, as uncertain as its covariance is, off the base."""
+        if self._noise is None:
+            return self.off_base(random.standard_normal((len(self.residual), count)))
+        return self.off_base(self._noise[:, random.integers(self._noise.shape[1], size=count)])
 
     def place(self, block: int) -> slice:
         """Return the columns of a block."""
@@ -144,7 +151,7 @@ class Evidence:
         """Whether the base parameters leave anything of the block that the recording reacts to."""
         columns = self.place(block)
         largest = np.max(self._reach[columns], initial=0.0)
-        return bool(largest > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > _BLIND * largest)
+        return bool(largest > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > BLIND * largest)
 
     def limit(self, blocks: Sequence[int]) -> float:
         """Return the detection limit of an effect that is asked at several places of a grid, in its own unit.
@@ -194,9 +201,9 @@ class Evidence:
         columns = self.columns[:, inside] / _safe(self._reach[inside])
         if columns.shape[1] > len(columns):
             values, vectors = np.linalg.eigh(columns @ columns.T)
-            return vectors[:, values > _BLIND**2]
+            return vectors[:, values > BLIND**2]
         values, vectors = np.linalg.eigh(columns.T @ columns)
-        keep = values > _BLIND**2
+        keep = values > BLIND**2
         return columns @ (vectors[:, keep] / np.sqrt(values[keep]))
 
     def _off_span(self, values: FloatArray) -> FloatArray:
@@ -220,7 +227,7 @@ class Evidence:
         drawn = self._noise
         if drawn is None:
             drawn = np.random.default_rng(20260101).standard_normal((len(self.residual), DRAWS))
-        noise = self._off_base(drawn)
+        noise = self.off_base(drawn)
         product = self.columns.T @ noise
         smallest, guard = np.ones(DRAWS), np.ones(DRAWS)
         left = self.freedom - self._spanned.shape[1]
@@ -309,7 +316,7 @@ def _roots(gram: FloatArray, lengths: FloatArray) -> tuple[FloatArray, NDArray[n
     what the estimated path is uncertain by.
     """
     values, vectors = np.linalg.eigh(_scaled(gram, lengths))
-    keep = values > _BLIND**2
+    keep = values > BLIND**2
     root = vectors / np.sqrt(np.where(keep, values, 1.0))[..., None, :] * keep[..., None, :]
     return root / _safe(lengths)[..., :, None], keep.sum(axis=-1)
 
@@ -343,7 +350,7 @@ def detection_limit(
     q = len(information)
     values = np.linalg.eigvalsh(information)
     whole = values[-1] if lengths is None else float(np.max(np.square(lengths), initial=0.0))
-    rank = int(np.sum(values > _BLIND**2 * max(whole, 0.0)))
+    rank = int(np.sum(values > BLIND**2 * max(whole, 0.0)))
     if values[-1] <= 0 or not rank:
         return float("inf")
     # whole orthogonal frames: their mean strength is that of all directions, whatever the draw

@@ -1,0 +1,698 @@
+"""Whose fault a finding is: a unit's, a session's or the board's, from recordings of several units in several sessions.
+
+Every recording is diagnosed by itself. Of each effect that one of them names, all give an estimate. The estimates β of
+unit u in session s are split as β_us = m + a_u + c_s + e_us: a value of the board, one of each unit, one of each
+session, and what scatters from recording to recording, each normally distributed with a variance of its own (Searle,
+Casella and McCulloch, Variance Components, 1992, ch. 6). A value is there if it is significant beside the others.
+
+A time course that is common to all units of a session is the first principal component of their rates at rest. It is
+compared with what drift as large and as slow in each unit, but independent, has in common by chance.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+import scipy
+
+from jaximu.data.drift import restricted_likelihood
+from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
+from jaximu.diagnosis.drift import DRAWS
+from jaximu.diagnosis.evidence import BLIND, FEWEST_DIMENSIONS, Evidence
+from jaximu.diagnosis.improvement import cross_validated
+from jaximu.estimation.leave_out import orthonormal
+from jaximu.estimation.track import TRIADS
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_sf
+from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
+from jaximu.ground.page import Result
+from jaximu.ground.quantities import counted, listed
+from jaximu.ground.units import SENSOR_UNITS
+from jaximu.mistakes.titles import effect_title
+from jaximu.model.effects import CATALOGUE
+from jaximu.recordings.recording import Recording, recordings_of
+
+__all__ = [
+    "COMMON_DRIFT",
+    "Attributed",
+    "Attribution",
+    "BoardRecording",
+    "CommonDrift",
+    "Part",
+    "attribute",
+    "places_of",
+    "split",
+]
+
+COMMON_DRIFT = "session.common_drift"
+
+_WIDE = 8.0
+"""Spread of the logarithm of a part's variance, in squares of usual sizes, beforehand: next to nothing is known."""
+
+
+@dataclass(frozen=True)
+class Rests:
+    """The rates at rest that a fit leaves, and how the conditions react to outputs that are off in single poses.
+
+    times (o,): middles of the poses, s. up (o, 3): direction of specific force. unwhiten (3 o, n): from whitened
+    conditions to rates, rad/s. reaction: by triad, whitened conditions (n, o, 3) by outputs.
+    """
+
+    times: FloatArray
+    up: FloatArray
+    unwhiten: FloatArray
+    reaction: Mapping[str, FloatArray]
+
+    def rates(self, whitened: FloatArray) -> FloatArray:
+        """Return rates at rest (o, 3, k), rad/s, of whitened conditions (n, k)."""
+        return (self.unwhiten @ whitened).reshape(len(self.times), 3, -1)
+
+    def columns(self, triad: str, curves: FloatArray) -> FloatArray:
+        """Return how the whitened conditions (n, 3 k) react to curves (o, k) in each axis of a triad."""
+        columns = np.einsum("noi,ok->nki", self.reaction[triad], curves)
+        return columns.reshape(len(columns), -1)
+
+    def off_orientation(self, rates: FloatArray) -> FloatArray:
+        """Return rates (o, …) without what follows orientation, a constant included."""
+        basis = orthonormal(np.concatenate([np.ones((len(self.times), 1)), self.up], axis=1))
+        return rates - np.tensordot(basis, np.tensordot(basis, rates, (0, 0)), 1)
+
+
+@dataclass(frozen=True)
+class BoardRecording:
+    """A recording of one unit in one session: what its diagnosis says, and the evidence that estimates come from.
+
+    diagnosis: the document. named: the effects that it names. chi2_heldout: per condition, on parts left out, with the
+    effects in the model. alone: the verdict with what the session has in common. without_drift: that was taken off.
+    """
+
+    file: str
+    unit: str
+    session: str
+    diagnosis: dict[str, Any]
+    named: tuple[Named, ...]
+    chi2_heldout: float
+    evidence: Evidence
+    rests: Rests
+    alone: str
+    without_drift: bool = False
+
+    @classmethod
+    def of(cls, file: str, unit: str, session: str, diagnosis: Diagnosis) -> BoardRecording:
+        """Return what is kept of a diagnosis."""
+        experiment, base = diagnosis.experiment, diagnosis.base
+        gain = diagnosis.gain or cross_validated(experiment, base)
+        held = gain.after if diagnosis.gain is not None else gain.before
+        observed = experiment.data.observed(base.imu, base.linear.details)
+        real, used = experiment.real, experiment.used
+        rest = real.of_kind("static_gyroscope")
+        poses = np.eye(len(observed.share))
+        reaction = {
+            name: (base.weights @ observed.react(name, poses)[used]).reshape(len(base.weights), len(poses), 3)
+            for name in TRIADS
+        }
+        unwhiten = np.linalg.inv(base.weights)[rest] * real.to_si[rest, None]
+        times = real.spans[real.first[rest][::3]].mean(axis=1)
+        assert observed.up is not None
+        rests = Rests(times, observed.up, unwhiten, reaction)
+        return cls(
+            file,
+            unit,
+            session,
+            diagnosis.document(),
+            diagnosis.named,
+            held.chi_squared / held.count,
+            base.evidence,
+            rests,
+            diagnosis.verdict,
+        )
+
+    @property
+    def place(self) -> str:
+        """Its unit and session, in words."""
+        return f"unit {self.unit} in session {self.session}"
+
+    def document(self) -> dict[str, Any]:
+        """Return the recording as `diagnosis.json` has it."""
+        return {
+            "file": self.file,
+            "unit": self.unit,
+            "session": self.session,
+            "verdict": self.diagnosis["verdict"],
+            "verdict_alone": self.alone,
+            "without_common_drift": self.without_drift,
+            "effects": self.diagnosis["effects"],
+            "chi2_heldout": self.chi2_heldout,
+        }
+
+    def block(self, name: str, inner: Mapping[str, float]) -> int | None:
+        """Return the question for an effect, at inner parameters closest to these; None where it cannot be asked."""
+        blocks = self.evidence.blocks
+        mine = [k for k, block in enumerate(blocks) if block.kind == "effect" and block.name == name]
+
+        def distance(k: int) -> float:
+            return sum(abs(np.log(max(blocks[k].inner[key], 1e-9) / max(inner[key], 1e-9))) for key in inner)
+
+        return min(mine, key=distance, default=None)
+
+    def estimate(
+        self,
+        name: str,
+        inner: Mapping[str, float],
+        beside: Mapping[str, Mapping[str, float]],
+        shared: FloatArray | None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return a whitened estimate of an effect's coefficients β, in units of their sizes: z (k,), X (k, q).
+
+        z ~ N(X β, 1), while other effects and a time course are free: those named here, those `beside`, with their
+        inner parameters, and what the session has in common, `shared`, (t, 2) times and rates.
+        """
+        evidence, block = self.evidence, self.block(name, inner)
+        if block is None:
+            return np.zeros(0), np.zeros((0, CATALOGUE[name].size))
+        known = {effect.name: _inner(effect) for effect in self.named} | dict(beside)
+        blocks = [self.block(other, at) for other, at in known.items() if other != name]
+        others = [evidence.columns[:, evidence.span([other for other in blocks if other is not None])]]
+        if shared is not None:
+            curve = np.interp(self.rests.times, *shared.T)[:, None]
+            others += [evidence.off_base(self.rests.columns(triad, curve)) for triad in TRIADS]
+        columns = evidence.columns[:, evidence.place(block)]
+        basis = orthonormal(np.concatenate(others, axis=1))
+        u, s, v = np.linalg.svd(columns - basis @ (basis.T @ columns), full_matrices=False)
+        kept = s > BLIND * np.max(np.linalg.norm(columns, axis=0), initial=1e-300)
+        return u[:, kept].T @ evidence.residual, s[kept, None] * v[kept]
+
+
+def _inner(effect: Named) -> dict[str, float]:
+    """Return an effect's inner parameters."""
+    return {key: float(getattr(effect.effect, key)) for key in effect.effect.inner}
+
+
+@dataclass(frozen=True)
+class Part:
+    """What of an effect belongs to units, to sessions or to the board.
+
+    values: by unit or session in which it is (of the board: one), the coefficients (q,), each in units of its size.
+    share: of the squares of all estimates, weighted with their information. p_value: of the first of them, all that
+    were tried allowed for.
+    """
+
+    belongs_to: str
+    values: dict[str, FloatArray]
+    share: float
+    p_value: float
+
+
+def split(
+    estimates: Sequence[tuple[FloatArray, FloatArray]], units: Sequence[str], sessions: Sequence[str], level: float
+) -> list[Part]:
+    """Split estimates of an effect, one of each recording, into parts of the board, of units and of sessions.
+
+    A unit's part is there, or a session's or the board's, if without it the estimates scatter by more than they do
+    from recording to recording: a χ² test at the variances so far. The most significant part is taken in with a
+    variance of its own, all variances are estimated again, and the others are asked once more.
+
+    **Arguments:** `estimates`: whitened, as `BoardRecording.estimate` returns them; `units`, `sessions`: of each;
+    `level`: of all parts together where nothing repeats.
+    """
+    measured = np.concatenate([z for z, _ in estimates])
+    rows = scipy.linalg.block_diag(*(x for _, x in estimates)).reshape(len(measured), len(estimates), -1)
+    groups = {"board": [""] * len(units), "unit": list(units), "session": list(sessions)}
+    columns = {
+        (kind, label): rows[:, np.equal(labels, label)].sum(axis=1)
+        for kind, labels in groups.items()
+        for label in dict.fromkeys(labels)
+        if labels.count(label) > 1
+    }
+    components = [sum(rows[:, k] @ rows[:, k].T for k in range(len(estimates)))]
+    chosen: dict[tuple[str, str], float] = {}
+    while True:
+        wide = np.zeros(len(components)), np.full(len(components), _WIDE)
+        nothing, white = np.zeros((len(measured), 0)), np.eye(len(measured))
+        variances = np.exp(restricted_likelihood(measured, nothing, white, np.stack(components), *wide)[0])
+        precision = np.asarray(np.linalg.inv(white + np.tensordot(variances, components, 1)), np.float64)
+        p_values = {
+            key: _absence(part, precision, measured) * len(columns)
+            for key, part in columns.items()
+            if key not in chosen
+        }
+        best = min(p_values, key=lambda key: p_values[key], default=None)
+        if best is None or p_values[best] >= level:
+            break
+        chosen[best] = p_values[best]
+        components.append(columns[best] @ columns[best].T)
+    pulled = precision @ measured
+    values = {key: v * columns[key].T @ pulled for key, v in zip(chosen, variances[1:], strict=True)}
+    parts = []
+    for kind in dict.fromkeys(kind for kind, _ in chosen):
+        mine = {label: value for (of, label), value in values.items() if of == kind}
+        left = measured - sum(columns[kind, label] @ value for label, value in mine.items())
+        share = 1 - float(left @ left) / float(measured @ measured)
+        p_value = min(p for (of, _), p in chosen.items() if of == kind)
+        parts.append(Part(kind, mine, min(max(share, 0.0), 1.0), p_value))
+    return parts
+
+
+def _absence(columns: FloatArray, precision: FloatArray, values: FloatArray) -> float:
+    """Return the p-value of values (n,) if nothing is added along columns (n, q)."""
+    information = columns.T @ precision @ columns
+    score = columns.T @ precision @ values
+    rank = int(np.linalg.matrix_rank(information, hermitian=True))
+    return float(chi2_sf(float(score @ np.linalg.pinv(information, hermitian=True) @ score), rank)) if rank else 1.0
+
+
+@dataclass(frozen=True)
+class CommonDrift:
+    """A time course that the rates at rest of all units of a session have in common, beside what follows orientation.
+
+    times (o,): s, on the clock of the recordings. curve (o,): rad/s, in a usual axis; what orientation could imitate of
+    it is as smooth as can be. share: of the variance of all axes. common: the same, each axis in units of its standard
+    deviation. chance: the median of that where drift is independent, as large and as slow in each axis as it is there.
+    p_value: that it then has as much in common. loadings: by unit, what its axes (3,) do in multiples of the curve.
+    axes (k, o): the drift of each axis that has a part in it, in multiples of its part, rad/s.
+    """
+
+    session: str
+    times: FloatArray
+    curve: FloatArray
+    share: float
+    common: float
+    chance: float
+    p_value: float
+    loadings: dict[str, FloatArray]
+    axes: FloatArray
+
+    @classmethod
+    def of(cls, parts: Sequence[BoardRecording], draws: int = DRAWS) -> CommonDrift:
+        """Return what recordings of a session have most in common in time, whether by chance or not.
+
+        `draws`: of independent drift, for chance and p-value. Raises `NotPossibleError` where they share no time.
+        """
+        times = _common_times(parts)
+        random = np.random.default_rng(20260101)
+        rates = np.concatenate([_rates(part, times, random, draws) for part in parts], axis=2)
+        rests = parts[0].rests
+        up = np.stack([np.interp(times, rests.times, axis) for axis in rests.up.T], axis=1)
+        if draws:
+            rates[1:] = _as_slow(rates, times, up, random)
+        courses, shares = _principal(rates)
+        loadings = courses[0] @ rates[0]
+        usual = float(np.sqrt(np.mean(loadings**2))) * (np.sign(courses[0][0]) or 1.0)
+        pace = 1 / np.sqrt(np.diff(times))
+        steep = np.linalg.lstsq(pace[:, None] * np.diff(up, axis=0), pace * np.diff(courses[0]), rcond=None)[0]
+        curve = usual * (courses[0] - up @ steep)
+        return cls(
+            parts[0].session,
+            times,
+            curve - curve.mean(),
+            float(np.sum(loadings**2) / np.sum(rates[0] ** 2)),
+            float(shares[0]),
+            float(np.median(shares[1:])) if draws else 0.0,
+            float(np.mean(shares >= shares[0])),
+            {part.unit: row / usual for part, row in zip(parts, loadings.reshape(-1, 3), strict=True)},
+            usual * (rates[0] / loadings).T[np.abs(loadings) > abs(usual) / 2] - usual * (up @ steep),
+        )
+
+    @property
+    def size(self) -> float:
+        """By how much the rate of a usual axis changes, rad/s."""
+        return float(np.ptp(self.curve))
+
+    def taken_off(self, recording: Recording, part: BoardRecording) -> Recording:
+        """Return a recording without the curve, in each axis as large as the recording shows it.
+
+        **Arguments:** `part`: the recording as it was diagnosed, which is no part of the curve.
+        """
+        rests, off_base = part.rests, part.evidence.off_base
+        curve = np.interp(rests.times, self.times, self.curve)[:, None]
+        questions = [rests.columns(triad, curve) for triad in TRIADS]
+        columns = off_base(np.concatenate([*questions, rests.columns("gyroscope", rests.up)], axis=1))
+        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        amounts = np.linalg.lstsq(columns / size, part.evidence.residual, rcond=BLIND)[0] / size
+        changed = {}
+        for triad, amount in zip(TRIADS, amounts[:6].reshape(2, 3), strict=True):
+            signal = recording.signals[triad]
+            course = np.interp(signal.time, self.times, self.curve)
+            changed[triad] = replace(signal, values=signal.values - course[:, None] * amount)
+        return replace(recording, **changed)
+
+
+def _common_times(parts: Sequence[BoardRecording]) -> FloatArray:
+    """Return the middles of the rests (o,) of the recording with the fewest, where all recordings go on."""
+    first = max(part.rests.times[0] for part in parts)
+    last = min(part.rests.times[-1] for part in parts)
+    shortest = min((part.rests.times for part in parts), key=len)
+    times = shortest[(shortest >= first) & (shortest <= last)]
+    if len(times) < FEWEST_DIMENSIONS:
+        raise NotPossibleError(
+            f"session {parts[0].session}: its recordings have {len(times)} rests at the same time by their clocks; a "
+            "time course that units have in common needs one clock for all units of a session."
+        )
+    return times
+
+
+def _rates(part: BoardRecording, times: FloatArray, random: np.random.Generator, draws: int) -> FloatArray:
+    """Return rates at rest (1 + draws, o, 3) less what follows orientation: as measured, and as the noise draws them.
+
+    That noise holds drift as the recording shows it, each axis by itself.
+    """
+    evidence, rests = part.evidence, part.rests
+    noise = evidence.draws(random, draws)
+    values = rests.off_orientation(rests.rates(np.concatenate([evidence.residual[:, None], noise], axis=1)))
+    onto = np.stack([np.interp(times, rests.times, pose) for pose in np.eye(len(values))], axis=1)
+    values = np.einsum("to,oik->kti", onto, values)
+    return values - values.mean(axis=1, keepdims=True)
+
+
+def _as_slow(rates: FloatArray, times: FloatArray, up: FloatArray, random: np.random.Generator) -> FloatArray:
+    """Return the draws among rates (1 + draws, o, k), independent random walks added, as slow as the measured axes.
+
+    Drift that a recording shows is pulled towards what is usual; draws that are too quick have too little in common.
+    As slow: their autocorrelation from rest to rest is that of the measured axes, a standard error added.
+    """
+    steps = np.sqrt(np.diff(times, prepend=2 * times[0] - times[1]))[:, None]
+    walks = np.cumsum(steps * random.standard_normal(rates[1:].shape), axis=1)
+    basis = orthonormal(np.concatenate([np.ones((len(times), 1)), up], axis=1))
+    walks -= basis @ (basis.T @ walks)
+    scaled, walks = (values / np.maximum(np.std(values, axis=1, keepdims=True), 1e-300) for values in (rates, walks))
+    measured, drawn, walking = (
+        np.mean(values[:, 1:] * values[:, :-1], axis=1) for values in (scaled[:1], scaled[1:], walks)
+    )
+    wanted = np.mean(measured) + np.std(measured) / np.sqrt(measured.size)
+    slow, quick = np.mean(walking) - wanted, wanted - np.mean(drawn)
+    return scaled[1:] + np.sqrt(max(quick, 0.0) / max(slow, 1e-3)) * walks
+
+
+def _principal(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the first principal component (..., t), of length one, of axes (..., t, k), and its share of variance."""
+    scaled = values / np.maximum(np.std(values, axis=-2, keepdims=True), 1e-300)
+    u, s, _ = np.linalg.svd(scaled, full_matrices=False)
+    return u[..., :, 0], s[..., 0] ** 2 / np.sum(s**2, axis=-1)
+
+
+@dataclass(frozen=True)
+class Attributed:
+    """A finding, and what it belongs to: "unit", "session" or "board".
+
+    values: by unit or session, coefficients in SI where an effect has them, in `unit`; the board's have no name.
+    """
+
+    name: str
+    belongs_to: str
+    units: tuple[str, ...]
+    sessions: tuple[str, ...]
+    share: float
+    p_value: float
+    values: dict[str, list[float]] = field(default_factory=dict)
+    unit: str = ""
+
+    def document(self) -> dict[str, Any]:
+        """Return the finding as `diagnosis.json` has it."""
+        return {**vars(self), "units": list(self.units), "sessions": list(self.sessions)}
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Attribution(Result, Document, page="attribution"):
+    """What belongs to units, to sessions and to the board, from recordings of several units in several sessions.
+
+    recordings: as diagnosed, a time course common to their session taken off. findings: what they belong to. drifts:
+    by session, what its units have in common in time. single: effects that show in single recordings alone, by name,
+    and which. skipped: recordings that could not be diagnosed, and why.
+    """
+
+    recordings: tuple[BoardRecording, ...]
+    findings: tuple[Attributed, ...]
+    drifts: tuple[CommonDrift, ...]
+    single: dict[str, list[str]]
+    skipped: dict[str, str]
+    latitude: float | None
+
+    @property
+    def units(self) -> list[str]:
+        """The units, by name."""
+        return _in_order(part.unit for part in self.recordings)
+
+    @property
+    def sessions(self) -> list[str]:
+        """The sessions, by name."""
+        return _in_order(part.session for part in self.recordings)
+
+    @property
+    def verdict(self) -> str:
+        """The board's: "unexplained" where a recording is, "effects" where something was named, or "adequate"."""
+        verdicts = {part.diagnosis["verdict"] for part in self.recordings}
+        if "unexplained" in verdicts:
+            return "unexplained"
+        return "effects" if "effects" in verdicts or self.findings else "adequate"
+
+    def document(self) -> dict[str, Any]:
+        """Return the board's diagnosis as a document of schema `jaximu.diagnosis/1`.
+
+        Of effects, checks and what could hide it keeps the most striking recording's, by name.
+        """
+        documents = [part.diagnosis for part in self.recordings]
+        limits = [(name, limit) for document in documents for name, limit in document["detection_limits"].items()]
+        blind = set.intersection(*(set(document["not_observable"]) for document in documents))
+        return {
+            "schema": documents[0]["schema"],
+            "verdict": self.verdict,
+            "effects": _by_name(documents, "effects", lambda effect: effect["p_value"]),
+            "preflight": [
+                finding | {"file": part.file} for part in self.recordings for finding in part.diagnosis["preflight"]
+            ],
+            "detection_limits": dict(sorted(limits, key=lambda entry: entry[1]["value"])),
+            "hidden": _by_name(documents, "hidden", lambda cause: -cause["limit"]),
+            "not_observable": {name: documents[0]["not_observable"][name] for name in sorted(blind)},
+            "checks": _by_name(documents, "checks", lambda check: check["adjusted"]),
+            "suggestion": self.suggestion,
+            "next": [],
+            "p_value": min(1.0, len(documents) * min(document["p_value"] for document in documents)),
+            "noise_scale": max(document["noise_scale"] for document in documents),
+            "notes": self.notes,
+            "shape": None,
+            "learned": None,
+            "data": {"files": [file for document in documents for file in document["data"]["files"]]},
+            "software": SOFTWARE,
+            "recordings": [part.document() for part in self.recordings],
+            "attribution": [finding.document() for finding in self.findings],
+            "common_drift": [
+                {
+                    "session": drift.session,
+                    "times": drift.times.tolist(),
+                    "rate": drift.curve.tolist(),
+                    "share": drift.share,
+                    "common": drift.common,
+                    "common_by_chance": drift.chance,
+                    "p_value": drift.p_value,
+                    "loadings": {unit: row.tolist() for unit, row in drift.loadings.items()},
+                }
+                for drift in self.drifts
+            ],
+        }
+
+    @property
+    def common(self) -> list[CommonDrift]:
+        """The time courses that are more than chance."""
+        there = {session for finding in self.findings if finding.name == COMMON_DRIFT for session in finding.sessions}
+        return [drift for drift in self.drifts if drift.session in there]
+
+    @property
+    def suggestion(self) -> str:
+        """What to do next."""
+        if self.common:
+            return (
+                "Log the temperature and the supply of the board with the next session: if the common time course "
+                "follows one of them, it can be compensated. It is no part of any unit's calibration."
+            )
+        if any(finding.belongs_to == "unit" for finding in self.findings):
+            return (
+                "Run `jaximu diagnose` on all recordings of a unit with an effect: it writes the extended calibration."
+            )
+        return ""
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader should know beside the verdict."""
+        return [
+            f"{effect_title(name)} repeats neither over sessions nor over units; it shows in {listed(places)}."
+            for name, places in self.single.items()
+        ] + [f"{file} was skipped: {why}" for file, why in self.skipped.items()]
+
+
+def _by_name(documents: Sequence[dict[str, Any]], key: str, rank: Callable[[dict[str, Any]], float]) -> list[dict]:
+    """Return of all recordings' entries of a list the first of each name, in order of rank."""
+    entries: dict[str, dict[str, Any]] = {}
+    for entry in sorted((entry for document in documents for entry in document[key]), key=rank):
+        entries.setdefault(entry["name"], entry)
+    return list(entries.values())
+
+
+def _in_order(names: Iterable[str]) -> list[str]:
+    """Return names without repetition, numbers by size."""
+    return sorted(dict.fromkeys(names), key=lambda name: (not name.isdigit(), len(name) * name.isdigit(), name))
+
+
+def places_of(files: Sequence[str], pattern: str) -> list[tuple[str, str]]:
+    """Return the unit and the session of each file, as a pattern of file names or folders has them.
+
+    **Arguments:** `pattern`: such as "unit{unit}_session{session}" or "{unit}/{session}", of the file's name, its
+    suffix left out or not, or of its folders.
+
+    Raises `InputError` for a pattern without both fields, a file that it does not fit, and two files of one place;
+    `NotPossibleError` for one unit or one session alone.
+    """
+    names = re.findall(r"\{(.*?)\}", pattern)
+    if sorted(names) != ["session", "unit"]:
+        raise InputError(
+            f"--by {pattern!r}: a pattern names {{unit}} and {{session}} once each, such as "
+            "'unit{unit}_session{session}'."
+        )
+    parts = re.split(r"(\{(?:unit|session)\})", pattern)
+    fields = {f"{{{name}}}": f"(?P<{name}>[^/]+?)" for name in names}
+    shape = re.compile("(?:.*/)?" + "".join(fields.get(part) or re.escape(part) for part in parts) + r"(?:\.[^/]*)?")
+    places: dict[tuple[str, str], str] = {}
+    strangers = []
+    for file in files:
+        path = PurePath(file)
+        match = next(filter(None, (shape.fullmatch(folder.as_posix()) for folder in (path, *path.parents))), None)
+        if match is None:
+            strangers.append(file)
+            continue
+        owner = match["unit"], match["session"]
+        if owner in places:
+            raise InputError(
+                f"--by {pattern!r}: {places[owner]} and {file} are both unit {owner[0]} in session {owner[1]}. Leave "
+                "one out, or let the pattern tell them apart."
+            )
+        places[owner] = file
+    if strangers:
+        more = f" and {len(strangers) - 1} more" if len(strangers) > 1 else ""
+        raise InputError(
+            f"--by {pattern!r} does not fit {strangers[0]}{more}: it is to fit the name or folder of every LOG."
+        )
+    require_several(places)
+    return list(places)
+
+
+def require_several(places: Iterable[tuple[str, str]], why: str = "") -> None:
+    """Raise `NotPossibleError` unless places are of two units and two sessions; `why`: what others were skipped for."""
+    units, sessions = map(set, zip(*places, strict=True)) if (places := list(places)) else (set(), set())
+    if len(units) < 2 or len(sessions) < 2:
+        raise NotPossibleError(
+            f"--by needs two units and two sessions or more to tell them apart, found {counted(len(units), 'unit')} in "
+            f"{counted(len(sessions), 'session')}: record the others, or diagnose the logs without --by. {why}".rstrip()
+        )
+
+
+def attribute(
+    recordings: Sequence[Recording],
+    pattern: str,
+    gravity: Gravity = STANDARD,
+    *,
+    level: float = 0.05,
+    report: Callable[[str], None] = lambda text: None,
+    **options: Any,
+) -> Attribution:
+    """Diagnose recordings of several units in several sessions, and split what is named by what it belongs to.
+
+    A time course that all units of a session have in common is taken off its recordings, as the other units show it,
+    and they are diagnosed again; each keeps the diagnosis that explains it with fewer effects.
+
+    **Arguments:** `pattern`: of their files, see `places_of`; `level`: of all attributions together where nothing
+    belongs to anything; `report`: is given each step in words; `options`: as for [`jaximu.diagnose`][].
+
+    Recordings that cannot be diagnosed are skipped. Raises `InputError` and `NotPossibleError` as `places_of` does, and
+    `InputError` as `jaximu.diagnose` does.
+    """
+    recordings, gravity = recordings_of(list(recordings)), as_gravity(gravity)
+    files = [recording.sources[0].path if recording.sources else recording.name for recording in recordings]
+    places = places_of(files, pattern)
+    skipped: dict[str, str] = {}
+
+    def diagnosed(index: int, recording: Recording, what: str) -> BoardRecording | None:
+        unit, session = places[index]
+        report(f"unit {unit} in session {session}{what}, {index + 1} of {len(recordings)}")
+        try:
+            diagnosis = diagnose(recording, gravity, level=level, **options)
+        except NotPossibleError as error:
+            skipped[files[index] + what] = str(error)
+            return None
+        return BoardRecording.of(files[index], unit, session, diagnosis)
+
+    first = {index: diagnosed(index, recording, "") for index, recording in enumerate(recordings)}
+    parts = {index: part for index, part in first.items() if part is not None}
+    require_several([(part.unit, part.session) for part in parts.values()], next(iter(skipped.values()), ""))
+    members = [[p for p in parts.values() if p.session == s] for s in _in_order(p.session for p in parts.values())]
+    together = {of[0].session: of for of in members if len(of) > 1}
+    drifts = [CommonDrift.of(of) for of in together.values()]
+    common = [drift for drift in drifts if drift.p_value * len(drifts) < level]
+    warm = {drift.session for drift in common}
+    for index, part in parts.items():
+        if part.session in warm:
+            others = [other for other in together[part.session] if other is not part]
+            without = CommonDrift.of(others, 0).taken_off(recordings[index], part)
+            repeated = diagnosed(index, without, ", its common drift taken off")
+            if repeated is not None:
+                parts[index] = min(replace(repeated, alone=part.alone, without_drift=True), part, key=_rank)
+    split_up, single = attributed(list(parts.values()), common, level)
+    findings = (*map(_of_drift, common), *split_up)
+    return Attribution(tuple(parts.values()), findings, tuple(drifts), single, skipped, gravity.latitude)
+
+
+def _rank(part: BoardRecording) -> tuple[bool, int, float]:
+    """Return what of several diagnoses of a recording is kept by, the least: unexplained, effects, error left out."""
+    return part.diagnosis["verdict"] == "unexplained", len(part.diagnosis["effects"]), part.chi2_heldout
+
+
+def _of_drift(drift: CommonDrift) -> Attributed:
+    """Return a common time course as a finding of its session."""
+    return Attributed(COMMON_DRIFT, "session", tuple(drift.loadings), (drift.session,), drift.share, drift.p_value)
+
+
+def attributed(
+    parts: Sequence[BoardRecording], common: Sequence[CommonDrift], level: float
+) -> tuple[list[Attributed], dict[str, list[str]]]:
+    """Return what each effect that a recording names belongs to, and where those show that belong to nothing.
+
+    The most significant one comes first; others are estimated beside it, and all beside the common time courses.
+    """
+    named = sorted((effect for part in parts for effect in part.named), key=lambda effect: effect.p_value)
+    strongest = {effect.name: effect for effect in reversed(named)}
+    shared = {drift.session: np.stack([drift.times, drift.curve], axis=1) for drift in common}
+    findings, single, beside = [], {}, {}
+    for name, strong in sorted(strongest.items(), key=lambda entry: entry[1].p_value):
+        inner, kind = _inner(strong), CATALOGUE[name]
+        sizes = np.asarray(kind(np.zeros(kind.size), **inner).typical_sizes(1.0).coefficients)
+        estimates = [part.estimate(name, inner, beside, shared.get(part.session)) for part in parts]
+        owners = {
+            "board": [""] * len(parts),
+            "unit": [part.unit for part in parts],
+            "session": [part.session for part in parts],
+        }
+        shares = split(estimates, owners["unit"], owners["session"], level / len(strongest))
+        for share in shares:
+            mine = [part for part, owner in zip(parts, owners[share.belongs_to], strict=True) if owner in share.values]
+            findings.append(
+                Attributed(
+                    name,
+                    share.belongs_to,
+                    tuple(_in_order(part.unit for part in mine)),
+                    tuple(_in_order(part.session for part in mine)),
+                    share.share,
+                    share.p_value,
+                    {label: (values * sizes).tolist() for label, values in share.values.items()},
+                    kind.coefficient_unit(SENSOR_UNITS.get(strong.triad, "")),
+                )
+            )
+        if shares:
+            beside[name] = inner
+        else:
+            single[name] = [part.place for part in parts if name in [effect.name for effect in part.named]]
+    return findings, single

@@ -1,0 +1,186 @@
+"""The page of units and sessions: each recording's verdict, what belongs to what, and common time courses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaximu.diagnosis import COMMON_DRIFT, Attributed, Attribution, CommonDrift
+from jaximu.ground.page import Page, Part, Picture, Statement, Table
+from jaximu.ground.quantities import counted, listed, number, probability, readable, sentence, size, unit_text
+from jaximu.mistakes.titles import effect_title
+from jaximu.model.effects import CATALOGUE
+from jaximu.report import figures
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["page_of"]
+
+
+def page_of(attribution: Attribution) -> Page:
+    """Return the verdict, what belongs to units, sessions and the board, each recording's verdict, and time courses."""
+    parts = attribution.recordings
+    explained = sum(part.diagnosis["verdict"] != "unexplained" for part in parts)
+    return Page(
+        f"{counted(len(attribution.units), 'unit')} in {counted(len(attribution.sessions), 'session')}: "
+        f"{attribution.verdict}",
+        [*_verdict(attribution)],
+        f"{explained} of {len(parts)}",
+        "recordings whose model is adequate, or whose effects explain them",
+        [*_first(attribution)],
+        notes=[sentence(note) for note in attribution.notes],
+        next=attribution.suggestion,
+        caution=explained < len(parts),
+    )
+
+
+def _verdict(attribution: Attribution) -> Iterator[str]:
+    """Say what belongs to what, the most reaching first."""
+    texts = [_sentence(finding, attribution) for finding in attribution.findings if finding.name != COMMON_DRIFT]
+    if attribution.common:
+        sessions = _names("session", [drift.session for drift in attribution.common], attribution.sessions)
+        sizes = listed([size(drift.size, "rad/s", 2) for drift in attribution.common])
+        shares = [100 * drift.share for drift in attribution.common]
+        share = f"{min(shares):.0f} %" if max(shares) - min(shares) < 1 else f"{min(shares):.0f} to {max(shares):.0f} %"
+        texts.insert(
+            0,
+            f"All units drift together in {sessions}: one time course, by {sizes} in a usual axis, is {share} of the "
+            "drift of all gyroscope axes.",
+        )
+    yield from texts or ["Nothing repeats over the sessions of a unit or over the units of a session."]
+    open_units = [part.unit for part in attribution.recordings if part.diagnosis["verdict"] == "unexplained"]
+    if open_units:
+        where = listed([unit for unit in attribution.units if unit in open_units])
+        yield (
+            f"{sentence(counted(len(open_units), 'recording'))} of unit{'s' * (len(set(open_units)) > 1)} {where} "
+            f"{'stay' if len(open_units) > 1 else 'stays'} unexplained."
+        )
+
+
+def _names(noun: str, names: Sequence[str], every: Sequence[str]) -> str:
+    """Return units or sessions in words."""
+    if len(names) == len(every):
+        return f"all {noun}s"
+    return f"{noun}{'s' * (len(names) > 1)} {listed(list(names))}"
+
+
+def _sentence(finding: Attributed, attribution: Attribution) -> str:
+    """Say what a finding belongs to."""
+    title = sentence(effect_title(finding.name))
+    if finding.belongs_to == "unit":
+        return f"{title} belongs to {_names('unit', finding.units, attribution.units)}: it repeats over the sessions."
+    if finding.belongs_to == "session":
+        where = _names("session", finding.sessions, attribution.sessions)
+        return f"{title} belongs to {where}: the units have it in common there."
+    return f"{title} belongs to the board: all units have it in common in all sessions."
+
+
+def _first(attribution: Attribution) -> Iterator[Part]:
+    """Return the picture of common time courses, the tables, and what a common cause could be."""
+    if attribution.drifts:
+        yield Picture(
+            "attribution",
+            partial(_drift_figure, attribution),
+            "What the gyroscopes of a session have in common in time",
+            "Coloured: the common time course of each session, in a usual axis. Grey: each axis that has a part in it, "
+            "less what follows orientation, divided by its part; where grey follows the line, the course is common.",
+        )
+    if attribution.findings:
+        yield _findings_table(attribution)
+    yield _verdicts_table(attribution)
+    if attribution.common:
+        yield Statement(
+            "What the common drift could be",
+            "Temperature that was not logged (warm-up after power-on), the supply, or the board bending: what acts on "
+            "all units at once. It belongs to the session, so no unit's calibration contains it.",
+        )
+    yield from _look_alikes(attribution)
+
+
+def _look_alikes(attribution: Attribution) -> Iterator[Statement]:
+    """Say what a board's effect looks like that the place would settle."""
+    for finding in attribution.findings:
+        alike = [] if finding.name not in CATALOGUE else list(CATALOGUE[finding.name].look_alikes)
+        settled = [name for name in alike if CATALOGUE[name].scope == "session" and "attitude" in CATALOGUE[name].needs]
+        if finding.belongs_to == "board" and settled and attribution.latitude is None:
+            text = (
+                f"{sentence(effect_title(finding.name))} that all units have in common looks like "
+                f"{listed([effect_title(name) for name in settled], 'or')}. State --latitude: it is then taken off."
+            )
+            yield Statement("What the common part may be", text, caution=True)
+
+
+def _findings_table(attribution: Attribution) -> Table:
+    """Return what each finding belongs to."""
+    rows = [
+        (
+            _title(finding),
+            finding.belongs_to,
+            _names("unit", finding.units, attribution.units),
+            _names("session", finding.sessions, attribution.sessions),
+            f"{100 * finding.share:.0f} %",
+            probability(finding.p_value).removeprefix("= "),
+        )
+        for finding in attribution.findings
+    ]
+    caption = (
+        "Share: of the squares of all recordings' estimates, weighted with their information; of a common drift, of "
+        "the variance of all axes. p: that the part is not there, beside scatter from recording to recording."
+    )
+    return Table(("finding", "belongs to", "units", "sessions", "share", "p-value"), rows, caption)
+
+
+def _title(finding: Attributed) -> str:
+    return f"common drift ({COMMON_DRIFT})" if finding.name == COMMON_DRIFT else effect_title(finding.name)
+
+
+def _verdicts_table(attribution: Attribution) -> Table:
+    """Return the verdict of each recording, units down and sessions across."""
+    cells = {
+        (
+            part.unit,
+            part.session,
+        ): f"{_short(part.diagnosis)}\nχ² {number(part.chi2_heldout, 3)}{' *' * part.without_drift}"
+        for part in attribution.recordings
+    }
+    rows = [
+        (f"unit {unit}", *(cells.get((unit, session), "not recorded") for session in attribution.sessions))
+        for unit in attribution.units
+    ]
+    caption = "χ² per condition on parts left out: 1 is noise and drift alone." + (
+        " *: the common drift was taken off, as the other units show it." if attribution.common else ""
+    )
+    return Table(("", *(f"session {session}" for session in attribution.sessions)), rows, caption)
+
+
+def _short(diagnosis: dict) -> str:
+    """Return a verdict, or the effects in plain words."""
+    names = [effect["name"] for effect in diagnosis["effects"]]
+    words = ", ".join(CATALOGUE[name].english if name in CATALOGUE else name for name in names)
+    return ": ".join(filter(None, (diagnosis["verdict"] if diagnosis["verdict"] != "effects" else "", words)))
+
+
+def _drift_figure(attribution: Attribution) -> Figure:
+    """Draw the common time course of each session, and each axis scaled by its part in it."""
+    drifts: Sequence[CommonDrift] = attribution.drifts
+    factor, unit = readable("rad/s", max(drift.size for drift in drifts))
+    figure = figures.new_figure(1.0 + 2.0 * len(drifts))
+    grid = figure.subplots(len(drifts), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+    for axes, drift in zip(grid, drifts, strict=True):
+        for line in drift.axes:
+            axes.plot(drift.times, factor * line, color=figures.BEFORE, linewidth=0.6, alpha=0.5)
+        there = drift in attribution.common
+        axes.plot(drift.times, factor * drift.curve, color=figures.AFTER if there else figures.FLAGGED, linewidth=2)
+        figures.zero_line(axes)
+        figures.dressed(axes)
+        text = "more in common than independent drift" if there else "no more in common than independent drift"
+        axes.set_title(f"session {drift.session}: {text}, p {probability(drift.p_value)}", loc="left", fontsize=9)
+        axes.set_ylabel(f"rate ({unit_text(unit)})", fontsize=8)
+    spread = factor * max(float(np.max(np.abs(drift.curve))) for drift in drifts)
+    grid[0].set_ylim(-2 * spread, 2 * spread)
+    grid[-1].set_xlabel("time (s)")
+    return figure

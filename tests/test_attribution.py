@@ -1,0 +1,167 @@
+"""What belongs to a unit, a session or the board: simulated boards, drawn estimates, and patterns that do not fit."""
+
+import json
+
+import numpy as np
+import pytest
+from simulated_board import PATTERN, board
+
+from jaximu.cli.app import main
+from jaximu.diagnosis import COMMON_DRIFT, attribute, places_of
+from jaximu.diagnosis.attribution import split
+from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.report.html import write_report
+
+UNITS, SESSIONS = 4, 3
+
+
+@pytest.fixture(scope="module")
+def attribution():
+    """Two units in two sessions; the first feels specific force, and in the second session both warm up together."""
+    recordings = board(1, 2, 2, {0: 4e-4}, [1])
+    return attribute(recordings, PATTERN, candidates=("gyro.g_sensitivity", "gyro.warm_up"))
+
+
+def test_a_boards_faults_go_to_their_owners(attribution):
+    findings = {finding.name: finding for finding in attribution.findings}
+    assert set(findings) == {COMMON_DRIFT, "gyro.g_sensitivity"}
+    drift, sensitivity = findings[COMMON_DRIFT], findings["gyro.g_sensitivity"]
+    assert (drift.belongs_to, drift.sessions, drift.units) == ("session", ("2",), ("1", "2"))
+    assert (sensitivity.belongs_to, sensitivity.units, sensitivity.sessions) == ("unit", ("1",), ("1", "2"))
+    assert drift.share > 0.8 and sensitivity.share > 0.8
+    assert not attribution.single
+
+
+def test_a_common_course_is_the_one_that_was_put_in(attribution):
+    (drift,) = attribution.common
+    truth = np.exp(-drift.times / (0.3 * 68.5))
+    assert np.corrcoef(drift.curve, truth)[0, 1] > 0.98
+    assert all(np.linalg.norm(loadings) > 1 for loadings in drift.loadings.values())
+
+
+def test_a_common_course_is_taken_off_before_the_units_are_judged(attribution):
+    verdicts = {(part.unit, part.session): part.diagnosis["verdict"] for part in attribution.recordings}
+    alone = {(part.unit, part.session): part.alone for part in attribution.recordings}
+    assert alone["2", "1"] == verdicts["2", "1"] == "adequate"
+    assert alone["2", "2"] != "adequate" and verdicts["2", "2"] == "adequate"
+    assert [part.diagnosis["effects"][0]["name"] for part in attribution.recordings if part.unit == "1"] == [
+        "gyro.g_sensitivity"
+    ] * 2
+
+
+def test_document_and_page(attribution, tmp_path):
+    document = json.loads(attribution.text())
+    assert document["schema"] == "jaximu.diagnosis/1" and document["verdict"] == "effects"
+    assert [entry["file"] for entry in document["recordings"]] == [part.file for part in attribution.recordings]
+    for entry in document["recordings"]:
+        assert {"file", "unit", "session", "verdict", "effects", "chi2_heldout"} <= set(entry)
+        assert 0.2 < entry["chi2_heldout"] < 2
+    for entry in document["attribution"]:
+        assert {"name", "belongs_to", "units", "sessions", "share"} <= set(entry)
+    assert {effect["name"] for effect in document["effects"]} == {"gyro.g_sensitivity"}
+    text = write_report(attribution, tmp_path).read_text(encoding="utf-8")
+    assert "belongs to unit 1" in text and "drift together in session 2" in text
+    assert (tmp_path / "attribution.png").is_file()
+
+
+def test_recordings_that_cannot_be_diagnosed_are_skipped_with_their_reason(monkeypatch):
+    def refuse(recording, *arguments, **options):
+        raise NotPossibleError("record twenty poses or more.")
+
+    monkeypatch.setattr("jaximu.diagnosis.attribution.diagnose", refuse)
+    with pytest.raises(NotPossibleError, match=r"0 units in 0 sessions.*record twenty poses or more"):
+        attribute(board(1, 2, 2, {}, []), PATTERN)
+
+
+def drawn(random, values, information=400.0):
+    """Estimates of three numbers (units, sessions, 3), whitened, with noise."""
+    estimates = []
+    for value in np.broadcast_to(values, (UNITS, SESSIONS, 3)).reshape(-1, 3):
+        root = np.sqrt(information) * np.tril(random.uniform(0.5, 1.5, (3, 3)))
+        estimates.append((root @ value + random.standard_normal(3), root))
+    return estimates
+
+
+LABELS = (
+    [str(unit) for unit in range(UNITS) for _ in range(SESSIONS)],
+    [str(session) for _ in range(UNITS) for session in range(SESSIONS)],
+)
+
+
+@pytest.mark.parametrize("kind", ["unit", "session", "board"])
+def test_estimates_are_split_by_what_they_repeat_over(kind):
+    """A vector of a usual size on one unit, on one session, or on all, beside a tenth of it that repeats nowhere."""
+    right, there = 0, 0
+    for seed in range(40):
+        random = np.random.default_rng([seed, 7])
+        values = 0.1 * random.standard_normal((UNITS, SESSIONS, 3))
+        values[{"unit": np.s_[1], "session": np.s_[:, 1], "board": np.s_[:]}[kind]] += random.standard_normal(3)
+        parts = split(drawn(random, values), *LABELS, 0.05)
+        right += [part.belongs_to for part in parts] == [kind]
+        there += bool(parts) and [*parts[0].values] == (["1"] if kind != "board" else [""])
+    assert right >= 36 and there >= 36  # of 40: 95 % right passes with 95 % probability
+
+
+def test_what_repeats_nowhere_belongs_to_nothing():
+    false = 0
+    for seed in range(100):
+        random = np.random.default_rng([seed, 8])
+        values = random.standard_normal((UNITS, SESSIONS, 3))
+        false += bool(split(drawn(random, values), *LABELS, 0.05))
+    assert false <= 10  # at 5 % more than ten have the probability 1 %
+
+
+def test_the_board_s_part_and_the_units_own_are_told_apart():
+    random = np.random.default_rng(9)
+    common, apart = random.standard_normal(3), random.standard_normal((UNITS, 1, 3))
+    parts = split(drawn(random, 3 * common + apart), *LABELS, 0.05)
+    assert {part.belongs_to for part in parts} == {"board", "unit"}
+    value = next(part for part in parts if part.belongs_to == "board").values[""]
+    assert np.linalg.norm(value - 3 * common - apart.mean(axis=(0, 1))) < np.linalg.norm(common)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "files", "places"),
+    [
+        (PATTERN, ["a/unit1_session1.csv", "a/unit1_session2.csv", "b/unit2_session1.csv"], "11 12 21"),
+        ("{unit}/{session}", ["x/A/1.csv", "x/B/1.csv", "x/A/2.csv"], "A1 B1 A2"),
+        ("{session}/unit{unit}.parquet", ["1/unit1.parquet", "2/unit2.parquet"], "11 22"),
+        ("unit{unit}_day{session}", ["unit1_day1/imu.csv", "unit2_day2/imu.csv"], "11 22"),
+    ],
+)
+def test_patterns_of_names_and_folders(pattern, files, places):
+    assert ["".join(place) for place in places_of(files, pattern)] == places.split()
+
+
+@pytest.mark.parametrize(
+    ("pattern", "files", "error", "words"),
+    [
+        ("unit{unit}", ["unit1.csv"], InputError, "session"),
+        ("{unit}{unit}_{session}", ["11_1.csv"], InputError, "once each"),
+        ("{unit}_{session}_{day}", ["1_1_1.csv"], InputError, "once each"),
+        (PATTERN, ["log1.csv", "log2.csv"], InputError, "log1.csv and 1 more"),
+        (PATTERN, ["unit1_session1.csv", "other.csv"], InputError, "other.csv"),
+        (PATTERN, ["a/unit1_session1.csv", "b/unit1_session1.csv"], InputError, "both unit 1 in session 1"),
+        (PATTERN, ["unit1_session1.csv", "unit1_session2.csv"], NotPossibleError, "1 unit in 2 sessions"),
+        (PATTERN, ["unit1_session1.csv", "unit2_session1.csv"], NotPossibleError, "2 units in 1 session"),
+    ],
+)
+def test_patterns_that_do_not_fit_name_the_file(pattern, files, error, words):
+    with pytest.raises(error, match=words):
+        places_of(files, pattern)
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "words"),
+    [
+        (["--heldout", "x.csv"], 2, "--heldout"),
+        (["--thermal"], 2, "--thermal"),
+        (["--reference", "x.csv"], 2, "--reference"),
+        ([], 2, "does not fit"),
+    ],
+)
+def test_the_command_refuses_in_a_sentence(options, status, words, tmp_path, capsys):
+    log = tmp_path / "log.csv"
+    log.write_text("time [s]\n0\n", encoding="utf-8")
+    assert main(["diagnose", str(log), "--by", PATTERN, *options]) == status
+    assert words in capsys.readouterr().err
