@@ -62,15 +62,14 @@ def alike(one: str, other: str) -> bool:
 
 def close(one: str, other: str) -> bool:
     """Tell whether two numbers as printed are equal: counts exactly, others within the tolerances."""
-    if one.lstrip("+-").isdigit() and other.lstrip("+-").isdigit():
-        return int(one) == int(other)
     first, second = float(one), float(other)
-    last = max(last_place(one), last_place(other))
-    return abs(first - second) <= max(RELATIVE * max(abs(first), abs(second)), 1.01 * last, SMALLEST)
+    last = min(last_place(one), last_place(other))
+    allowed = max(RELATIVE * max(abs(first), abs(second)), 1.01 * last, SMALLEST) if last != 1.0 else 0.0
+    return abs(first - second) <= allowed
 
 
 def last_place(text: str) -> float:
-    """Return what one in the last decimal place of a number as printed is worth."""
+    """Return what one in the last decimal place of a number as printed is worth, 1 for a count."""
     mantissa, _, power = text.partition("e")
     return 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
 
