@@ -46,9 +46,9 @@ def lines(cell: Notebook) -> list[str]:
 
 
 def words(text: list[str]) -> Iterator[tuple[str, str]]:
-    """Yield each word with its line. Where lines are broken and how long rules are depends on the numbers in them."""
+    """Yield each word with its line. Line breaks, the length of rules and NumPy's padding depend on the numbers."""
     for line in text:
-        for word in line.split():
+        for word in re.sub(r"\[ +", "[", line).split():
             if not _RULE.fullmatch(word):
                 yield _POWER.sub(lambda power: f"e{power[1]}", word.replace("−", "-")).translate(_PLAIN), line
 
