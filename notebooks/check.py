@@ -33,16 +33,16 @@ Notebook = Mapping[str, Any]
 
 def lines(cell: Notebook) -> list[str]:
     """Return what a cell shows, a line each: standard output in one piece, results, and a mark for each picture."""
-    text = ""
+    parts: list[str] = []
     for output in cell.get("outputs", []):
         data = output.get("data", {})
         if any(kind.startswith("image/") for kind in data):
-            text += f"\n{PICTURE}\n"
+            parts.append(f"\n{PICTURE}\n")
         elif "text/html" in data:
-            text += f"\n{html.unescape(_MARKUP.sub(' ', ''.join(data['text/html'])))}\n"
+            parts.append(f"\n{html.unescape(_MARKUP.sub(' ', ''.join(data['text/html'])))}\n")
         elif output.get("name") != "stderr":
-            text += "".join(output.get("text", data.get("text/plain", "")))
-    return text.splitlines()
+            parts += output.get("text", data.get("text/plain", ""))
+    return "".join(parts).splitlines()
 
 
 def words(text: list[str]) -> Iterator[tuple[str, str]]:
@@ -107,7 +107,7 @@ def main() -> None:
     import nbformat
     from nbclient.exceptions import CellExecutionError
 
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("notebooks", nargs="*", type=Path, metavar="NOTEBOOK", help="Default: all, beside this script.")
     parser.add_argument("--write", action="store_true", help="Store the outputs of the run.")
     options = parser.parse_args()

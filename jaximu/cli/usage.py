@@ -190,14 +190,15 @@ def _require_all(name: str, options: Sequence[OptionHelp], line: Sequence[str]) 
         return
     valued = {text for option in options if option.metavar for text in option.names}
     words = sum(before not in valued and text[:1] != "-" for before, text in itertools.pairwise(["", *line]))
-    for option in options:
-        if option.default is inspect.Parameter.empty:
-            words -= option.positional
-            if words < 0 if option.positional else not any(text.startswith(option.names) for text in line):
-                stated = (
-                    f"{option.names[-1]} {option.metavar}" if option.names else option.metavar.split()[0].strip(".")
-                )
-                raise InputError(f"{stated} is missing. See `jaximu {name} --help`.")
+    needed = [option for option in options if option.default is inspect.Parameter.empty]
+    missing = [option.metavar.split()[0].strip(".") for option in needed if option.positional][words:]
+    missing += [
+        f"{option.names[-1]} {option.metavar}"
+        for option in needed
+        if option.names and not any(text.startswith(option.names) for text in line)
+    ]
+    if missing:
+        raise InputError(f"{missing[0]} is missing. See `jaximu {name} --help`.")
 
 
 _VALUE = re.compile(r"Error parsing (?P<option>\S+): .*? from \[(?P<value>.*?)\]\.")
