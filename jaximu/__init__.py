@@ -107,7 +107,41 @@ __all__ = [
     "write_recording",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.acceptance": "accept",
+        "jaximu.acceptance.history": "compare",
+        "jaximu.acceptance.verify": "verify",
+        "jaximu.calibration": (
+            "Calibration, calibrate, compensate, load_calibration, calibrate_against_attitude as reference, "
+            "calibrate_array as array, calibrate_by_filter as filter, calibrate_magnetometer as magnetometer, "
+            "calibrate_thermal as thermal, calibrate_turntable as turntable"
+        ),
+        "jaximu.data.poses": "observe, stack",
+        "jaximu.diagnosis": "check, diagnose",
+        "jaximu.estimation.fitting": "Fit, Prior, fit",
+        "jaximu.estimation.problem": "Parameters, Problem",
+        "jaximu.estimation.solver": "solve",
+        "jaximu.fleets": "run_fleet as fleet",
+        "jaximu.ground.errors": "InputError, JaximuError, NotPossibleError",
+        "jaximu.ground.gravity": "LocalGravity, parse_gravity, wgs84_gravity",
+        "jaximu.ground.stored": "cache",
+        "jaximu.model.effects": "CATALOGUE, Effect, register",
+        "jaximu.model.sensor": "Imu, Triad",
+        "jaximu.model.stimulus": "Stimulus",
+        "jaximu.navigation.consequences": "consequences",
+        "jaximu.noise.analysis": "analyse_noise as allan",
+        "jaximu.planning": "propose as plan",
+        "jaximu.planning.budget": "budget",
+        "jaximu.recordings": "write_recording",
+        "jaximu.recordings.readers": "ReadOptions, read_recording",
+        "jaximu.recordings.recording": "Recording, Signal",
+        "jaximu.recordings.segmentation": "Segmentation, SegmentationOptions, segment",
+        "jaximu.report.export": "export",
+        "jaximu.simulation": "simulate",
+    },
+)
 
 
 def __dir__() -> list[str]:

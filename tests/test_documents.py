@@ -2,11 +2,13 @@
 
 import importlib.util
 import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from jaximu._version import __version__
 from jaximu.cli.app import main
 from jaximu.model.effects import CATALOGUE
 
@@ -72,3 +74,17 @@ def test_the_catalogue_is_counted_right():
     guide = (ROOT / "notebooks" / "commands.md").read_text(encoding="utf-8")
     assert f"the catalogue: {causes} causes" in guide
     assert f"and {causes - 1} other causes" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_citation_names_this_version():
+    """And the title, licence and authors that the package states."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    stated = dict(re.findall(r"(?m)^(?:  - )?(\w[\w-]*): (\S.*)$", text))
+    assert {key: stated[key] for key in ("title", "version", "license", "name")} == {
+        "title": project["name"],
+        "version": __version__,
+        "license": project["license"],
+        "name": project["authors"][0]["name"],
+    }
+    assert re.findall(r"(?m)^  - (\w[\w ]*)$", text) == project["keywords"]

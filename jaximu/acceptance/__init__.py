@@ -22,4 +22,13 @@ __all__ = [
     "read_limits",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.acceptance.acceptance": "Acceptance, accept",
+        "jaximu.acceptance.decision": "Rule",
+        "jaximu.acceptance.item": "Item",
+        "jaximu.acceptance.limits": "Limits, read_limits",
+        "jaximu.acceptance.line": "Line, follow",
+    },
+)

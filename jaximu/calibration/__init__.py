@@ -67,4 +67,28 @@ __all__ = [
     "turn_pairs",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.calibration.array": "calibrate_array",
+        "jaximu.calibration.array_together": "LeftOutTurns, Together, fit_together, leave_out_turns",
+        "jaximu.calibration.array_units": "Array, ArrayUnit",
+        "jaximu.calibration.attitude": "calibrate_against_attitude",
+        "jaximu.calibration.calibration": "Calibration, load_calibration",
+        "jaximu.calibration.closed_form": "ferraris, linear_least_squares, six_position, turn_pairs",
+        "jaximu.calibration.compensation": "compensate",
+        "jaximu.calibration.hand_held": "Method, fit_hand_held",
+        "jaximu.calibration.identifiability": "Identifiability",
+        "jaximu.calibration.in_use": "FilterInUse, FilterState, followed_in_use",
+        "jaximu.calibration.magnetometer": "FieldStrength, Heading, MagneticLog, calibrate_magnetometer",
+        "jaximu.calibration.means": "calibrate_means",
+        "jaximu.calibration.nominal": "nominal_imu",
+        "jaximu.calibration.recipe": "calibrate",
+        "jaximu.calibration.refusals": "require_spanning",
+        "jaximu.calibration.scheme": "Scheme, describe_scheme",
+        "jaximu.calibration.systematic": "History, calibrate_by_filter",
+        "jaximu.calibration.thermal": "ThermalCalibration, calibrate_thermal",
+        "jaximu.calibration.thermal_triad": "TriadFit",
+        "jaximu.calibration.turntable": "calibrate_turntable, fit_turntable",
+    },
+)

@@ -5,11 +5,10 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import NoReturn
 
 from jaximu._version import __version__
@@ -120,10 +119,9 @@ def _groups() -> dict[str, list[str]]:
 
 def _parse(name: str, arguments: Sequence[str]) -> Callable[[], None]:
     """Return a verb with its arguments. Raises `InputError` for a mistake in them."""
-    import tyro
-
     run = _verb(name)
     line = check_options(name, run, arguments)
+    import tyro  # with what it loads for its checks, it takes as long as all that a mistake above needs
 
     @functools.wraps(run)
     def bind(*values, **options) -> Callable[[], None]:
@@ -132,7 +130,7 @@ def _parse(name: str, arguments: Sequence[str]) -> Callable[[], None]:
     config = tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes
     printed = io.StringIO()
     try:
-        with _defaults_unchecked(), redirect_stderr(printed):
+        with redirect_stderr(printed):
             return tyro.cli(bind, prog=f"jaximu {name}", args=line, config=config)
     except SystemExit:
         raise usage_mistake(name, run, printed.getvalue()) from None
@@ -154,21 +152,6 @@ def _common(arguments: Sequence[str]) -> list[str]:
         else:
             rest.append(text)
     return rest
-
-
-@contextmanager
-def _defaults_unchecked() -> Iterator[None]:
-    """Keep tyro from checking our options' defaults (pyright does): typeguard takes a third of the time to start."""
-    if "typeguard" in sys.modules:
-        yield
-        return
-    unchecked = ModuleType("typeguard")
-    unchecked.__dict__.update(check_type=lambda value, _: value, TypeCheckError=TypeError)
-    sys.modules["typeguard"] = unchecked
-    try:
-        yield
-    finally:
-        del sys.modules["typeguard"]
 
 
 def _run(arguments: Sequence[str]) -> int:

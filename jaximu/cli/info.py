@@ -45,8 +45,6 @@ def run(
       jaximu info raw.txt --columns "time [ms],accel [mg],gyro [mdps]"
 
     """
-    if not logs:
-        raise InputError("no log was given: name one or more files.")
     stated = [log.with_gyroscope(path) for path in logs]
     documents = [_describe(*_read(*pair)) for pair in zip(stated, logs, strict=True)]
     if as_json:

@@ -66,8 +66,6 @@ def run(
 
     """
     options.require_files(*logs, *mag_log, calibration, check)
-    if not logs:
-        raise InputError("no log was given: name one or more files.")
     if mag_log and len(mag_log) != len(logs):
         raise InputError(f"{len(logs)} logs need as many --mag-log, found {len(mag_log)}.")
     effects = [_effect(text) for text in effect]

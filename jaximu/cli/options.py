@@ -217,8 +217,6 @@ class LogOptions:
         self, paths: tuple[Path, ...], gravity: LocalGravity, noise: NoiseOptions | None = None, alone: bool = False
     ) -> tuple[list[Recording], Recording | NoiseModel | None]:
         """Read the logs of one unit, and its recording at rest, or the noise that is stated, if there is one."""
-        if not paths:
-            raise InputError("no log was given: name one or more files.")
         if self.gyro_log is not None and len(paths) > 1:
             raise InputError("--gyro-log goes with one LOG; with several, each must hold its own gyroscope.")
         with progress("reading"):

@@ -160,7 +160,7 @@ def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], Callable[.
 def check_options(name: str, run: Callable[..., None], arguments: Sequence[str]) -> list[str]:
     """Return the command line, with `--option=value` where a value begins with a minus, as the axes -x,-y,z do.
 
-    Raises `InputError` for an option that the verb has not, naming the nearest that it has.
+    Raises `InputError` for an option that the verb has not, naming the nearest that it has, and for one that it needs.
     """
     options = (*options_of(run), *COMMON)
     known = [text for option in options for text in option.names]
@@ -180,7 +180,25 @@ def check_options(name: str, run: Callable[..., None], arguments: Sequence[str])
             line[-1] += f"={text}"
         else:
             line.append(text)
+    _require_all(name, options, line)
     return line
+
+
+def _require_all(name: str, options: Sequence[OptionHelp], line: Sequence[str]) -> None:
+    """Refuse a line without an argument or an option that has no default."""
+    if "--" in line:  # what follows it may look like options
+        return
+    valued = {text for option in options if option.metavar for text in option.names}
+    words = sum(before not in valued and text[:1] != "-" for before, text in itertools.pairwise(["", *line]))
+    needed = [option for option in options if option.default is inspect.Parameter.empty]
+    missing = [option.metavar.split()[0].strip(".") for option in needed if option.positional][words:]
+    missing += [
+        f"{option.names[-1]} {option.metavar}"
+        for option in needed
+        if option.names and not any(text.startswith(option.names) for text in line)
+    ]
+    if missing:
+        raise InputError(f"{missing[0]} is missing. See `jaximu {name} --help`.")
 
 
 _VALUE = re.compile(r"Error parsing (?P<option>\S+): .*? from \[(?P<value>.*?)\]\.")
@@ -198,8 +216,6 @@ def usage_mistake(name: str, run: Callable[..., None], printed: str) -> InputErr
         kinds = {spelling: option.metavar for option in options_of(run) for spelling in option.names}
         kind = "a number" if "FLOAT" in text or "INT" in text else kinds.get(match["option"], "what it takes")
         text = f"{match['option']}: {match['value']} is not {kind}."
-    if text.startswith("Missing from"):
-        text = f"{message[1]} is missing."
     text = re.sub(r"Unrecognized options: (.*)", r"unexpected: \1.", text)
     return InputError(f"{text} See `jaximu {name} --help`.")
 

@@ -9,7 +9,6 @@ from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.options import option
-from jaximu.ground.errors import InputError
 from jaximu.ground.page import Page, Table
 from jaximu.ground.reexport import later
 
@@ -36,8 +35,6 @@ def run(
       jaximu verify accepted/acceptance.json --folder archive/
 
     """
-    if not documents:
-        raise InputError("name a calibration.json or an acceptance.json.")
     options.require_files(*documents)
     from jaximu.acceptance.verify import CHANGED, INTACT, verify
 

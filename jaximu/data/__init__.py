@@ -22,4 +22,13 @@ __all__ = [
     "without_startup",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.data.attitude": "AgainstAttitude",
+        "jaximu.data.poses": "forces_and_angles, residual_rms",
+        "jaximu.data.recorded_stations": "RecordedStations",
+        "jaximu.data.rest_blocks": "Leg, RestBlocks, without_startup",
+        "jaximu.data.station_error": "turntable_error",
+    },
+)

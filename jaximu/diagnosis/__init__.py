@@ -43,4 +43,17 @@ __all__ = [
     "twin_of",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.diagnosis.attitude": "diagnose_against_attitude",
+        "jaximu.diagnosis.attribution": "COMMON_DRIFT, Attributed, Attribution, CommonDrift, attribute, places_of",
+        "jaximu.diagnosis.checking": "check",
+        "jaximu.diagnosis.checks": "Check",
+        "jaximu.diagnosis.diagnosis": "Diagnosis, Named, diagnose, twin_of",
+        "jaximu.diagnosis.magnetometer": "MagneticDiagnosis, MagneticShift, check_magnetometer, diagnose_magnetometer",
+        "jaximu.diagnosis.thermal": "diagnose_thermal",
+        "jaximu.diagnosis.turntable": "diagnose_turntable",
+        "jaximu.diagnosis.validity": "Validity",
+    },
+)

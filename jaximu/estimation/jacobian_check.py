@@ -51,9 +51,10 @@ class JacobianCheck:
 
     def __str__(self) -> str:
         verdict = "agree" if self.ok else "DISAGREE"
+        where = "" if self.ok else f"in row {self.row}, parameter {self.name} "  # of rounding errors it means nothing
         head = (
             f"Hand-derived and automatic Jacobian {verdict}: largest relative difference {self.worst_relative:.1e} "
-            f"in row {self.row}, parameter {self.name} (allowed {self.rtol:.0e}); "
+            f"{where}(allowed {self.rtol:.0e}); "
             f"largest absolute difference {self.worst_absolute:.1e}."
         )
         width = max(9, *(len(name) for name, _, _ in self.table))

@@ -22,4 +22,12 @@ __all__ = [
     "run_fleet",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.fleets.fit": "FleetUnit, fit_units",
+        "jaximu.fleets.jobs": "Job, Settings, find_jobs",
+        "jaximu.fleets.rows": "PARAMETERS, SCHEMA, rows_of",
+        "jaximu.fleets.run": "run_fleet",
+    },
+)

@@ -1,11 +1,7 @@
 """Packages whose names load their modules when they are first used: a command that only parses stays quick."""
 
-import ast
-import sys
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Mapping
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 __all__ = ["later", "lazily"]
@@ -19,20 +15,17 @@ def later(module: str, name: str) -> Any:
     return getattr(import_module(f"jaximu.{module}"), name)
 
 
-def lazily(package: str) -> Callable[[str], Any]:
-    """Return a package's `__getattr__` (PEP 562): its names are those that it imports `if TYPE_CHECKING`."""
-
-    @cache
-    def homes() -> dict[str, tuple[str, str]]:
-        tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8"))
-        (guarded,) = (node for node in tree.body if isinstance(node, ast.If))
-        imports = [node for node in guarded.body if isinstance(node, ast.ImportFrom)]
-        return {alias.asname or alias.name: (str(node.module), alias.name) for node in imports for alias in node.names}
+def lazily(package: str, table: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return a package's `__getattr__` (PEP 562): `table` lists the names of each module, as its import would."""
+    homes: dict[str, tuple[str, str]] = {}
+    for module, names in table.items():
+        for called, _, name in (text.partition(" as ") for text in names.split(", ")):
+            homes[name or called] = module, called
 
     def get(name: str) -> Any:
-        if name not in homes():
+        if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        module, called = homes()[name]
+        module, called = homes[name]
         return getattr(import_module(module), called)
 
     return get

@@ -21,4 +21,9 @@ __all__ = [
     "without_rows",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.mistakes.preparation": "MISTAKES, Prepared, inspect, one_or_several, prepare, prepared, without_rows",
+    },
+)

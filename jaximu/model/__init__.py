@@ -43,4 +43,16 @@ __all__ = [
     "to_discrete",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.model.data_sheet": "convert, from_discrete, parse_quantity, to_discrete",
+        "jaximu.model.noise": "Noise",
+        "jaximu.model.noise_model": "AxisNoise, NoiseModel",
+        "jaximu.model.processes": (
+            "BiasInstability, BiasRepeatability, FirstOrderGaussMarkov, Process, Quantisation, RandomConstant, "
+            "RandomWalk, RateRamp, SecondOrderGaussMarkov, White"
+        ),
+        "jaximu.model.state_space": "LinearSystem",
+    },
+)

@@ -21,4 +21,11 @@ __all__ = [
     "preintegrate",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.data.preintegration": "Preintegrated, increments, preintegrate",
+        "jaximu.navigation.mechanisation": "Navigation, deviation, linearised, mechanise, mechanise_increments",
+        "jaximu.navigation.propagation": "noise_covariance",
+    },
+)

@@ -21,4 +21,11 @@ __all__ = [
     "identify",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.noise.cleaning": "PeriodicLine",
+        "jaximu.noise.deviations": "Deviation, averaging_factors, deviation",
+        "jaximu.noise.identification": "GaussMarkov, Identified, Term, WarmUp, identify",
+    },
+)

@@ -26,4 +26,11 @@ __all__ = [
     "table_information",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.planning.information": "Accuracy, Design, hand_held_information, table_information",
+        "jaximu.planning.plan": "EQUIPMENT, Equipment, Known, Pose, Proposal, Turn, propose",
+        "jaximu.planning.sequences": "FILTERED, Filter, propose_sequence",
+    },
+)

@@ -14,4 +14,10 @@ __all__ = [
     "write_recording",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.recordings.finding": "Finding",
+        "jaximu.recordings.write": "arrow_table, write_recording",
+    },
+)

@@ -11,4 +11,9 @@ __all__ = [
     "write_report",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.report.html": "write_report",
+    },
+)

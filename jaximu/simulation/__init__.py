@@ -27,4 +27,12 @@ __all__ = [
     "write_case",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.simulation.artefacts": "ARTEFACTS, Artefact",
+        "jaximu.simulation.draw": "ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, consumer_noise, draw_imu",
+        "jaximu.simulation.engine": "Case, Stream, Truth, simulate, simulate_cases, write_case",
+        "jaximu.simulation.specification": "Specification, read_specification",
+    },
+)

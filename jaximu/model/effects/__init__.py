@@ -17,4 +17,10 @@ __all__ = [
     "registered",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.model.effects.base": "Effect, Inner, SetupEffect",
+        "jaximu.model.effects.catalogue": "CATALOGUE, register, registered",
+    },
+)

@@ -30,4 +30,12 @@ __all__ = [
     "read_schedule",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.recordings.readers.attitude": "holds_attitude, read_attitude",
+        "jaximu.recordings.readers.reader": "advise_reading, read_frame, read_magnetometer, read_means, read_recording",
+        "jaximu.recordings.readers.schedule": "ScheduleEntry, read_reference, read_schedule",
+        "jaximu.recordings.recording": "ReadOptions",
+    },
+)

@@ -23,4 +23,12 @@ __all__ = [
     "write_messages",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.report.export.base": "Correction, ExportedUnit, Written",
+        "jaximu.report.export.catalogue": "WRITERS, export",
+        "jaximu.report.export.cost": "Loss, Range, losses",
+        "jaximu.report.export.messages": "is_messages, write_messages",
+    },
+)

@@ -44,4 +44,22 @@ __all__ = [
     "earth_rate",
 ]
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazily(
+    __name__,
+    {
+        "jaximu.simulation.protocols.base": "Plan, Protocol",
+        "jaximu.simulation.protocols.catalogue": "PROTOCOLS",
+        "jaximu.simulation.protocols.course": "Course, Environment, Interval, Tone, attitude_of",
+        "jaximu.simulation.protocols.dividing_head": "DividingHead",
+        "jaximu.simulation.protocols.ferraris": "Ferraris",
+        "jaximu.simulation.protocols.hand_held": "HandHeld",
+        "jaximu.simulation.protocols.motion": "Motion, block_length, earth_rate",
+        "jaximu.simulation.protocols.positions": "Positions",
+        "jaximu.simulation.protocols.rate_table": "RateTable",
+        "jaximu.simulation.protocols.rotations": "Rotations",
+        "jaximu.simulation.protocols.single_axis_table": "SingleAxisTable",
+        "jaximu.simulation.protocols.soak_and_ramp": "SoakAndRamp",
+        "jaximu.simulation.protocols.static": "Static",
+        "jaximu.simulation.protocols.vibration": "Vibration",
+    },
+)
