@@ -148,7 +148,7 @@ def bounds(rows, rng):
 
 def main() -> None:
     options = arguments(__doc__)
-    units = 6 if options.small else 60
+    units = 6 if options.small else 40
     table = Table(
         f"Stated intervals of {units} units a setting (goal: 93 to 97 % within the 99 % bounds)",
         [
