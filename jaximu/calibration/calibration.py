@@ -53,8 +53,11 @@ class Calibration(Result, Document, page="calibration"):
     """A calibrated unit: y = gain·u + bias + Σ effects, u in SI, with uncertainty and provenance.
 
     imu: the model. names, covariance: the free parameters and their covariance (p, p), gravity's uncertainty included,
-    in output units per SI unit (gains) and output units (biases). magnetic: what is known of a magnetometer's field and
-    heading, by the keys `MAGNETIC`. rms: per residual (before, after, unit). rank, weak:
+    in output units per SI unit (gains) and output units (biases). Biases are those for use after the recording: means
+    over as long again as the (first) recording took, without another power-on. bias_sigma_recording: standard
+    deviations (3,), by triad, of their means over it; where a triad is missing there, the two are the same.
+    magnetic: what is known of a magnetometer's field and heading, by the keys `MAGNETIC`. rms: per residual
+    (before, after, unit). rank, weak:
     what the data determine. excess: variance beyond the measured noise, in multiples of it. data, notes: where it comes
     from. reading: how its log, or the first of several, was read; None where that is not known.
     trace: which unit it is, who calibrated it with what, see `jaximu.recordings.trace`. digest: the hash of the file
@@ -90,6 +93,7 @@ class Calibration(Result, Document, page="calibration"):
     filter: dict[str, Any] | None = None
     absent: tuple[str, ...] = ()
     reading: Reading | None = None
+    bias_sigma_recording: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def plot_residuals(self) -> Figure:
         """Return a figure of the errors by pose and turn, before and after, with what the noise explains.
@@ -201,6 +205,7 @@ class Calibration(Result, Document, page="calibration"):
                 "bias": np.asarray(model.bias).tolist(),
                 "gain_sigma": gain_sigma.tolist(),
                 "bias_sigma": bias_sigma.tolist(),
+                "bias_sigma_recording": np.asarray(self.bias_sigma_recording.get(name, bias_sigma)).tolist(),
                 "temperature_reference": model.temperature_reference,
                 "time_reference": model.time_reference,
                 "effects": self._effects(name, model),
@@ -453,6 +458,11 @@ def _from_document(document: dict[str, Any]) -> Calibration:
         filter=document.get("filter"),
         absent=("accelerometer",) if accelerometer is None else (),
         reading=None if document.get("reading") is None else Reading.from_document(document["reading"]),
+        bias_sigma_recording={
+            name: _numbers(document[name]["bias_sigma_recording"], (3,))
+            for name in sensors
+            if "bias_sigma_recording" in (document.get(name) or {})
+        },
         magnetic=None
         if magnetometer is None
         else {key: document.get(key) if key == "next" else document[key] for key in MAGNETIC},

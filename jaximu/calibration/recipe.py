@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jaximu.calibration.arrangement import arrangement
+from jaximu.calibration.bias_drift import knowing_drift
 from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, effect_named, provenance
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
@@ -16,14 +17,15 @@ from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.refusals import require_determined
 from jaximu.calibration.saturation import saturation
 from jaximu.data.by_hand import RecordedByHand
-from jaximu.data.drift import with_drift
-from jaximu.data.poses import EXCESS_NAMES, residual_rms
+from jaximu.data.drift import means_by_hand
+from jaximu.data.poses import EXCESS_NAMES, condensed, residual_rms, with_gyroscope
 from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import Prior, fit, linearise
 from jaximu.estimation.problem import Loss
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
+from jaximu.ground.tracing import first, lifted
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
@@ -119,7 +121,7 @@ def calibrate(
         calibration, unusual = calibrate_ready([one.recording for one in ready], choices, repair)
     notes = [*(note for item in ready for note in item.notes), *(item.text for item in unusual)]
     calibration = replace(calibration, notes=tuple(dict.fromkeys((*notes, *calibration.notes))))
-    return calibration if static is not None else _with_drift(calibration)
+    return _with_drift(calibration, noise_of(static))
 
 
 def _calibrated_jointly(
@@ -203,15 +205,18 @@ def _distinct(names: Sequence[str]) -> list[str]:
     return [f"{name} {count + 1}" if count else name for name, count in zip(names, before, strict=True)]
 
 
-def _with_drift(calibration: Calibration) -> Calibration:
-    """Return a calibration by hand whose uncertainty knows the drift of the biases that its recordings show."""
+def _with_drift(calibration: Calibration, noise: NoiseModel | None) -> Calibration:
+    """Return a calibration by hand whose uncertainty knows how biases drift: as `noise` says, or as its poses show."""
     if calibration.loss != "linear" or calibration.method.startswith("two-step"):
         advice = f"{_NO_DRIFT}: use the joint method with the linear loss, or add --static LOG."
-        return replace(calibration, notes=(*calibration.notes, advice))
-    assert calibration.fit is not None and calibration.observations is not None
-    fit, sentences = with_drift(calibration.fit, calibration.observations, calibration.segmentations)
-    covariance = fit.total_covariance(calibration.gravity.sigma, clock_sigma(calibration.segmentations))
-    return replace(calibration, fit=fit, covariance=covariance, notes=(*calibration.notes, *sentences))
+        return calibration if noise else replace(calibration, notes=(*calibration.notes, advice))
+    fitted, observations, parts = calibration.fit, calibration.observations, calibration.segmentations
+    assert fitted is not None and observations is not None
+    rows = "all" if "gyroscope" in fitted.imu.triads() else "norm"
+    about = condensed(*lifted((with_gyroscope(fitted.imu).with_effects(), observations)), rows)
+    assert about.reaction is not None
+    means = means_by_hand(observations, parts, about.reaction)
+    return knowing_drift(calibration, first(about.covariance), means, noise, clock_sigma(parts))
 
 
 def calibrate_ready(

@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
+from jaximu.calibration.bias_drift import knowing_drift
 from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.refusals import require_determined
 from jaximu.data.observe_stations import observe_stations
 from jaximu.data.poses import EXCESS_NAMES
-from jaximu.data.stations import KnownStations, station_rms
+from jaximu.data.recorded_stations import station_means
+from jaximu.data.stations import KnownStations, station_covariance, station_rms
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import TOLERANCE, Loss, Name, Parameters
 from jaximu.estimation.uncertainty import UNDETERMINED, station_advice
@@ -189,7 +191,10 @@ def calibrate_table_ready(
         reading=recordings[0].reading,
         absent=() if "accelerometer" in recordings[0].signals else ("accelerometer",),
     )
-    return replace(calibration, notes=(*calibration.notes, *_turned_as_a_whole(calibration)))
+    calibration = replace(calibration, notes=(*calibration.notes, *_turned_as_a_whole(calibration)))
+    if loss != "linear":
+        return calibration
+    return knowing_drift(calibration, station_covariance(stations), station_means(stations, recordings), noise)
 
 
 def _turned_as_a_whole(calibration: Calibration) -> list[str]:

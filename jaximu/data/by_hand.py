@@ -9,7 +9,7 @@ from functools import cached_property
 import jax
 import numpy as np
 
-from jaximu.data.drift import drift_components, mean_output_reactions
+from jaximu.data.drift import drift_components, mean_output_reactions, means_by_hand
 from jaximu.data.handling import bend, handling, moved_by_hand, sway
 from jaximu.data.poses import (
     COARSE_EXCESS,
@@ -24,7 +24,7 @@ from jaximu.data.poses import (
 )
 from jaximu.data.tracks_by_hand import rest_shifts, samples_by_hand
 from jaximu.data.twin_by_hand import twin_recordings
-from jaximu.estimation.data import About, Handling, Observed, OfOneUnit
+from jaximu.estimation.data import About, Handling, Observed, OfOneUnit, OutputMeans
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import pose_advice
@@ -162,7 +162,11 @@ class RecordedByHand(OfOneUnit):
 
     def drifts(self, noise: NoiseModel, details: Along, within: bool) -> tuple[dict[str, AxisNoise], FloatArray]:
         """Return drifts of the biases by name, at a size of one, and the covariance (k, n, n) that each adds."""
-        return drift_components(noise, self.observations, self.segmentations, details.reaction, within)
+        return drift_components(noise, self.output_means(details), within)
+
+    def output_means(self, details: Along) -> OutputMeans:
+        """Return the mean outputs in the poses."""
+        return means_by_hand(self.observations, self.segmentations, details.reaction)
 
     def handling(self, imu: Imu, details: Along, noise: NoiseModel) -> Handling:
         """Return what the samples show of poses that move and turns that are too quick."""

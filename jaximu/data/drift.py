@@ -11,25 +11,28 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaximu.data.poses import condensed, with_gyroscope
 from jaximu.data.poses_covariance import Sensitivities
 from jaximu.data.rest_blocks import RATIO, correlation_times
+from jaximu.estimation.covariance import Chain, Covariance
+from jaximu.estimation.data import OutputMeans
 from jaximu.estimation.fitting import Fit, unwhitened
 from jaximu.estimation.leave_out import orthonormal
+from jaximu.estimation.problem import Name
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
-from jaximu.ground.tracing import first, lifted
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.recordings.observations import Observations
-from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation
 
 __all__ = [
     "DRIFT_ESTIMATED",
     "USUAL_DRIFT",
+    "about_biases",
     "drift_components",
+    "drifting",
     "mean_output_reactions",
+    "means_by_hand",
     "power_on_text",
     "restricted_likelihood",
     "slow_units",
@@ -121,37 +124,77 @@ def power_on_text(units: Mapping[str, AxisNoise], sizes: Mapping[str, float]) ->
 
 
 def with_drift(
-    fitted: Fit, observations: Observations, segmentations: Sequence[Segmentation]
-) -> tuple[Fit, tuple[str, ...]]:
-    """Return a fit of one unit whose covariance knows how the biases drift, and what was estimated, in sentences.
+    fitted: Fit, covariance: Covariance | Chain, means: OutputMeans, noise: NoiseModel | None = None
+) -> tuple[Fit, dict[str, FloatArray], tuple[str, ...]]:
+    """Return a fit of one unit about its biases after the recording, sigmas of those in it, and what was estimated.
 
-    The fit's weights know white noise and the excess alone. Its estimate is linear in the conditions to first order,
-    T = N⁻¹JᵀW, so its covariance changes by T ΔC Tᵀ, ΔC what the conditions' covariance changes by once drift and
-    excess are estimated together. `fitted`: of a linear loss, to poses and turns or to poses alone; `observations`:
-    with what its effects add taken off.
+    The fit's weights know what `covariance`, of its conditions, knows, and the excess. Its estimate is linear in the
+    conditions to first order, T = N⁻¹JᵀW, so that its covariance changes by T ΔC Tᵀ, ΔC what the conditions'
+    covariance changes by once drift and excess are estimated together. `fitted`: of a linear loss; `noise`: what is
+    known of the drift, and is in `covariance`; else it is estimated. The sigmas are as `about_biases` has them.
     """
-    rows = "all" if "gyroscope" in fitted.imu.triads() else "norm"
-    about = condensed(*lifted((with_gyroscope(fitted.imu).with_effects(), observations)), rows)
-    assert about.reaction is not None
-    chain = first(about.covariance)
-    residual, jacobian = unwhitened(fitted, chain)
-    covariance = chain.dense()
-    used = covariance.used > 0
-    bare = covariance.measured[np.ix_(used, used)]
-    present = [k for k in range(len(covariance.factors)) if np.any(covariance.group[used] == k)]
-    excess = [covariance.component(k)[np.ix_(used, used)] for k in present]
-    weighted = bare + np.einsum("k,kij->ij", np.asarray(fitted.excess)[present], np.stack(excess))
-    noise = _noise_of_scatter(observations, segmentations[0].recording)
-    drifts, components = drift_components(noise, observations, segmentations, about.reaction)
-    priors = [_USUAL_EXCESS] * len(excess) + [USUAL_DRIFT[name.partition(" ")[2]] for name in drifts]
-    components = np.concatenate([np.stack(excess), components[:, used][:, :, used]])
-    log_size, _ = restricted_likelihood(residual[used], jacobian[used], bare, components, *_beforehand(priors))
-    changed = bare + np.einsum("k,kij->ij", np.exp(log_size), components) - weighted
-    sizes = np.asarray(fitted.sizes)
-    react = np.asarray(fitted.covariance) / sizes @ np.linalg.solve(weighted, jacobian[used]).T
-    drift_sizes = dict(zip(drifts, np.exp(log_size[len(excess) :] / 2), strict=True))
-    total = np.asarray(fitted.covariance) + react @ changed @ react.T
-    return replace(fitted, covariance=total), (DRIFT_ESTIMATED, *power_on_text(drifts, drift_sizes))
+    residual, jacobian = unwhitened(fitted, covariance)
+    whole, excess = covariance.dense(), np.asarray(fitted.excess)
+    used = whole.used > 0
+    weighted = whole.total(excess)[np.ix_(used, used)]
+    total, sizes = np.asarray(fitted.covariance, np.float64), np.asarray(fitted.sizes)
+    by_conditions = np.zeros((len(total), len(used)))
+    by_conditions[:, used] = -total / sizes @ np.linalg.solve(weighted, jacobian[used]).T
+    sentences: tuple[str, ...] = ()
+    if noise is None:
+        present = [k for k in range(len(excess)) if np.any(whole.group[used] == k)]
+        drifts, components = drift_components(means.noise, means)
+        components = np.stack([*(whole.component(k) for k in present), *components])[:, used][:, :, used]
+        priors = [_USUAL_EXCESS] * len(present) + [USUAL_DRIFT[name.partition(" ")[2]] for name in drifts]
+        bare = whole.measured[np.ix_(used, used)]
+        log_size, _ = restricted_likelihood(residual[used], jacobian[used], bare, components, *_beforehand(priors))
+        changed = bare + np.einsum("k,kij->ij", np.exp(log_size), components) - weighted
+        total = total + by_conditions[:, used] @ changed @ by_conditions[:, used].T
+        drift_sizes = dict(zip(drifts, np.exp(log_size[len(present) :] / 2), strict=True))
+        noise = drifting(means.noise, drifts, drift_sizes)
+        sentences = DRIFT_ESTIMATED, *power_on_text(drifts, drift_sizes)
+    total, sigmas = about_biases(fitted.names, total, by_conditions, means, noise)
+    return replace(fitted, covariance=total), sigmas, sentences
+
+
+def drifting(noise: NoiseModel, drifts: Mapping[str, AxisNoise], sizes: Mapping[str, float]) -> NoiseModel:
+    """Return a noise model with drifts, by name, of these standard deviations relative to their own."""
+    for name, unit in drifts.items():
+        noise = with_noise(noise, name.partition(" ")[0], replace(unit, variance=sizes[name] ** 2 * unit.variance))
+    return noise
+
+
+def about_biases(
+    names: Sequence[Name], covariance: FloatArray, by_conditions: FloatArray, means: OutputMeans, noise: NoiseModel
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Return the covariance (p, p) about the biases after the recording, and the sigmas (3,) about those in it.
+
+    A bias that drifts is one number only as a mean over a time: over the recording, or over as long again after it
+    (the first of several). With d the drift in the mean outputs, t its mean over that time and S = −T R how the
+    numbers react to the outputs, a number is off by S d − t, t for a bias alone:
+    S C Sᵀ − S c eᵀ − e cᵀ Sᵀ + e v eᵀ, C of d, c of d and t, v of t; the first term is in `covariance` (p, p), which is
+    about a bias that its process has in the mean. **Arguments:** `by_conditions` (p, n): how the numbers react to the
+    conditions; `noise`: what drifts. Sigmas are by triad, in output units, of the triads whose biases are free.
+    """
+    first_one = means.recording == means.recording[0]
+    begin, end = means.start[first_one].min(), means.stop[first_one].max()
+    start, stop = np.append(means.start, [begin, end]), np.append(means.stop, [end, 2 * end - begin])
+    during, after = np.array(covariance), np.array(covariance)
+    biases: dict[str, list[int]] = {}
+    for place, name in enumerate(names):
+        if name.part != "bias" or name.effect is not None or getattr(noise, name.owner) is None:
+            continue
+        biases.setdefault(name.owner, []).append(place)
+        (axis,) = name.axes
+        slow, scale = getattr(noise, name.owner).drift(), means.scale[name.owner][axis]
+        of_times = scale**2 * slow.covariance(start, stop)[axis]
+        by_outputs = by_conditions @ means.reactions[name.owner][:, :, axis]
+        for kept, time in ((during, -2), (after, -1)):
+            across = by_outputs @ (first_one * of_times[:-2, time])
+            kept[:, place] -= across
+            kept[place] -= across
+            kept[place, place] += of_times[time, time]
+    return after, {triad: np.sqrt(np.diag(during)[places]) for triad, places in biases.items()}
 
 
 def _beforehand(priors: Sequence[tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
@@ -160,56 +203,50 @@ def _beforehand(priors: Sequence[tuple[float, float]]) -> tuple[FloatArray, Floa
     return 2 * np.log(median), 2 * spread
 
 
-def _noise_of_scatter(observations: Observations, recording: Recording) -> NoiseModel:
-    """Return white noise as the scatter in the poses tells it."""
-    poses = observations.poses
-    real = poses.mask
-    duration = (poses.stop - poses.start)[real]
-
-    def white(signal: Signal, covariance) -> AxisNoise:
-        scatter = np.diagonal(covariance[real], axis1=1, axis2=2) / np.square(signal.nominal_scale)
-        return AxisNoise.of_white(np.mean(scatter * duration[:, None], axis=0))
-
-    gyroscope = recording.gyroscope
-    return NoiseModel(
-        white(recording.accelerometer, poses.accelerometer_covariance),
-        None if gyroscope is None else white(gyroscope, poses.gyroscope_covariance),
-    )
-
-
 def drift_components(
-    noise: NoiseModel,
-    observations: Observations,
-    segmentations: Sequence[Segmentation],
-    reaction: Sensitivities,
-    within: bool = True,
+    noise: NoiseModel, means: OutputMeans, within: bool = True
 ) -> tuple[dict[str, AxisNoise], FloatArray]:
     """Return drifts by name, at a size of one, and the covariance (k, n, n) of all conditions that each adds.
 
     Sizes are relative to what `noise` does in a second. Between recordings nothing is carried over, and of several the
-    accelerometer's bias is another in each; the gyroscope's is measured at rest and was taken off. A gyroscope's bias
-    in a turn is taken to be the mean of its neighbours'. `within`: false where `noise` knows the drift in a recording.
+    accelerometer's bias is another in each; the gyroscope's is measured at rest and was taken off. `within`: false
+    where `noise` knows the drift in a recording.
     """
-    poses = observations.poses
-    real = np.flatnonzero(poses.mask)
-    start, stop = poses.start[real], poses.stop[real]
-    counts = [len(part.intervals) for part in segmentations]
-    which = np.repeat(np.arange(len(counts)), counts)
-    duration = max(float(part.intervals[-1, 1] - part.intervals[0, 0]) for part in segmentations)
-    reactions = mean_output_reactions(reaction)
-    units, covariances = {}, [np.zeros((0, *[len(reactions[0])] * 2))]
-    for triad, output_reaction in zip(TRIADS, reactions, strict=True):
-        known, by_output = getattr(noise, triad), output_reaction[:, real]
+    start, stop, which = means.start, means.stop, means.recording
+    parts = [which == number for number in np.unique(which)]
+    duration = max(float(stop[part].max() - start[part].min()) for part in parts)
+    units: dict[str, AxisNoise] = {}
+    covariances = [np.zeros((0, *[len(rows) for rows in means.reactions.values()][:1] * 2))]
+    for triad, by_output in means.reactions.items():
+        known = getattr(noise, triad)
         drifts = slow_units(known, float(np.median(stop - start)), duration) if known and within else {}
-        if known and len(segmentations) > 1 and triad == "accelerometer":
+        if known and len(parts) > 1 and triad == "accelerometer":
             drifts[_POWER_ON] = _power_on(known)
         for kind, unit in drifts.items():
-            scale = segmentations[0].recording.signals[triad].nominal_scale
-            slow = np.square(scale)[:, None, None] * unit.covariance(start, stop)
+            slow = np.square(means.scale[triad])[:, None, None] * unit.covariance(start, stop)
             slow *= which[:, None] == which
             units[f"{triad} {kind}"] = unit
             covariances.append(np.einsum("npi,ipq,mqi->nm", by_output, slow, by_output, optimize=True)[None])
     return units, np.concatenate(covariances)
+
+
+def means_by_hand(
+    observations: Observations, segmentations: Sequence[Segmentation], reaction: Sensitivities
+) -> OutputMeans:
+    """Return the mean outputs in the poses. A gyroscope's bias in a turn is taken to be the mean of its neighbours'."""
+    poses = observations.poses
+    real = np.flatnonzero(poses.mask)
+    counts = [len(part.intervals) for part in segmentations]
+    scales = {name: signal.nominal_scale for name, signal in segmentations[0].recording.signals.items()}
+    reactions = {
+        name: rows[:, real]
+        for name, rows in zip(TRIADS, mean_output_reactions(reaction), strict=True)
+        if name in scales
+    }
+    scatter = {"accelerometer": poses.accelerometer_covariance, "gyroscope": poses.gyroscope_covariance}
+    variances = {name: np.diagonal(np.asarray(scatter[name])[real], axis1=1, axis2=2) for name in reactions}
+    start, stop = np.asarray(poses.start)[real], np.asarray(poses.stop)[real]
+    return OutputMeans.of(start, stop, np.repeat(np.arange(len(counts)), counts)[real], reactions, scales, variances)
 
 
 def mean_output_reactions(reaction: Sensitivities) -> tuple[FloatArray, FloatArray]:

@@ -135,7 +135,7 @@ def observe_stations(
         measured[1] += later * np.square(POWER_ON["gyroscope"] * parts[0][0].gyroscope.nominal_scale)[:, None, None]
     stimulus = jax.tree.map(lambda *leaves: np.concatenate(leaves), *stimuli)
     force = len(parts[0][0].accelerometer) > 0
-    return _assembled(stacked, measured, stimulus, span, turn, gravity, force), tuple(dict.fromkeys(notes))
+    return _assembled(stacked, measured, stimulus, span, turn, gravity, owner, force), tuple(dict.fromkeys(notes))
 
 
 def _means(signal: Signal, span: FloatArray) -> FloatArray:
@@ -251,7 +251,8 @@ def scheme_stations(
         if axes is not None
     ]
     zero = np.zeros((len(entries), 3))
-    stations = _assembled([zero, zero][: len(scale)], covariances, stimulus, span, turn, float(motion.gravity))
+    gravity, alone = float(motion.gravity), np.zeros(len(entries), np.int64)
+    stations = _assembled([zero, zero][: len(scale)], covariances, stimulus, span, turn, gravity, alone)
     means = stored.call(_mean_outputs, "station means", imu, stations)
     means += [np.zeros_like(stations.gyroscope_mean)] * (2 - len(means))
     return replace(stations, accelerometer_mean=means[0], gyroscope_mean=means[1])
@@ -296,6 +297,7 @@ def _assembled(
     span: FloatArray,
     turn: NDArray[np.bool_],
     gravity: float,
+    recording: NDArray[np.int64],
     force: bool = True,
 ) -> Stations:
     """Put stations together, padded to a bucket; without `force` the accelerometer is not used."""
@@ -329,4 +331,5 @@ def _assembled(
         accelerometer_used=used[0],
         gyroscope_used=used[1],
         gravity=np.asarray(gravity),
+        recording=np.pad(recording, (0, size - count)),
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jaximu.data.observe_stations import observe_stations
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.stations import KnownStations, StationConditions, station_covariances, station_rms, station_rows
-from jaximu.estimation.data import About, Observed, OfOneUnit
+from jaximu.estimation.data import About, Observed, OfOneUnit, OutputMeans
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import TRIADS, Track, added, mean_outputs, stimuli
@@ -30,7 +30,7 @@ from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.reference import Entry, entries_of_columns
 
-__all__ = ["AtStations", "RecordedStations", "output_reaction", "station_of"]
+__all__ = ["AtStations", "RecordedStations", "output_reaction", "station_means", "station_of"]
 
 
 @dataclass(frozen=True)
@@ -134,6 +134,10 @@ class RecordedStations(OfOneUnit):
         at_rest = np.asarray(self.stations.gyroscope_used) & ~np.asarray(self.stations.turn)
         return np.asarray(self.stations.gyroscope_mean)[at_rest].mean(axis=0) if at_rest.any() else None
 
+    def output_means(self, details: AtStations) -> OutputMeans:
+        """Return the mean outputs in the stations."""
+        return station_means(self.stations, (self.recording,))
+
     def with_noise(self, noise: NoiseModel) -> RecordedStations:
         """Return the stations with the covariance that a noise of the samples makes."""
         if not self.sampled:
@@ -204,6 +208,20 @@ def output_reaction(triad: str, shape: FloatArray, used: NDArray[np.bool_]) -> F
     for axis in range(3):
         columns[used, 3 * TRIADS.index(triad) + axis, :, axis] = shape[used]
     return columns.reshape(6 * len(shape), -1)
+
+
+def station_means(stations: Stations, recordings: Sequence[Recording]) -> OutputMeans:
+    """Return the mean outputs in the stations that are used, of which the conditions are; `recordings`: theirs."""
+    kept = np.flatnonzero(_used(stations))
+    unit, used, variances = np.eye(len(stations.turn))[:, kept], {}, {}
+    scales = {name: signal.nominal_scale for name, signal in recordings[0].signals.items() if name in TRIADS}
+    for name in scales:
+        used[name] = np.asarray(getattr(stations, f"{name}_used"))
+        measured = np.diagonal(getattr(stations, f"{name}_covariance"), axis1=1, axis2=2).T
+        variances[name] = np.where(used[name][kept, None], measured[kept], np.nan)
+    reactions = {name: output_reaction(name, unit, used[name]).reshape(-1, len(kept), 3) for name in scales}
+    start, stop, which = (np.asarray(part)[kept] for part in (stations.start, stations.stop, stations.recording))
+    return OutputMeans.of(start, stop, which, reactions, scales, variances)
 
 
 def _used(stations: Stations) -> NDArray[np.bool_]:

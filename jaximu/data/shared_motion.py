@@ -79,6 +79,7 @@ def shared_stations(
         used,
         used,
         np.asarray(gravity),
+        np.zeros(size, np.int64),
     )  # pyright: ignore
 
 

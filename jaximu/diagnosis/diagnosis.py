@@ -11,10 +11,11 @@ import jax
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.calibration.calibration import concluded
+from jaximu.calibration.bias_drift import with_gravity
+from jaximu.calibration.calibration import clock_sigma, concluded
 from jaximu.calibration.recipe import Choices, calibrate, calibrate_ready
 from jaximu.data.by_hand import RecordedByHand
-from jaximu.data.drift import with_usual_drift
+from jaximu.data.drift import about_biases, with_usual_drift
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.drift import DriftComponents, drifted, estimate_drift, hands_of
 from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS, LIMIT_POWER
@@ -280,14 +281,15 @@ class Diagnosis(Result, Document, page="diagnosis"):
             "p_value": self.p_value,
             "suggestion": self.suggestion,
         }
-        return replace(extended(self.calibration, self.experiment, self.extended), diagnosis=diagnosis)
+        with_effects = extended(self.calibration, self.experiment, self.extended, self.noise)
+        return replace(with_effects, diagnosis=diagnosis)
 
 
-def extended(calibration: Calibration, experiment: Experiment, state: State) -> Calibration:
+def extended(calibration: Calibration, experiment: Experiment, state: State, noise: NoiseModel) -> Calibration:
     """Return the calibration that a fit with effects is: its own rank, excess, weak directions and rms.
 
     Without effects it is, by hand, one whose weights and intervals know the slow noise, and what hands added where
-    that was estimated.
+    that was estimated. `noise`: of the samples, as it is in the covariance of the conditions.
     """
     if not state.effects and not experiment.data.by_hand:
         return calibration
@@ -323,7 +325,24 @@ def extended(calibration: Calibration, experiment: Experiment, state: State) -> 
         nominal=calibration.nominal,
         reading=calibration.reading,
     )
-    return replace(calibrated, reference=experiment.reference)
+    calibrated = replace(calibrated, reference=experiment.reference)
+    means = experiment.data.output_means(linear.details)
+    if means is None:
+        return calibrated
+    slope, columns = linear.slope / linear.sizes[: linear.slope.shape[1]], linear.columns
+    places = [linear.names.index(name) for name in fitted.names]
+    jacobian, used = np.concatenate([slope, columns], axis=1)[:, places], experiment.used
+    by_conditions = np.zeros(jacobian.T.shape)
+    total = np.asarray(fitted.covariance, np.float64)
+    by_conditions[:, used] = -total @ np.linalg.solve(linear.covariance[np.ix_(used, used)], jacobian[used]).T
+    total, sigmas = about_biases(fitted.names, total, by_conditions, means, noise)
+    fitted = replace(fitted, covariance=total)
+    return replace(
+        calibrated,
+        fit=fitted,
+        covariance=fitted.total_covariance(calibration.gravity.sigma, clock_sigma(calibration.segmentations)),
+        bias_sigma_recording=with_gravity(fitted, sigmas, calibration.gravity),
+    )
 
 
 def diagnose(

@@ -8,7 +8,7 @@ estimated from the same data enters the law of the smallest p-value.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from jaximu.data.drift import (
     DRIFT_ESTIMATED,
     USUAL_DRIFT,
+    drifting,
     power_on_text,
     restricted_likelihood,
-    with_noise,
 )
 from jaximu.estimation.data import Data, Handling
 from jaximu.estimation.fitting import Linear
@@ -118,15 +118,14 @@ class DriftComponents:
     def notes(self) -> list[str]:
         """What was estimated, in sentences."""
         sizes = {name: size for name, (size, _) in self.sizes.items()}
-        drifting = [DRIFT_ESTIMATED] if any(name.endswith("bias instability") for name in sizes) else []
-        return drifting + power_on_text(dict(zip(self.names, self.units, strict=False)), sizes)
+        estimated = [DRIFT_ESTIMATED] if any(name.endswith("bias instability") for name in sizes) else []
+        return estimated + power_on_text(dict(zip(self.names, self.units, strict=False)), sizes)
 
 
 def drifted(noise: NoiseModel, drift: DriftComponents) -> NoiseModel:
     """Return a noise model with the drift that was estimated."""
-    for name, unit, size in zip(drift.names, drift.units, np.exp(drift.log_size), strict=False):
-        noise = with_noise(noise, name.partition(" ")[0], replace(unit, variance=size * unit.variance))
-    return noise
+    units = dict(zip(drift.names, drift.units, strict=False))
+    return drifting(noise, units, {name: size for name, (size, _) in drift.sizes.items()})
 
 
 def estimate_drift(
@@ -136,15 +135,15 @@ def estimate_drift(
     imu: Imu,
     noise: NoiseModel,
     columns: FloatArray,
-    drifting: bool = True,
+    within: bool = True,
 ) -> DriftComponents:
     """Estimate what a recording shows beyond `noise`: drift, of which that knows nothing, and what hands add.
 
     **Arguments:** `data`, `linear`: made with `noise`, about `imu`, a unit close to the recording's; `used` (n,): which
     conditions are real; `columns` (n, q): derivatives of the real conditions by effects that may be present and must
-    not pass for drift; `drifting`: false where the noise comes from elsewhere and knows the drift within a recording.
+    not pass for drift; `within`: false where the noise comes from elsewhere and knows the drift within a recording.
     """
-    units, components = data.drifts(noise, linear.details, drifting)
+    units, components = data.drifts(noise, linear.details, within)
     if components is None:
         components = np.zeros((0, *linear.covariance.shape))
     names = list(units)

@@ -142,7 +142,7 @@ def calibrate_thermal_by_hand(
             steps.append((name, statistic, gain))
         else:
             refused.add(name)
-    result = extended(calibration, experiment, state)
+    result = extended(calibration, experiment, state, noise)
     assert result.fit is not None
     require_solved(result.fit, logs[0].name)
     notes = tuple(dict.fromkeys((*calibration.notes, *noise.notes)))

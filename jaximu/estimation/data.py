@@ -34,7 +34,17 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
-__all__ = ["About", "Conditions", "Data", "Handling", "Observed", "OfOneUnit", "derivatives_by_numbers", "free_columns"]
+__all__ = [
+    "About",
+    "Conditions",
+    "Data",
+    "Handling",
+    "Observed",
+    "OfOneUnit",
+    "OutputMeans",
+    "derivatives_by_numbers",
+    "free_columns",
+]
 
 _GRID = 16
 """Inner parameters of an effect are asked for in multiples of so many."""
@@ -90,6 +100,40 @@ class Observed:
     duration: float | None = None
     attitude: FloatArray | None = None
     curves: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class OutputMeans:
+    """The mean outputs that conditions are made of, and how the conditions react to them.
+
+    start, stop (o,): s, on the clock of the recording (o,) that each is of. reactions: by triad, of the conditions
+    (n, o, 3) to the outputs of each axis. scale (3,): by triad, output units per SI. noise: white, as the scatter
+    within the means shows it.
+    """
+
+    start: FloatArray
+    stop: FloatArray
+    recording: NDArray[np.int64]
+    reactions: Mapping[str, FloatArray]
+    scale: Mapping[str, FloatArray]
+    noise: NoiseModel
+
+    @classmethod
+    def of(
+        cls,
+        start: FloatArray,
+        stop: FloatArray,
+        recording: NDArray[np.int64],
+        reactions: Mapping[str, FloatArray],
+        scale: Mapping[str, FloatArray],
+        variance: Mapping[str, FloatArray],
+    ) -> OutputMeans:
+        """Return mean outputs of measured `variance` (o, 3), by triad, in output units squared; NaN where unused."""
+        noise = {"accelerometer": AxisNoise.of_white(0.0)}
+        for triad in reactions:
+            density = np.nanmean(variance[triad] * (stop - start)[:, None], axis=0)
+            noise[triad] = AxisNoise.of_white(density / np.square(scale[triad]))
+        return cls(start, stop, recording, reactions, scale, NoiseModel(**noise))
 
 
 class Handling(NamedTuple):
@@ -303,6 +347,10 @@ class Data(ABC):
         `within`: false where `noise` knows the drift in a recording; what changes between several counts in any case.
         """
         return {}, None
+
+    def output_means(self, details: Any) -> OutputMeans | None:
+        """Return the mean outputs that the conditions are made of; None where they are not made of such."""
+        return None
 
     def handling(self, imu: Imu, details: Any, noise: NoiseModel) -> Handling | None:
         """Return what hands add to the conditions, where hands moved the unit."""

@@ -13,7 +13,7 @@ this is a non-negative least-squares problem, reweighted until its weights are t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -84,6 +84,10 @@ class AxisNoise:
         """Return the Allan variance (n, 3) at averaging times (n,), s: (4 V(τ) − V(2τ)) / 2τ², V = 2G."""
         tau = np.asarray(tau, float)
         return np.asarray((4 * self.integrated(tau) - self.integrated(2 * tau)) / tau[..., None] ** 2, np.float64)
+
+    def drift(self) -> AxisNoise:
+        """Return the slow bias alone, without white noise and quantisation."""
+        return replace(self, white=np.zeros(3), quantisation=np.zeros(3))
 
     def split(self, shortest: float) -> tuple[FloatArray, AxisNoise]:
         """Return the density (3,) of what is as good as white over times from `shortest` (s) on, and all the rest."""

@@ -85,3 +85,4 @@ class Stations(eqx.Module):
     accelerometer_used: Bool[Array, " S"]
     gyroscope_used: Bool[Array, " S"]
     gravity: Float[Array, ""]  # m/s², as the set-up says; specific force is in proportion to it
+    recording: Int[Array, " S"]  # the number of the one that it is of

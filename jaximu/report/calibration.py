@@ -15,6 +15,7 @@ from jaximu.data.stations import station_errors
 from jaximu.ground.page import Code, Page, Part, Picture, Section, Statement, Table
 from jaximu.ground.parameters import Parameter
 from jaximu.ground.quantities import Z95, change, counted, sentence, size, with_interval
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.report import figures, tables, words
 from jaximu.report.evidence import evidence
 
@@ -210,6 +211,21 @@ def _parameters(calibration: Calibration) -> Iterator[Part]:
         "“misalignment y from x” is how much of the input along x appears on output y."
         + " Rows marked * take part in a weak combination."
         * bool(calibration.weak)
+    )
+    if calibration.bias_sigma_recording:
+        yield _biases_of_the_recording(calibration)
+
+
+def _biases_of_the_recording(calibration: Calibration) -> str:
+    """Say what the biases are good for, and how well their means over the recording are known."""
+    means = []
+    for name, sigma in calibration.bias_sigma_recording.items():
+        triad = calibration.triads()[name]
+        scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
+        means.append(f"± {size(Z95 * float(np.max(sigma / scale)), SENSOR_UNITS[name], 2)} ({name})")
+    return (
+        "The biases, and their intervals, are for use after the recording, for as long again as it took and without "
+        f"another power-on. As means over the recording itself they are known to {' and '.join(means)}, worst axis."
     )
 
 
