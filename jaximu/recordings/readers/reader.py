@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from importlib import import_module
@@ -412,11 +413,33 @@ def read_table(path: str | os.PathLike[str]) -> LogTable:
     return first
 
 
+_KEPT: ContextVar[dict[Any, tuple[LogTable, ...]] | None] = ContextVar("tables that are kept", default=None)
+
+
+@contextmanager
+def tables_kept() -> Iterator[None]:
+    """Keep the tables of files while this lasts: a file that several verbs read is parsed once."""
+    token = _KEPT.set({})
+    try:
+        yield
+    finally:
+        _KEPT.reset(token)
+
+
 def read_tables(path: str | os.PathLike[str], selection: MessageSelection | None = None) -> tuple[LogTable, ...]:
     """The tables of a file, the accelerometer's first; the format is found from the content.
 
     Raises InputError naming the file, and the package to install where one is missing.
     """
+    kept, key = _KEPT.get(), (name_of(path), selection or MessageSelection())
+    if kept is None:
+        return _tables_of(path, selection)
+    if key not in kept:
+        kept[key] = _tables_of(path, selection)
+    return kept[key]
+
+
+def _tables_of(path: str | os.PathLike[str], selection: MessageSelection | None) -> tuple[LogTable, ...]:
     name, file = name_of(path), Path(path)
     with readable(file):
         kind = _recognise(file)
