@@ -38,8 +38,10 @@ _HELD = {"calibrate": ("diagnose", "calibration")}
 """A verb whose result another holds, as which document: it is run alone where that one gives none."""
 _UNFILLED = re.compile(r"\b(NEW_)?LOG\b|\bCALIBRATION\b")
 _COMMAND = re.compile(r"`(jaximu [^`]+)`")
+_ALONE = re.compile(r"magnetometer alone: .* --columns '([^']*)'")
 _RATES = re.compile(r"([\d.]+(?:e[+-]?\d+)?) Hz in (\w+)")
 _USUAL_RATE, _USUAL_SCALE = 100.0, "131 count/(deg/s)"  # Hz; of a range of 250 deg/s
+_MIDDLE_RATE = 50.0  # Hz; of two rates that stamps may mean, the nearer one is likelier
 _RECORD = (
     "For a calibration, record rests of two seconds or more in nine orientations or more, with turns between them; "
     "for its noise, the unit at rest for an hour or more."
@@ -77,8 +79,7 @@ def run(
     from jaximu.recordings.readers.reader import tables_kept
 
     with tables_kept():
-        with progress("reading"):
-            contents, references = _contents_of(logs, log, asker)
+        contents, references = _contents_of(logs, log, asker)
         outcomes, refused = _run_all(_jobs(contents, references, {"local": local, "noise": noise}))
     if not outcomes:
         raise NotPossibleError(f"{_names(logs)}: {' '.join(_reasons(contents, refused))} {_RECORD}")
@@ -155,14 +156,16 @@ def _contents_of(logs: Sequence[Path], log: options.LogOptions, asker: _Asker) -
 
 def _content(path: Path, log: options.LogOptions, asker: _Asker) -> _Content:
     log, advice = _settled(path, log, asker)
-    recording, _, notes = read_openly(log, path)
-    return _Content(path, log, *describe(recording, advice, notes))
+    with progress("looking for what it allows"):
+        recording, _, notes = read_openly(log, path)
+        return _Content(path, log, *describe(recording, advice, notes))
 
 
 def _settled(path: Path, log: options.LogOptions, asker: _Asker) -> tuple[options.LogOptions, Advice | None]:
     """Return the options with which every verb reads a log, and how columns that it does not name were understood."""
     try:
-        log.read(path, check=False, alone=True)
+        with progress("reading"):
+            log.read(path, check=False, alone=True)
     except JaximuError:
         from jaximu.recordings.readers import advise_reading
 
@@ -211,7 +214,7 @@ def _open_points(values: Mapping[str, Any], questions: Sequence[str]) -> Iterato
         yield "columns", "gyro [?]", text, "rad/s" if "accel [m/s^2]" in columns else "deg/s"
     if "time [?]" in columns:
         text = question("a row: ", "")
-        rates = {unit: abs(math.log(float(rate) / _USUAL_RATE)) for rate, unit in _RATES.findall(text)}
+        rates = {unit: abs(math.log(float(rate) / _MIDDLE_RATE)) for rate, unit in _RATES.findall(text)}
         if rates:
             yield "columns", "time [?]", text, min(rates, key=lambda unit: rates[unit])
     if values["rate"] == "?":
@@ -224,10 +227,12 @@ def _open_points(values: Mapping[str, Any], questions: Sequence[str]) -> Iterato
 
 def _without_inertial(path: Path, log: options.LogOptions) -> _Content | None:
     """Return the content of a log of a magnetometer alone; None for any other."""
-    from jaximu.recordings.readers import read_magnetometer
+    from jaximu.recordings.readers import advise_reading, read_magnetometer
     from jaximu.report.recording import signal_facts
 
     try:
+        if log.columns is None and (advice := advise_reading(path)) and (text := _ALONE.search(advice.sentence())):
+            log = replace(log, columns=text[1])
         signal, _, _ = read_magnetometer(path, log.reading())
     except JaximuError:
         return None
