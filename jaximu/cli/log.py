@@ -39,6 +39,7 @@ _HELD = {"calibrate": ("diagnose", "calibration")}
 _UNFILLED = re.compile(r"\b(NEW_)?LOG\b|\bCALIBRATION\b")
 _COMMAND = re.compile(r"`(jaximu [^`]+)`")
 _ALONE = re.compile(r"magnetometer alone: .* --columns '([^']*)'")
+_GRAVITY = re.compile(r"They hold 1 g in ([^\s,]+),")
 _RATES = re.compile(r"([\d.]+(?:e[+-]?\d+)?) Hz in (\w+)")
 _USUAL_RATE, _USUAL_SCALE = 100.0, "131 count/(deg/s)"  # Hz; of a range of 250 deg/s
 _MIDDLE_RATE = 50.0  # Hz; of two rates that stamps may mean, the nearer one is likelier
@@ -132,9 +133,16 @@ class _Asker:
 
 
 def _contents_of(logs: Sequence[Path], log: options.LogOptions, asker: _Asker) -> tuple[list[_Content], list[Path]]:
-    """Return what is in the logs of sensors, and which of them hold a reference's attitude alone."""
+    """Return what is in the logs of sensors, and which of them hold a reference's attitude alone.
+
+    Two files that are named after an accelerometer and a gyroscope are one log.
+    """
+    from jaximu.recordings.readers.archive import by_sensor
+
     contents: list[_Content] = []
     references: list[Path] = []
+    if log.gyro_log is None and len(logs) == 2 and {"accel", "gyro"} == set(pair := by_sensor(map(str, logs))):
+        logs, log = [Path(pair["accel"])], replace(log, gyro_log=Path(pair["gyro"]))
     for path in logs:
         try:
             contents.append(_content(path, log.with_gyroscope(path) if len(logs) == 1 else log, asker))
@@ -167,36 +175,64 @@ def _settled(path: Path, log: options.LogOptions, asker: _Asker) -> tuple[option
         with progress("reading"):
             log.read(path, check=False, alone=True)
     except JaximuError:
-        from jaximu.recordings.readers import advise_reading
-
-        advice = advise_reading(path, log.rate) if log.columns is None and log.gyro_log is None else None
-        values = {name: getattr(log, name) or getattr(advice, name, None) for name in _READ_AS}
-        if advice is None:
-            values |= _unstated(values)
+        advice, values = _advised(path, log)
         for option, blank, question, default in _open_points(values, advice.questions if advice else ()):
+            if option == "gyro_scale":
+                default = _scale_by_turning(path, replace(log, **_numbers(values) | {option: default}), default)
             answer = asker.answer(option.replace("_", "-"), question, default)
             values[option] = values[option].replace(blank, blank.replace("?", answer))
         if any("?" in str(value) for value in values.values()):
             read_openly(log, path)  # which says what is open
-        try:
-            values["rate"] = None if values["rate"] is None else float(values["rate"])
-        except ValueError:
-            raise InputError(f"--rate: {values['rate']!r} is not a number.") from None
-        settled = replace(log, **values)
+        settled = replace(log, **_numbers(values))
         if settled == log:
             raise
-        return settled, advice and replace(advice, **values | {"rate": values["rate"] and f"{values['rate']:g}"})
+        stated = {name: value and str(value) for name, value in values.items() if name != "gyro_columns"}
+        return settled, advice and replace(advice, **stated)
     return log, None
 
 
-_READ_AS = "columns", "rate", "accel_scale", "gyro_scale"
+def _advised(path: Path, log: options.LogOptions) -> tuple[Advice | None, dict[str, Any]]:
+    """Return how the columns of a log can be understood, and the options that say it; a "?" is left open."""
+    from jaximu.recordings.readers import advise_reading
+
+    values: dict[str, Any] = {name: getattr(log, name) for name in _READ_AS}
+    if log.columns is not None:
+        blanks = {"rate": "time" not in log.columns, "gyro_scale": "gyro [count]" in log.columns}
+        return None, values | {name: "?" for name, blank in blanks.items() if blank and values[name] is None}
+    advice = advise_reading(path, log.rate)
+    guesses = [(advice, "columns")]
+    if log.gyro_log is not None and log.gyro_columns is None:
+        guesses.append((advise_reading(log.gyro_log, log.rate), "gyro_columns"))
+    for guess, columns in guesses:
+        for name in ("columns", "rate", "accel_scale", "gyro_scale") if guess else ():
+            option = columns if name == "columns" else name
+            values[option] = values[option] or getattr(guess, name)
+    return advice, values
 
 
-def _unstated(values: Mapping[str, Any]) -> dict[str, str]:
-    """Return what columns that a user names leave open."""
-    columns = values["columns"] or ""
-    blanks = {"rate": "time" not in columns, "gyro_scale": "gyro [count]" in columns}
-    return {name: "?" for name, blank in blanks.items() if blank and values[name] is None}
+def _numbers(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options with the rate as a number, where it is known."""
+    rate = values["rate"]
+    try:
+        return {**values, "rate": None if rate in (None, "?") else float(rate)}
+    except ValueError:
+        raise InputError(f"--rate: {rate!r} is not a number.") from None
+
+
+def _scale_by_turning(path: Path, log: options.LogOptions, default: str) -> str:
+    """Return the gyroscope's scale with which its turns are those of gravity, where that shows; else the default."""
+    from jaximu.recordings.alignment import CORRELATED
+
+    try:
+        turning = log.read(path, check=False, alone=True).turning
+    except JaximuError:
+        return default
+    number, _, unit = default.partition(" ")
+    sure = turning is not None and abs(turning.correlation) > CORRELATED
+    return f"{float(number) / abs(turning.slope):.3g} {unit}" if sure else default
+
+
+_READ_AS = "columns", "gyro_columns", "rate", "accel_scale", "gyro_scale"
 
 
 def _open_points(values: Mapping[str, Any], questions: Sequence[str]) -> Iterator[tuple[str, str, str, str]]:
@@ -217,6 +253,10 @@ def _open_points(values: Mapping[str, Any], questions: Sequence[str]) -> Iterato
         rates = {unit: abs(math.log(float(rate) / _MIDDLE_RATE)) for rate, unit in _RATES.findall(text)}
         if rates:
             yield "columns", "time [?]", text, min(rates, key=lambda unit: rates[unit])
+    if "accel [?]" in columns:
+        text = question("1 g in ", "")
+        if unit := _GRAVITY.search(text):
+            yield "columns", "accel [?]", text, unit[1]
     if values["rate"] == "?":
         text = question("(--rate)", "How many samples a second? No column is the time.")
         yield "rate", "?", text, f"{_USUAL_RATE:g}"

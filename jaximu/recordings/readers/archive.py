@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import tempfile
 import zipfile
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
@@ -14,7 +14,7 @@ from jaximu.recordings.columns.habits import sensor_of, words_of
 from jaximu.recordings.columns.table import Unpacking
 from jaximu.recordings.recording import Source
 
-__all__ = ["is_archive", "opened"]
+__all__ = ["by_sensor", "is_archive", "opened"]
 
 _MOST = 1000  # files of a recording
 _LETTERS = 3  # of a word that names a file's sensor
@@ -88,13 +88,21 @@ def _chosen(files: Collection[str], path: Path, name: str) -> dict[str, str]:
     paths = [file for file in paths if not any(part.startswith(".") or part.lower() in _ABOUT for part in file.parts)]
     logs = [file for file in paths if file.suffix.lower() not in _NO_LOG] or paths
     logs = [file for file in logs if _rank(file) is not None]
-    sensors = {sensor: _best([file for file in logs if _rank(file)[0] == sensor]) for sensor in _SENSORS}
-    of_phone = {sensor: str(file) for sensor, file in sensors.items() if file is not None}
-    if "accel" in of_phone and len(of_phone) > 1 and len({sensors[sensor].parent for sensor in of_phone}) == 1:
-        return of_phone
+    if sensors := by_sensor(map(str, logs)):
+        return sensors
     if len(logs) == 1 and logs[0].suffix.lower() not in _PACKED:
         return {"": str(logs[0])}
     raise InputError(_refusal([*files], path, name))
+
+
+def by_sensor(files: Iterable[str]) -> dict[str, str]:
+    """Return by sensor the files of one folder that are called after an accelerometer and others; else nothing."""
+    paths = [PurePosixPath(file) for file in files]
+    best = {sensor: _best([file for file in paths if (_rank(file) or "")[:1] == (sensor,)]) for sensor in _SENSORS}
+    sensors = {sensor: file for sensor, file in best.items() if file is not None}
+    if "accel" not in sensors or len(sensors) < 2 or len({file.parent for file in sensors.values()}) > 1:
+        return {}
+    return {sensor: str(file) for sensor, file in sensors.items()}
 
 
 def _rank(file: PurePosixPath) -> tuple[str | None, int] | None:
