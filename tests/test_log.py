@@ -257,6 +257,46 @@ def test_units_that_nothing_decides_are_assumed(tmp_path, verbs, capsys):
     assert document["logs"][0]["guess"]["line"].startswith('--columns "time [us]')
 
 
+def test_two_files_of_one_recording_are_one_log(phone, verbs, tmp_path, capsys):
+    paths = [tmp_path / name for name in ("Gyroscope.csv", "Accelerometer.csv")]
+    for path in paths:
+        path.write_text(phone["phyphox"][path.name])
+    status, document, _ = answered(paths, capsys)
+    assert status == 0 and document["verbs"] == ["calibrate", "diagnose"]
+    assert verbs[0][1] == (paths[1],) and verbs[0][2]["log"].gyro_log == paths[0]
+
+
+def test_several_logs_of_poses_are_one_unit_s(folder, verbs, tmp_path, capsys):
+    other = tmp_path / "other.csv"
+    other.write_bytes((folder / "poses.csv").read_bytes())
+    assert answered([folder / "poses.csv", other], capsys)[0] == 0
+    assert [logs for _, logs, _ in verbs] == [(folder / "poses.csv", other)]
+
+
+def test_a_scale_of_counts_that_is_not_stated_comes_from_turning(folder, verbs, tmp_path, capsys):
+    """23 counts to 1 °/s are no sensor's of the list: the turns of gravity show it."""
+    recording = read_recording(folder / "poses.csv")
+    counts = np.round(np.degrees(recording.gyroscope.values) * 23)
+    columns = np.column_stack([recording.gyroscope.time, recording.accelerometer.values, counts])
+    path = tmp_path / "counts.csv"
+    head = ",".join(["time [s]", *(f"accel_{a} [m/s^2]" for a in "xyz"), *(f"gyro_{a} [count]" for a in "xyz")])
+    np.savetxt(path, columns, delimiter=",", header=head, comments="", fmt="%.9g")
+    status, document, _ = answered([path], capsys)
+    scale, unit = verbs[0][2]["log"].gyro_scale.split()
+    assert status == 0 and 20 < float(scale) < 26 and unit == "count/(deg/s)"
+    assert "--gyro-scale" in document["assumed"][0]
+
+
+def test_a_few_blocks_over_temperature_are_refused(tmp_path, capsys):
+    random = np.random.default_rng(2)
+    columns = [np.arange(1200) / 100, *random.normal([0.1, 0.2, 9.8], 0.02, (1200, 3)).T, np.linspace(20, 40, 1200)]
+    path = tmp_path / "short.csv"
+    head = "time [s],accel_x [m/s^2],accel_y [m/s^2],accel_z [m/s^2],temperature [degC]"
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=head, comments="", fmt="%.9g")
+    status, document, _ = answered([path], capsys)
+    assert status == 1 and "at rest" in document["error"] and "should not happen" not in document["error"]
+
+
 # --- what is a log
 
 
