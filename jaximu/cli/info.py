@@ -207,6 +207,17 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
         yield Use(
             "magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round"
         )
+    yield from _noise_uses(length, rest, longest, begin)
+    heat = recording.temperature
+    if heat is not None and (span := np.ptp(heat.values)) >= 5.0:
+        yield Use("thermal", f"the temperature spans {span:.0f} K")
+    yield _COMPENSATE
+    if poses > 1 and "gyroscope" in signals:
+        yield Use("check", "whether a calibration of this unit is still valid", "", _OLD, alone=False)
+
+
+def _noise_uses(length: float, rest: float, longest: float, begin: float) -> Iterator[Use]:
+    """Yield what a log of `length` seconds, `rest` of them at rest, `longest` at a stretch, shows of the noise."""
     moved = length - rest
     if rest >= 60.0 and moved <= 2.0 + _BUMPS * length:
         apart = f" but for {moved:.0f} s" if moved > 2.0 else ""
@@ -218,12 +229,6 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
             "averaging"
         )
         yield Use("allan", why, " -o noise", alone=False)
-    heat = recording.temperature
-    if heat is not None and (span := np.ptp(heat.values)) >= 5.0:
-        yield Use("thermal", f"the temperature spans {span:.0f} K")
-    yield _COMPENSATE
-    if poses > 1 and "gyroscope" in signals:
-        yield Use("check", "whether a calibration of this unit is still valid", "", _OLD, alone=False)
 
 
 def _poses(recording: Recording, findings: list[str]) -> int:

@@ -227,9 +227,10 @@ def _scale_by_turning(path: Path, log: options.LogOptions, default: str) -> str:
         turning = log.read(path, check=False, alone=True).turning
     except JaximuError:
         return default
+    if turning is None or abs(turning.correlation) < CORRELATED:
+        return default
     number, _, unit = default.partition(" ")
-    sure = turning is not None and abs(turning.correlation) > CORRELATED
-    return f"{float(number) / abs(turning.slope):.3g} {unit}" if sure else default
+    return f"{float(number) / abs(turning.slope):.3g} {unit}"
 
 
 _READ_AS = "columns", "gyro_columns", "rate", "accel_scale", "gyro_scale"
@@ -365,7 +366,11 @@ def _run_all(jobs: Iterator[_Job]) -> tuple[dict[str, _Outcome], dict[str, str]]
             outcomes[verb] = _outcome(waiting[verb])
         except JaximuError as error:
             refused[verb] = str(error)
-    return {verb: outcomes[verb] for verb in _ORDER if verb in outcomes}, refused
+    return _ordered(outcomes), _ordered(refused)
+
+
+def _ordered(by_verb: Mapping[str, Any]) -> dict[str, Any]:
+    return {verb: by_verb[verb] for verb in _ORDER if verb in by_verb}
 
 
 def _outcome(job: _Job) -> _Outcome:

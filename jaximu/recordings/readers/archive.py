@@ -19,6 +19,8 @@ __all__ = ["by_sensor", "is_archive", "opened"]
 _MOST = 1000  # files of a recording
 _LETTERS = 3  # of a word that names a file's sensor
 _SENSORS = "accel", "gyro", "mag"
+_PART = "part of a measurement"
+"""In place of a sensor: gravity alone, or what is left without it."""
 _WITH_GRAVITY = ("total", "acceleration")
 """The words with which Sensor Logger names its accelerometer; what it calls that has gravity taken out."""
 _ABOUT = ("meta", "__macosx")
@@ -87,7 +89,7 @@ def _chosen(files: Collection[str], path: Path, name: str) -> dict[str, str]:
     paths = [PurePosixPath(file) for file in files]
     paths = [file for file in paths if not any(part.startswith(".") or part.lower() in _ABOUT for part in file.parts)]
     logs = [file for file in paths if file.suffix.lower() not in _NO_LOG] or paths
-    logs = [file for file in logs if _rank(file) is not None]
+    logs = [file for file in logs if _rank(file)[0] != _PART]
     if sensors := by_sensor(map(str, logs)):
         return sensors
     if len(logs) == 1 and logs[0].suffix.lower() not in _PACKED:
@@ -98,21 +100,21 @@ def _chosen(files: Collection[str], path: Path, name: str) -> dict[str, str]:
 def by_sensor(files: Iterable[str]) -> dict[str, str]:
     """Return by sensor the files of one folder that are called after an accelerometer and others; else nothing."""
     paths = [PurePosixPath(file) for file in files]
-    best = {sensor: _best([file for file in paths if (_rank(file) or "")[:1] == (sensor,)]) for sensor in _SENSORS}
+    best = {sensor: _best([file for file in paths if _rank(file)[0] == sensor]) for sensor in _SENSORS}
     sensors = {sensor: file for sensor, file in best.items() if file is not None}
     if "accel" not in sensors or len(sensors) < 2 or len({file.parent for file in sensors.values()}) > 1:
         return {}
     return {sensor: str(file) for sensor, file in sensors.items()}
 
 
-def _rank(file: PurePosixPath) -> tuple[str | None, int] | None:
-    """Return the sensor that a file is named after, and how plain the name is; None for one without gravity."""
+def _rank(file: PurePosixPath) -> tuple[str, int]:
+    """Return the sensor that a file is named after, "" for none, and how far the name is from plain."""
     words = tuple(words_of(file.stem))
     if words == _WITH_GRAVITY:
         return "accel", 0
     sensor, refusal = sensor_of(words)
     named = sensor if max(map(len, words), default=0) >= _LETTERS else None  # a.csv and b.csv are two logs
-    return None if refusal else (named, len(words))
+    return _PART if refusal else named or "", len(words)
 
 
 def _best(files: Sequence[PurePosixPath]) -> PurePosixPath | None:
