@@ -533,8 +533,8 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     null = scipy.linalg.null_space(taken.T, rcond=1e-9)
     if not null.shape[1]:
         raise NotPossibleError(
-            f"{len(taken)} blocks of {blocks.duration:g} s at rest are too few to tell noise from what the temperature "
-            "does. Record longer at rest while the temperature changes slowly up and down."
+            f"{len(taken)} blocks of {blocks.duration:g} s at rest are too few to distinguish noise from what the "
+            "temperature does. Record longer at rest while the temperature changes slowly up and down."
         )
     left = {name: null.T @ means for name, means in blocks.means.items()}
     flicker, walk = np.ones(len(times)), np.zeros(len(times))
