@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from jaximu.recordings.columns.guess import Advice
     from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["Use", "allowed", "describe", "read_openly", "run"]
+__all__ = ["ASSUMED_RATE", "Use", "allowed", "describe", "read_openly", "run"]
 
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
 _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
 _BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
 _CUT = 600.0  # s at rest that are worth cutting out of a log
-_ASSUMED_RATE = 100.0
+ASSUMED_RATE = 100.0  # Hz, of a log that does not say it
 _TABLE, _NEAR_GRAVITY = 200, 0.15
 """Rows, and how far off gravity each of them may be, up to which a file without time may be a table of pose means."""
 _TILTED = 25.0  # degrees from their mean that poses must lie at least to be several orientations
@@ -99,7 +99,7 @@ def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice 
             if (stated := getattr(advice, name, None)) or (advice is None and "count]" in (columns or ""))
         }
         recording = None
-        for rate in [log.rate] if log.rate or (advice and advice.rate is None) else [None, _ASSUMED_RATE]:
+        for rate in [log.rate] if log.rate or (advice and advice.rate is None) else [None, ASSUMED_RATE]:
             try:
                 recording = recording or replace(log, columns=columns, rate=rate, **scales).read(path, check=False)
             except JaximuError:
@@ -108,7 +108,7 @@ def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice 
             raise
     notes = []
     if log.rate is None and any("stamps from --rate" in note for note in recording.notes):
-        notes.append(f"no time column: {_ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
+        notes.append(f"no time column: {ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
     if any(scale == "1" for scale in scales.values()):
         notes.append(
             "raw counts: state scales with --accel-scale and --gyro-scale (the accelerometer's is also found "

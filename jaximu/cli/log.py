@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import arg
 
 from jaximu.cli import options
-from jaximu.cli.info import Use, describe, read_openly
+from jaximu.cli.info import ASSUMED_RATE, Use, describe, read_openly
 from jaximu.cli.messages import progress, say
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.quantities import sentence
@@ -41,7 +41,7 @@ _COMMAND = re.compile(r"`(jaximu [^`]+)`")
 _ALONE = re.compile(r"magnetometer alone: .* --columns '([^']*)'")
 _GRAVITY = re.compile(r"They hold 1 g in ([^\s,]+),")
 _RATES = re.compile(r"([\d.]+(?:e[+-]?\d+)?) Hz in (\w+)")
-_USUAL_RATE, _USUAL_SCALE = 100.0, "131 count/(deg/s)"  # Hz; of a range of 250 deg/s
+_USUAL_SCALE = "131 count/(deg/s)"  # of a range of 250 deg/s
 _MIDDLE_RATE = 50.0  # Hz; of two rates that stamps may mean, the nearer one is likelier
 _RECORD = (
     "For a calibration, record rests of two seconds or more in nine orientations or more, with turns between them; "
@@ -260,7 +260,7 @@ def _open_points(values: Mapping[str, Any], questions: Sequence[str]) -> Iterato
             yield "columns", "accel [?]", text, unit[1]
     if values["rate"] == "?":
         text = question("(--rate)", "How many samples a second? No column is the time.")
-        yield "rate", "?", text, f"{_USUAL_RATE:g}"
+        yield "rate", "?", text, f"{ASSUMED_RATE:g}"
     if values["gyro_scale"] == "?":
         text = question("(--gyro-scale)", "Which scale have the gyroscope's counts?")
         yield "gyro_scale", "?", text, _USUAL_SCALE
