@@ -173,9 +173,10 @@ def test_help_and_version_are_commands(capsys, line, words):
 
 
 def test_a_folder_is_answered_with_what_lies_in_it(recording, tmp_path, capsys):
-    write(tmp_path / "log.csv", recording.accelerometer.time, values_of(recording))
+    for name in ("log.csv", "more.csv"):
+        write(tmp_path / name, recording.accelerometer.time, values_of(recording))
     assert main(["info", str(tmp_path)]) == 2
     said = capsys.readouterr().err
-    assert "it holds log.csv" in said and f"jaximu fleet {tmp_path}" in said
+    assert "it holds log.csv, more.csv" in said and f"jaximu fleet {tmp_path}" in said
     assert main(["help", "calibrat"]) == 2
     assert "did you mean calibrate" in capsys.readouterr().err

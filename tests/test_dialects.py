@@ -124,8 +124,9 @@ def test_archives_are_named(tmp_path, suffix):
 
     path = tmp_path / f"log{suffix}"
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("xl/workbook.xml" if suffix == ".xlsx" else "Accelerometer.csv", "x")
-    with pytest.raises(InputError, match="save its sheet as CSV" if suffix == ".xlsx" else "unpack it"):
+        for name in ["xl/workbook.xml"] if suffix == ".xlsx" else ["monday.csv", "tuesday.csv"]:
+            archive.writestr(name, "x")
+    with pytest.raises(InputError, match="save its sheet as CSV" if suffix == ".xlsx" else "Unpack it"):
         read_recording(path)
 
 

@@ -55,6 +55,8 @@ GROUPS = {
     "Simulate and plan": "demo simulate plan",
 }
 """How the overview arranges them."""
+LOG = "LOG"
+"""What stands for a log in place of a verb, in messages."""
 _FIRST = "compiling for the first time on this machine; later runs start sooner"
 
 
@@ -107,7 +109,12 @@ def _say_what_was_not_drawn() -> None:
 
 
 def _verb(name: str) -> Callable[..., None]:
-    return import_module(f"jaximu.cli.{name}").run
+    return import_module(f"jaximu.cli.{name.lower()}").run
+
+
+def _names_log(word: str) -> bool:
+    """Whether a first word is a log and no mistyped verb: it is there, or looks like the name of a file."""
+    return word == LOG or bool(word and (set(word) & set("./\\") or Path(word).exists()))
 
 
 def _groups() -> dict[str, list[str]]:
@@ -157,14 +164,16 @@ def _common(arguments: Sequence[str]) -> list[str]:
 def _run(arguments: Sequence[str]) -> int:
     """Run the verb that comes first with the options that follow it."""
     name, *rest = arguments or [""]
-    if name in VERBS:
+    if name not in VERBS and not name.startswith("-") and _names_log(name):
+        name, rest = LOG, [word for word in arguments if word != LOG]
+    if name in (*VERBS, LOG):
         if "--help" in rest or "-h" in rest:
             print(help_text(name, _verb(name)))
             return 0
         work = _parse(name, _common(rest))
         _settings()
         work()
-    elif name == "help" and rest and rest[0] in VERBS:
+    elif name == "help" and rest and rest[0] in (*VERBS, LOG):
         print(help_text(rest[0], _verb(rest[0])))
     elif name in ("--help", "-h") or (name == "help" and not rest):
         print(listed(_groups(), _verb))

@@ -146,7 +146,7 @@ def end(verdict: str, fail_on: str) -> None:
 
 def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:
     """Print a diagnosis; write it, the extended calibration and the report where asked."""
-    documents = {} if results.output is None else {"calibration": diagnosis.extended_calibration()}
+    documents = {"calibration": diagnosis.extended_calibration()} if results.keeps else {}
     results.present(
         diagnosis.summary,
         "diagnosis.json, calibration.json and report.html",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,17 +17,36 @@ if TYPE_CHECKING:
     from jaximu.recordings.columns.guess import Advice
     from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["run"]
+__all__ = ["ASSUMED_RATE", "Use", "allowed", "describe", "read_openly", "run"]
 
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
 _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
 _BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
 _CUT = 600.0  # s at rest that are worth cutting out of a log
-_ASSUMED_RATE = 100.0
+ASSUMED_RATE = 100.0  # Hz, of a log that does not say it
 _TABLE, _NEAR_GRAVITY = 200, 0.15
 """Rows, and how far off gravity each of them may be, up to which a file without time may be a table of pose means."""
 _TILTED = 25.0  # degrees from their mean that poses must lie at least to be several orientations
 _STATIONS = 6  # poses from which on a turntable fit tells all of an accelerometer
+
+
+@dataclass(frozen=True)
+class Use:
+    """A verb that a log allows.
+
+    why: what it gives. before, after: what its command line has before and after the log. alone: whether the log, as
+    it is, is all that it needs.
+    """
+
+    verb: str
+    why: str
+    after: str = " -o results"
+    before: str = ""
+    alone: bool = True
+
+    def line(self, path: Path, stated: str) -> str:
+        """Return the command line; `stated`: the options with which the log is read."""
+        return f"jaximu {self.verb}{self.before} {shlex.quote(str(path))}{stated}{self.after}"
 
 
 def run(
@@ -46,18 +65,21 @@ def run(
 
     """
     stated = [log.with_gyroscope(path) for path in logs]
-    documents = [_describe(*_read(*pair)) for pair in zip(stated, logs, strict=True)]
+    described = [describe(*read_openly(*pair)) for pair in zip(stated, logs, strict=True)]
     if as_json:
+        documents = [document for document, _ in described]
         options.print_json(documents[0] if len(documents) == 1 else documents)
         return
     from jaximu.report.recording import log_page
     from jaximu.report.terminal import show
 
-    for path, document, reading in zip(logs, documents, stated, strict=True):
-        show(log_page(document, [*_lines(document, path, reading.line())]))
+    for path, (document, uses), reading in zip(logs, described, stated, strict=True):
+        guess = document.get("guess")
+        line = f" {guess['line']}" if guess else reading.line()
+        show(log_page(document, [use.line(path, line) for use in uses]))
 
 
-def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
+def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
     """The recording, how its columns were understood where the file does not say it, and what other verbs would ask."""
     options.require_files(path)
     try:
@@ -75,7 +97,7 @@ def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None
             if (stated := getattr(advice, name, None)) or (advice is None and "count]" in (columns or ""))
         }
         recording = None
-        for rate in [log.rate] if log.rate or (advice and advice.rate is None) else [None, _ASSUMED_RATE]:
+        for rate in [log.rate] if log.rate or (advice and advice.rate is None) else [None, ASSUMED_RATE]:
             try:
                 recording = recording or replace(log, columns=columns, rate=rate, **scales).read(path, check=False)
             except JaximuError:
@@ -84,7 +106,7 @@ def _read(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None
             raise
     notes = []
     if log.rate is None and any("stamps from --rate" in note for note in recording.notes):
-        notes.append(f"no time column: {_ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
+        notes.append(f"no time column: {ASSUMED_RATE:g} Hz assumed here, state it with --rate HZ")
     if any(scale == "1" for scale in scales.values()):
         notes.append(
             "raw counts: state scales with --accel-scale and --gyro-scale (the accelerometer's is also found "
@@ -103,35 +125,43 @@ def _shown(advice: Advice) -> str:
     )
 
 
-def _describe(recording: Recording, advice: Advice | None, guessed: list[str]) -> dict[str, Any]:
-    """Return what the log holds, what was noticed, and what it can be used for: as `--json` prints it."""
+def describe(
+    recording: Recording, advice: Advice | None = None, guessed: list[str] | None = None
+) -> tuple[dict[str, Any], list[Use]]:
+    """Return what the log holds, what was noticed, and what it can be used for, as `--json` prints it; and its uses."""
     from jaximu.mistakes import prepare
     from jaximu.report.recording import signal_facts
 
     ready = prepare(recording)
-    used = ready.recording.signals
+    used, guessed = ready.recording.signals, guessed or []
     signals = {name: signal_facts(signal, used[name]) for name, signal in recording.signals.items()}
     guessing = guessed or advice is not None
     notes = [note for note in recording.remarks if not guessing or "--" not in note]  # options that only this verb gave
     findings = [*guessed, *notes, *ready.notes]
     if "accelerometer" in signals:
-        uses = _uses(recording, ready.recording, findings, not guessed or recording.accelerometer.unit != "count")
+        physical = not guessed or recording.accelerometer.unit != "count"
+        uses = [*allowed(recording, ready.recording, findings, physical)]
     else:
         findings.append("no accelerometer: poses cannot be found")
-        uses = {
-            "turntable": "with a schedule of rests and turns (--reference)",
-            "compensate": "with a calibration of this gyroscope",
-        }
+        uses = [
+            Use("turntable", "with a schedule of rests and turns (--reference)", _WITH_SCHEDULE, alone=False),
+            replace(_COMPENSATE, why="with a calibration of this gyroscope"),
+        ]
         advice = None
     document = {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings))}
-    document["uses"] = [{"verb": verb, "why": why} for verb, why in uses.items()]
+    document["uses"] = [{"verb": use.verb, "why": use.why} for use in uses]
     if advice is not None:
         document["guess"] = {"line": advice.line(), **{k: getattr(advice, k) for k in ("reasons", "questions", "rows")}}
-    return document
+    return document, uses
 
 
-def _uses(recording: Recording, repaired: Recording, findings: list[str], physical: bool) -> dict[str, str]:
-    """Return by verb why it can be run on a log with an accelerometer; what is noticed is added to `findings`.
+_OLD = " results/calibration.json"
+_WITH_SCHEDULE = " --reference REF -o results"
+_COMPENSATE = Use("compensate", "to correct it with a calibration of this unit", " -o corrected.csv", _OLD, alone=False)
+
+
+def allowed(recording: Recording, repaired: Recording, findings: list[str], physical: bool) -> Iterator[Use]:
+    """Yield what can be run on a log with an accelerometer, and why; what is noticed is added to `findings`.
 
     `physical`: the outputs are in physical units, or their scale is known.
     """
@@ -140,7 +170,7 @@ def _uses(recording: Recording, repaired: Recording, findings: list[str], physic
     from jaximu.recordings.recording import plausibility
     from jaximu.report.recording import signal_facts
 
-    uses, signals, poses = {}, recording.signals, 0
+    signals, poses = recording.signals, 0
     force = np.linalg.norm(recording.accelerometer.si(), axis=1)
     timeless = any("stamps from --rate" in note for note in recording.notes)
     near = bool(np.all(np.abs(force / STANDARD.value - 1) < _NEAR_GRAVITY))
@@ -159,36 +189,44 @@ def _uses(recording: Recording, repaired: Recording, findings: list[str], physic
             f"{_STILL_FORCE:g} m/s²{f' and {_STILL_RATE:g} rad/s' if 'gyroscope' in signals else ''} rms)"
         )
     if means:
-        uses["calibrate --means"] = f"if each of the {len(force)} rows is the mean of a pose at rest"
-    if "magnetometer" in signals:
-        uses["magnetometer"] = "soft and hard iron, and how good a heading becomes, where the unit is turned all round"
+        yield Use("calibrate --means", f"if each of the {len(force)} rows is the mean of a pose at rest", alone=False)
     if poses >= 9:
-        uses["calibrate"] = f"{poses} poses" + (" and the turns between them" if "gyroscope" in signals else "")
+        yield Use("calibrate", f"{poses} poses" + (" and the turns between them" if "gyroscope" in signals else ""))
         if "gyroscope" in signals:
-            uses["diagnose"] = "the same, and what the model gets wrong"
+            yield Use("diagnose", "the same, and what the model gets wrong")
     elif poses > 1:
-        uses["calibrate"] = f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one"
+        yield Use("calibrate", f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one")
+    table = [name for name in ("table_angle", "table_rate") if getattr(recording, name) is not None]
+    if table or (recording.attitude is not None and poses >= _STATIONS):
+        yield Use("turntable", f"it holds a reference: {', '.join(table) or 'attitude'}")
+    if recording.attitude is not None and "gyroscope" in signals:
+        yield Use("reference", "the attitude beside it calibrates both sensors in any motion that turns about all axes")
+    if "magnetometer" in signals:
+        yield Use(
+            "magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round"
+        )
+    yield from _noise_uses(length, rest, longest, begin)
+    heat = recording.temperature
+    if heat is not None and (span := np.ptp(heat.values)) >= 5.0:
+        yield Use("thermal", f"the temperature spans {span:.0f} K")
+    yield _COMPENSATE
+    if poses > 1 and "gyroscope" in signals:
+        yield Use("check", "whether a calibration of this unit is still valid", "", _OLD, alone=False)
+
+
+def _noise_uses(length: float, rest: float, longest: float, begin: float) -> Iterator[Use]:
+    """Yield what a log of `length` seconds, `rest` of them at rest, `longest` at a stretch, shows of the noise."""
     moved = length - rest
     if rest >= 60.0 and moved <= 2.0 + _BUMPS * length:
         apart = f" but for {moved:.0f} s" if moved > 2.0 else ""
-        uses["allan"] = f"at rest for {length:.0f} s{apart}: noise up to some {length / 10:.0f} s of averaging"
+        why = f"at rest for {length:.0f} s{apart}: noise up to some {length / 10:.0f} s of averaging"
+        yield Use("allan", why, " -o noise")
     elif longest >= _CUT:
-        uses["allan"] = (
+        why = (
             f"once cut to the {longest:.0f} s at rest from {begin:.0f} s on: noise up to some {longest / 10:.0f} s of "
             "averaging"
         )
-    heat = recording.temperature
-    if heat is not None and (span := np.ptp(heat.values)) >= 5.0:
-        uses["thermal"] = f"the temperature spans {span:.0f} K"
-    table = [name for name in ("table_angle", "table_rate") if getattr(recording, name) is not None]
-    if table or (recording.attitude is not None and poses >= _STATIONS):
-        uses["turntable"] = f"it holds a reference: {', '.join(table) or 'attitude'}"
-    if recording.attitude is not None and "gyroscope" in signals:
-        uses["reference"] = "the attitude beside it calibrates both sensors in any motion that turns about all axes"
-    uses["compensate"] = "to correct it with a calibration of this unit"
-    if poses > 1 and "gyroscope" in signals:
-        uses["check"] = "whether a calibration of this unit is still valid"
-    return uses
+        yield Use("allan", why, " -o noise", alone=False)
 
 
 def _poses(recording: Recording, findings: list[str]) -> int:
@@ -243,22 +281,3 @@ def _rest(recording: Recording) -> tuple[float, float, float]:
     runs = edges[1::2] - edges[::2]
     at = int(np.argmax(runs)) if len(runs) else 0
     return float(still.sum()), float(np.max(runs, initial=0)), float(start + edges[2 * at]) if len(runs) else 0.0
-
-
-_MORE = {
-    "turntable": (" --reference REF", " -o results"),
-    "check": ("", ""),
-    "compensate": ("", " -o corrected.csv"),
-    "allan": ("", " -o noise"),
-}
-"""What the line to paste needs beside the log, and where results go."""
-
-
-def _lines(document: dict[str, Any], path: Path, stated: str) -> Iterator[str]:
-    """Yield the line to paste for each use; `stated`: the options with which the log was read."""
-    if guess := document.get("guess"):
-        stated = f" {guess['line']}"
-    for use in document["uses"]:
-        needs, results = _MORE.get(use["verb"], ("", " -o results"))
-        first = " results/calibration.json" if use["verb"] in ("check", "compensate") else ""
-        yield f"jaximu {use['verb']}{first} {shlex.quote(str(path))}{stated}{needs}{results}"

@@ -70,6 +70,7 @@ __all__ = [
     "require_apart",
     "require_files",
     "stated_noise",
+    "typed",
 ]
 
 
@@ -177,12 +178,7 @@ class LogOptions:
 
     def line(self) -> str:
         """Return the options that were given, as one types them."""
-        options = ((option.name, getattr(self, option.name), option.default) for option in fields(self) if option.repr)
-        return "".join(
-            f" --{name.replace('_', '-')} {shlex.quote(str(value))}"
-            for name, value, default in options
-            if value != default
-        )
+        return typed(self)
 
     def with_gyroscope(self, path: Path) -> LogOptions:
         """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""
@@ -330,6 +326,11 @@ class Results:
     as_json: JsonFlag = False
     force: ForceFlag = False
 
+    @property
+    def keeps(self) -> bool:
+        """Whether documents beside the one to print are kept."""
+        return self.output is not None
+
     def prepare(self, *sensors: str) -> None:
         """Fail before the work rather than after it: where the folder cannot be made or would lose something.
 
@@ -405,15 +406,8 @@ class Results:
 
         @cache
         def made() -> Page:
-            content, folder = page(), self.output
-            if folder is None:
-                return content
-
-            def file(match: re.Match[str]) -> str:
-                name = match[0].lower()
-                return shlex.quote(str(folder / f"{name}.json")) if name in documents else match[0]
-
-            return replace(content, next=_PLACEHOLDER.sub(file, content.next))
+            content = page()
+            return replace(content, next=self.filled(content.next, documents))
 
         self.give(
             lambda: later("report.terminal", "show")(made()),
@@ -423,6 +417,18 @@ class Results:
             text,
             **documents,
         )
+
+    def filled(self, text: str, names: Iterable[str]) -> str:
+        """Return a next command with the paths of the documents that are written; `names`: theirs, in small letters."""
+        folder = self.output
+        if folder is None:
+            return text
+
+        def file(match: re.Match[str]) -> str:
+            name = match[0].lower()
+            return shlex.quote(str(folder / f"{name}.json")) if name in names else match[0]
+
+        return _PLACEHOLDER.sub(file, text)
 
     def _write(
         self,
@@ -436,6 +442,14 @@ class Results:
             self._require_kept(folder / name, json.loads(text))
         encoded = {name: (text + "\n").encode() for name, text in texts.items()}
         return [*write_folder(folder, encoded | dict(files)), *draw(lambda: write(folder), folder / "report.html")]
+
+
+def typed(group: LogOptions | GravityOptions | NoiseOptions) -> str:
+    """Return the options of a group that were given, as one types them."""
+    options = ((option.name, getattr(group, option.name), option.default) for option in fields(group) if option.repr)
+    return "".join(
+        f" --{name.replace('_', '-')} {shlex.quote(str(value))}" for name, value, default in options if value != default
+    )
 
 
 def draw(write: Callable[[], Path | Iterable[Path]], page: Path) -> list[Path]:

@@ -111,7 +111,9 @@ def help_text(name: str, run: Callable[..., None]) -> str:
     text, _, examples = (inspect.getdoc(run) or "").partition("\n\nExamples:\n")
     options = options_of(run)
     positional = [option for option in options if option.positional]
-    lines = [f"usage: jaximu {name} [OPTIONS] {' '.join(option.metavar for option in positional)}".rstrip(), ""]
+    places = [option.metavar for option in positional]
+    verb = [] if places and places[0].startswith(name) else [name]  # a log stands in place of a verb
+    lines = [" ".join(["usage: jaximu", *verb, "[OPTIONS]", *places]), ""]
     for paragraph in text.split("\n\n"):
         lines += [*textwrap.wrap(" ".join(paragraph.split()), width), ""]
     for option in positional:
@@ -140,7 +142,13 @@ def _lines(left: str, text: str, width: int, indent: int = 26) -> list[str]:
 def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], Callable[..., None]]) -> str:
     """Return the overview: the usage, and by group what each verb does in its own words."""
     width = min(shutil.get_terminal_size().columns, 100)
-    lines = ["usage: jaximu VERB [OPTIONS] …", "", "Calibrate inertial measurement units.", ""]
+    lines = [
+        "usage: jaximu VERB [OPTIONS] …",
+        "       jaximu LOG [LOG ...] [--yes] [-o DIR]    all that the logs allow, in one report",
+        "",
+        "Calibrate inertial measurement units.",
+        "",
+    ]
     for group, names in groups.items():
         lines.append(f"{group}:")
         for name in names:
@@ -153,7 +161,14 @@ def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], Callable[.
         ("--completion SHELL", "Print a script that completes verbs and options: bash, zsh or fish."),
     ]
     lines += ["Options:", *(line for left, text in rest for line in _lines(left, text, width, 24)), ""]
-    lines += ["Examples:", "  jaximu demo", "  jaximu info log.csv", "  jaximu calibrate log.csv -o results", ""]
+    lines += [
+        "Examples:",
+        "  jaximu demo",
+        "  jaximu log.csv -o results",
+        "  jaximu info log.csv",
+        "  jaximu calibrate log.csv -o results",
+        "",
+    ]
     return "\n".join([*lines, *textwrap.wrap(EXIT_STATUS, width)])
 
 

@@ -522,6 +522,8 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
 
     **Arguments:** `smooth` (n, k): what temperature may do, generously; it is projected off (restricted likelihood), so
     that slow noise is told by what no temperature explains. Some flicker is always taken to be there.
+
+    Raises `NotPossibleError` where these functions could follow every block.
     """
     shortest = blocks.duration
     longest = 4 * max(blocks.spans)
@@ -529,6 +531,11 @@ def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:
     indicator = np.eye(blocks.levels)[blocks.level]
     taken = np.concatenate([indicator, smooth / np.maximum(np.linalg.norm(smooth, axis=0), 1e-300)], axis=1)
     null = scipy.linalg.null_space(taken.T, rcond=1e-9)
+    if not null.shape[1]:
+        raise NotPossibleError(
+            f"{len(taken)} blocks of {blocks.duration:g} s at rest are too few to distinguish noise from what the "
+            "temperature does. Record longer at rest while the temperature changes slowly up and down."
+        )
     left = {name: null.T @ means for name, means in blocks.means.items()}
     flicker, walk = np.ones(len(times)), np.zeros(len(times))
     walk[-1] = 1.0  # so slow that it is a random walk here

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 from jaximu.ground.reexport import later
@@ -121,9 +121,20 @@ class Page:
 
     def section(self) -> Section:
         """Return the first screen as one section."""
-        number = [f"{self.number}: {self.meaning}"] if self.number else []
         notes = [Items(self.notes)] if self.notes else []
-        return Section(self.title, (*self.verdict, *number, *self.first, *notes), 4)
+        return Section(self.title, (*self._headline(), *self.first, *notes), 4)
+
+    def chapter(self, name: str, whole: bool) -> Section:
+        """Return the page as a section of another, its pictures kept as NAME_….png.
+
+        whole: with all that the HTML file shows, not the first screen alone.
+        """
+        notes = [Section("Notes", [Items(self.notes)])] if self.notes else []
+        parts = (*self._headline(), *self.first, *(self.rest() if whole else ()), *notes)
+        return Section(self.title, [_inside(part, name) for part in parts])
+
+    def _headline(self) -> list[str]:
+        return [*self.verdict, *([f"{self.number}: {self.meaning}"] if self.number else [])]
 
     def __str__(self) -> str:
         return later("report.terminal", "text")(self)
@@ -132,6 +143,16 @@ class Page:
 
     def _repr_html_(self) -> str:
         return later("report.html", "fragment")(self)
+
+
+def _inside(part: Part, name: str) -> Part:
+    """Return a part as it stands in a chapter: its headings a level lower, its pictures under the chapter's name."""
+    match part:
+        case Section(parts=parts, level=level):
+            return replace(part, parts=[_inside(inner, name) for inner in parts], level=level + 1)
+        case Picture():
+            return replace(part, name=f"{name}_{part.name}")
+    return part
 
 
 class Result:

@@ -28,15 +28,15 @@ def page_of(recording: Recording) -> Page:
 
 
 def log_page(document: Mapping[str, Any], commands: Sequence[str]) -> Page:
-    """Return the page of a log that `jaximu info` described; `commands`: a line to paste for each of its uses."""
+    """Return the page of a log that `jaximu info` described; `commands`: a line to paste for each use, or none."""
     uses: list[Part] = []
-    for use, command in zip(document["uses"], commands, strict=True):
+    for use, command in zip(document["uses"] if commands else (), commands, strict=True):
         uses += [f"{sentence(use['why'])}:", Code(command)]
     parts = [
         _table(document["signals"]),
         *_guess(document.get("guess")),
         Section("What was noticed", [Items([*map(sentence, document["findings"])])]),
-        Section("What it can be used for", uses),
+        *([Section("What it can be used for", uses)] if uses else []),
     ]
     return _page(document["file"], document["signals"], parts)
 

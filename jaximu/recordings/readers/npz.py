@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.lib import format as npy
 
-from jaximu.ground.errors import InputError
 from jaximu.recordings.columns.table import LogTable, Unpacking
 from jaximu.recordings.readers.arrays import table_of
 from jaximu.recordings.recording import Source
@@ -18,12 +17,6 @@ def read(data: bytes, source: Source) -> LogTable:
     """The table in an NPZ file; a row's number counts from 1."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = archive.infolist()
-        if not any(member.filename.endswith(".npy") for member in members):
-            inside = [member.filename for member in members if not member.is_dir()]
-            what = f"an archive of {', '.join(inside[:4])}; unpack it and read the files in it"
-            if "xl/workbook.xml" in inside:
-                what = "an Excel workbook; save its sheet as CSV"
-            raise InputError(f"{source.path}: is {what}.")
         Unpacking(source, len(data)).take(sum(member.file_size for member in members))
         return table_of(
             {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}, source

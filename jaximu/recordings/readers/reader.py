@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from importlib import import_module
@@ -41,7 +42,8 @@ from jaximu.recordings.columns.table import (
     mapped_axes,
     named_with_units,
 )
-from jaximu.recordings.readers.records import apart, of_device
+from jaximu.recordings.readers.archive import is_archive, opened
+from jaximu.recordings.readers.records import apart, of_device, of_sensor
 from jaximu.recordings.recording import (
     Defect,
     PoseMeans,
@@ -254,11 +256,12 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     naming the file where it has no such columns.
     """
     options = _sound(options)
-    parts = []
-    for at, table in enumerate(_read(path, options)):
+    parts, tables = [], _read(path, options)
+    for at, table in enumerate(tables):
         options = options if at else _alike(options, table)
         table = _stamped(table, options.columns)
-        columns = choose_columns(table, options.columns, "mag") if not table.messages else header_columns(table) or ()
+        named = table.messages or len(tables) > 1
+        columns = header_columns(table) or () if named else choose_columns(table, options.columns, "mag")
         if options.rate is None and table.rate is None and not any(column.name == TIME for column in columns):
             options = replace(options, rate=1.0)
         parts.append(extract(table, columns, options, {"mag"}))
@@ -370,26 +373,19 @@ _MAGIC: tuple[tuple[int, bytes, _Format], ...] = (
 """By the first bytes, the formats; suffixes lie."""
 
 
-def _recognise(path: Path) -> _Format:
-    """The format of a file. Raises InputError for a folder that is no bag and for an empty file."""
+def _recognise(path: Path, name: str) -> _Format:
+    """The format of a file, or of the folder of a bag. Raises InputError for an empty file."""
     if path.is_dir():
-        if (path / "metadata.yaml").is_file():
-            return _ROS2
-        files = sorted(file.name for file in path.iterdir() if file.is_file())
-        held = f"it holds {', '.join(files[:3])}{' …' if len(files) > 3 else ''}" if files else "no file lies in it"
-        raise InputError(
-            f"{path}: is a folder, not a file, and no ROS 2 bag (it has no metadata.yaml); {held}. Name one log, or "
-            f"calibrate all: jaximu fleet {path} -o fleet.parquet."
-        )
+        return _ROS2
     with path.open("rb") as file:
         head = file.read(HEAD)
     if not head or head.isspace():
-        raise InputError(f"{path}: is empty.")
+        raise InputError(f"{name}: is empty.")
     kind = next((kind for at, magic, kind in _MAGIC if head[at : at + len(magic)] == magic), _TEXT)
-    return _of_text(head, path) if kind is _TEXT else kind
+    return _of_text(head, name) if kind is _TEXT else kind
 
 
-def _of_text(head: bytes, path: Path) -> _Format:
+def _of_text(head: bytes, name: str) -> _Format:
     """The format of text. Raises InputError for text that cannot be read as it stands, saying what it is."""
     from jaximu.recordings.readers.printed import explained, prints
     from jaximu.recordings.readers.tagged import dialect
@@ -400,7 +396,7 @@ def _of_text(head: bytes, path: Path) -> _Format:
     if start[:1] == b"{" or (re.match(rb"\[\s*[\[{\d\-\"]", start) and b"] $" not in start[:100]):
         return _JSON
     if why := explained(head):
-        raise InputError(f"{path}: {why}.")
+        raise InputError(f"{name}: {why}.")
     return _PRINTED if prints(head) else _TEXT
 
 
@@ -412,14 +408,71 @@ def read_table(path: str | os.PathLike[str]) -> LogTable:
     return first
 
 
+_KEPT: ContextVar[dict[Any, tuple[LogTable, ...]] | None] = ContextVar("tables that are kept", default=None)
+
+
+@contextmanager
+def tables_kept() -> Iterator[None]:
+    """Keep the tables of files while this lasts: a file that several verbs read is parsed once."""
+    token = _KEPT.set({})
+    try:
+        yield
+    finally:
+        _KEPT.reset(token)
+
+
 def read_tables(path: str | os.PathLike[str], selection: MessageSelection | None = None) -> tuple[LogTable, ...]:
     """The tables of a file, the accelerometer's first; the format is found from the content.
 
     Raises InputError naming the file, and the package to install where one is missing.
     """
+    kept, key = _KEPT.get(), (name_of(path), selection or MessageSelection())
+    if kept is None:
+        return _tables_of(path, selection)
+    if key not in kept:
+        kept[key] = _tables_of(path, selection)
+    return kept[key]
+
+
+def _tables_of(path: str | os.PathLike[str], selection: MessageSelection | None) -> tuple[LogTable, ...]:
     name, file = name_of(path), Path(path)
     with readable(file):
-        kind = _recognise(file)
+        archive = is_archive(file)
+    if not archive:
+        return _tables_of_file(file, name, selection)
+    try:
+        with opened(file, name) as files:
+            parts = {sensor: _tables_of_file(inner, inside, selection) for sensor, (inside, inner) in files.items()}
+        source = Source(name, _hash(file), 0)
+    except InputError:
+        raise
+    except Exception as error:  # the library behind raises nearly anything on damaged archives
+        raise _damaged(name, "a ZIP archive", error) from error
+    tables = parts.get("") or _of_sensors({sensor: first for sensor, (first, *_) in parts.items()})
+    return tuple(replace(table, source=replace(source, rows=table.source.rows)) for table in tables)
+
+
+def _of_sensors(tables: Mapping[str, LogTable]) -> list[LogTable]:
+    """The sensors of a recording of several files; what cannot be used beside the accelerometer is left out."""
+    first, *others = tables.items()
+    whole, notes = [of_sensor(table, sensor) for sensor, table in [first]], []
+    for sensor, table in others:
+        try:
+            whole.append(of_sensor(table, sensor))
+        except InputError as error:
+            notes.append(f"not used: {error.args[0]}")
+    return [replace(whole[0], notes=(*whole[0].notes, *notes)), *whole[1:]]
+
+
+def _damaged(name: str, kind: str, error: Exception) -> InputError:
+    reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+    return InputError(f"{name}: begins like {kind} but cannot be read; it is cut off or damaged ({reason}).")
+
+
+def _tables_of_file(file: Path, name: str, selection: MessageSelection | None) -> tuple[LogTable, ...]:
+    """The tables of one file, which messages call `name`."""
+    with readable(name):
+        kind = _recognise(file, name)
         data = file if kind.by_path else file.read_bytes()
     more = (selection or MessageSelection(),) if kind.needs or kind is _TAGGED else ()
     try:
@@ -440,10 +493,7 @@ def read_tables(path: str | os.PathLike[str], selection: MessageSelection | None
             "pip install 'jaximu[formats]'."
         ) from error
     except Exception as error:  # the libraries behind raise nearly anything on damaged files
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        raise InputError(
-            f"{name}: begins like {kind.name} but cannot be read; it is cut off or damaged ({reason})."
-        ) from error
+        raise _damaged(name, kind.name, error) from error
     if tables == ():
         raise InputError(f"{name}: holds no message of these sensors; it is cut off or damaged.")
     return tuple(_checked(table, source) for table in (tables if isinstance(tables, tuple) else (tables,)))

@@ -16,7 +16,7 @@ import numpy as np
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
 from jaximu.recordings.columns.habits import fields_of, sensor_of, words_of
-from jaximu.recordings.columns.names import rises
+from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.readers.arrays import table_of
 from jaximu.recordings.readers.clock import seconds_of
@@ -133,6 +133,23 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
         table = _table(named, source)
         notes = ('units are those of Android\'s sensors, by "type" in each line.',) if android else ()
         yield sensor, replace(table, notes=(*table.notes, *notes))
+
+
+def of_sensor(table: LogTable, sensor: str) -> LogTable:
+    """The time and one sensor's columns of a file that is called after it, named and with their units.
+
+    Raises InputError where they are not there, or their unit is not known.
+    """
+    columns, wanted = header_columns(table) or (), (TIME, *GROUPS[sensor].columns)
+    if "seconds_elapsed" in table.header:  # Sensor Logger's, in Android's units
+        axes = {axis: Column(f"{sensor}_{axis}", _ANDROID[sensor]) for axis in "xyz"}
+        columns = [axes.get(name, column) for name, column in zip(table.header, columns, strict=True)]
+    if missing := set(wanted[1:]) - {column.name for column in columns}:
+        raise InputError(f"{table.path}: columns {', '.join(sorted(missing))} are missing; it has {table.header}.")
+    places = {column.name: at for at, column in enumerate(columns)}
+    kept = {name: columns[places[name]].unit for name in wanted if name in places}
+    names = tuple(f"{name} [{unit}]" if unit else name for name, unit in kept.items())
+    return replace(table, names=names, columns=tuple(table.columns[places[name]] for name in kept))
 
 
 def apart(table: LogTable) -> LogTable:

@@ -1,0 +1,473 @@
+"""`jaximu LOG`: all that logs allow, in one report."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import re
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from tyro.conf import arg
+
+from jaximu.cli import options
+from jaximu.cli.info import ASSUMED_RATE, Use, describe, read_openly
+from jaximu.cli.messages import progress, say
+from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
+from jaximu.ground.quantities import sentence
+from jaximu.ground.reexport import later
+
+if TYPE_CHECKING:
+    from jaximu.ground.document import Document
+    from jaximu.ground.page import Page
+    from jaximu.recordings.columns.guess import Advice
+
+__all__ = ["run"]
+
+_ORDER = ("calibrate", "diagnose", "turntable", "reference", "magnetometer", "allan", "thermal")
+"""Verbs that need no more than logs."""
+_HELD = {"calibrate": ("diagnose", "calibration")}
+"""A verb whose result another holds, as which document: it is run alone where that one gives none."""
+_UNFILLED = re.compile(r"\b(NEW_)?LOG\b|\bCALIBRATION\b")
+_COMMAND = re.compile(r"`(jaximu [^`]+)`")
+_ALONE = re.compile(r"magnetometer alone: .* --columns '([^']*)'")
+_GRAVITY = re.compile(r"They hold 1 g in ([^\s,]+),")
+_RATES = re.compile(r"([\d.]+(?:e[+-]?\d+)?) Hz in (\w+)")
+_USUAL_SCALE = "131 count/(deg/s)"  # of a range of 250 deg/s
+_MIDDLE_RATE = 50.0  # Hz; of two rates that stamps may mean, the nearer one is likelier
+_RECORD = (
+    "For a calibration, record rests of two seconds or more in nine orientations or more, with turns between them; "
+    "for its noise, the unit at rest for an hour or more."
+)
+
+
+def run(
+    logs: options.Logs,
+    /,
+    *,
+    yes: Annotated[bool, arg(help="Ask nothing: take the default for what the logs leave open, and say so.")] = False,
+    log: options.Reading = options.READING,
+    local: options.Local = options.LOCAL,
+    noise: options.Noise = options.NOISE,
+    results: options.Output = options.RESULTS,
+) -> None:
+    """Run all that LOGs allow, in one report: calibration, diagnosis, noise, temperature and more.
+
+    LOGs are files, a phone's folder or its ZIP archive: recordings of one unit. One of them at rest states the noise
+    for the others, and one of an attitude is their reference. DIR receives report.html, pictures, and the documents
+    that each verb writes (calibration.json, diagnosis.json, allan.json …).
+
+    Examples:
+      jaximu log.csv
+      jaximu phone.zip -o results
+      jaximu poses.csv rest.csv --yes --latitude 48.1 -o results
+
+    """
+    if not logs:
+        raise InputError("no log was given: name one or more files.")
+    options.require_files(*logs, log.gyro_log, noise.static, noise.noise)
+    local.value()  # a mistake in it is said before any work
+    results.prepare()
+    asker = _Asker(yes)
+    from jaximu.recordings.readers.reader import tables_kept
+
+    with tables_kept():
+        contents, references = _contents_of(logs, log, asker)
+        outcomes, refused = _run_all(_jobs(contents, references, {"local": local, "noise": noise}))
+    if not outcomes:
+        raise NotPossibleError(f"{_names(logs)}: {' '.join(_reasons(contents, refused))} {_RECORD}")
+    stated = "".join(map(options.typed, (log, local, noise)))
+    report = _Report(logs, contents, outcomes, refused, asker.assumed, stated, results)
+    report.give()
+
+
+# --- what is in the logs
+
+
+@dataclass(frozen=True)
+class _Content:
+    """A log, the options with which every verb reads it, what `jaximu info` says of it, and its uses."""
+
+    path: Path
+    log: options.LogOptions
+    document: dict[str, Any]
+    uses: Sequence[Use]
+
+    def allows(self, verb: str) -> bool:
+        return any(use.verb == verb and use.alone for use in self.uses)
+
+
+class _Asker:
+    """Asks a person at most one question, and takes the default where there is no person, or after that one.
+
+    assumed: what was taken, as sentences.
+    """
+
+    def __init__(self, yes: bool):
+        self.silent = yes or not (sys.stdin.isatty() and sys.stderr.isatty())
+        self.answers: dict[str, str] = {}
+        self.assumed: list[str] = []
+
+    def answer(self, option: str, question: str, default: str) -> str:
+        """Return what a person answers, or the default; the same question of another log has the same answer."""
+        if question in self.answers:
+            return self.answers[question]
+        answer = default
+        if not self.silent:
+            self.silent = True
+            print(f"{question} [{default}] ", end="", file=sys.stderr, flush=True)
+            answer = sys.stdin.readline().strip() or default
+        else:
+            say(f"{question} Assumed: {default}; state it with --{option}.")
+            self.assumed.append(f"{question} Assumed: {default}; `--{option}` states another.")
+        self.answers[question] = answer
+        return answer
+
+
+def _contents_of(logs: Sequence[Path], log: options.LogOptions, asker: _Asker) -> tuple[list[_Content], list[Path]]:
+    """Return what is in the logs of sensors, and which of them hold a reference's attitude alone.
+
+    Two files that are named after an accelerometer and a gyroscope are one log.
+    """
+    from jaximu.recordings.readers.archive import by_sensor
+
+    contents: list[_Content] = []
+    references: list[Path] = []
+    if log.gyro_log is None and len(logs) == 2 and {"accel", "gyro"} == set(pair := by_sensor(map(str, logs))):
+        logs, log = [Path(pair["accel"])], replace(log, gyro_log=Path(pair["gyro"]))
+    for path in logs:
+        try:
+            contents.append(_content(path, log.with_gyroscope(path) if len(logs) == 1 else log, asker))
+        except InputError as error:
+            if path.is_dir():
+                raise NotPossibleError(str(error.args[0])) from None
+            if (alone := _without_inertial(path, log)) is not None:
+                contents.append(alone)
+            elif _holds_attitude(path):
+                references.append(path)
+            else:
+                raise
+    if not contents:
+        raise InputError(
+            f"{_names(references)}: holds an attitude and no sensor. Give it together with the log of the same motion."
+        )
+    return contents, references
+
+
+def _content(path: Path, log: options.LogOptions, asker: _Asker) -> _Content:
+    log, advice = _settled(path, log, asker)
+    with progress("looking for what it allows"):
+        recording, _, notes = read_openly(log, path)
+        return _Content(path, log, *describe(recording, advice, notes))
+
+
+def _settled(path: Path, log: options.LogOptions, asker: _Asker) -> tuple[options.LogOptions, Advice | None]:
+    """Return the options with which every verb reads a log, and how columns that it does not name were understood."""
+    try:
+        with progress("reading"):
+            log.read(path, check=False, alone=True)
+    except JaximuError:
+        advice, values = _advised(path, log)
+        for option, blank, question, default in _open_points(values, advice.questions if advice else ()):
+            if option == "gyro_scale":
+                default = _scale_by_turning(path, replace(log, **_numbers(values) | {option: default}), default)
+            answer = asker.answer(option.replace("_", "-"), question, default)
+            values[option] = values[option].replace(blank, blank.replace("?", answer))
+        if any("?" in str(value) for value in values.values()):
+            read_openly(log, path)  # which says what is open
+        settled = replace(log, **_numbers(values))
+        if settled == log:
+            raise
+        stated = {name: value and str(value) for name, value in values.items() if name != "gyro_columns"}
+        return settled, advice and replace(advice, **stated)
+    return log, None
+
+
+def _advised(path: Path, log: options.LogOptions) -> tuple[Advice | None, dict[str, Any]]:
+    """Return how the columns of a log can be understood, and the options that say it; a "?" is left open."""
+    from jaximu.recordings.readers import advise_reading
+
+    values: dict[str, Any] = {name: getattr(log, name) for name in _READ_AS}
+    if log.columns is not None:
+        blanks = {"rate": "time" not in log.columns, "gyro_scale": "gyro [count]" in log.columns}
+        return None, values | {name: "?" for name, blank in blanks.items() if blank and values[name] is None}
+    advice = advise_reading(path, log.rate)
+    guesses = [(advice, "columns")]
+    if log.gyro_log is not None and log.gyro_columns is None:
+        guesses.append((advise_reading(log.gyro_log, log.rate), "gyro_columns"))
+    for guess, columns in guesses:
+        for name in ("columns", "rate", "accel_scale", "gyro_scale") if guess else ():
+            option = columns if name == "columns" else name
+            values[option] = values[option] or getattr(guess, name)
+    return advice, values
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options with the rate as a number, where it is known."""
+    rate = values["rate"]
+    try:
+        return {**values, "rate": None if rate in (None, "?") else float(rate)}
+    except ValueError:
+        raise InputError(f"--rate: {rate!r} is not a number.") from None
+
+
+def _scale_by_turning(path: Path, log: options.LogOptions, default: str) -> str:
+    """Return the gyroscope's scale with which its turns are those of gravity, where that shows; else the default."""
+    from jaximu.recordings.alignment import CORRELATED
+
+    try:
+        turning = log.read(path, check=False, alone=True).turning
+    except JaximuError:
+        return default
+    if turning is None or abs(turning.correlation) < CORRELATED:
+        return default
+    number, _, unit = default.partition(" ")
+    return f"{float(number) / abs(turning.slope):.3g} {unit}"
+
+
+_READ_AS = "columns", "gyro_columns", "rate", "accel_scale", "gyro_scale"
+
+
+def _open_points(values: Mapping[str, Any], questions: Sequence[str]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield what reading leaves open and can be assumed: the option, its blank, the question, the default.
+
+    First what changes the answer most.
+    """
+    columns = values["columns"] or ""
+
+    def question(words: str, otherwise: str) -> str:
+        return next((text for text in questions if words in text), otherwise)
+
+    if "gyro [?]" in columns:
+        text = question("in deg/s or rad/s", "Is the gyroscope in deg/s or rad/s?")
+        yield "columns", "gyro [?]", text, "rad/s" if "accel [m/s^2]" in columns else "deg/s"
+    if "time [?]" in columns:
+        text = question("a row: ", "")
+        rates = {unit: abs(math.log(float(rate) / _MIDDLE_RATE)) for rate, unit in _RATES.findall(text)}
+        if rates:
+            yield "columns", "time [?]", text, min(rates, key=lambda unit: rates[unit])
+    if "accel [?]" in columns:
+        text = question("1 g in ", "")
+        if unit := _GRAVITY.search(text):
+            yield "columns", "accel [?]", text, unit[1]
+    if values["rate"] == "?":
+        text = question("(--rate)", "How many samples a second? No column is the time.")
+        yield "rate", "?", text, f"{ASSUMED_RATE:g}"
+    if values["gyro_scale"] == "?":
+        text = question("(--gyro-scale)", "Which scale have the gyroscope's counts?")
+        yield "gyro_scale", "?", text, _USUAL_SCALE
+
+
+def _without_inertial(path: Path, log: options.LogOptions) -> _Content | None:
+    """Return the content of a log of a magnetometer alone; None for any other."""
+    from jaximu.recordings.readers import advise_reading, read_magnetometer
+    from jaximu.report.recording import signal_facts
+
+    try:
+        if log.columns is None and (advice := advise_reading(path)) and (text := _ALONE.search(advice.sentence())):
+            log = replace(log, columns=text[1])
+        signal, _, _ = read_magnetometer(path, log.reading())
+    except JaximuError:
+        return None
+    document = {"file": str(path), "signals": {"magnetometer": signal_facts(signal)}, "findings": []}
+    use = Use("magnetometer", "soft and hard iron, where the unit is turned all round")
+    return _Content(path, log, document | {"uses": [{"verb": use.verb, "why": use.why}]}, [use])
+
+
+def _holds_attitude(path: Path) -> bool:
+    from jaximu.recordings.readers import holds_attitude
+
+    try:
+        return holds_attitude(path)
+    except JaximuError:
+        return False
+
+
+# --- what they allow
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A verb, the logs that it takes, and what else its function may take by name."""
+
+    verb: str
+    paths: tuple[Path, ...]
+    arguments: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """What a verb gave: its page, files and documents, and the document that it prints."""
+
+    page: Callable[[], Page]
+    text: Callable[[], str]
+    files: Mapping[str, bytes] = field(default_factory=dict)
+    documents: Mapping[str, Document] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Collected(options.Results):
+    """Takes what a verb gives, in place of the terminal and the folder."""
+
+    outcomes: list[_Outcome] = field(default_factory=list)
+    keeps: ClassVar[bool] = True
+
+    def present(
+        self,
+        page: Callable[[], Page],
+        names: str = "",
+        files: Mapping[str, bytes] = MappingProxyType({}),
+        text: Callable[[], str] | None = None,
+        **documents: Document,
+    ) -> None:
+        """Keep the result."""
+        self.outcomes.append(_Outcome(cache(page), text or next(iter(documents.values())).text, files, documents))
+
+
+def _jobs(contents: Sequence[_Content], references: Sequence[Path], arguments: Mapping[str, Any]) -> Iterator[_Job]:
+    """Yield what the logs allow, each verb with all the logs that allow it and are read alike."""
+    by_hand = [content for content in contents if content.allows("diagnose")]
+    rests = [content.path for content in contents if content not in by_hand and content.allows("allan")]
+    noise = arguments["noise"]
+    if by_hand and rests and noise == options.NOISE:
+        say(f"{rests[0]} is at rest: it states the noise of the others.")
+        noise = replace(noise, static=rests[0])
+    for verb in _ORDER:
+        logs = [content for content in contents if content.allows(verb)]
+        more: dict[str, Any] = {}
+        if verb == "reference" and references and not logs:
+            logs = [content for content in contents if "gyroscope" in content.document["signals"]]
+            more = {"reference": references[0]}
+        if logs:
+            alike = tuple(content.path for content in logs if content.log == logs[0].log)
+            yield _Job(verb, alike, {**arguments, "noise": noise, "log": logs[0].log, **more})
+
+
+def _run_all(jobs: Iterator[_Job]) -> tuple[dict[str, _Outcome], dict[str, str]]:
+    """Run verbs by their functions; return what they gave, and why others gave nothing, by verb."""
+    waiting = {job.verb: job for job in jobs}
+    outcomes: dict[str, _Outcome] = {}
+    refused: dict[str, str] = {}
+    for verb in sorted(waiting, key=lambda verb: verb in _HELD):
+        holder, name = _HELD.get(verb, ("", ""))
+        if holder in outcomes:
+            document: Any = outcomes[holder].documents[name]
+            outcomes[verb] = _Outcome(cache(document.summary), document.text)
+            continue
+        try:
+            outcomes[verb] = _outcome(waiting[verb])
+        except JaximuError as error:
+            refused[verb] = str(error)
+    return _ordered(outcomes), _ordered(refused)
+
+
+def _ordered(by_verb: Mapping[str, Any]) -> dict[str, Any]:
+    return {verb: by_verb[verb] for verb in _ORDER if verb in by_verb}
+
+
+def _outcome(job: _Job) -> _Outcome:
+    run = import_module(f"jaximu.cli.{job.verb}").run
+    accepted = inspect.signature(run).parameters
+    collected = _Collected()
+    arguments = {**job.arguments, "results": collected}
+    log = job.paths if "logs" in accepted else job.paths[0]
+    run(log, **{name: value for name, value in arguments.items() if name in accepted})
+    return collected.outcomes[0]
+
+
+def _reasons(contents: Sequence[_Content], refused: Mapping[str, str]) -> list[str]:
+    """Say why nothing could be run."""
+    if refused:
+        return [sentence(f"{verb}: {text}") for verb, text in refused.items()]
+    poses = [text for content in contents for text in content.document["findings"] if " pose" in text]
+    return ["Nothing can be determined from it as it is.", *(f"{sentence(text).rstrip('.')}." for text in poses)]
+
+
+def _names(paths: Sequence[Path]) -> str:
+    return ", ".join(map(str, paths))
+
+
+# --- one report
+
+
+@dataclass(frozen=True)
+class _Report:
+    """All results in one page, one document, and one folder."""
+
+    logs: tuple[Path, ...]
+    contents: Sequence[_Content]
+    outcomes: Mapping[str, _Outcome]
+    refused: Mapping[str, str]
+    assumed: Sequence[str]
+    stated: str
+    results: options.Results
+
+    @property
+    def lead(self) -> str:
+        """The verb whose verdict counts."""
+        return next(verb for verb in (*(holder for holder, _ in _HELD.values()), *_ORDER) if verb in self.outcomes)
+
+    def give(self) -> None:
+        """Write the documents and the report, then print the page, or all as one document."""
+        files: dict[str, bytes] = {}
+        documents: dict[str, Document] = {}
+        for verb, outcome in self.outcomes.items():
+            files |= {name if name not in files else f"{verb}_{name}": data for name, data in outcome.files.items()}
+            for name, document in outcome.documents.items():
+                documents[name if name not in documents else f"{verb}_{name}"] = document
+        after = self._next({*documents, *(name.removesuffix(".json") for name in files)})
+        self.results.give(
+            lambda: later("report.terminal", "show")(self._page(after, whole=False)),
+            lambda folder: later("report.html", "write_report")(self._page(after, whole=True), folder),
+            "the report and the documents of each verb",
+            files,
+            lambda: json.dumps(self._document(after), indent=1, allow_nan=False),
+            **documents,
+        )
+
+    def _page(self, after: str, whole: bool) -> Page:
+        return later("report.log", "page_of")(
+            ", ".join(path.name or str(path) for path in self.logs),
+            {verb: outcome.page() for verb, outcome in self.outcomes.items()},
+            self.lead,
+            [content.document for content in self.contents],
+            self.refused,
+            self.assumed,
+            f"`{after}`",
+            whole,
+        )
+
+    def _document(self, after: str) -> dict[str, Any]:
+        printed = {verb: json.loads(outcome.text()) for verb, outcome in self.outcomes.items()}
+        verdict = printed[self.lead].get("verdict") or " ".join(self.outcomes[self.lead].page().verdict[:1])
+        return {
+            "schema": "jaximu.log/1",
+            "verbs": [*self.outcomes],
+            "verdict": verdict,
+            "next": after,
+            "assumed": [*self.assumed],
+            "refused": dict(self.refused),
+            "logs": [content.document for content in self.contents],
+            **printed,
+        }
+
+    def _next(self, names: set[str]) -> str:
+        """Return the next command, with the names of files that there are."""
+        folder, logs = self.results.output, " ".join(shlex.quote(str(path)) for path in self.logs)
+        if folder is None:
+            return f"jaximu {logs}{self.stated} -o results"
+        proposed = _COMMAND.search(self.results.filled(self.outcomes[self.lead].page().next, names))
+        if proposed and not _UNFILLED.search(proposed[1]):
+            return proposed[1]
+        path = {name: shlex.quote(str(folder / f"{name}.json")) for name in names}
+        if "calibration" in path:
+            return f"jaximu compensate {path['calibration']} {shlex.quote(str(self.contents[0].path))} -o corrected.csv"
+        return f"jaximu calibrate POSES.csv --noise {path['allan']} -o {shlex.quote(str(folder))}"

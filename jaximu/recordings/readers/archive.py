@@ -1,0 +1,138 @@
+"""Recordings of several files: the folder or ZIP archive in which a phone's app writes one file a sensor."""
+
+from __future__ import annotations
+
+import shlex
+import tempfile
+import zipfile
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+
+from jaximu.ground.errors import InputError
+from jaximu.recordings.columns.habits import sensor_of, words_of
+from jaximu.recordings.columns.table import Unpacking
+from jaximu.recordings.recording import Source
+
+__all__ = ["by_sensor", "is_archive", "opened"]
+
+_MOST = 1000  # files of a recording
+_LETTERS = 3  # of a word that names a file's sensor
+_SENSORS = "accel", "gyro", "mag"
+_PART = "part of a measurement"
+"""In place of a sensor: gravity alone, or what is left without it."""
+_WITH_GRAVITY = ("total", "acceleration")
+"""The words with which Sensor Logger names its accelerometer; what it calls that has gravity taken out."""
+_ABOUT = ("meta", "__macosx")
+"""Folders of what is about a recording."""
+_NO_LOG = set(".json .jsonc .xml .plist .yaml .yml .toml .html .md .pdf .png .jpg .svg .py .ipynb".split())
+"""Suffixes of files that are logs only where there is no other."""
+_PACKED = set(".zip .gz .bz2 .xz .7z .rar .tar .tgz".split())
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a path is a folder that is no ROS 2 bag, or a ZIP archive that is no NPZ file."""
+    if path.is_dir():
+        return not (path / "metadata.yaml").is_file()
+    with path.open("rb") as file:
+        if file.read(2) != b"PK":
+            return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return not any(name.endswith(".npy") for name in archive.namelist())
+    except zipfile.BadZipFile:
+        return True  # a damaged one
+
+
+@contextmanager
+def opened(path: Path, name: str) -> Iterator[dict[str, tuple[str, Path]]]:
+    """Gives the files of the one recording in a folder or archive, by sensor: how each is called, and where it lies.
+
+    A single file stands under "". What an archive holds is unpacked into a folder that goes away afterwards.
+
+    Raises InputError where there is no recording, or more than one, and for an archive that is too large.
+    """
+    if path.is_dir():
+        files = {file.name: file for file in sorted(path.iterdir()) if file.is_file()}
+        chosen = _chosen(files, path, name)
+        yield {sensor: (f"{name}/{inside}", files[inside]) for sensor, inside in chosen.items()}
+        return
+    with zipfile.ZipFile(path) as archive, tempfile.TemporaryDirectory() as folder:
+        members = _members(archive, name)
+        files = {}
+        unpacking = Unpacking(Source(name, "", 0), path.stat().st_size)
+        for number, (sensor, inside) in enumerate(_chosen(members, path, name).items()):
+            unpacking.take(members[inside].file_size)
+            file = Path(folder) / f"{number}{PurePosixPath(inside).suffix}"  # never a path that the archive states
+            file.write_bytes(archive.read(members[inside]))
+            files[sensor] = f"{name}/{inside}", file
+        yield files
+
+
+def _members(archive: zipfile.ZipFile, name: str) -> dict[str, zipfile.ZipInfo]:
+    """Return the files in an archive. Raises InputError for too many, or one that cannot be read."""
+    inside = archive.infolist()
+    if len(inside) > _MOST:
+        raise InputError(f"{name}: is an archive of {len(inside)} files, as no recording is.")
+    members = {member.filename: member for member in inside if not member.is_dir()}
+    if not members:
+        raise InputError(f"{name}: is an archive with nothing in it.")
+    if "xl/workbook.xml" in members:
+        raise InputError(f"{name}: is an Excel workbook; save its sheet as CSV.")
+    if any(member.flag_bits & 1 for member in members.values()):
+        raise InputError(f"{name}: is an archive with a password; unpack it and read the files in it.")
+    return members
+
+
+def _chosen(files: Collection[str], path: Path, name: str) -> dict[str, str]:
+    """Return by sensor which of the files are the one recording. Raises InputError where there is none, or several."""
+    paths = [PurePosixPath(file) for file in files]
+    paths = [file for file in paths if not any(part.startswith(".") or part.lower() in _ABOUT for part in file.parts)]
+    logs = [file for file in paths if file.suffix.lower() not in _NO_LOG] or paths
+    logs = [file for file in logs if _rank(file)[0] != _PART]
+    if sensors := by_sensor(map(str, logs)):
+        return sensors
+    if len(logs) == 1 and logs[0].suffix.lower() not in _PACKED:
+        return {"": str(logs[0])}
+    raise InputError(_refusal([*files], path, name))
+
+
+def by_sensor(files: Iterable[str]) -> dict[str, str]:
+    """Return by sensor the files of one folder that are called after an accelerometer and others; else nothing."""
+    paths = [PurePosixPath(file) for file in files]
+    best = {sensor: _best([file for file in paths if _rank(file)[0] == sensor]) for sensor in _SENSORS}
+    sensors = {sensor: file for sensor, file in best.items() if file is not None}
+    if "accel" not in sensors or len(sensors) < 2 or len({file.parent for file in sensors.values()}) > 1:
+        return {}
+    return {sensor: str(file) for sensor, file in sensors.items()}
+
+
+def _rank(file: PurePosixPath) -> tuple[str, int]:
+    """Return the sensor that a file is named after, "" for none, and how far the name is from plain."""
+    words = tuple(words_of(file.stem))
+    if words == _WITH_GRAVITY:
+        return "accel", 0
+    sensor, refusal = sensor_of(words)
+    named = sensor if max(map(len, words), default=0) >= _LETTERS else None  # a.csv and b.csv are two logs
+    return _PART if refusal else named or "", len(words)
+
+
+def _best(files: Sequence[PurePosixPath]) -> PurePosixPath | None:
+    """Return the file with the plainest name; None where several are as plain: they are of several recordings."""
+    ranks = [_rank(file)[1] for file in files]
+    return files[ranks.index(min(ranks))] if ranks and ranks.count(min(ranks)) == 1 else None
+
+
+def _refusal(files: Sequence[str], path: Path, name: str) -> str:
+    """Say what is there in place of one recording, and what to do."""
+    held = f"it holds {', '.join(files[:3])}{f' and {len(files) - 3} more' if len(files) > 3 else ''}"
+    if path.is_dir():
+        return (
+            f"{name}: is a folder, not a file, and no ROS 2 bag (it has no metadata.yaml); "
+            f"{held if files else 'no file lies in it'}. Name one log, or calibrate all: jaximu fleet "
+            f"{shlex.quote(name)} -o fleet.parquet."
+        )
+    return (
+        f"{name}: is an archive, and not of one recording: {held}. Unpack it, and name one log, or calibrate all: "
+        "jaximu fleet FOLDER -o fleet.parquet."
+    )
