@@ -8,7 +8,6 @@ import equinox as eqx
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
@@ -111,6 +110,8 @@ class Loss:
         """The loss as one line."""
         costs = [
             f"{size(worst, SENSOR_UNITS[name])} at worst, {size(self.rms[name], SENSOR_UNITS[name])} rms"
+            if np.isfinite(worst)
+            else f"the {name} is not determined"
             for name, worst in self.worst.items()
             if worst
         ]
@@ -193,26 +194,10 @@ def _loss(what: str, gaps: dict[str, FloatArray]) -> Loss:
 
 
 def _uncertainty(calibration: Calibration, extent: Range) -> Loss:
-    """The standard deviation of corrected values that gains and biases are not known better than.
-
-    δu = −K⁻¹ (δK u + δb), its covariance from that of the parameters, for gravity (turns) along and between the axes.
-    """
-    directions = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    index = {name: at for at, name in enumerate(calibration.names)}
+    """The standard deviation of corrected values (the length of their vector) over the range."""
     worst, rms = {}, {}
-    for name, triad in calibration.imu.triads().items():
-        inverse = np.linalg.inv(np.asarray(triad.gain))
-        largest = {"accelerometer": extent.gravity, "gyroscope": extent.rate, "magnetometer": extent.field or 0.0}[name]
-        inputs = largest * directions
-        inputs = np.vstack([np.zeros(3), inputs]) if name == "gyroscope" else inputs
-        jacobian = np.zeros((len(inputs), 3, len(index)))
-        for row in range(3):
-            for column in range(3):
-                if (at := index.get(Name(name, "gain", (row, column)))) is not None:
-                    jacobian[:, :, at] -= inputs[:, column, None] * inverse[:, row]
-            if (at := index.get(Name(name, "bias", (row,)))) is not None:
-                jacobian[:, :, at] -= inverse[:, row]
-        variance = np.einsum("nip,pq,niq->n", jacobian, calibration.covariance, jacobian)
-        worst[name], rms[name] = float(np.sqrt(variance.max())), float(np.sqrt(variance.mean()))
+    uncertainties = [calibration.uncertainty_of(path) for path in extent.paths()]
+    for name in uncertainties[0]:
+        lengths = [np.linalg.norm(uncertainty[name].sigma, axis=-1) for uncertainty in uncertainties]
+        worst[name], rms[name] = float(np.max(lengths)), float(np.sqrt(np.mean(np.square(lengths))))
     return Loss("the uncertainty (1 sigma of corrected values; not an error of the file)", worst, rms)
