@@ -12,16 +12,8 @@ import numpy as np
 
 from jaximu.estimation.fitting import Fit
 from jaximu.estimation.problem import TOLERANCE, Name, flatten, names_of, typical_sizes, without_equipment
-from jaximu.estimation.projection import sensitivity
-from jaximu.estimation.uncertainty import (
-    UNDETERMINED,
-    WeakDirection,
-    describe,
-    gains_open,
-    pose_advice,
-    weak_directions,
-)
-from jaximu.ground import stored
+from jaximu.estimation.projection import OutputUncertainty, output_uncertainty
+from jaximu.estimation.uncertainty import WeakDirection, describe, gains_open, pose_advice, weak_directions
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage, read_document
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -61,30 +53,6 @@ _VECTORS = ("specific_force", "angular_rate", "angular_acceleration", "magnetic_
 _NUMBERS = ("temperature", "temperature_rate", "time", "vibration_power", "current")
 _LENGTHS = dict.fromkeys(_VECTORS, 3) | {"attitude": 4} | dict.fromkeys(_NUMBERS, 0)
 """Entries along the last axis of a stimulus' fields; 0 for a number per sample."""
-
-
-@dataclass(frozen=True)
-class OutputUncertainty:
-    """How uncertain a triad's corrected output is, in the body frame, in SI.
-
-    covariance: (..., 3, 3). In directions that the data do not determine it is that of the data sheet's tolerance.
-    expected: (..., 3) how far the output of a typical unit is off by the same numbers before any calibration.
-    """
-
-    covariance: FloatArray
-    expected: FloatArray
-
-    @property
-    def sigma(self) -> FloatArray:
-        """The standard deviation of each axis (..., 3); infinite where the data say no more than the data sheet."""
-        sigma = np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
-        return np.where(sigma > UNDETERMINED * self.expected, np.inf, sigma)
-
-    @property
-    def largest(self) -> FloatArray:
-        """The standard deviation (...) along the direction in which it is largest; infinite if any axis is."""
-        values = np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance)[..., -1], 0.0))
-        return np.where(np.isinf(self.sigma).any(axis=-1), np.inf, values)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -217,21 +185,13 @@ class Calibration(Result, Document, page="calibration"):
         require_float64()
         triads = self.triads()
         stimulus = _checked(stimulus, [triad.quantity for triad in triads.values()])
-        names, sizes = names_of(self.imu), flatten(typical_sizes(self.imu))
         stated = self._of_data_sheet()
         free = (*self.names, *stated)
-        places = np.array([names.index(name) for name in free], int)
-        tolerance = np.where([name in stated for name in free], TOLERANCE * sizes[places], 0.0)
-        covariance = self.covariance_of(free) + np.diag(tolerance**2)
-        slopes = stored.call(sensitivity, "uncertainty_of", self.imu, places, stimulus)
-        return {
-            name: OutputUncertainty(
-                slope @ covariance @ np.swapaxes(slope, -1, -2),
-                np.sqrt(np.sum((slope * sizes[places]) ** 2, axis=-1)),
-            )
-            for name, slope in slopes.items()
-            if name in triads
-        }
+        sizes = dict(zip(names_of(self.imu), flatten(typical_sizes(self.imu)), strict=True))
+        tolerance = [TOLERANCE * sizes[name] if name in stated else 0.0 for name in free]
+        covariance = self.covariance_of(free) + np.diag(np.square(tolerance))
+        uncertainty = output_uncertainty(self.imu, free, covariance, stimulus)
+        return {name: uncertainty[name] for name in triads if name in uncertainty}
 
     def sigma(self, triad: str) -> tuple[FloatArray, FloatArray]:
         """Return the standard deviations of a triad's gain (3, 3) and bias (3,); zero where fixed by convention."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -99,21 +100,22 @@ class Range:
 class Loss:
     """One thing that a file does not hold, and the greatest and rms error of the corrected values without it.
 
-    worst, rms: by triad, in m/s² and rad/s (the length of the error vector).
+    worst, rms: by triad, in m/s² and rad/s (the length of the error vector); None where it is not determined.
     """
 
     what: str
-    worst: dict[str, float]
-    rms: dict[str, float]
+    worst: Mapping[str, float | None]
+    rms: Mapping[str, float | None]
 
     def text(self) -> str:
         """The loss as one line."""
+        pairs = [(name, worst, self.rms[name]) for name, worst in self.worst.items()]
         costs = [
-            f"{size(worst, SENSOR_UNITS[name])} at worst, {size(self.rms[name], SENSOR_UNITS[name])} rms"
-            if np.isfinite(worst)
+            f"{size(worst, SENSOR_UNITS[name])} at worst, {size(rms, SENSOR_UNITS[name])} rms"
+            if worst is not None and rms is not None
             else f"the {name} is not determined"
-            for name, worst in self.worst.items()
-            if worst
+            for name, worst, rms in pairs
+            if worst != 0
         ]
         return f"{self.what}: {'; '.join(costs) or 'costs nothing here'}"
 
@@ -151,7 +153,7 @@ def losses(parameters: ExportedUnit, written: Written, extent: Range) -> tuple[L
                 one = [_outputs(imu.with_effects(effect), path) for path in paths]
                 shift = [(with_[name] - without[name]) @ inverse.T for with_, without in zip(one, plain, strict=True)]
                 parts.append(_loss(f"the effect {effect.name}", {name: np.concatenate(shift)}))
-    parts = [part for part in parts if any(worst > _NOTHING for worst in part.worst.values())]
+    parts = [part for part in parts if any((worst or 0.0) > _NOTHING for worst in part.worst.values())]
     if len(parts) > 1:
         whole = [_outputs(imu, path) for path in paths]
         gaps = {name: _gap(parameters, written, name, whole, paths) for name in parameters.triads}
@@ -198,6 +200,8 @@ def _uncertainty(calibration: Calibration, extent: Range) -> Loss:
     worst, rms = {}, {}
     uncertainties = [calibration.uncertainty_of(path) for path in extent.paths()]
     for name in uncertainties[0]:
-        lengths = [np.linalg.norm(uncertainty[name].sigma, axis=-1) for uncertainty in uncertainties]
-        worst[name], rms[name] = float(np.max(lengths)), float(np.sqrt(np.mean(np.square(lengths))))
+        lengths = np.linalg.norm([uncertainty[name].sigma for uncertainty in uncertainties], axis=-1)
+        determined = bool(np.isfinite(lengths).all())
+        worst[name] = float(lengths.max()) if determined else None
+        rms[name] = float(np.sqrt(np.mean(lengths**2))) if determined else None
     return Loss("the uncertainty (1 sigma of corrected values; not an error of the file)", worst, rms)
