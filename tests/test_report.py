@@ -72,7 +72,7 @@ def written(calibration, tmp_path_factory):
 
 def test_report_and_pictures_are_written_whole(written):
     path, page = written
-    names = {"report.html", "recording.png", "residuals.png", "correlation.png", "orientations.png"}
+    names = {"report.html", "recording.png", "residuals.png", "correlation.png", "orientations.png", "uncertainty.png"}
     assert {each.name for each in path.parent.iterdir()} == names  # nothing temporary is left
     for name in names - {"report.html"}:
         assert (path.parent / name).read_bytes().startswith(PNG)
