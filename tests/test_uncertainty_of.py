@@ -1,6 +1,7 @@
 """The uncertainty of the corrected output: closed forms, draws, differences, and what the data leave open."""
 
 import json
+import re
 from dataclasses import replace
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from matplotlib.figure import Figure
 
 import jaximu
 from jaximu import InputError, LocalGravity
@@ -17,6 +19,7 @@ from jaximu.estimation.projection import output_error, sensitivity
 from jaximu.estimation.uncertainty import WeakDirection
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.stimulus import Stimulus
+from jaximu.report.uncertainty import uncertainty_parts
 from jaximu.simulation import draw_imu
 
 GRAVITY = 9.80665
@@ -209,3 +212,66 @@ def test_weak_directions_do_not_matter_where_the_output_does_not_feel_them():
     traded = replace(calibration, covariance=np.outer(change, change), weak=(weak,))
     up, down = traded.uncertainty_of(Stimulus(GRAVITY * np.array([[0.0, 0, 1], [0, 0, -1]])))["accelerometer"].largest
     assert up == pytest.approx(0.0, abs=1e-6) and np.isinf(down)
+
+
+# --- pages
+
+
+def shown(calibration) -> tuple[dict[str, str], dict[str, Figure]]:
+    """Return the sentences by what they are about, and the drawn pictures by name."""
+    parts = [*uncertainty_parts(calibration)]
+    return (
+        {part.about: part.text for part in parts if part.kind == "statement"},
+        {part.name: part.draw() for part in parts if part.kind == "picture"},
+    )
+
+
+def test_the_page_names_the_worst_orientation_and_the_worst_rate():
+    sigma = {"accelerometer.gain[1,0]": 1e-3, "accelerometer.bias": 1e-3, "gyroscope.gain[1,1]": 1e-3}
+    sentences, pictures = shown(calibration_of(NOMINAL, sigma | {"gyroscope.bias": np.radians(0.01)}))
+    assert re.search(r"the direction [+−]x up: ±19 mm/s² \(95 %", sentences["At rest"])  # 1.96 √(g² + 1) 1e-3 m/s²
+    assert "0.11° if it is used as a level" in sentences["At rest"] and "±2.0 mm/s²" in sentences["At rest"]
+    assert "Gravity" not in sentences["At rest"]
+    assert re.search(r"±0\.020 °/s at rest, and to ±0\.49 °/s at 250 °/s about [+−]y", sentences["Turning"])
+    assert set(pictures) == {"orientations", "uncertainty"}
+    assert pictures["orientations"].axes[2].get_xlabel() == "specific force at rest, ± 95 % (mm/s²)"
+    assert [line.get_ydata()[-1] for line in pictures["uncertainty"].axes[0].lines] == pytest.approx(
+        [0.0196, 1.96 * np.hypot(0.01, 0.25), 0.0196], rel=1e-6
+    )
+
+
+def test_gravity_is_stated_beside_the_map():
+    calibration = calibration_of(NOMINAL, {"accelerometer.bias": 1e-3})
+    calibration = replace(calibration, gravity=LocalGravity(GRAVITY, 0.015))
+    scaled = np.array([name in {f"accelerometer.gain[{k},{k}]" for k in range(3)} for name in calibration.names])
+    shift = scaled * 0.015 / GRAVITY
+    np.testing.assert_array_equal(calibration.gravity_shift(), 0.0)  # nothing of it is in the covariance
+    calibration = replace(calibration, covariance=calibration.covariance + 1.001 * np.outer(shift, shift))
+    np.testing.assert_allclose(calibration.gravity_shift(), shift)
+    assert calibration.uncertainty_of(STILL)["accelerometer"].largest == pytest.approx(np.hypot(0.015, 1e-3), rel=1e-3)
+    sentences, _ = shown(calibration)
+    assert "±2.2 mm/s²" in sentences["At rest"] and "Gravity's own uncertainty adds ±29 mm/s²" in sentences["At rest"]
+
+
+def test_the_page_of_what_is_open_says_so():
+    open_scale = calibration_of(COUNTS, {"accelerometer.gain[2,2]": 0.5 / GRAVITY, "accelerometer.bias": 1e-3})
+    sheet = open_scale.of_numbers(lambda name: not name.startswith("gyroscope.gain"))
+    sentences, pictures = shown(sheet)
+    assert "up the corrected specific force is not determined: a combination" in sentences["At rest"]
+    assert "but is not determined at 250 °/s" in sentences["Turning"]
+    assert "Not determined" in pictures["orientations"].get_suptitle()
+    nothing = open_scale.of_numbers(lambda name: "gain" not in name)
+    sentences, pictures = shown(replace(nothing, covariance=nothing.covariance + 100 * np.eye(len(nothing.names))))
+    assert "the accelerometer gain is the data sheet's" in sentences["At rest"] and not pictures
+
+
+def test_a_gyroscope_alone_has_no_sphere_and_over_temperature_there_are_curves():
+    imu = NOMINAL.with_effects(CATALOGUE["gyro.temperature"].make(1e-5), CATALOGUE["accel.temperature"].make(1e-3))
+    both = calibration_of(imu, {"gyroscope.bias": 1e-4, "gyroscope.effects": 1e-5, "accelerometer.effects": 1e-4})
+    sentences, pictures = shown(both)
+    force = pictures["uncertainty"].axes[1].lines[0]
+    assert force.get_xdata()[[0, -1]].tolist() == [5.0, 45.0]
+    np.testing.assert_allclose(force.get_ydata()[[0, 20, -1]], [1.96 * 2, 0, 1.96 * 2], atol=1e-9)  # mm/s²
+    alone = both.of_numbers(lambda name: name.owner == "gyroscope", absent=("accelerometer",))
+    sentences, pictures = shown(alone)
+    assert set(sentences) == {"Turning"} and set(pictures) == {"uncertainty"} and len(pictures["uncertainty"].axes) == 2

@@ -49,6 +49,7 @@ MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias
 """What a document with a magnetometer says beside its triad."""
 EXACT = 1e-6
 """Share of an error before the fit below which what is left is rounding: as many parameters as conditions."""
+_ROUNDING = 1e-9
 _VECTORS = ("specific_force", "angular_rate", "angular_acceleration", "magnetic_field")
 _NUMBERS = ("temperature", "temperature_rate", "time", "vibration_power", "current")
 _LENGTHS = dict.fromkeys(_VECTORS, 3) | {"attitude": 4} | dict.fromkeys(_NUMBERS, 0)
@@ -214,10 +215,10 @@ class Calibration(Result, Document, page="calibration"):
         values = dict(zip(names_of(self.imu), flatten(self.imu).tolist(), strict=True))
         scaled = [name.owner == "accelerometer" and name.part == "gain" for name in self.names]
         shift = np.where(scaled, [values[name] for name in self.names], 0.0) * self.gravity.sigma / self.gravity.value
-        scale = np.sqrt(np.diagonal(self.covariance))
+        scale = np.sqrt(np.maximum(np.diagonal(self.covariance), shift**2))
         scale = np.where(scale > 0, scale, 1.0)
-        inverse = np.linalg.pinv(self.covariance / scale[:, None] / scale, hermitian=True)
-        held = (shift / scale) @ inverse @ (shift / scale) < 1  # C − s sᵀ > 0
+        rest = (self.covariance - np.outer(shift, shift)) / scale[:, None] / scale
+        held = np.linalg.eigvalsh(rest).min(initial=0.0) > -_ROUNDING  # C − s sᵀ is a covariance
         return shift if held else np.zeros(len(shift))
 
     def _effects(self, owner: str, model: Triad) -> dict[str, Any]:

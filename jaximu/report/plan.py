@@ -206,20 +206,16 @@ def _picture(proposal: Proposal) -> Picture:
 
 def _map(proposal: Proposal) -> Iterator[Picture]:
     """Return how uncertain the corrected force is before the poses, or after them where it is open until then."""
-    for covariance, title in zip(proposal.covariances, ("Until then least certain", "Then least certain"), strict=True):
-        known = partial(
-            output_uncertainty,
-            proposal.imu,
-            proposal.names,
-            covariance - np.outer(proposal.by_gravity, proposal.by_gravity),
-        )
-        rest = partial(steady, gravity=STANDARD_GRAVITY, temperature=proposal.imu.accelerometer.temperature_reference)
+    gravity = np.outer(proposal.by_gravity, proposal.by_gravity)
+    rest = partial(steady, gravity=STANDARD_GRAVITY, temperature=proposal.imu.accelerometer.temperature_reference)
+    for covariance, when in zip(proposal.covariances, ("Before", "After"), strict=True):
+        known = partial(output_uncertainty, proposal.imu, proposal.names, covariance - gravity)
         if np.isfinite(known(rest(np.eye(3)))["accelerometer"].largest).all():
             up = np.array([pose.up for pose in proposal.poses])
             names = [f"pose {index}: {pose.words}" for index, pose in enumerate(proposal.poses, 1)]
             yield Picture(
                 "orientations",
-                partial(sphere_figure, known, rest, up, names, title),
+                partial(sphere_figure, known, rest, up, names, f"{when} these poses, least certain"),
                 "The next poses on a map of the uncertainty of the corrected specific force at rest over orientation",
                 "Colours: 95 % of the corrected specific force at rest over the direction that points up in the body, "
                 "without gravity's own error. Numbers: the poses to record.",
