@@ -118,7 +118,7 @@ def _at_rest(calibration: Calibration, directions: FloatArray, half: FloatArray,
     if by_gravity:
         yield (
             f"Gravity's own uncertainty adds ±{size(Z95 * gravity.sigma, 'm/s^2', 2)} along the vertical in every "
-            "orientation, which no pose makes smaller; `--latitude` or `--gravity` does."
+            "orientation, which no pose makes smaller: state the local gravity."
         )
 
 
