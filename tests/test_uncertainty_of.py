@@ -232,7 +232,9 @@ def test_the_page_names_the_worst_orientation_and_the_worst_rate():
     assert re.search(r"the direction [+−]x up: ±19 mm/s² \(95 %", sentences["At rest"])  # 1.96 √(g² + 1) 1e-3 m/s²
     assert "0.11° if it is used as a level" in sentences["At rest"] and "±2.0 mm/s²" in sentences["At rest"]
     assert "Gravity" not in sentences["At rest"]
-    assert re.search(r"±0\.020 °/s at rest, and to ±0\.49 °/s at 250 °/s about [+−]y", sentences["Turning"])
+    assert re.search(
+        r"±0\.020 °/s \(95 %\) at rest, and known to ±0\.49 °/s \(95 %\) at 250 °/s about [+−]y", sentences["Turning"]
+    )
     assert set(pictures) == {"orientations", "uncertainty"}
     assert pictures["orientations"].axes[2].get_xlabel() == "specific force at rest, ± 95 % (mm/s²)"
     assert [line.get_ydata()[-1] for line in pictures["uncertainty"].axes[0].lines] == pytest.approx(
@@ -258,7 +260,7 @@ def test_the_page_of_what_is_open_says_so():
     sheet = open_scale.of_numbers(lambda name: not name.startswith("gyroscope.gain"))
     sentences, pictures = shown(sheet)
     assert "up the corrected specific force is not determined: a combination" in sentences["At rest"]
-    assert "but is not determined at 250 °/s" in sentences["Turning"]
+    assert "and not determined at 250 °/s" in sentences["Turning"]
     assert "Not determined" in pictures["orientations"].get_suptitle()
     nothing = open_scale.of_numbers(lambda name: "gain" not in name)
     sentences, pictures = shown(replace(nothing, covariance=nothing.covariance + 100 * np.eye(len(nothing.names))))

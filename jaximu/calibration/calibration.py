@@ -51,8 +51,11 @@ EXACT = 1e-6
 """Share of an error before the fit below which what is left is rounding: as many parameters as conditions."""
 _ROUNDING = 1e-9
 _VECTORS = ("specific_force", "angular_rate", "angular_acceleration", "magnetic_field")
-_NUMBERS = ("temperature", "temperature_rate", "time", "vibration_power", "current")
-_LENGTHS = dict.fromkeys(_VECTORS, 3) | {"attitude": 4} | dict.fromkeys(_NUMBERS, 0)
+_LENGTHS = (
+    dict.fromkeys(_VECTORS, 3)
+    | {"attitude": 4}
+    | dict.fromkeys(("temperature", "temperature_rate", "time", "vibration_power", "current"), 0)
+)
 """Entries along the last axis of a stimulus' fields; 0 for a number per sample."""
 
 

@@ -17,6 +17,7 @@ from jaximu.ground.quantities import Z95, listed, number, readable, size
 from jaximu.model.stimulus import Stimulus
 from jaximu.report import figures
 from jaximu.report.evidence import evidence
+from jaximu.report.export import Range
 from jaximu.report.words import direction_words
 from jaximu.simulation.protocols.positions import spiral
 
@@ -27,10 +28,8 @@ __all__ = ["sphere_figure", "steady", "uncertainty_parts"]
 
 Known = Callable[[Stimulus], dict[str, OutputUncertainty]]
 
-_RATE = 250.0  # °/s, the range of common gyroscopes
-_AROUND = 20.0  # K on either side of the temperature, as for exports
 _APART = 1e6  # s between samples: whatever lags has settled
-_TICKS = 81
+_TICKS, _STEPS = 81, 41
 _LEAST_RANGE = 0.8
 """Share of the worst value at which the colours begin at the latest: a map that is alike everywhere looks alike."""
 _FACES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -63,7 +62,8 @@ def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
     """
     triads, shift = calibration.triads(), calibration.gravity_shift()
     recorded = replace(calibration, covariance=calibration.covariance - np.outer(shift, shift))
-    temperature = _temperature(calibration)
+    extent = Range.of(calibration)
+    temperature = float(np.mean(extent.temperature))
     if "accelerometer" in triads:
         rest = partial(steady, gravity=calibration.gravity.value, temperature=temperature)
         errors = evidence(calibration)
@@ -83,8 +83,8 @@ def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
                 "Noise of single samples is not part of it, nor what the model lacks.",
             )
     if "gyroscope" in triads:
-        yield Statement("Turning", " ".join(_turning(recorded, temperature)))
-    panels = [panel for panel in _panels(recorded, temperature) if np.isfinite(panel[-1]).any()]
+        yield Statement("Turning", _turning(recorded, extent))
+    panels = [panel for panel in _panels(recorded, extent) if np.isfinite(panel[-1]).any()]
     if panels:
         yield Picture(
             "uncertainty",
@@ -93,11 +93,6 @@ def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
             "95 % of the corrected output along the direction in which it is least certain, z up while turning; gaps "
             "are not determined. The gyroscope's bias counts as it was in the recording.",
         )
-
-
-def _temperature(calibration: Calibration) -> float:
-    stated = next(iter(calibration.triads().values())).temperature_reference
-    return float(calibration.data.get("temperature", stated))
 
 
 def _at_rest(calibration: Calibration, directions: FloatArray, half: FloatArray, by_gravity: bool) -> Iterator[str]:
@@ -122,37 +117,34 @@ def _at_rest(calibration: Calibration, directions: FloatArray, half: FloatArray,
         )
 
 
-def _turning(calibration: Calibration, temperature: float) -> Iterator[str]:
+def _turning(calibration: Calibration, extent: Range) -> str:
     """Say how well the corrected rate is known at rest, and at the end of the range about the worst axis."""
-    rates = np.concatenate([np.zeros((1, 3)), np.radians(_RATE) * _FACES])
+    rates = np.concatenate([np.zeros((1, 3)), extent.rate * _FACES])
     up = np.tile([0.0, 0.0, 1.0], (len(rates), 1))
-    stimulus = steady(up, calibration.gravity.value, temperature, rates)
+    stimulus = steady(up, extent.gravity, np.mean(extent.temperature), rates)
     half = Z95 * np.degrees(calibration.uncertainty_of(stimulus)["gyroscope"].largest)
-    still = f"the corrected rate is known to ±{number(half[0], 2)} °/s at rest"
-    if not np.isfinite(half[0]):
-        still = "the corrected rate is not determined at rest"
-    worst = int(np.argmax(half[1:]))
-    about = direction_words(_FACES[worst])
-    if np.isfinite(half[1 + worst]):
-        turning = f"to ±{number(half[1 + worst], 2)} °/s at {_RATE:g} °/s about {about}, the worst axis (95 %)."
-        yield f"T{still[1:]}, and {turning}"
-    else:
-        yield f"T{still[1:]}, but is not determined at {_RATE:g} °/s about {about}."
+    worst = 1 + int(np.argmax(half[1:]))
+    still, turning = (
+        f"known to ±{number(value, 2)} °/s (95 %)" if np.isfinite(value) else "not determined"
+        for value in (half[0], half[worst])
+    )
+    end = f"{np.degrees(extent.rate):.4g} °/s about {direction_words(_FACES[worst - 1])}, the worst axis"
+    return f"The corrected rate is {still} at rest, and {turning} at {end}."
 
 
-def _panels(calibration: Calibration, temperature: float) -> Iterator[tuple[str, str, str, dict[str, FloatArray], Any]]:
+def _panels(calibration: Calibration, extent: Range) -> Iterator[tuple[str, str, str, dict[str, FloatArray], Any]]:
     """Return title, words of both axes, lines by name and their heights (lines, n) of each panel."""
-    triads, gravity = calibration.triads(), calibration.gravity.value
-    up = np.array([0.0, 0.0, 1.0])
+    triads, gravity = calibration.triads(), extent.gravity
     if "gyroscope" in triads:
-        rates = np.linspace(0.0, _RATE, 41)
+        rates = np.linspace(0.0, np.degrees(extent.rate), _STEPS)
         both = np.radians(rates)[:, None, None] * _FACES
-        stimulus = steady(np.broadcast_to(up, both.shape).reshape(-1, 3), gravity, temperature, both.reshape(-1, 3))
+        up = np.tile([0.0, 0.0, 1.0], (both.size // 3, 1))
+        stimulus = steady(up, gravity, np.mean(extent.temperature), both.reshape(-1, 3))
         half = Z95 * np.degrees(calibration.uncertainty_of(stimulus)["gyroscope"].largest).reshape(-1, 2, 3)
-        yield "Rate while turning", "rate (°/s)", "± 95 % (°/s)", dict.fromkeys("xyz", rates), half.max(axis=1).T
+        yield "Rate while turning", "rate (°/s)", "± 95 % (°/s)", {axis: rates for axis in "xyz"}, half.max(axis=1).T
     warm = {name for name, triad in triads.items() if any("temperature" in effect.needs for effect in triad.effects)}
-    low, high = calibration.data.get("temperature_range", (temperature - _AROUND, temperature + _AROUND))
-    temperatures = np.linspace(low, high, 41)
+    low, high = calibration.data.get("temperature_range", extent.temperature)
+    temperatures = np.linspace(low, high, _STEPS)
     faces = np.tile(_FACES, (len(temperatures), 1))
     stimulus = steady(faces, gravity, np.repeat(temperatures, len(_FACES)))
     uncertainty = calibration.uncertainty_of(stimulus) if warm & {"accelerometer", "gyroscope"} else {}
