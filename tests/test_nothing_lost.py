@@ -266,7 +266,7 @@ def test_a_figure_that_fails_takes_nothing_else_with_it(folder, tmp_path, monkey
     told = "The figure “residuals” could not be drawn (IndexError: list index out of range)"
     assert f"note: {told}" in said
     page = (tmp_path / "report.html").read_text()
-    assert told in page and "Map of the directions" in page and "Parameters" in page
+    assert told in page and "Map of the uncertainty" in page and "Parameters" in page
     assert {"calibration.json", "orientations.png"} <= set(content(tmp_path)) >= {"correlation.png"}
     assert "residuals.png" not in content(tmp_path)
     status, _, said = run(*line)  # the test-suite, where warnings are errors, meets it as a failure

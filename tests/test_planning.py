@@ -478,7 +478,13 @@ def test_plan_writes_a_page_and_a_schedule(specification, tmp_path, capsys):
     assert main(["plan", specification, "--equipment", "table", "--poses", "6", "-o", str(out)]) == 0
     printed = capsys.readouterr()
     assert "z up" in printed.out and "not known" in printed.out
-    assert sorted(path.name for path in out.iterdir()) == ["plan.json", "poses.png", "report.html", "schedule.csv"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "orientations.png",
+        "plan.json",
+        "poses.png",
+        "report.html",
+        "schedule.csv",
+    ]
     document = json.loads((out / "plan.json").read_text())
     assert document["schema"] == "jaximu.plan/1"
     assert len(document["poses"]) == len(document["turns"]) == 6

@@ -72,12 +72,12 @@ def written(calibration, tmp_path_factory):
 
 def test_report_and_pictures_are_written_whole(written):
     path, page = written
-    names = {"report.html", "recording.png", "residuals.png", "correlation.png", "orientations.png"}
+    names = {"report.html", "recording.png", "residuals.png", "correlation.png", "orientations.png", "uncertainty.png"}
     assert {each.name for each in path.parent.iterdir()} == names  # nothing temporary is left
     for name in names - {"report.html"}:
         assert (path.parent / name).read_bytes().startswith(PNG)
     assert path.read_text(encoding="utf-8").rstrip().endswith("</html>")
-    assert page.tags.count("svg") == 4
+    assert page.tags.count("svg") == 5
 
 
 def test_report_works_offline(written):
@@ -101,7 +101,7 @@ def test_the_one_script_is_the_one_that_the_page_allows_and_asks_nobody(written)
 def test_figures_are_whole_drawings_whose_ids_are_their_own(written):
     text = written[0].read_text(encoding="utf-8")
     found = re.findall(r"<svg.*?</svg>", text, re.DOTALL)
-    assert len(found) == 4
+    assert len(found) == 5
     for each in found:
         assert ElementTree.fromstring(each).get("aria-label")
     ids = re.findall(r'\bid="([^"]+)"', text)
@@ -200,7 +200,7 @@ def test_hostile_names_and_notes_are_escaped(calibration, tmp_path):
     text = write_report(hostile, tmp_path).read_text(encoding="utf-8")
     page = Page(text)
     assert page.tags.count("script") == 1 and "alert" not in page.scripts[0]
-    assert page.tags.count("svg") == 4
+    assert page.tags.count("svg") == 5
     assert not page.handlers
     assert text.count("<title>") == text.count("</title>") == 1
     assert "49" not in page.text.partition("Notes")[2]  # {{ 7 * 7 }} is not computed
@@ -234,7 +234,7 @@ def test_stored_calibration_reports_what_it_still_knows(calibration, tmp_path):
     path = write_report(load_calibration(tmp_path / "calibration.json"), tmp_path)
     page = Page(path.read_text(encoding="utf-8"))
     assert "made from a stored calibration" in page.text
-    assert page.tags.count("svg") == 1
+    assert page.tags.count("svg") == 3  # correlation, and what is uncertain
     assert snippet(calibration) in path.read_text(encoding="utf-8")
 
 

@@ -17,6 +17,7 @@ from jaximu.data.poses import PosesAndTurns, condense
 from jaximu.data.poses_covariance import turned_by
 from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.problem import Name, without_equipment
+from jaximu.estimation.projection import output_error, sensitivity
 from jaximu.estimation.track import Recorded
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.stimulus import Stimulus
@@ -380,6 +381,8 @@ TRACEABLE = {
     "Imu.respond with effects": lambda imu, data: imu.with_effects(*_EFFECTS).respond(_STIMULUS),
     "Imu.recover": lambda imu, data: imu.recover(data.poses.accelerometer_mean, data.poses.gyroscope_mean),
     "Imu.recover with effects": lambda imu, data: imu.with_effects(*_EFFECTS).recover(*_OUTPUTS, _STIMULUS),
+    "sensitivity": lambda imu, data: sensitivity(imu, np.arange(24), _STIMULUS),
+    "output_error": lambda imu, data: output_error(NOMINAL, imu, _STIMULUS),
     "gravity_norm": _norm,
     "gravity_direction": _direction,
     "static_gyroscope": lambda imu, data: static_gyroscope(imu, data, jnp.ones((len(data.poses.mask), 3, 3))),

@@ -19,7 +19,7 @@ import numpy as np
 from jaximu.acceptance.quantities import measure, of_calibration
 from jaximu.calibration import Calibration
 from jaximu.estimation.fitting import effect_numbers
-from jaximu.estimation.problem import Name, flatten, names_of, without_equipment_or_effects
+from jaximu.estimation.problem import Name, without_equipment_or_effects
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
@@ -126,16 +126,7 @@ def epochs_of(calibrations: Sequence[Calibration], files: Sequence[str], nominal
 
 def _epoch(calibration: Calibration, reasons: Mapping[str, str], file: str, turned: bool, scales: Scales) -> Epoch:
     measured = measure(of_calibration(calibration), scales, ())
-    gravity = calibration.gravity
-    flat = dict(zip(names_of(calibration.imu), flatten(calibration.imu).tolist(), strict=True))
-    scaled = [name.owner == "accelerometer" and name.part == "gain" for name in calibration.names]
-    values = np.array([flat[name] for name in calibration.names])
-    by_gravity = np.where(scaled, values, 0.0) * gravity.sigma / gravity.value
-    covariance, scale = calibration.covariance, np.sqrt(np.diagonal(calibration.covariance))
-    scale = np.where(scale > 0, scale, 1.0)
-    inverse = np.linalg.pinv(covariance / scale[:, None] / scale, hermitian=True)
-    held = (by_gravity / scale) @ inverse @ (by_gravity / scale) < 1  # C − s sᵀ > 0
-    by_gravity = by_gravity if held else np.zeros(len(values))
+    by_gravity = calibration.gravity_shift()
     quantities = {}
     for column, name in enumerate(measured.names):
         stem, owner = name.partition("[")[0], owner_of(name)
@@ -147,7 +138,9 @@ def _epoch(calibration: Calibration, reasons: Mapping[str, str], file: str, turn
         elif not measured.determined[0, column]:
             unless = f"{file} does not determine all of that"
         quantities[name] = Measurand(float(measured.value[0, column]), measured.slope[0, column], unless)
-    return Epoch(file, calibration, turned, covariance - np.outer(by_gravity, by_gravity), by_gravity, quantities)
+    return Epoch(
+        file, calibration, turned, calibration.covariance - np.outer(by_gravity, by_gravity), by_gravity, quantities
+    )
 
 
 # --- temperature ------------------------------------------------------------------------------------------------------

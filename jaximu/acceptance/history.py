@@ -27,6 +27,7 @@ from jaximu.acceptance.words import si_unit
 from jaximu.calibration import Calibration
 from jaximu.calibration.calibration import require_calibration
 from jaximu.estimation.problem import flatten, names_of
+from jaximu.estimation.projection import output_error
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import holm
@@ -520,12 +521,12 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
 
 def _error(first: Imu, last: Imu, stimulus: Stimulus, owner: str) -> Any:
     """Return what a triad of the first makes of an input that the last puts out, less that input."""
-    triads = []
-    for triad in (first.triads()[owner], last.triads()[owner]):
-        effects = tuple(effect for effect in triad.effects if effect.scope == "device")
-        bias = jnp.zeros(3) if owner == "gyroscope" else triad.bias  # another after every power-on
-        triads.append(replace(triad, effects=effects, bias=bias))
-    return triads[0].recover(triads[1].respond(stimulus), stimulus) - getattr(stimulus, SENSOR_QUANTITIES[owner])
+
+    def of_any_power_on(imu: Imu) -> Imu:
+        """Return the unit without the gyroscope's bias, which is another after every power-on."""
+        return imu if imu.gyroscope is None else replace(imu, gyroscope=replace(imu.gyroscope, bias=jnp.zeros(3)))
+
+    return output_error(of_any_power_on(first), of_any_power_on(last), stimulus)[owner]
 
 
 # --- limits and words -------------------------------------------------------------------------------------------------

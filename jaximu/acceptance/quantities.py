@@ -3,9 +3,9 @@
 Every quantity is a function q(θ) of the model's numbers; its variance is ∂q C ∂qᵀ with the covariance C of the fit
 (law of propagation, GUM 5.1.2), by automatic differentiation. *Bias* is what an axis puts out at zero input, over its
 gain; *scale* its gain over the nominal one, less one; *misalignment* a cross-axis gain over the axis's own. *Output* is
-the error of the corrected output: were the unit θ and not what was estimated, θ̂, an input u would come out as
-u + (∂y/∂u)⁻¹ (y(u; θ) − y(u; θ̂)), which is zero at θ̂ and has its uncertainty; *raw output* is what the output is off
-without any calibration. Of both the input of the range counts at which |error| + 2 standard uncertainties is greatest.
+the error of the corrected output, were the unit θ and not what was estimated, θ̂ (`jaximu.estimation.projection`): zero
+at θ̂, with its uncertainty; *raw output* is what the output is off without any calibration. Of both the input of the
+range counts at which |error| + 2 standard uncertainties is greatest.
 
 Gravity acts on the accelerometer's gain as a whole, K ∝ 1/g. The rest of the variance is the recording's; as far as it
 rests on the scatter of n conditions beyond their known noise (a share s of it), it has n − p degrees of freedom, and
@@ -15,7 +15,7 @@ the whole ν = (n − p) u⁴ / (s u²_recording)² (Welch and Satterthwaite, GU
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name, flatten, names_of, typical_sizes, unflatten
+from jaximu.estimation.projection import output_error
 from jaximu.estimation.uncertainty import UNDETERMINED
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
-from jaximu.ground.rotation import apply_matrix, inverse_matrix
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSORS
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
@@ -199,40 +199,27 @@ def output_stimulus(limit: Limit, imu: Imu) -> Stimulus:
         warmth = np.repeat([low, (low + high) / 2, high], len(_GRID))
         inputs = {name: np.tile(values, (3, 1)) for name, values in inputs.items()} | {"temperature": warmth}
     stimulus = Stimulus(**inputs)
-    triad = imu.triads()[limit.owner]
     try:
-        jax.eval_shape(lambda one: replace(triad, effects=_effects(triad)).respond(one), stimulus)
+        jax.eval_shape(imu.transferable().triads()[limit.owner].respond, stimulus)
     except InputError as error:
         raise InputError(f"{limit.key}: {error} State it beside `over`, or limit the parameters.") from error
     return stimulus
 
 
-def _effects(triad):
-    return tuple(effect for effect in triad.effects if effect.scope == "device")
-
-
 def _error_of_output(limit: Limit, like, flat, scales, stimulus):
     """Return the function of a model's numbers that gives the output's error (points, 3), in SI."""
-    scale, offset = scales[limit.owner]
-    quantity = SENSOR_QUANTITIES[limit.owner]
-    true = getattr(stimulus, quantity)
+    restore = ravel_pytree(like)[1]
 
-    def output(flat, value):
-        triad = ravel_pytree(like)[1](flat).triads()[limit.owner]
-        context = replace(stimulus, **{quantity: value})
-        return replace(triad, effects=_effects(triad)).respond(context)
+    def raw(numbers):
+        scale, offset = scales[limit.owner]
+        triad = restore(numbers).transferable().triads()[limit.owner]
+        return (triad.respond(stimulus) - offset) / scale - getattr(stimulus, triad.quantity)
 
-    if limit.part == "raw_output":
-        return lambda numbers: (output(numbers, true) - offset) / scale - true
-    # each point's output reacts to its own input alone: three directional derivatives give all points' slopes
-    columns = [
-        jax.jvp(lambda value: output(flat, value), (true,), (jnp.broadcast_to(unit, true.shape),))[1]
-        for unit in jnp.eye(3)
-    ]
-    slope, estimate = jnp.stack(columns, axis=-1), output(flat, true)
-    # by hand, not by LAPACK: its batched calls from within a compiled loop wait for each other on two cores
-    inverse = inverse_matrix(slope)
-    return lambda numbers: apply_matrix(inverse, output(numbers, true) - estimate)
+    def corrected(numbers):
+        error = output_error(restore(flat), restore(numbers), stimulus)[limit.owner]
+        return error - output_error(restore(flat), restore(flat), stimulus)[limit.owner]
+
+    return raw if limit.part == "raw_output" else corrected
 
 
 def _freedom(units: Units, names: Sequence[str], sigma: FloatArray, gravity: FloatArray) -> FloatArray:

@@ -11,7 +11,8 @@ import jax
 import numpy as np
 
 from jaximu.estimation.fitting import Fit
-from jaximu.estimation.problem import Name, names_of, without_equipment
+from jaximu.estimation.problem import TOLERANCE, Name, flatten, names_of, typical_sizes, without_equipment
+from jaximu.estimation.projection import OutputUncertainty, output_uncertainty
 from jaximu.estimation.uncertainty import WeakDirection, describe, gains_open, pose_advice, weak_directions
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, damage, read_document
@@ -19,11 +20,13 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.page import Result
 from jaximu.ground.parameters import Parameter, ParameterTable
-from jaximu.ground.quantities import unit_text
+from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.reexport import later
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu, Triad
+from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Stations
 from jaximu.recordings.recording import Reading, Recording
 from jaximu.recordings.segmentation import Segmentation
@@ -46,6 +49,14 @@ MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias
 """What a document with a magnetometer says beside its triad."""
 EXACT = 1e-6
 """Share of an error before the fit below which what is left is rounding: as many parameters as conditions."""
+_ROUNDING = 1e-9
+_VECTORS = ("specific_force", "angular_rate", "angular_acceleration", "magnetic_field")
+_LENGTHS = (
+    dict.fromkeys(_VECTORS, 3)
+    | {"attitude": 4}
+    | dict.fromkeys(("temperature", "temperature_rate", "time", "vibration_power", "current"), 0)
+)
+"""Entries along the last axis of a stimulus' fields; 0 for a number per sample."""
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -155,15 +166,40 @@ class Calibration(Result, Document, page="calibration"):
         names = tuple(self.names[row] for row in rows)
         return replace(self, names=names, covariance=self.covariance[np.ix_(rows, rows)], **changes)
 
+    def _of_data_sheet(self) -> tuple[Name, ...]:
+        """Return the numbers of gains and biases that no recording determined."""
+        free = (name for name in names_of(self.imu) if without_equipment(name) and name.effect is None)
+        return tuple(name for name in free if name.owner in self.triads() and name not in self.names)
+
     @property
     def from_data_sheet(self) -> tuple[str, ...]:
         """Gains and biases that no recording determined, such as "gyroscope gain"; they are the data sheet's."""
-        free = (name for name in names_of(self.imu) if without_equipment(name) and name.effect is None)
-        return tuple(
-            dict.fromkeys(
-                f"{name.owner} {name.part}" for name in free if name.owner in self.triads() and name not in self.names
-            )
-        )
+        return tuple(dict.fromkeys(f"{name.owner} {name.part}" for name in self._of_data_sheet()))
+
+    def uncertainty_of(self, stimulus: Stimulus) -> dict[str, OutputUncertainty]:
+        """Return how uncertain the corrected output is at some input, by triad: of those whose input it holds.
+
+        The covariance is J C Jᵀ, C that of the calibration's numbers and J the derivatives of `recover` by them
+        (`jaximu.estimation.projection`): mrcal's projection uncertainty, for an IMU. It holds all that the calibration
+        is uncertain of, gravity's error included; not the noise of the samples that are corrected, nor effects of a
+        session. Numbers of the data sheet count with its tolerance, five typical sizes.
+
+        **Arguments:** `stimulus`: the true input, such as `jaximu.Stimulus(specific_force=[0, 0, 9.8])`: force
+        (..., 3) m/s², rate (..., 3) rad/s, and what effects need (temperature, °C), in the body frame.
+
+        Raises `InputError` where it holds no calibrated triad's input, a shape is wrong or a number not finite, or an
+        effect needs what it lacks.
+        """
+        require_float64()
+        triads = self.triads()
+        stimulus = _checked(stimulus, [triad.quantity for triad in triads.values()])
+        stated = self._of_data_sheet()
+        free = (*self.names, *stated)
+        sizes = dict(zip(names_of(self.imu), flatten(typical_sizes(self.imu)), strict=True))
+        tolerance = [TOLERANCE * sizes[name] if name in stated else 0.0 for name in free]
+        covariance = self.covariance_of(free) + np.diag(np.square(tolerance))
+        uncertainty = output_uncertainty(self.imu, free, covariance, stimulus)
+        return {name: uncertainty[name] for name in triads if name in uncertainty}
 
     def sigma(self, triad: str) -> tuple[FloatArray, FloatArray]:
         """Return the standard deviations of a triad's gain (3, 3) and bias (3,); zero where fixed by convention."""
@@ -180,6 +216,17 @@ class Calibration(Result, Document, page="calibration"):
         whole = np.zeros((len(names), len(names)))
         whole[np.ix_(there, there)] = self.covariance[np.ix_(rows, rows)]
         return whole
+
+    def gravity_shift(self) -> FloatArray:
+        """Return what one sigma of gravity's error, K ∝ 1/g, adds to the numbers (p,); zeros where C lacks it."""
+        values = dict(zip(names_of(self.imu), flatten(self.imu).tolist(), strict=True))
+        scaled = [name.owner == "accelerometer" and name.part == "gain" for name in self.names]
+        shift = np.where(scaled, [values[name] for name in self.names], 0.0) * self.gravity.sigma / self.gravity.value
+        scale = np.sqrt(np.maximum(np.diagonal(self.covariance), shift**2))
+        scale = np.where(scale > 0, scale, 1.0)
+        rest = (self.covariance - np.outer(shift, shift)) / scale[:, None] / scale
+        held = np.linalg.eigvalsh(rest).min(initial=0.0) > -_ROUNDING  # C − s sᵀ is a covariance
+        return shift if held else np.zeros(len(shift))
 
     def _effects(self, owner: str, model: Triad) -> dict[str, Any]:
         """Return the effects of a triad as the JSON document has them."""
@@ -295,6 +342,26 @@ def concluded(
         fit=fitted,
         **working,
     )
+
+
+def _checked(stimulus: Stimulus, quantities: Sequence[str]) -> Stimulus:
+    """Return a stimulus as arrays. Raises `InputError` where it holds none of these inputs, or what is no input."""
+    if all(getattr(stimulus, quantity) is None for quantity in quantities):
+        raise InputError(f"the stimulus holds no {listed([*quantities], 'or').replace('_', ' ')} to be corrected.")
+    arrays, axes = {}, set()
+    for name, length in _LENGTHS.items():
+        if getattr(stimulus, name) is None:
+            continue
+        arrays[name] = values = np.asarray(getattr(stimulus, name), float)
+        words = name.replace("_", " ")
+        if length and values.shape[-1:] != (length,):
+            raise InputError(f"the {words} has the shape {values.shape}: its last axis must have {length} entries.")
+        if not np.isfinite(values).all():
+            raise InputError(f"the {words} holds a number that is not finite.")
+        axes.add(values.shape[:-1] if length else values.shape)
+    if len(axes) > 1:
+        raise InputError(f"the stimulus' arrays differ in their leading axes: {listed(sorted(map(str, axes)))}.")
+    return replace(stimulus, **arrays)
 
 
 def clock_sigma(segmentations: Sequence[Segmentation]) -> float:

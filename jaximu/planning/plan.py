@@ -226,10 +226,10 @@ class Turn:
 class Proposal(Result, Document, page="plan"):
     """The next poses and turns, and what they are expected to do to the uncertainty.
 
-    By hand and on a robot, turn k leads from pose k to the next. before, after: standard deviations of the parameters
-    (own units) without and with them; criterion_before, …_after, …_exact: the criterion as a standard deviation,
-    …_exact before the angles were rounded. rank, open: what all data together determine, and directions they leave
-    open.
+    By hand and on a robot, turn k leads from pose k to the next. covariances: of the parameters (p, p), own units,
+    without and with them; by_gravity (p,): what one sigma of gravity's error adds to the parameters, zero where that
+    is another number. criterion_before, …_after, …_exact: the criterion as a standard deviation, …_exact before the
+    angles were rounded. rank, open: what all data together determine, and directions they leave open.
     """
 
     equipment: Equipment
@@ -238,8 +238,8 @@ class Proposal(Result, Document, page="plan"):
     turns: tuple[Turn, ...]
     imu: Imu
     names: tuple[Name, ...]
-    before: FloatArray
-    after: FloatArray
+    covariances: tuple[FloatArray, FloatArray]
+    by_gravity: FloatArray
     criterion_before: float
     criterion_after: float
     criterion_exact: float
@@ -247,6 +247,16 @@ class Proposal(Result, Document, page="plan"):
     open: tuple[WeakDirection, ...]
     source: str
     notes: tuple[str, ...]
+
+    @property
+    def before(self) -> FloatArray:
+        """The standard deviations of the parameters (p,), own units, without the poses."""
+        return np.sqrt(np.diagonal(self.covariances[0]))
+
+    @property
+    def after(self) -> FloatArray:
+        """The standard deviations of the parameters (p,), own units, with the poses."""
+        return np.sqrt(np.diagonal(self.covariances[1]))
 
     @property
     def gain(self) -> float:
@@ -367,7 +377,6 @@ def propose(
     root = root_of(best.information + question.prior - np.eye(len(size)) / TOLERANCE**2)
     rank, weak = weak_directions(root.T, names, size, question.imu)
     stages = prior, best.covariance, covariance(question, exact).covariance
-    before, after, _ = (np.sqrt(np.diagonal(stage)) * size for stage in stages)
     unit = float(size @ question.weights) or 1.0  # of a parameter; else a typical size
     criteria = (score(question, stage) * unit for stage in stages)
     return Proposal(
@@ -377,8 +386,8 @@ def propose(
         _turns(design, equipment),
         question.imu,
         names,
-        before,
-        after,
+        (size[:, None] * prior * size, size[:, None] * best.covariance * size),
+        size * np.asarray(question.by_gravity),
         *criteria,
         rank=rank,
         open=weak,

@@ -339,7 +339,7 @@ def _proposal(
     notes: tuple[str, ...],
 ) -> Proposal:
     start, size = estimator.begun(), estimator.size
-    before, after = (np.sqrt(np.diagonal(estimator.numbers(stage))) for stage in (start, knowledge))
+    before, after = (np.asarray(estimator.numbers(stage)) for stage in (start, knowledge))
     states, earth = estimator.errors.states, list(estimator.earth)
     root = estimator.whole(words, known=False).root[states:, states:]
     # gravity's column comes last, so that the rows above it hold without it only where it is known
@@ -350,9 +350,9 @@ def _proposal(
     )
     of_earth = {estimator.names[index] for index in earth}
     weak = tuple(direction for direction in weak if not {name for name, _ in direction.parameters} <= of_earth)
-    unshown = [index for index in earth if after[index] > _SHOWN * before[index]]
+    unshown = [index for index in earth if after[index, index] > _SHOWN**2 * before[index, index]]
     if unshown:
-        left = spoken_amount(estimator.names[unshown[0]], 1.96 * after[unshown[0]], estimator.imu)
+        left = spoken_amount(estimator.names[unshown[0]], 1.96 * np.sqrt(after[unshown[0], unshown[0]]), estimator.imu)
         notes += (
             "the gyroscope's noise hides the Earth's rotation from this sequence: it is known to "
             f"± {left} (95 %), and is part of how uncertain the biases are.",
@@ -368,8 +368,8 @@ def _proposal(
         turns,
         estimator.imu,
         estimator.names,
-        before,
-        after,
+        (before, after),
+        np.zeros(len(size)),
         at_first,
         at_last,
         at_last,

@@ -18,6 +18,7 @@ from jaximu.ground.quantities import Z95, change, counted, sentence, size, with_
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.report import figures, tables, words
 from jaximu.report.evidence import evidence
+from jaximu.report.uncertainty import uncertainty_parts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,22 +42,11 @@ _ERRORS = {
 def page_of(calibration: Calibration) -> Page:
     """Return the page of a calibration from poses, turns or rests."""
     return calibration_page(
-        calibration, _pictures(calibration), words.trust(calibration), partial(_limits, calibration)
+        calibration,
+        _pictures(calibration),
+        words.trust(calibration),
+        partial(words.limits, calibration, evidence(calibration)),
     )
-
-
-def _limits(calibration: Calibration) -> Iterator[Part]:
-    """Return what the data cannot show, and where the poses pointed."""
-    errors = evidence(calibration)
-    yield from words.limits(calibration, errors)
-    if errors is not None:
-        yield Picture(
-            "orientations",
-            partial(figures.orientation_figure, errors),
-            "Map of the directions that pointed up in each pose",
-            "The two halves of the sphere of orientations, seen along z, areas true. A calibration speaks best for "
-            "orientations near its poses; colours that go with the direction point to a cause that the model lacks.",
-        )
 
 
 def _pictures(calibration: Calibration) -> Iterator[Picture]:
@@ -120,6 +110,8 @@ def calibration_page(
     def rest() -> Iterator[Part]:
         if settled:
             yield Section("What to trust", settled)
+        if uncertain := [*uncertainty_parts(calibration)]:
+            yield Section("What is still uncertain", uncertain)
         yield Section("What the data cannot show", [*limits()])
         yield from _equations(calibration)
         yield _correlation(calibration)

@@ -12,7 +12,7 @@ from jaximu.data import forces_and_angles
 from jaximu.ground.array_types import FloatArray
 from jaximu.simulation.protocols.positions import spiral
 
-__all__ = ["PoseAndTurnErrors", "evidence", "largest_gap", "nearest_angles"]
+__all__ = ["PoseAndTurnErrors", "evidence", "largest_gap"]
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,9 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
     )
 
 
-def nearest_angles(points: FloatArray, directions: FloatArray) -> FloatArray:
-    """Return the angle (deg) from each of the unit vectors `points` (n, 3) to the nearest of `directions` (P, 3)."""
-    return np.degrees(np.arccos(np.clip((points @ directions.T).max(axis=1), -1.0, 1.0)))
-
-
 def largest_gap(directions: FloatArray) -> tuple[float, FloatArray]:
     """Return how far (deg) an orientation can lie from every pose, and the direction (3,) where that is so."""
     points = spiral(4000)  # one every 3°
-    angles = nearest_angles(points, directions)
+    angles = np.degrees(np.arccos(np.clip((points @ directions.T).max(axis=1), -1.0, 1.0)))
     worst = int(np.argmax(angles))
     return angles[worst], points[worst]

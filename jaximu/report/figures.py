@@ -20,7 +20,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import number, raised, readable, size, unit_text
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.report.evidence import PoseAndTurnErrors, evidence, largest_gap, nearest_angles
+from jaximu.report.evidence import PoseAndTurnErrors, evidence
 from jaximu.report.tables import short_name
 from jaximu.report.vector import named
 from jaximu.report.words import how_much_smaller
@@ -34,7 +34,6 @@ __all__ = [
     "AXES",
     "BEFORE",
     "FLAGGED",
-    "GAPS",
     "LEAST_SHARE",
     "OTHERS",
     "PALETTE",
@@ -45,7 +44,9 @@ __all__ = [
     "legend_below",
     "logarithmic",
     "new_figure",
+    "number_dots",
     "png",
+    "raised_to_sphere",
     "recording_of",
     "residuals_of",
     "signals_figure",
@@ -57,7 +58,6 @@ AXES = {"x": "#0072B2", "y": "#D55E00", "z": "#009E73"}
 BEFORE, AFTER, FLAGGED, POSE = "#8A8A8A", "#0072B2", "#D55E00", "#F0E442"
 PALETTE, OTHERS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#000000"), "#B8B8B8"
 NOISE, SCATTER = "#56B4E9", "#CFE8F7"
-GAPS = ("white", "#E6E6E6", "#C4C4C4", "#9C9C9C")
 
 LEAST_SHARE = 0.01
 """Of a variance: what is below it everywhere is drawn among the others."""
@@ -383,30 +383,30 @@ def _flat(directions: FloatArray) -> FloatArray:
     return directions[:, :2] * (radius / np.maximum(across, 1e-12))[:, None]
 
 
-def hemispheres(
-    figure: Figure,
-    columns: int,
-    directions: FloatArray,
-    values: FloatArray,
-    span: float,
-    label: str,
-    called: str,
-    **dots: Any,
-) -> tuple[list[tuple[Axes, int, NDArray[np.bool_], FloatArray]], Any]:
-    """Draw directions (n, 3) on the two half spheres about ±z, coloured by values (n,) up to ±span, with their scale.
+def raised_to_sphere(x: FloatArray, y: FloatArray, sign: int) -> FloatArray:
+    """Return the directions (..., 3) of points of a disc of radius one, the inverse of that map; its edge beyond."""
+    radius = np.hypot(x, y)
+    height = 1 - np.minimum(radius, 1.0) ** 2
+    scale = np.sqrt(1 - height**2) / np.maximum(radius, 1e-12)
+    return np.stack([scale * x, scale * y, sign * height], axis=-1)
 
-    A page calls each `called` and its number.
+
+def hemispheres(
+    figure: Figure, columns: int, directions: FloatArray, names: Sequence[str], colors: Any = None, **dots: Any
+) -> tuple[list[tuple[Axes, int, NDArray[np.bool_], FloatArray]], Any]:
+    """Draw directions (n, 3), called by their names, on the two half spheres about ±z; `colors` (n,): values.
+
     **Returns:** the two panels, each with the sign of its z, which directions (n,) lie in it, and where (m, 2); and
-    the figure's grid, in whose `columns` the panels are the first two.
+    the figure's grid, in whose `columns` the panels are the first two, with room for a colour bar below.
     """
     grid = figure.add_gridspec(2, columns, height_ratios=(1, 0.03))
-    circle, panels, drawn, unit = np.linspace(0, 2 * np.pi, 200), [], None, label.rpartition("(")[2].rstrip(")")
+    circle, panels = np.linspace(0, 2 * np.pi, 200), []
     for column, sign in enumerate((1, -1)):
         axes = figure.add_subplot(grid[0, column])
         here = directions[:, 2] >= 0 if sign > 0 else directions[:, 2] < 0
         spot = _flat(directions[here])
-        drawn = axes.scatter(*spot.T, c=values[here], cmap="PuOr_r", vmin=-span, vmax=span, zorder=3, **dots)
-        named(drawn, [f"{called} {index}: {number(values[index - 1], 2)} {unit}" for index in np.flatnonzero(here) + 1])
+        drawn = axes.scatter(*spot.T, c=None if colors is None else colors[here], zorder=3, **dots)
+        named(drawn, [name for name, inside in zip(names, here, strict=True) if inside])
         axes.plot(np.cos(circle), np.sin(circle), color="black", linewidth=1)
         for px, py, text in ((1.14, 0, "+x"), (-1.14, 0, "−x"), (0, 1.12, "+y"), (0, -1.12, "−y")):
             axes.text(px, py, text, ha="center", va="center", fontsize=9)
@@ -414,12 +414,10 @@ def hemispheres(
         axes.set_axis_off()
         axes.set(xlim=(-1.22, 1.22), ylim=(-1.18, 1.18))
         panels.append((axes, sign, here, spot))
-    assert drawn is not None
-    figure.colorbar(drawn, cax=figure.add_subplot(grid[1, :2]), orientation="horizontal").set_label(label)
     return panels, grid
 
 
-def _number_dots(axes: Axes, spots: FloatArray, numbers: NDArray[np.intp]) -> None:
+def number_dots(axes: Axes, spots: FloatArray, numbers: NDArray[np.intp]) -> None:
     """Write one label for all poses on nearly the same spot: their numbers, the first three of them."""
     left = list(range(len(spots)))
     while left:
@@ -427,60 +425,3 @@ def _number_dots(axes: Axes, spots: FloatArray, numbers: NDArray[np.intp]) -> No
         text = ", ".join(map(str, numbers[near[:3]])) + (" …" if len(near) > 3 else "")
         axes.annotate(text, spots[left[0]], (5, 4), textcoords="offset points", fontsize=7, color="#333333", zorder=5)
         left = [dot for dot in left if dot not in near]
-
-
-def orientation_figure(poses: PoseAndTurnErrors) -> Figure:
-    """Draw which way was up in each pose, and where no pose was."""
-    figure = new_figure(5.4)
-    errors, label = 1000 * poses.norm_after, "error of gravity's magnitude after calibration (mm/s²)"
-    panels, _ = hemispheres(
-        figure,
-        2,
-        poses.directions,
-        errors,
-        np.max(np.abs(errors)),
-        label,
-        "pose",
-        s=70,
-        edgecolors="black",
-        linewidths=0.8,
-    )
-    gap, where = largest_gap(poses.directions)
-    ticks = np.linspace(-1, 1, 161)
-    x, y = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
-    radius = np.hypot(x, y)
-    height = 1 - np.minimum(radius, 1.0) ** 2
-    scale = np.sqrt(1 - height**2) / np.maximum(radius, 1e-12)
-    circle = np.linspace(0, 2 * np.pi, 200)
-    for axes, sign, here, spot in panels:
-        points = np.stack([scale * x, scale * y, sign * height], axis=1)
-        angles = np.where(radius <= 1, nearest_angles(points, poses.directions), np.nan).reshape(161, 161)
-        axes.contourf(ticks, ticks, angles, levels=[0, 30, 45, 60, 181], colors=GAPS)
-        for tilt in (30, 60):
-            ring = np.sqrt(1 - np.cos(np.radians(tilt)))
-            axes.plot(ring * np.cos(circle), ring * np.sin(circle), color="#BBBBBB", linewidth=0.5)
-        _number_dots(axes, spot, np.flatnonzero(here) + 1)
-        if (where[2] >= 0) == (sign > 0):
-            px, py = _flat(where[None])[0]
-            axes.plot(px, py, "x", color="#CC0033", markersize=10, markeredgewidth=2.2, zorder=4)
-            axes.annotate(
-                f"{gap:.0f}°",
-                (px, py),
-                (8, -11),
-                textcoords="offset points",
-                fontsize=9,
-                color="#CC0033",
-                fontweight="bold",
-                zorder=4,
-            )
-        axes.plot(0, 0, "+", color="#666666", markersize=7)
-        middle, way = ("+z", "up") if sign > 0 else ("−z", "down")
-        axes.set_title(f"{middle} in the middle: poses with z pointing {way}", fontsize=9)
-    what = "Orientations are missing" if gap > 60 else "Orientations have gaps"
-    title = f"{what}: the cross lies {gap:.0f}° from the nearest pose"
-    if gap < 45:
-        title = f"Orientations are well spread: every direction lies within {gap:.0f}° of a pose"
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
-    key = "dot: body direction that pointed up in a pose (number); grey: farther than 30°, 45°, 60° from every pose"
-    figure.supxlabel(key, fontsize=8, color="#444444")
-    return figure

@@ -268,7 +268,7 @@ def _changes_figure(history: UnitHistory) -> Figure:
     rows = history.movements[::-1]
     figure = figures.new_figure(1.0 + 0.17 * len(rows))
     panel = figure.subplots(1, 1)
-    panel.axvspan(-Z95, Z95, color=figures.GAPS[1], linewidth=0)
+    panel.axvspan(-Z95, Z95, color="#E6E6E6", linewidth=0)
     for row, movement in enumerate(rows):
         colour = figures.FLAGGED if movement.moved else figures.AFTER if movement.tested else figures.BEFORE
         panel.plot(movement.z, row, "o", color=colour, markersize=5)

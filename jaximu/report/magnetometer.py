@@ -143,20 +143,24 @@ def _figure(calibration: Calibration, measurement: MagneticField, heading: Headi
     length = np.linalg.norm(field, axis=1)
     off, span = 100 * (length / measurement.strength - 1), 0.98
     figure = new_figure(3.6)
+    limit = np.quantile(np.abs(off), span)
     panels, grid = hemispheres(
         figure,
         2 if heading is None else 3,
         field / length[:, None],
+        [f"window {index}: {number(value, 2)} %" for index, value in enumerate(off, 1)],
         off,
-        np.quantile(np.abs(off), span),
-        "strength off after calibration (%)",
-        "window",
+        cmap="PuOr_r",
+        vmin=-limit,
+        vmax=limit,
         s=18,
         edgecolors="#555555",
         linewidths=0.3,
     )
     for axes, sign, *_ in panels:
         axes.set_title(f"field along {'+z' if sign > 0 else '−z'}", fontsize=10)
+    bar = figure.colorbar(axes.collections[0], cax=figure.add_subplot(grid[1, :2]), orientation="horizontal")
+    bar.set_label("strength off after calibration (%)")
     if heading is not None:
         axes, turned = figure.add_subplot(grid[:, 2]), np.append(heading.heading, 360.0)
         names = ["level", "rolled 45°", "rolled −45°", "pitched 45°", "pitched −45°", "upside down"]

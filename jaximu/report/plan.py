@@ -12,12 +12,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaximu.estimation.problem import Name
+from jaximu.estimation.projection import output_uncertainty
 from jaximu.estimation.uncertainty import describe, spoken_amount
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Page, Picture, Section, Statement, Table
 from jaximu.ground.quantities import Z95, number, plain, sentence
+from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.planning import Proposal
 from jaximu.report import figures
+from jaximu.report.uncertainty import sphere_figure, steady
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,7 +47,7 @@ def page_of(proposal: Proposal) -> Page:
         f"{_times(proposal.gain)}×",
         f"smaller uncertainty expected than with {Path(proposal.source).name} alone",
         (
-            Section("The poses", [_picture(proposal), *_instructions(proposal), _poses(proposal)]),
+            Section("The poses", [_picture(proposal), *_map(proposal), *_instructions(proposal), _poses(proposal)]),
             *_turns(proposal),
             Section("What they are expected to gain", [_parameters(proposal)]),
             *_open(proposal),
@@ -199,6 +202,25 @@ def _picture(proposal: Proposal) -> Picture:
     else:
         caption = f"Seen a little from above; the heading on the table does not matter. {caption}"
     return Picture("poses", partial(_poses_figure, proposal), "The unit drawn in each pose", caption)
+
+
+def _map(proposal: Proposal) -> Iterator[Picture]:
+    """Return how uncertain the corrected force is before the poses, or after them where it is open until then."""
+    gravity = np.outer(proposal.by_gravity, proposal.by_gravity)
+    rest = partial(steady, gravity=STANDARD_GRAVITY, temperature=proposal.imu.accelerometer.temperature_reference)
+    for covariance, when in zip(proposal.covariances, ("Before", "After"), strict=True):
+        known = partial(output_uncertainty, proposal.imu, proposal.names, covariance - gravity)
+        if np.isfinite(known(rest(np.eye(3)))["accelerometer"].largest).all():
+            up = np.array([pose.up for pose in proposal.poses])
+            names = [f"pose {index}: {pose.words}" for index, pose in enumerate(proposal.poses, 1)]
+            yield Picture(
+                "orientations",
+                partial(sphere_figure, known, rest, up, names, f"{when} these poses, least certain"),
+                "The next poses on a map of the uncertainty of the corrected specific force at rest over orientation",
+                "Colours: 95 % of the corrected specific force at rest over the direction that points up in the body, "
+                "without gravity's own error. Numbers: the poses to record.",
+            )
+            return
 
 
 def _poses_figure(proposal: Proposal) -> Figure:

@@ -15,6 +15,7 @@ from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
 __all__ = [
     "counts",
+    "direction_words",
     "gravity_statements",
     "how_much_smaller",
     "limits",
@@ -179,8 +180,8 @@ def limits(calibration: Calibration, errors: PoseAndTurnErrors | None = None) ->
         gap, where = largest_gap(errors.directions)
         if gap > 60:
             text = (
-                f"The direction {_direction(where)} is {gap:.0f}° away from every direction that pointed up in a pose: "
-                "what the accelerometer does there is extrapolated. Record poses there."
+                f"The direction {direction_words(where)} is {gap:.0f}° away from every direction that pointed up in a "
+                "pose: what the accelerometer does there is extrapolated. Record poses there."
             )
             yield Statement("Orientations", text, True)
     if "gravity_norm" in calibration.rms:
@@ -208,7 +209,7 @@ def limits(calibration: Calibration, errors: PoseAndTurnErrors | None = None) ->
     yield Statement("Not modelled", text)
 
 
-def _direction(vector: np.ndarray) -> str:
+def direction_words(vector: np.ndarray) -> str:
     """Put a direction into words, by its axes longer than a third of it."""
     parts = [("+" if value > 0 else "−") + axis for axis, value in zip("xyz", vector, strict=True) if abs(value) > 0.33]
     return parts[0] if len(parts) == 1 else f"between {listed(parts)}"

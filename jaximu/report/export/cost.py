@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import equinox as eqx
 import numpy as np
 
 from jaximu.calibration import Calibration
-from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
@@ -100,19 +100,22 @@ class Range:
 class Loss:
     """One thing that a file does not hold, and the greatest and rms error of the corrected values without it.
 
-    worst, rms: by triad, in m/s² and rad/s (the length of the error vector).
+    worst, rms: by triad, in m/s² and rad/s (the length of the error vector); None where it is not determined.
     """
 
     what: str
-    worst: dict[str, float]
-    rms: dict[str, float]
+    worst: Mapping[str, float | None]
+    rms: Mapping[str, float | None]
 
     def text(self) -> str:
         """The loss as one line."""
+        pairs = [(name, worst, self.rms[name]) for name, worst in self.worst.items()]
         costs = [
-            f"{size(worst, SENSOR_UNITS[name])} at worst, {size(self.rms[name], SENSOR_UNITS[name])} rms"
-            for name, worst in self.worst.items()
-            if worst
+            f"{size(worst, SENSOR_UNITS[name])} at worst, {size(rms, SENSOR_UNITS[name])} rms"
+            if worst is not None and rms is not None
+            else f"the {name} is not determined"
+            for name, worst, rms in pairs
+            if worst != 0
         ]
         return f"{self.what}: {'; '.join(costs) or 'costs nothing here'}"
 
@@ -150,7 +153,7 @@ def losses(parameters: ExportedUnit, written: Written, extent: Range) -> tuple[L
                 one = [_outputs(imu.with_effects(effect), path) for path in paths]
                 shift = [(with_[name] - without[name]) @ inverse.T for with_, without in zip(one, plain, strict=True)]
                 parts.append(_loss(f"the effect {effect.name}", {name: np.concatenate(shift)}))
-    parts = [part for part in parts if any(worst > _NOTHING for worst in part.worst.values())]
+    parts = [part for part in parts if any((worst or 0.0) > _NOTHING for worst in part.worst.values())]
     if len(parts) > 1:
         whole = [_outputs(imu, path) for path in paths]
         gaps = {name: _gap(parameters, written, name, whole, paths) for name in parameters.triads}
@@ -193,26 +196,12 @@ def _loss(what: str, gaps: dict[str, FloatArray]) -> Loss:
 
 
 def _uncertainty(calibration: Calibration, extent: Range) -> Loss:
-    """The standard deviation of corrected values that gains and biases are not known better than.
-
-    δu = −K⁻¹ (δK u + δb), its covariance from that of the parameters, for gravity (turns) along and between the axes.
-    """
-    directions = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    index = {name: at for at, name in enumerate(calibration.names)}
+    """The standard deviation of corrected values (the length of their vector) over the range."""
     worst, rms = {}, {}
-    for name, triad in calibration.imu.triads().items():
-        inverse = np.linalg.inv(np.asarray(triad.gain))
-        largest = {"accelerometer": extent.gravity, "gyroscope": extent.rate, "magnetometer": extent.field or 0.0}[name]
-        inputs = largest * directions
-        inputs = np.vstack([np.zeros(3), inputs]) if name == "gyroscope" else inputs
-        jacobian = np.zeros((len(inputs), 3, len(index)))
-        for row in range(3):
-            for column in range(3):
-                if (at := index.get(Name(name, "gain", (row, column)))) is not None:
-                    jacobian[:, :, at] -= inputs[:, column, None] * inverse[:, row]
-            if (at := index.get(Name(name, "bias", (row,)))) is not None:
-                jacobian[:, :, at] -= inverse[:, row]
-        variance = np.einsum("nip,pq,niq->n", jacobian, calibration.covariance, jacobian)
-        worst[name], rms[name] = float(np.sqrt(variance.max())), float(np.sqrt(variance.mean()))
+    uncertainties = [calibration.uncertainty_of(path) for path in extent.paths()]
+    for name in uncertainties[0]:
+        lengths = np.linalg.norm([uncertainty[name].sigma for uncertainty in uncertainties], axis=-1)
+        determined = bool(np.isfinite(lengths).all())
+        worst[name] = float(lengths.max()) if determined else None
+        rms[name] = float(np.sqrt(np.mean(lengths**2))) if determined else None
     return Loss("the uncertainty (1 sigma of corrected values; not an error of the file)", worst, rms)

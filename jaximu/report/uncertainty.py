@@ -1,0 +1,231 @@
+"""Where a calibration is still uncertain: corrected force over orientation, rate over rate, both over temperature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaximu.calibration import Calibration
+from jaximu.estimation.projection import OutputUncertainty
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.page import Part, Picture, Statement
+from jaximu.ground.quantities import Z95, listed, number, readable, size
+from jaximu.model.stimulus import Stimulus
+from jaximu.report import figures
+from jaximu.report.evidence import evidence
+from jaximu.report.export import Range
+from jaximu.report.words import direction_words
+from jaximu.simulation.protocols.positions import spiral
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["sphere_figure", "steady", "uncertainty_parts"]
+
+Known = Callable[[Stimulus], dict[str, OutputUncertainty]]
+
+_APART = 1e6  # s between samples: whatever lags has settled
+_TICKS, _STEPS = 81, 41
+_LEAST_RANGE = 0.8
+"""Share of the worst value at which the colours begin at the latest: a map that is alike everywhere looks alike."""
+_FACES = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+def steady(up: FloatArray, gravity: float, temperature: Any, rate: FloatArray | float = 0.0) -> Stimulus:
+    """Return what a unit goes through in steady states.
+
+    **Arguments:** `up` (n, 3): which way is up in the body; `gravity`: m/s²; `temperature`: °C; `rate` (n, 3): rad/s.
+    """
+    nothing, none = np.zeros(len(up)), np.zeros_like(up)
+    return Stimulus(
+        specific_force=gravity * up,
+        angular_rate=none + rate,
+        angular_acceleration=none,
+        temperature=nothing + temperature,
+        temperature_rate=nothing,
+        time=_APART * np.arange(len(up)),
+        attitude=np.tile([1.0, 0.0, 0.0, 0.0], (len(up), 1)),
+        vibration_power=nothing,
+        magnetic_field=none,
+        current=nothing,
+    )
+
+
+def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
+    """Return what is uncertain of the corrected output, in sentences and pictures.
+
+    Gravity's error is stated beside: it is alike in every orientation, and no pose makes it smaller.
+    """
+    triads, shift = calibration.triads(), calibration.gravity_shift()
+    recorded = replace(calibration, covariance=calibration.covariance - np.outer(shift, shift))
+    extent = Range.of(calibration)
+    temperature = float(np.mean(extent.temperature))
+    if "accelerometer" in triads:
+        rest = partial(steady, gravity=calibration.gravity.value, temperature=temperature)
+        errors = evidence(calibration)
+        poses, after = (np.zeros((0, 3)), []) if errors is None else (errors.directions, errors.norm_after)
+        names = [f"pose {index}: error {size(error, 'm/s^2', 2)}" for index, error in enumerate(after, 1)]
+        directions = spiral(2000)
+        half = Z95 * recorded.uncertainty_of(rest(directions))["accelerometer"].largest
+        yield Statement("At rest", " ".join(_at_rest(calibration, directions, half, bool(shift.any()))))
+        if np.isfinite(half).any():
+            yield Picture(
+                "orientations",
+                partial(sphere_figure, recorded.uncertainty_of, rest, poses, names),
+                "Map of the uncertainty of the corrected specific force at rest over orientation, with the poses",
+                "The two halves of the sphere of directions that point up in the body, seen along z, areas true. "
+                "Colours: 95 % of the corrected specific force at rest, along the direction in which it is least "
+                "certain; misalignment counts against the body frame. Numbers: the poses. Cross: the worst. "
+                "Noise of single samples is not part of it, nor what the model lacks.",
+            )
+    if "gyroscope" in triads:
+        yield Statement("Turning", _turning(recorded, extent))
+    panels = [panel for panel in _panels(recorded, extent) if np.isfinite(panel[-1]).any()]
+    if panels:
+        yield Picture(
+            "uncertainty",
+            partial(_curves_figure, panels),
+            "Uncertainty of the corrected output over rate and temperature",
+            "95 % of the corrected output along the direction in which it is least certain, z up while turning; gaps "
+            "are not determined. The gyroscope's bias counts as it was in the recording.",
+        )
+
+
+def _at_rest(calibration: Calibration, directions: FloatArray, half: FloatArray, by_gravity: bool) -> Iterator[str]:
+    """Say where the corrected force is least certain, and what that means, half an interval (n,) by direction."""
+    gravity, worst = calibration.gravity, int(np.argmax(half))
+    where = f"the direction {direction_words(directions[worst])}"
+    if not np.isfinite(half).all():
+        sheet = [name for name in calibration.from_data_sheet if name.startswith("accelerometer")]
+        why = f"the {listed(sheet)} is the data sheet's" if sheet else "a combination of parameters is open"
+        yield f"With {where} up the corrected specific force is not determined: {why}."
+        return
+    tilt = np.degrees(half[worst] / gravity.value)
+    yield (
+        f"The corrected specific force is least certain with {where} up: ±{size(half[worst], 'm/s^2', 2)} (95 %, along "
+        f"its worst direction), {number(tilt, 2)}° if it is used as a level; in the best orientation it is "
+        f"±{size(half.min(), 'm/s^2', 2)}. `jaximu plan CALIBRATION` chooses the poses that make it smaller."
+    )
+    if by_gravity:
+        yield (
+            f"Gravity's own uncertainty adds ±{size(Z95 * gravity.sigma, 'm/s^2', 2)} along the vertical in every "
+            "orientation, which no pose makes smaller: state the local gravity."
+        )
+
+
+def _turning(calibration: Calibration, extent: Range) -> str:
+    """Say how well the corrected rate is known at rest, and at the end of the range about the worst axis."""
+    rates = np.concatenate([np.zeros((1, 3)), extent.rate * _FACES])
+    up = np.tile([0.0, 0.0, 1.0], (len(rates), 1))
+    stimulus = steady(up, extent.gravity, np.mean(extent.temperature), rates)
+    half = Z95 * np.degrees(calibration.uncertainty_of(stimulus)["gyroscope"].largest)
+    worst = 1 + int(np.argmax(half[1:]))
+    still, turning = (
+        f"known to ±{number(value, 2)} °/s (95 %)" if np.isfinite(value) else "not determined"
+        for value in (half[0], half[worst])
+    )
+    end = f"{np.degrees(extent.rate):.4g} °/s about {direction_words(_FACES[worst - 1])}, the worst axis"
+    return f"The corrected rate is {still} at rest, and {turning} at {end}."
+
+
+def _panels(calibration: Calibration, extent: Range) -> Iterator[tuple[str, str, str, dict[str, FloatArray], Any]]:
+    """Return title, words of both axes, lines by name and their heights (lines, n) of each panel."""
+    triads, gravity = calibration.triads(), extent.gravity
+    if "gyroscope" in triads:
+        rates = np.linspace(0.0, np.degrees(extent.rate), _STEPS)
+        both = np.radians(rates)[:, None, None] * _FACES
+        up = np.tile([0.0, 0.0, 1.0], (both.size // 3, 1))
+        stimulus = steady(up, gravity, np.mean(extent.temperature), both.reshape(-1, 3))
+        half = Z95 * np.degrees(calibration.uncertainty_of(stimulus)["gyroscope"].largest).reshape(-1, 2, 3)
+        yield "Rate while turning", "rate (°/s)", "± 95 % (°/s)", {axis: rates for axis in "xyz"}, half.max(axis=1).T
+    warm = {name for name, triad in triads.items() if any("temperature" in effect.needs for effect in triad.effects)}
+    low, high = calibration.data.get("temperature_range", extent.temperature)
+    temperatures = np.linspace(low, high, _STEPS)
+    faces = np.tile(_FACES, (len(temperatures), 1))
+    stimulus = steady(faces, gravity, np.repeat(temperatures, len(_FACES)))
+    uncertainty = calibration.uncertainty_of(stimulus) if warm & {"accelerometer", "gyroscope"} else {}
+    for name, title, factor, unit in (
+        ("accelerometer", "Specific force at rest, the worst of six faces up", 1e3, "mm/s²"),
+        ("gyroscope", "Rate at rest", np.degrees(1.0), "°/s"),
+    ):
+        if name in warm:
+            half = factor * Z95 * uncertainty[name].largest.reshape(-1, len(_FACES)).max(axis=1)
+            yield title, "temperature (°C)", f"± 95 % ({unit})", {"": temperatures}, half[None]
+
+
+def _curves_figure(panels: list) -> Figure:
+    figure = figures.new_figure(2.6 * len(panels), 6.4)
+    grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    for axes, (title, across, up, lines, heights) in zip(grid, panels, strict=True):
+        for (name, values), height in zip(lines.items(), heights, strict=True):
+            axes.plot(
+                values,
+                np.where(np.isfinite(height), height, np.nan),
+                color=figures.AXES.get(name, figures.AFTER),
+                linewidth=1.8,
+                label=f"about {name}" if name else None,
+            )
+        figures.dressed(axes, title, xlabel=across, ylabel=up)
+        axes.set_ylim(0, None)
+        if len(lines) > 1:
+            figures.legend(axes, 3, "upper left")
+    return figure
+
+
+def sphere_figure(
+    known: Known,
+    rest: Callable[[FloatArray], Stimulus],
+    poses: FloatArray,
+    names: list[str],
+    called: str = "Least certain",
+) -> Figure:
+    """Draw how uncertain the corrected specific force is at rest over orientation, and where poses were or will be.
+
+    **Arguments:** `known`: the uncertainty of the output at an input; `rest`: what the unit goes through with some
+    directions (n, 3) up; `poses` (P, 3): directions, with their `names`.
+    """
+    import matplotlib
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap
+    from matplotlib.patches import Circle
+    from matplotlib.ticker import MaxNLocator
+
+    figure = figures.new_figure(4.6, 6.8)
+    panels, grid = figures.hemispheres(figure, 2, poses, names, s=60, color="white", edgecolors="black", linewidths=0.9)
+    ticks = np.linspace(-1, 1, _TICKS)
+    x, y = np.meshgrid(ticks, ticks)
+    points = np.stack([figures.raised_to_sphere(x, y, sign) for _, sign, *_ in panels])
+    half = Z95 * known(rest(points.reshape(-1, 3)))["accelerometer"].largest.reshape(points.shape[:-1])
+    factor, unit = readable("m/s^2", float(np.max(half[np.isfinite(half)])))
+    half = factor * half
+    best, worst = (float(end(half[np.isfinite(half)])) for end in (np.min, np.max))
+    levels = MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]).tick_values(min(best, _LEAST_RANGE * worst), worst)
+    colors = LinearSegmentedColormap.from_list("", matplotlib.colormaps["YlGnBu"](np.linspace(0.0, 0.6, 64)))
+    norm = BoundaryNorm(levels, colors.N)
+    inside = np.where(x**2 + y**2 <= 1, half, -1.0)
+    at = np.unravel_index(int(np.argmax(inside)), half.shape)
+    for panel, (axes, sign, here, spot) in enumerate(panels):
+        edge = Circle((0, 0), 1, transform=axes.transData)
+        axes.add_patch(Circle((0, 0), 1, facecolor="white", edgecolor="#777777", hatch="///", linewidth=0, zorder=0))
+        shades = axes.contourf(x, y, np.ma.masked_invalid(half[panel]), levels=levels, norm=norm, cmap=colors, zorder=1)
+        shades.set_clip_path(edge)
+        figures.number_dots(axes, spot, np.flatnonzero(here) + 1)
+        if at[0] == panel:
+            text = f"±{number(half[at], 2)} {unit}" if np.isfinite(half[at]) else "not determined"
+            axes.plot(x[at[1:]], y[at[1:]], "x", color="#CC0033", markersize=11, markeredgewidth=2.4, zorder=4)
+            style = {"fontsize": 10, "color": "#CC0033", "fontweight": "bold", "zorder": 6, "ha": "center"}
+            box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0}
+            axes.annotate(text, (0.75 * x[at[1:]], y[at[1:]]), (0, -17), textcoords="offset points", bbox=box, **style)
+        middle, way = ("+z", "up") if sign > 0 else ("−z", "down")
+        axes.set_title(f"z {way} ({middle} in the middle)", fontsize=10)
+    bar = figure.colorbar(ScalarMappable(norm, colors), cax=figure.add_subplot(grid[1, :2]), orientation="horizontal")
+    bar.set_label(f"specific force at rest, ± 95 % ({unit})", fontsize=10)
+    what = called if np.isfinite(half[at]) else "Not determined"
+    figure.suptitle(
+        f"{what} with the direction {direction_words(points[at])} up", x=0.01, ha="left", fontsize=12, fontweight="bold"
+    )
+    return figure
