@@ -121,8 +121,12 @@ def attempt(dialect: Dialect, folder: Path) -> Outcome:
         stated[name] = text
     asked = bool(advice.questions)
     if "accel" not in dialect.sensors:
-        return Outcome("asked", str(refusal)) if asked else Outcome("wrong", advice.line())
-    if asked and (any("?" in (text or "") for text in stated.values()) or "accel" not in (advice.columns or "accel")):
+        return Outcome("asked", str(refusal)) if asked or not advice.line() else Outcome("wrong", advice.line())
+    if asked and (
+        not advice.accelerometer
+        or any("?" in (text or "") for text in stated.values())
+        or "accel" not in (advice.columns or "accel")
+    ):
         return Outcome("unanswerable", advice.sentence())
     try:
         rate = float(stated.pop("rate") or 0) or None

@@ -6,7 +6,8 @@ import re
 
 import numpy as np
 import pytest
-from dialects import ALL, G, attempt, random_table, simulate, text, wrong_line, xyz
+from dialects import G, attempt, random_table, simulate, text, wrong_line, xyz
+from makers import ALL
 from rich.console import Console
 
 from jaximu.cli import main
@@ -30,9 +31,9 @@ def test_dialect(name, tmp_path):
 
 
 def test_most_dialects_are_read_or_answered(tmp_path):
-    """The goal: of sixty and more, 95 % of those that can be read without being told something are."""
-    readable = [name for name, each in ALL.items() if "asked" not in each.must]
-    assert len(ALL) >= 60 and len(readable) > 0.8 * len(ALL)
+    """The goal: of 130 and more, those that can be read without being told something are."""
+    readable = [name for name, each in ALL.items() if not {"asked", "unanswerable"} & {*each.must}]
+    assert len(ALL) >= 130 and len(readable) > 0.75 * len(ALL)
 
 
 def test_random_tables_get_no_wrong_line(tmp_path):

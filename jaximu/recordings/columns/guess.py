@@ -22,7 +22,7 @@ from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.alignment import CORRELATED, Turning, turning
-from jaximu.recordings.columns.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
+from jaximu.recordings.columns.habits import Field, fields_of, measures, sensor_of, words_of
 from jaximu.recordings.columns.known import EPOCH
 from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
@@ -44,13 +44,15 @@ _COUNTERS = set(
     "status".split()
 )
 _ANGLES = {name: unit_named(name).factor for name in ("rad/s", "deg/s", "mdeg/s", "mrad/s")}
-_PLAIN = set("var column col field data channel ch ans unnamed imu c v x y out simout".split())
+_PLAIN = set("var column col field data channel ch ans unnamed imu c v x y out simout value".split())
 """Words that say nothing of a column."""
 _SHOWN = 3
 _UNIT_LENGTH = 2e-3  # that the norm of a quaternion may be off by, as few digits make it
 _ATTITUDES = {"q", "quat", "quaternion", "orientation", "attitude"}
 _ROUGH = 0.15  # logarithm by which turns may be off what a gyroscope's scale makes of them
 _TURNING = 5.0  # times the scatter in them by which means of a gyroscope at rest do not differ
+_ANOTHER = math.log(2.0)  # logarithm by which a level at rest must miss 1 g for its unit to be another
+_COPY = 0.99  # share of an accelerometer's variance that its own values in another unit explain
 _HOTTEST = 125.0  # °C that a sensor survives
 _TURN = "turn gravity as the accelerometer shows"
 _SINGLE = ("temperature", "ambient_temperature", "current", "table_angle", "table_rate")
@@ -263,7 +265,7 @@ class _Guess:
         for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
             if values is None or field.sensor or not rises(values):
                 continue
-            if not _plain(field) and not find_unit(field.unit or "", "time"):
+            if not (_plain(field) or find_unit(field.unit or "", "time") or "time" in field.stem):
                 continue  # a name that says something else: a counter, a tick, an angle
             steps = np.diff(values)
             usual = np.median(steps)
@@ -294,8 +296,7 @@ class _Guess:
             named = sensor is not None and bool(stem)
             if sensor is None and not stem and self.file in ("accel", "gyro", "mag"):
                 sensor = self.file
-            if sensor is None and unit and unit != "G" and (measured := find_unit(unit)):
-                sensor = QUANTITIES.get(measured.quantity)  # Trigno x [g]: the word is unknown, the unit is not
+            sensor = sensor or measures(unit)  # Trigno x [g]: the word is unknown, the unit is not
             if sensor is None and not stem and self.file_not:
                 self.questions.append(f"Does this file hold an accelerometer? By its name it is {self.file_not}.")
                 continue
@@ -439,6 +440,7 @@ class _Guess:
 
     def _by_turning(self, free: list[_Triad], accel: _Triad) -> _Triad | None:
         """The triad whose rates turn gravity as the accelerometer says."""
+        free = [triad for triad in free if not _copies(triad, accel)]
         fits = [(abs(fit.correlation), triad) for triad in free if (fit := self._turning(accel, triad))]
         correlation, best = max(fits, key=lambda pair: pair[0], default=(0.0, None))
         if best is not None and correlation > CORRELATED:
@@ -533,6 +535,14 @@ class _Guess:
             self._take(accel, "accel", None)
             return
         unit = _fitting(accel.unit, "accel")
+        stated = find_unit(unit or "", "acceleration")
+        if (
+            stated
+            and accel.gravity_unit in _GRAVITY_IN
+            and abs(math.log(accel.level * stated.factor / STANDARD_GRAVITY)) > _ANOTHER
+        ):
+            self.reasons.append(f"{accel.label!r} is in {unit} by its name, and does not hold 1 g in it")
+            unit = None
         if unit is None:
             unit = accel.gravity_unit
             if unit == "?":
@@ -811,8 +821,9 @@ def _plausible(peak: float, bias: float, noise: float | None) -> list[str]:
 
 
 def _fitting(unit: str | None, group: str) -> str | None:
-    """A stated unit, if it is one of what the group's columns measure."""
-    return unit if find_unit(unit or "", GROUPS[group].quantities) else None
+    """A stated unit, if it is one of what the group's columns measure; "count" by whatever name."""
+    stated = find_unit(unit or "", GROUPS[group].quantities)
+    return stated and ("count" if stated.quantity == "raw count" else unit)
 
 
 def _plain(field: Field) -> bool:
@@ -820,10 +831,19 @@ def _plain(field: Field) -> bool:
     return all(word.rstrip("0123456789") in _PLAIN or word.isdigit() for word in field.stem)
 
 
+def _copies(triad: _Triad, accel: _Triad) -> bool:
+    """Whether a triad holds the accelerometer's values once more, in another unit."""
+    if len(triad.values) != len(accel.values):
+        return False
+    pairs = zip(triad.values.T, accel.values.T, strict=True)
+    return all(np.std(a) > 0 and np.std(b) > 0 and np.corrcoef(a, b)[0, 1] ** 2 > _COPY for a, b in pairs)
+
+
 def _alike(one: Field, other: Field) -> bool:
-    """Whether two names differ by a number alone, or are none: columns of one matrix."""
+    """Whether two names differ by a number or their last word alone, or are none: columns of one matrix."""
     words = [[word.rstrip("0123456789") for word in field.stem if not word.isdigit()] for field in (one, other)]
-    return words[0] == words[1] and one.unit == other.unit
+    same = words[0] == words[1] or (len(words[0]) == len(words[1]) > 1 and words[0][:-1] == words[1][:-1])
+    return same and one.unit == other.unit
 
 
 def _lone_gyroscope(table: LogTable) -> str:

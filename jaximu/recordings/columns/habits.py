@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from jaximu.ground.units import find_unit, parse_column
 
-__all__ = ["QUANTITIES", "Field", "fields_of", "sensor_of", "stated_rate", "words_of"]
+__all__ = ["QUANTITIES", "Field", "fields_of", "last_of", "measures", "sensor_of", "stated_rate", "words_of"]
 
 _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
@@ -54,7 +54,8 @@ _REFUSED = {word: reason for reason, words in _REFUSALS.items() for word in word
 _ESTIMATED = {("b", "w"), ("b", "a"), ("b", "g")}
 """How the names of an estimated state's biases begin, as in EuRoC's b_w_RS_S_x."""
 _TIME = set(
-    "t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec zeit".split()
+    "t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec zeit temps "
+    "tiempo unix epoch tow".split()
 )
 _TIME_ALONE = set("ms us ns sec secs seconds milliseconds microseconds nanoseconds epoch uptime".split())
 """Words that name a column of time where they are its whole name, and no other names one."""
@@ -63,15 +64,15 @@ _TIME_BESIDE = _NEUTRAL | set(
     "recording phone node chip epoc "
     "startup us ms ns sec nanosec nanoseconds nanos micros microseconds millis milliseconds usec msec nsec "
     "accelerometer "
-    "acc gyro gyroscope logging "
+    "acc gyro gyroscope logging arrival creation gps week whole "
     "absolute relative and date txt".split()
 )
 _UNIT_NAMES = {
     "time": {
         "s": "s, sec, secs, seconds",
         "ms": "ms, msec, msecs, millis, milliseconds",
-        "us": "us, usec, micros, microseconds",
-        "ns": "ns, nsec, nanos, nanosec, nanoseconds",
+        "us": "us, usec, usecs, micros, microseconds",
+        "ns": "ns, nsec, nsecs, nanos, nanosec, nanosecs, nanoseconds",
     },
     "accel": {"g": "g, gs", "mg": "mg", "m/s^2": "ms2, mps2, mss, m s 2, m s2, m s s, m per s2, m s"},
     "gyro": {
@@ -93,9 +94,26 @@ _GLUED = re.compile(
 _LEADING = re.compile(r"([xyz])(a|acc|accel|acceleration|gyro|gyr|rate|rot|rotation|mag|magn)")
 _TURNS = {"roll": "x", "pitch": "y", "yaw": "z"}
 _INSTANCE = re.compile(r"([a-z]+)\d+")
+_MIDDLE = re.compile(r"(.*?)\s*[\[(]((?:[^\[\]()]|\([^()]*\))+)[\])]\s*([^\s\[\]()].*)")
+"""A unit that stands within a name: Acceleration - x (m/s²) Run #1."""
 QUANTITIES = {"acceleration": "accel", "angular rate": "gyro", "magnetic field": "mag"}
 """The sensor of a quantity."""
 _OWN = re.compile(r"(ambient_temperature|current|table_angle|table_rate|attitude_[wxyz])")
+
+
+def measures(unit: str | None) -> str | None:
+    """The sensor of a unit, None for none; a G or mG may be gauss or gravity."""
+    measured = find_unit(unit or "")
+    if measured is None or (measured.quantity == "magnetic field" and find_unit(unit or "", "acceleration")):
+        return None
+    return QUANTITIES.get(measured.quantity)
+
+
+def last_of(name: str) -> tuple[str, str | None]:
+    """What stands before a unit of time that ends a name, and that unit; None where it ends in none."""
+    match = re.fullmatch(r"(.*?)([a-z]+)", name.strip('" #').lower())
+    unit = _UNIT_WORDS["time"].get(match[2]) if match else None
+    return (match[1], unit) if match and unit else (name, None)
 
 
 def words_of(text: str) -> list[str]:
@@ -133,7 +151,10 @@ class Field:
     @classmethod
     def of(cls, name: str) -> Field:
         """Read a column's name."""
-        text, unit = parse_column(name.strip().lstrip("%#"))
+        name = name.strip().lstrip("%#")
+        if (match := _MIDDLE.fullmatch(name)) and find_unit(match[2]):
+            name = f"{match[1]} {match[3]} [{match[2]}]"
+        text, unit = parse_column(name)
         plain = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
         if match := _OWN.fullmatch(plain):
             return cls((plain,), None, match[1], unit)
@@ -159,9 +180,9 @@ class Field:
             return cls(tuple(words), None, "temperature", unit)  # T (°)
         if axis is None and len(words) == 1 and words[0] in _TIME_ALONE:
             return cls(tuple(words), None, "time", unit or _UNIT_WORDS["time"].get(words[0]))
-        measured = find_unit(unit) if unit and axis and unit != "G" else None
+        measured = find_unit(unit or "") if axis else None
         if measured and not stem and axis in tuple("xyz"):  # X (m/s^2)
-            sensor = QUANTITIES.get(measured.quantity)
+            sensor = measures(unit)
         if not stem and measured and measured.quantity == "time":  # X [s], the abscissa
             return cls((), None, "time", unit)
         if axis and sensor in ("temperature", "ambient_temperature"):

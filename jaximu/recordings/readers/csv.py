@@ -19,7 +19,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, stated_rate
 from jaximu.recordings.columns.table import HEAD, LogTable, from_arrow, parse_name
-from jaximu.recordings.readers.clock import seconds_of
+from jaximu.recordings.readers.clock import measured, seconds_of
 from jaximu.recordings.recording import Source
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
@@ -76,6 +76,10 @@ def read(path: Path, source: Source) -> LogTable:
             columns[at] = stamps
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [ns]", *names[at + 1 :])
+        elif with_unit := measured(column, layout.decimal):
+            columns[at] = with_unit[0]
+            if names:
+                names = (*names[:at], f"{parse_column(names[at])[0]} [{with_unit[1]}]", *names[at + 1 :])
     notes = (
         ()
         if wide or whole is None

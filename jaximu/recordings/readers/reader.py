@@ -23,7 +23,7 @@ from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.columns import nominal
 from jaximu.recordings.columns.choose import choose_columns, choose_pair, column_units
 from jaximu.recordings.columns.guess import Advice, advise, without_gravity
-from jaximu.recordings.columns.known import known_names, whole_stamps
+from jaximu.recordings.columns.known import JOINED, known_names, whole_stamps
 from jaximu.recordings.columns.names import (
     COUNTS_ADVICE,
     GROUPS,
@@ -107,8 +107,7 @@ def read_recording(
         with _noted(tables[0].notes):
             parts = _parts(tables, options)
     else:
-        table, second = _stamped(tables[0], options.columns), _read(gyro_log, options)[0]
-        second = _stamped(second, options.columns or options.gyro_columns)
+        table, second = whole_stamps(tables[0]), whole_stamps(_read(gyro_log, options)[0])
         first_columns, second_columns = choose_pair(table, second, options.columns, options.gyro_columns)
         parts = [
             extract(table, first_columns, options, set(GROUPS) - {"gyro"}),
@@ -221,14 +220,9 @@ def _read_as(
     )
 
 
-def _stamped(table: LogTable, columns: str | Sequence[str] | None) -> LogTable:
-    """Return the table with whole stamps, unless options name its columns as they stand."""
-    return table if columns else whole_stamps(table)
-
-
 def _parts(tables: Sequence[LogTable], options: ReadOptions) -> "list[_FilePart]":
     """Return the signals of one file's tables."""
-    first = _stamped(tables[0], options.columns)
+    first = whole_stamps(tables[0])
     named = {column.name for column in header_columns(first) or ()}
     sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
     sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
@@ -257,7 +251,7 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     parts = []
     for at, table in enumerate(_read(path, options)):
         options = options if at else _alike(options, table)
-        table = _stamped(table, options.columns)
+        table = whole_stamps(table)
         columns = choose_columns(table, options.columns, "mag") if not table.messages else header_columns(table) or ()
         if options.rate is None and table.rate is None and not any(column.name == TIME for column in columns):
             options = replace(options, rate=1.0)
@@ -499,8 +493,12 @@ def extract(
     """The signals of the wanted groups in a table, checked sample by sample."""
     group_of = {name: key for key, group in GROUPS.items() for name in group.columns}
     wanted = [
-        column if column.name == TIME or group_of.get(column.name or "") in groups else Column(None)
-        for column in columns
+        Column(TIME, "ns")
+        if column.name == TIME and title == JOINED
+        else column
+        if column.name == TIME or group_of.get(column.name or "") in groups
+        else Column(None)
+        for column, title in zip(columns, table.header, strict=True)
     ]
     sensor = "gyro" if option == "--gyro-columns" else None
     used = column_units(table, wanted, option, sensor)
