@@ -27,7 +27,7 @@ from jaximu.recordings.columns.known import EPOCH
 from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import LogTable
-from jaximu.recordings.recording import Signal
+from jaximu.recordings.recording import FASTEST, SLOWEST, Signal
 
 __all__ = ["Advice", "advise", "without_gravity"]
 
@@ -196,6 +196,7 @@ class _Guess:
         self.chosen: dict[int, Column] = {}
         self.time: int | None = None
         self.assumed: float | None = None
+        self.doubted = False  # whether the stamps are not in the unit that they state
         self.rate = self.accel_scale = self.gyro_scale = None
         self.unknown: list[_Triad] = []
         self.refused: list[tuple[_Triad, str]] = []  # triads that are named, and why they are no measurement
@@ -474,7 +475,18 @@ class _Guess:
         return self.assumed
 
     def _stated_time(self) -> Unit | None:
-        return None if self.time is None else find_unit(self.fields[self.time].unit or "", "time")
+        return None if self.time is None or self.doubted else find_unit(self.fields[self.time].unit or "", "time")
+
+    def _stated_rate(self) -> float:
+        """Rows a second (Hz) by the stated unit of the stamps; NaN without one."""
+        stated = self._stated_time()
+        return 1.0 / max(self._step() * stated.factor, 1e-300) if stated else math.nan
+
+    def _doubt_time(self) -> None:
+        self.doubted = True
+        self.reasons.append(
+            f"{self.table.label(self.time or 0)} rises by {self._step():.5g} a row: no rate in its unit"
+        )
 
     def _turning(self, accel: _Triad, gyro: _Triad) -> Turning | None:
         force_time, rate_time = self._stamps(accel), self._stamps(gyro)
@@ -510,16 +522,20 @@ class _Guess:
     def _units(self, accel: _Triad | None, gyro: _Triad | None) -> None:
         if accel is not None:
             self._accel_unit(accel)
-        turned = None
+        turned, rate = None, self._stated_rate()
+        if rate > FASTEST:
+            self._doubt_time()
         if accel is not None and gyro is not None:
-            unclear = self.time is not None and self._stated_time() is None
+            unclear = self.time is not None and (rate < SLOWEST or self._stated_time() is None)
             tried = []
             for factor in [factor for _, factor in self._time_units()] if unclear else [None]:
                 self.assumed = factor
                 if fit := self._turning(accel, gyro):
                     tried.append((abs(fit.correlation), self.assumed, fit))
             if tried:
-                _, self.assumed, turned = max(tried, key=lambda trial: trial[0])
+                correlation, self.assumed, turned = max(tried, key=lambda trial: trial[0])
+                if rate < SLOWEST and correlation > CORRELATED:
+                    self._doubt_time()
         slope = abs(turned.slope) if turned and abs(turned.correlation) > CORRELATED else None
         if self.time is not None:
             slope = self._time_unit(self.time, gyro, slope)
@@ -535,14 +551,8 @@ class _Guess:
             self._take(accel, "accel", None)
             return
         unit = _fitting(accel.unit, "accel")
-        stated = find_unit(unit or "", "acceleration")
-        if (
-            stated
-            and accel.gravity_unit in _GRAVITY_IN
-            and abs(math.log(accel.level * stated.factor / STANDARD_GRAVITY)) > _ANOTHER
-        ):
-            self.reasons.append(f"{accel.label!r} is in {unit} by its name, and does not hold 1 g in it")
-            unit = None
+        if accel.gravity_unit in _GRAVITY_IN:
+            unit = self._kept(accel, unit, "acceleration", STANDARD_GRAVITY / accel.level, "hold 1 g at rest")
         if unit is None:
             unit = accel.gravity_unit
             if unit == "?":
@@ -574,6 +584,14 @@ class _Guess:
                     f"How many counts are 1 g (--accel-scale)? The accelerometer's norm at rest is {accel.level:.5g}."
                 )
         self._take(accel, "accel", unit)
+
+    def _kept(self, triad: _Triad, unit: str | None, quantity: str, factor: float | None, does: str) -> str | None:
+        """The unit that is stated, None where the values show another one, of which `factor` is about one in SI."""
+        stated = find_unit(unit or "", quantity)
+        if stated is None or factor is None or abs(math.log(factor / stated.factor)) < _ANOTHER:
+            return unit
+        self.reasons.append(f"{triad.label!r} is in {unit} by its name, in which it does not {does}")
+        return None
 
     def _increment(self, accel: _Triad) -> bool:
         """Whether the triad is g times the sampling interval: velocity increments."""
@@ -615,7 +633,7 @@ class _Guess:
 
     def _gyro_unit(self, gyro: _Triad, accel: _Triad | None, slope: float | None, per_sample: float | None) -> None:
         """Decide the gyroscope's unit; `per_sample`: the slope at 100 Hz where the rate is not known."""
-        unit = _fitting(gyro.unit, "gyro")
+        unit = self._kept(gyro, _fitting(gyro.unit, "gyro"), "angular rate", slope, _TURN)
         peak = np.abs(gyro.values).max()
         rest = np.abs(np.median(gyro.values, axis=0)).max()
         resting = accel is not None and accel.still and not accel.posed and not gyro.turns

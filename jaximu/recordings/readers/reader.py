@@ -237,7 +237,13 @@ def _finished(parts: "Sequence[_FilePart]", table: LogTable, options: ReadOption
         recording = apply_axes(recording, options.axes)
     if options.like is not None:
         options.like.require_alike(recording.reading, recording.name, options.like.units)
-    notes = plausibility(recording, options.gravity) if options.check else ()
+    try:
+        notes = plausibility(recording, options.gravity) if options.check else ()
+    except InputError as error:
+        advice = None if options.columns or table.messages else advise(whole_stamps(table))
+        if advice is None or not (advice.columns and advice.readable):
+            raise
+        raise InputError(f"{error.args[0]} Or, after checking: {advice.sentence()}") from None
     return replace(recording, notes=(*recording.notes, *notes))
 
 
