@@ -150,7 +150,8 @@ class Reading:
     rate: stated for a log without a time column, Hz. axes: map to body axes, see `parse_axes`; None: those of the log.
     frame: "FRD" where the format defines its axes as an autopilot's: forward, right, down.
     units: by signal, as the file has them. scales: by triad in counts, counts per SI unit (3,); offsets: counts at zero
-    input (3,); both in the log's axes. topic, instance, stamp: what was taken of a bag or flight log.
+    input (3,); both in the log's axes. topic, instance, stamp: what was taken of a bag or flight log. device: whose
+    rows were taken of a table of several units.
     """
 
     columns: str | None = None
@@ -165,6 +166,7 @@ class Reading:
     topic: str | None = None
     instance: int | None = None
     stamp: str = "header"
+    device: str | None = None
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "Reading":

@@ -127,7 +127,8 @@ def read_recording(
 def _read(path: str | os.PathLike[str], options: ReadOptions) -> list[LogTable]:
     """The tables of a file, with the rows of one unit where several write into it in turn."""
     tables = read_tables(path, MessageSelection(options.topic, options.instance, options.stamp))
-    return [table if table.messages else of_device(table, options.device) for table in tables]
+    usual = (options.like or Reading()).device
+    return [table if table.messages else of_device(table, options.device, usual) for table in tables]
 
 
 def read_frame(frame: Any, options: ReadOptions | None = None) -> Recording:
@@ -217,6 +218,7 @@ def _read_as(
         topic=options.topic,
         instance=options.instance,
         stamp=options.stamp,
+        device=table.device,
     )
 
 
