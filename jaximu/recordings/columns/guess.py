@@ -236,6 +236,7 @@ class _Guess:
 
     def advice(self) -> Advice:
         self.time = self._time_column()
+        self._carry_on()
         triads = self._named_triads()
         accel = self._best(triads, "accel") or self._with_gravity()
         gyro = self._best(triads, "gyro")
@@ -276,6 +277,16 @@ class _Guess:
             return at
         return None
 
+    def _carry_on(self) -> None:
+        """Let the time go on where a counter starts again, whatever its end is."""
+        values = None if self.time is None else self.numbers[self.time]
+        if self.time is None or values is None:
+            return
+        steps = np.diff(values)
+        if (steps < 0).any():
+            steps = np.where(steps < 0, np.median(steps[steps > 0]), steps)
+            self.numbers[self.time] = values[0] + np.concatenate([[0.0], np.cumsum(steps)])
+
     def _named_triads(self) -> list[_Triad]:
         """The triads that names show, of whatever sensor."""
         groups: dict[tuple, dict[str, int]] = {}
@@ -297,8 +308,7 @@ class _Guess:
             named = sensor is not None and bool(stem)
             if sensor is None and not stem and self.file in ("accel", "gyro", "mag"):
                 sensor = self.file
-            sensor = sensor or measures(unit)  # Trigno x [g]: the word is unknown, the unit is not
-            if sensor is None and not stem and self.file_not:
+            if sensor is None and not measures(unit) and not stem and self.file_not:
                 self.questions.append(f"Does this file hold an accelerometer? By its name it is {self.file_not}.")
                 continue
             triad = self._triad(
@@ -306,6 +316,7 @@ class _Guess:
             )
             if triad is not None:
                 triad.label = " ".join(stem) or "x, y, z"
+                triad.sensor = sensor or measures(unit, triad.level)  # Trigno x [g]: the word is unknown, the unit not
                 triads.append(triad)
         return triads
 
@@ -730,6 +741,7 @@ class _Guess:
             unit = _fitting(field.unit, name)
             if unit is None and "temperature" in name and -60 < np.nanmin(values) <= np.nanmax(values) < _HOTTEST:
                 unit = "degC"
+                self.reasons.append(f"{self.table.label(at)} states no unit and is taken to be in °C")
             elif unit is None and "temperature" in name and np.ptp(values[np.isfinite(values)]) > 0:
                 unit = "count"
                 self.reasons.append(

@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from jaximu.ground.units import find_unit, parse_column
+from jaximu.ground.units import STANDARD_GRAVITY, find_unit, parse_column
 
 __all__ = ["QUANTITIES", "Field", "fields_of", "last_of", "measures", "sensor_of", "stated_rate", "words_of"]
 
@@ -55,7 +55,7 @@ _ESTIMATED = {("b", "w"), ("b", "a"), ("b", "g")}
 """How the names of an estimated state's biases begin, as in EuRoC's b_w_RS_S_x."""
 _TIME = set(
     "t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec zeit temps "
-    "tiempo unix epoch tow".split()
+    "tiempo unix epoch tow utc".split()
 )
 _TIME_ALONE = set("ms us ns sec secs seconds milliseconds microseconds nanoseconds epoch uptime".split())
 """Words that name a column of time where they are its whole name, and no other names one."""
@@ -94,6 +94,8 @@ _GLUED = re.compile(
 _LEADING = re.compile(r"([xyz])(a|acc|accel|acceleration|gyro|gyr|rate|rot|rotation|mag|magn)")
 _TURNS = {"roll": "x", "pitch": "y", "yaw": "z"}
 _INSTANCE = re.compile(r"([a-z]+)\d+")
+_ABOUT = 0.15  # of 1 g, that an accelerometer at rest may be off
+_FIELD = 15.0, 80.0  # uT of the Earth's field, disturbed indoors
 _MIDDLE = re.compile(r"(.*?)\s*[\[(]((?:[^\[\]()]|\([^()]*\))+)[\])]\s*([^\s\[\]()].*)")
 """A unit that stands within a name: Acceleration - x (m/s²) Run #1."""
 QUANTITIES = {"acceleration": "accel", "angular rate": "gyro", "magnetic field": "mag"}
@@ -101,12 +103,15 @@ QUANTITIES = {"acceleration": "accel", "angular rate": "gyro", "magnetic field":
 _OWN = re.compile(r"(ambient_temperature|current|table_angle|table_rate|attitude_[wxyz])")
 
 
-def measures(unit: str | None) -> str | None:
-    """The sensor of a unit, None for none; a G or mG may be gauss or gravity."""
+def measures(unit: str | None, level: float | None = None) -> str | None:
+    """The sensor of a unit, None for none. G and mG may be gravity or gauss, as which values of a `level` can be."""
     measured = find_unit(unit or "")
-    if measured is None or (measured.quantity == "magnetic field" and find_unit(unit or "", "acceleration")):
-        return None
-    return QUANTITIES.get(measured.quantity)
+    gravity = find_unit(unit or "", "acceleration")
+    if measured and gravity and measured.quantity == "magnetic field":
+        if level is not None and abs(level * gravity.factor / STANDARD_GRAVITY - 1) < _ABOUT:
+            return "accel"
+        return "mag" if level is not None and _FIELD[0] < level * measured.factor < _FIELD[1] else None
+    return QUANTITIES.get(measured.quantity) if measured else None
 
 
 def last_of(name: str) -> tuple[str, str | None]:
@@ -172,7 +177,7 @@ class Field:
                 short_sensor, reason = sensor_of(short)
                 if tail in _UNIT_WORDS.get(short_sensor or "", {}) and (at or short_sensor == "temperature"):
                     return cls(short, at, short_sensor, unit or _UNIT_WORDS[short_sensor or ""][tail], reason)
-        if axis is None and _time(words):
+        if axis is None and _time(words, unit):
             tail = next((word for word in reversed(words) if word in _UNIT_WORDS["time"] and len(word) > 1), None)
             stated = find_unit(unit or "", "temperature") if words == ["t"] else None
             if stated is None:
@@ -243,8 +248,10 @@ def _without_prefix(names: Sequence[str]) -> list[str]:
     return left
 
 
-def _time(words: list[str]) -> bool:
-    return any(word in _TIME for word in words) and all(
+def _time(words: list[str], unit: str | None = None) -> bool:
+    """Whether words name a time: by one that says so, or by a unit of time beside others that would fit one."""
+    timed = find_unit(unit or "", "time") or (len(words) > 1 and any(word in _TIME_ALONE for word in words))
+    return (any(word in _TIME for word in words) or bool(words and timed)) and all(
         word in _TIME or word in _TIME_BESIDE or word.isdigit() for word in words
     )
 

@@ -7,11 +7,12 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import find_unit
 
-__all__ = ["measured", "seconds_of"]
+__all__ = ["DAY", "measured", "seconds_of"]
 
 _CLOCK = re.compile(r"(?:^|[\sT])(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
 _MEASURED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)\s*([^\d\s.].*?)\s*")
-_HALF_DAY, _DAY = 43200, 86400
+DAY = 86400 * 10**9
+"""ns."""
 
 
 def seconds_of(column: np.ndarray) -> np.ndarray | None:
@@ -27,8 +28,8 @@ def seconds_of(column: np.ndarray) -> np.ndarray | None:
         hours = int(match[1]) % 12 + 12 * (match[5].lower() == "pm") if match[5] else int(match[1])
         seconds = 3600 * hours + 60 * int(match[2]) + int(match[3])
         stamps[at] = seconds * 10**9 + int((match[4] or "").ljust(9, "0"))
-    midnights = np.cumsum(np.diff(stamps, prepend=stamps[:1]) < -_HALF_DAY * 10**9)
-    return stamps + midnights * _DAY * 10**9
+    midnights = np.cumsum(np.diff(stamps, prepend=stamps[:1]) < -DAY // 2)
+    return stamps + midnights * DAY
 
 
 def measured(column: np.ndarray, decimal: str = ".") -> tuple[FloatArray, str] | None:

@@ -19,12 +19,13 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, stated_rate
 from jaximu.recordings.columns.table import HEAD, LogTable, from_arrow, parse_name
-from jaximu.recordings.readers.clock import measured, seconds_of
+from jaximu.recordings.readers.clock import DAY, measured, seconds_of
 from jaximu.recordings.recording import Source
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
 _PIECE = 1 << 22  # bytes parsed at once
 _LOOKED_AT = 200  # lines in which the layout is looked for
+_CUT_OFF = "the file ends in zero bytes, as after a power loss: its last row is left out."
 _SINGLE_BLOCK = 2**31 - 2
 
 
@@ -60,6 +61,7 @@ def read(path: Path, source: Source) -> LogTable:
         table, rows = _read_cleaned(_lines(path.read_bytes() if whole is None else whole), layout, source.path)
         parsed = [from_arrow(column) for column in table.columns], table.schema
     (columns, schema), names = parsed, layout.names or None
+    notes = [] if wide or whole is None else [_CUT_OFF]
     if names:  # a column of dates states its own unit
         names = tuple(
             f"{name} [{kind.type.unit}]" if pa.types.is_timestamp(kind.type) and "[" not in name else name
@@ -74,18 +76,16 @@ def read(path: Path, source: Source) -> LogTable:
             columns[at] = np.array([cell[:-1] for cell in column], object)
         elif (stamps := seconds_of(column)) is not None:
             columns[at] = stamps
+            if len(days := np.flatnonzero(np.diff(stamps // DAY))):
+                where = rows + int(days[0]) + 1 if isinstance(rows, int) else rows[days[0] + 1]
+                notes.append(f"the time of day passes midnight (row {where}): it goes on from there.")
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [ns]", *names[at + 1 :])
         elif with_unit := measured(column, layout.decimal):
             columns[at] = with_unit[0]
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [{with_unit[1]}]", *names[at + 1 :])
-    notes = (
-        ()
-        if wide or whole is None
-        else ("the file ends in zero bytes, as after a power loss: its last row is left out.",)
-    )
-    return LogTable(source, names, tuple(columns), rows, layout.rate, notes=notes)
+    return LogTable(source, names, tuple(columns), rows, layout.rate, notes=tuple(notes))
 
 
 def _without_zeros(path: Path) -> bytes | None:
