@@ -37,6 +37,7 @@ def write(path, time, values, name="time [s]", extra=None):
 CLOCKS = {
     "milliseconds in 16 bits": ("ms", 2**16, 1e3, 65_000),
     "microseconds in 32 bits": ("time [us]", 2**32, 1e6, 2**32 - 5_000_000),
+    "microseconds in 16 bits": ("time [us]", 2**16, 1e6, 0),
     "microseconds in 24 bits": ("time [us]", 2**24, 1e6, 0),
     "a time of day past midnight": ("time [s]", 86400.0, 1.0, 86395.0),
     "a week of GPS that ends": ("time [s]", 604800.0, 1.0, 604790.0),

@@ -64,7 +64,8 @@ _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their 
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
 _ENDS = sorted({2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-9, 1e-6, 1e-3)} | {86400.0, 604800.0})
 """Seconds after which clocks start again: counters of 16, 24 and 32 bits, a day, a week of GPS."""
-_COUNTED = 64.0  # samples that a counter tells apart at the least
+_COUNTED, _FEW_COUNTED = 64.0, 4.0  # samples that a counter tells apart, and at the least
+_EVENLY = 0.8, 1.25  # sample intervals across the end of a counter of few samples
 _CARRIED = 10.0  # sample intervals between the last stamp before a clock started again and the first after
 _FEW_SHARED, _FEW_SHARES = 10, 0.02  # rows, and share of them, from which on repeated stamps are a habit
 _SHARED = 0.1  # of the messages may share a stamp
@@ -562,12 +563,15 @@ def _carried_on(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[Log
         return table, []
     usual = np.median(steps[steps > 0])
     for seconds in _ENDS:
-        if seconds / unit.factor < _COUNTED * usual:
-            continue
         span = seconds / unit.factor
+        if span < _FEW_COUNTED * usual:
+            continue
+        # one that ends after a few samples must go on as evenly as they come
+        nearest, farthest = (0.0, _CARRIED) if span > _COUNTED * usual else _EVENLY
         full = stamps.dtype.type(round(span) if stamps.dtype.kind == "i" else span)
         back = np.flatnonzero(steps < -full / 2)
-        if not len(back) or not np.all((steps[back] + full > 0) & (steps[back] + full < _CARRIED * usual)):
+        after = (steps[back] + full) / usual
+        if not len(back) or not np.all((after > nearest) & (after < farthest)):
             continue
         turns = np.zeros(len(stamps), stamps.dtype)
         turns[back + 1] = full
