@@ -69,6 +69,13 @@ _TEXTS = {
     "us.date": lambda log: clock(log.time, day="05/01/2024 "),
     "de.date": lambda log: clock(log.time, day="01.05.2024 "),
     "midnight": lambda log: clock((log.time + 36005.0 + 50400 - 50400) % 86400),
+    **{
+        f"{kind}{mark}": lambda log, kind=kind, form=form: [
+            form.format(*row) for row in (log.force if kind == "f" else log.rate * DEG)
+        ]
+        for kind in "fw"
+        for mark, form in (("[]", '"[{:.6f}, {:.6f}, {:.6f}]"'), ("||", "{:.6f}|{:.6f}|{:.6f}"))
+    },
     "sec": lambda log: [f"{t:.2f} sec" for t in log.time],
 }
 
@@ -308,6 +315,18 @@ habit(
     "accelerometerAcceleration{XYZ}|gyroTimestamp_sinceReboot|gyroRotation{XYZ}",
     "isotz n t f.g t w",
 )
+habit(
+    "a browser's DeviceMotion: alpha, beta, gamma",
+    "timestamp|acceleration.{xyz}|accelerationIncludingGravity.{xyz}|"
+    "rotationRate.alpha|rotationRate.beta|rotationRate.gamma|interval",
+    "t.ms+ lin f >w.dps =16",
+)
+habit("acceleration with and without gravity", "t|acc_with_gravity_{xyz}|acc_no_g_{xyz}|gyro_{xyz}", "t f lin w")
+habit("G-Force", "Time|G-Force {XYZ}|Gyro {XYZ}", "t f.g w")
+habit("raw and calibrated side by side", "t|Acc_{xyz}_raw|Acc_{xyz}_cal|Gyro_{xyz}_cal", "t f.100 f w.dps")
+habit("names of pandas for doubled columns", "t|X|Y|Z|X.1|Y.1|Z.1", "t f w")
+habit("vectors in cells: brackets", "t|acc|gyro [dps]", "t f[] w[]")
+habit("vectors in cells: bars", "t|acc|gyro [dps]", "t f|| w||")
 habit(
     "Apple CoreMotion: attitude, rotation rate, gravity, user acceleration",
     "timestamp|attitude.roll|attitude.pitch|attitude.yaw|rotationRate.{xyz}|gravity.{xyz}|userAcceleration.{xyz}",

@@ -350,7 +350,8 @@ class _Guess:
         named = [triad for triad in triads if triad.sensor == sensor]
         if not named:
             return None
-        named.sort(key=lambda triad: (sensor == "accel" and triad.gravity_unit is None, triad.plain, triad.places))
+        unsure = {None: 2, "?": 1, "count": 1}
+        named.sort(key=lambda one: (sensor == "accel" and unsure.get(one.gravity_unit, 0), one.plain, one.places))
         first, name = named[0], GROUPS[sensor].field
         if len(named) > 1:
             others = ", ".join(repr(triad.label) for triad in named[1:])
@@ -739,17 +740,25 @@ class _Guess:
             if name not in _SINGLE or values is None or self._has(name):
                 continue
             unit = _fitting(field.unit, name)
-            if unit is None and "temperature" in name and -60 < np.nanmin(values) <= np.nanmax(values) < _HOTTEST:
-                unit = "degC"
-                self.reasons.append(f"{self.table.label(at)} states no unit and is taken to be in °C")
-            elif unit is None and "temperature" in name and np.ptp(values[np.isfinite(values)]) > 0:
-                unit = "count"
-                self.reasons.append(
-                    f"{self.table.label(at)} is between {np.nanmin(values):.6g} and {np.nanmax(values):.6g}, which is "
-                    f"no temperature in °C but a chip's counts: {COUNTS_ADVICE}, for jaximu thermal"
-                )
+            if unit is None and "temperature" in name:
+                unit = self._temperature_unit(self.table.label(at), values[np.isfinite(values)])
             if unit:
                 self.chosen[at] = Column(name, unit)
+
+    def _temperature_unit(self, label: str, values: FloatArray) -> str | None:
+        """°C, or a chip's counts: whole numbers beside sensors in counts, or what no sensor survives."""
+        low, high = values.min(), values.max()
+        counts = any(column.unit == "count" for column in self.chosen.values()) and np.all(values == np.round(values))
+        if -60 < low <= high < _HOTTEST and not counts:
+            self.reasons.append(f"{label} states no unit and is taken to be in °C")
+            return "degC"
+        if low == high:
+            return None
+        self.reasons.append(
+            f"{label} is between {low:.6g} and {high:.6g}, which is no temperature in °C but a chip's counts: "
+            f"{COUNTS_ADVICE}, for jaximu thermal"
+        )
+        return "count"
 
     def _quaternion(self) -> None:
         """An attitude by name, whose four numbers have norm 1."""

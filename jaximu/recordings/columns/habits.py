@@ -23,6 +23,7 @@ _SENSORS = {
     "temperature": "temp temperature temperatures temperatur temperatura température tmp",
     "ambient_temperature": "ambient",
 }
+_ACCELERATIONS = {word for word in _SENSORS["accel"].split() if len(word) > 1}
 _WORDS = {word: sensor for sensor, words in _SENSORS.items() for word in words.split()}
 _HELPERS = {"angular": "gyro", "ang": "gyro", "velocity": "gyro", "vel": "gyro", "turn": "gyro", "speed": "gyro"}
 """Words that name no sensor alone: an angular velocity is a gyroscope's, a velocity is not."""
@@ -92,6 +93,10 @@ _GLUED = re.compile(
     r"([xyz])"
 )
 _LEADING = re.compile(r"([xyz])(a|acc|accel|acceleration|gyro|gyr|rate|rot|rotation|mag|magn)")
+_WITH, _WITHOUT = {"with", "including", "incl"}, {"without", "no", "excluding", "excl", "minus"}
+"""Words before gravity."""
+_BROWSER = {"beta": "x", "gamma": "y", "alpha": "z"}
+"""Axes of the rotation rate in a browser's DeviceMotion."""
 _TURNS = {"roll": "x", "pitch": "y", "yaw": "z"}
 _INSTANCE = re.compile(r"([a-z]+)\d+")
 _ABOUT = 0.15  # of 1 g, that an accelerometer at rest may be off
@@ -260,6 +265,8 @@ def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
     """The words without the axis among them, and the axis."""
     letters = [at for at, word in enumerate(words) if word in ("x", "y", "z")]
     turns = [at for at, word in enumerate(words) if word in _TURNS]
+    if len(words) > 1 and words[-1] in _BROWSER and words[-2] in ("rate", "rotation"):
+        return tuple(words[:-1]), _BROWSER[words[-1]]
     of_sensor = len(words) > 1 and any(word in _WORDS or word in _HELPERS for word in words)
     for places in (letters, turns if of_sensor else []):
         if len(places) == 1:
@@ -275,11 +282,22 @@ def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
     return tuple(words), None
 
 
+def _gravity_beside(stem: tuple[str, ...]) -> tuple[tuple[str, ...], bool]:
+    """The words without those that say that gravity is in, and whether others say that it is not."""
+    for at, word in enumerate(stem[:-1]):
+        if stem[at + 1] in ("gravity", "g") and word in _WITH | _WITHOUT:
+            return (*stem[:at], *stem[at + 2 :]), word in _WITHOUT
+    return stem, False
+
+
 def sensor_of(stem: tuple[str, ...]) -> tuple[str | None, str | None]:
     """The sensor that the words of a name mean, None for none or more than one, and why it is not its measurement."""
     sensors: set[str] = set()
-    why_not = None
-    for word in stem:
+    stem, without = _gravity_beside(stem)
+    why_not = "gravity is taken out" if without else None
+    for at, word in enumerate(stem):
+        if word == "g" and set(stem[at + 1 :]) & _ACCELERATIONS:
+            continue  # G-Force
         plain = match[1] if (match := _INSTANCE.fullmatch(word)) else word
         if plain in _REFUSED and any(other != "var" and not other.isdigit() for other in stem):  # Var1 says nothing
             why_not = why_not or _REFUSED[plain]

@@ -26,6 +26,8 @@ _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
 _PIECE = 1 << 22  # bytes parsed at once
 _LOOKED_AT = 200  # lines in which the layout is looked for
 _CUT_OFF = "the file ends in zero bytes, as after a power loss: its last row is left out."
+_NUMBER = r"\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*"
+_VECTOR = re.compile(rf"[\[(]{_NUMBER}[,; ]{_NUMBER}[,; ]{_NUMBER}[\])]|{_NUMBER}\|{_NUMBER}\|{_NUMBER}")
 _SINGLE_BLOCK = 2**31 - 2
 
 
@@ -67,6 +69,8 @@ def read(path: Path, source: Source) -> LogTable:
             f"{name} [{kind.type.unit}]" if pa.types.is_timestamp(kind.type) and "[" not in name else name
             for name, kind in zip(names, schema, strict=True)
         )
+    if names and any(column.dtype == object for column in columns):
+        names, columns = _vectors_apart(names, columns)
     for at, column in enumerate(columns):
         if column.dtype != object:
             continue
@@ -86,6 +90,24 @@ def read(path: Path, source: Source) -> LogTable:
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [{with_unit[1]}]", *names[at + 1 :])
     return LogTable(source, names, tuple(columns), rows, layout.rate, notes=tuple(notes))
+
+
+def _vectors_apart(names: tuple[str, ...], columns: Sequence[np.ndarray]) -> tuple[tuple[str, ...], list[np.ndarray]]:
+    """The columns, with x, y and z of their own where each cell holds three numbers, in brackets or with bars."""
+    titles: list[str] = []
+    parts: list[np.ndarray] = []
+    for name, column in zip(names, columns, strict=True):
+        vector = column.dtype == object and _VECTOR.fullmatch(str(column[0]))
+        matches = [_VECTOR.fullmatch(str(cell)) for cell in column] if vector else [None]
+        if not all(matches):
+            titles, parts = [*titles, name], [*parts, column]
+            continue
+        title, unit = parse_column(name)
+        titles += [f"{title}.{axis}" + (f" [{unit}]" if unit else "") for axis in "xyz"]
+        parts += [
+            *np.array([[number for number in match.groups() if number] for match in matches if match], np.float64).T
+        ]
+    return tuple(titles), parts
 
 
 def _without_zeros(path: Path) -> bytes | None:
