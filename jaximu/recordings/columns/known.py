@@ -81,19 +81,6 @@ _LAYOUTS = [
             "MAVLink SCALED_IMU (ms, mg, mrad/s, mG)",
             "time_boot_ms=time [ms], *acc=accel_* [mg], *gyro=gyro_* [mrad/s], ?*mag=mag_* [mG]",
         ),
-        *(
-            (
-                "a table of sensor_msgs/Imu (rad/s, m/s^2), time being the header's stamp",
-                f"{stamp.format(prefix)}, {prefix}angular_velocity.*=gyro_* [rad/s], "
-                f"{prefix}linear_acceleration.*=accel_* [m/s^2], ?time=received, ?%time=received",
-            )
-            for stamp in (
-                "{0}header.stamp.sec=, {0}header.stamp.nanosec=",
-                "{0}header.stamp.secs=, {0}header.stamp.nsecs=",
-                "{0}header.stamp=time [ns]",
-            )
-            for prefix in ("", "field.", "msg.")
-        ),
     )
 ]
 JOINED = "whole time [ns]"
@@ -159,9 +146,15 @@ def _of_message(table: LogTable, names: tuple[str, ...]) -> tuple[tuple[str, ...
     known = [titles[match[1]].format(match[2]) if match else name for match, name in zip(matches, names, strict=True)]
     if sum(match is not None for match in matches) != 6 or len(set(known)) < len(known):
         return None
+    stamped = any(".stamp" in name.lower() for name in names)
     for at, (name, column) in enumerate(zip(names, table.columns, strict=True)):
+        plain = name.strip("_% ").lower()
         since = column.dtype.kind == "f" and EPOCH[0] < np.nanmin(column) <= np.nanmax(column) < EPOCH[1]
-        if since and name.strip("_").lower() in ("time", "timestamp", "stamp"):
+        if stamped and plain == "time":
+            known[at] = "received"
+        elif plain.endswith("header.stamp") and column.dtype.kind == "i":
+            known[at] = "time [ns]"
+        elif since and plain in ("time", "timestamp", "stamp"):
             known[at] = "time [s]"
     return tuple(known), (
         "columns and units as sensor_msgs/Imu has them (rad/s, m/s^2): its linear_acceleration holds gravity."

@@ -5,7 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate, pairwise
 from os import SEEK_END
@@ -63,7 +63,7 @@ def read(path: Path, source: Source) -> LogTable:
         table, rows = _read_cleaned(_lines(path.read_bytes() if whole is None else whole), layout, source.path)
         parsed = [from_arrow(column) for column in table.columns], table.schema
     (columns, schema), names = parsed, layout.names or None
-    notes = [] if wide or whole is None else [_CUT_OFF]
+    midnight = 0
     if names:  # a column of dates states its own unit
         names = tuple(
             f"{name} [{kind.type.unit}]" if pa.types.is_timestamp(kind.type) and "[" not in name else name
@@ -80,16 +80,18 @@ def read(path: Path, source: Source) -> LogTable:
             columns[at] = np.array([cell[:-1] for cell in column], object)
         elif (stamps := seconds_of(column)) is not None:
             columns[at] = stamps
-            if len(days := np.flatnonzero(np.diff(stamps // DAY))):
-                where = rows + int(days[0]) + 1 if isinstance(rows, int) else rows[days[0] + 1]
-                notes.append(f"the time of day passes midnight (row {where}): it goes on from there.")
+            midnight = int(np.argmax(np.diff(stamps // DAY, prepend=stamps[:1] // DAY) > 0))
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [ns]", *names[at + 1 :])
         elif with_unit := measured(column, layout.decimal):
             columns[at] = with_unit[0]
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [{with_unit[1]}]", *names[at + 1 :])
-    return LogTable(source, names, tuple(columns), rows, layout.rate, notes=tuple(notes))
+    table = LogTable(source, names, tuple(columns), rows, layout.rate)
+    notes = () if wide or whole is None else (_CUT_OFF,)
+    if midnight:
+        notes = (*notes, f"the time of day passes midnight (row {table.row(midnight)}): it goes on from there.")
+    return replace(table, notes=notes)
 
 
 def _vectors_apart(names: tuple[str, ...], columns: Sequence[np.ndarray]) -> tuple[tuple[str, ...], list[np.ndarray]]:
