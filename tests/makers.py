@@ -107,7 +107,6 @@ def _spread(part: str) -> list[str]:
 
 
 A, NONE, ASKED = ["accel"], [], ["asked"]
-TAB = {"sep": "\t"}
 MT = "// General information:\n// MT Manager version: 2022.0\n// Update Rate: 100.0Hz\n// Filter Profile: General\n"
 
 # --- inertial units
@@ -117,7 +116,7 @@ habit(
     "Acc_{XYZ}|FreeAcc_{ENU}|Gyr_{XYZ}|Mag_{XYZ}|Roll|Pitch|Yaw",
     "n t.fine rest.ns =2024 =5 =1 =13 =59 =50 =1 f lin w m.one angles",
     before=MT,
-    **TAB,
+    sep="\t",
 )
 habit(
     "Xsens: VelInc and OriInc, increments alone",
@@ -125,7 +124,7 @@ habit(
     "n t.fine fdt q",
     sensors=A,
     before=MT,
-    **TAB,
+    sep="\t",
 )
 habit(
     "Movella DOT: Euler and free acceleration",
@@ -155,7 +154,7 @@ habit(
     "t.ms+ f.16384 w.131",
     rough=0.03,
     after_names="\t".join(["ms", *["no_units"] * 6]) + "\n",
-    **TAB,
+    sep="\t",
 )
 habit(
     "Epson: Gx dps, Ax mG",
@@ -184,7 +183,7 @@ habit(
     "timestamp|status|accel{XYZ}|gyro{XYZ}|temperature|deltaVel{XYZ}",
     "t.us =0 f w T f",
     after_names="\t".join(["(us)", "(na)", *["(m.s-2)"] * 3, *["(rad.s-1)"] * 3, "(degC)", *["(m.s-2)"] * 3]) + "\n",
-    **TAB,
+    sep="\t",
 )
 habit(
     "Advanced Navigation: Unix Time and Microseconds",
@@ -218,9 +217,9 @@ habit(
     before="STEVAL-MKI109V3\nLSM6DSOX\n\n",
     answers=["100"],
     must=["asked"],
-    **TAB,
+    sep="\t",
 )
-habit("ST MEMS Studio", "time[us]|acc_{xyz}[mg]|gyro_{xyz}[dps]|temp[C]", "t.us f.mg w.dps T", **TAB)
+habit("ST MEMS Studio", "time[us]|acc_{xyz}[mg]|gyro_{xyz}[dps]|temp[C]", "t.us f.mg w.dps T", sep="\t")
 habit("ST HSDatalog", "Time|A_{xyz} [g]|G_{xyz} [mdps]", "t f.g w.mdps")
 habit("Bosch BMI270, LSB", "Time stamp(us)|Acc_{xyz}(LSB)|Gyro_{xyz}(LSB)", "t.us f.8192 w.16_4", rough=0.03, sep=";")
 habit(
@@ -267,7 +266,7 @@ habit(
     "address|Time(s)|ChipTime|a{xyz}(g)|w{xyz}(deg/s)|Angle{XYZ}(deg)|T(°)",
     "=0x50 clock us.date f.g w.dps angles T",
     before="StartTime: 2024-05-01 13:59:50.000\n",
-    **TAB,
+    sep="\t",
 )
 habit("a column dt and no time", "dt|ax|ay|az|gx|gy|gz", "dt f w", answers=["100"], must=["asked", "line"])
 
@@ -569,7 +568,7 @@ habit(
     before="LabVIEW Measurement\t\nWriter_Version\t2\nSeparator\tTab\nDecimal_Separator\t.\n***End_of_Header***\t\n\t\n"
     "Channels\t6\nSamples\t4000\t4000\nX_Dimension\tTime\tTime\nDelta_X\t0.010000\t0.010000\n***End_of_Header***\n",
     file="log.lvm",
-    **TAB,
+    sep="\t",
 )
 habit(
     "Excel in German: Latin-1, semicolons, decimal commas",

@@ -247,16 +247,18 @@ class LogOptions:
 
         Raises `InputError` where their numbers differ.
         """
-        layouts = [None] if self.columns is None else self.columns.split(";")
-        devices = [None] if self.device is None else self.device.split(",")
+        layouts = [self.columns] if self.columns is None else self.columns.split(";")
+        devices = [self.device] if self.device is None else self.device.split(",")
         count = max(map(len, (paths, layouts, devices)))
         for option, parts in (("--columns", layouts), ("--device", devices), ("LOG", paths)):
             if len(parts) not in (1, count):
                 raise InputError(f"{option}: {len(parts)} are given for {count} recordings; give one, or one for each.")
-        paths, layouts, devices = (parts * (count if len(parts) == 1 else 1) for parts in ([*paths], layouts, devices))
         return [
-            (path, replace(self, columns=columns, device=device))
-            for path, columns, device in zip(paths, layouts, devices, strict=True)
+            (
+                paths[at % len(paths)],
+                replace(self, columns=layouts[at % len(layouts)], device=devices[at % len(devices)]),
+            )
+            for at in range(count)
         ]
 
 
