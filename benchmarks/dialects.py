@@ -1,7 +1,8 @@
 """Files of other makers: how many `jaximu` reads, answers with a line to paste, asks about, or reads wrong.
 
-`python benchmarks/dialects.py`. The files are those of `tests/dialects.py`: simulated recordings written in each
-maker's habit of names, units, separators and preambles, so that what is read can be compared with the truth.
+`python benchmarks/dialects.py`. The files are those of `tests/dialects.py` and `tests/makers.py`: simulated
+recordings written in each maker's habit of names, units, separators and preambles, so that what is read can be compared
+with the truth.
 """
 
 import os
@@ -14,7 +15,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from common import Table, arguments, finish
-from dialects import ALL, attempt, random_table, wrong_line
+from dialects import attempt, random_table, wrong_line
+from makers import ALL
 
 WORDS = {"read": "read", "line": "line to paste", "asked": "asked", "unanswerable": "asked, without a line"}
 

@@ -121,8 +121,12 @@ def attempt(dialect: Dialect, folder: Path) -> Outcome:
         stated[name] = text
     asked = bool(advice.questions)
     if "accel" not in dialect.sensors:
-        return Outcome("asked", str(refusal)) if asked else Outcome("wrong", advice.line())
-    if asked and (any("?" in (text or "") for text in stated.values()) or "accel" not in (advice.columns or "accel")):
+        return Outcome("asked", str(refusal)) if asked or not advice.line() else Outcome("wrong", advice.line())
+    if asked and (
+        not advice.accelerometer
+        or any("?" in (text or "") for text in stated.values())
+        or "accel" not in (advice.columns or "accel")
+    ):
         return Outcome("unanswerable", advice.sentence())
     try:
         rate = float(stated.pop("rate") or 0) or None
@@ -158,6 +162,12 @@ def off(dialect: Dialect, recording: Recording) -> str:
             return f"the {name} is off by {error:.3g} of {size:.3g}"
         if abs(signal.rate / (dialect.rate or RATE) - 1) > 0.02:
             return f"{signal.rate:.4g} Hz instead of {dialect.rate or RATE:g}"
+    for name, truth in (("temperature", log.heat[:, None]), ("magnetometer", log.field)):
+        signal = getattr(recording, name)
+        if signal is not None and len(signal) == len(truth) and signal.unit != "count":
+            scatter = np.std(signal.si() - truth, axis=0).max()  # a fixture may be at another temperature
+            if scatter > 0.01 * np.std(truth, axis=0).max() + 1e-3:
+                return f"the {name} scatters by {scatter:.3g} about the truth"
     return ""
 
 

@@ -187,6 +187,54 @@ def test_the_command(tmp_path, capsys):
     assert "two units or more" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("layout", ["ids", "side by side", "columns for each log"])
+def test_units_in_one_file_are_those_in_files_of_their_own(tmp_path, layout, capsys):
+    """By the IDs of rows, by columns side by side, or from logs of different columns: the same array."""
+    first, second = recordings(moved())[:2]
+    values = [np.hstack([each.accelerometer.values, each.gyroscope.values]) for each in (first, second)]
+    rows = min(map(len, values))
+    time = first.accelerometer.time[:rows]
+    left, right = (part[:rows] for part in values)
+    if layout == "ids":
+        files = [tmp_path / "rack.csv"]
+        header = "time [s],id," + ",".join(names())
+        lines = [
+            f"{t:.4f},{unit}," + ",".join(f"{v:.9g}" for v in part)
+            for t, *parts in zip(time, left, right, strict=True)
+            for unit, part in zip(("left", "right"), parts, strict=True)
+        ]
+        options = ["--device", "left,right"]
+        files[0].write_text("\n".join([header, *lines]))
+    elif layout == "side by side":
+        files = [tmp_path / "wide.csv"]
+        np.savetxt(files[0], np.column_stack([time, left, right]), delimiter=",", fmt="%.9g")
+        stated = "accel [m/s^2],gyro [rad/s]"
+        options = ["--columns", f"time [s],{stated},_*6;time [s],_*6,{stated}"]
+    else:
+        files = [tmp_path / "left.csv", tmp_path / "right.csv"]
+        np.savetxt(files[0], np.column_stack([time, left]), delimiter=",", fmt="%.9g")
+        np.savetxt(files[1], np.column_stack([right, time * 1e3]), delimiter=",", fmt="%.9g")
+        options = ["--columns", "time [s],accel [m/s^2],gyro [rad/s];accel [m/s^2],gyro [rad/s],time [ms]"]
+    stated = [*map(str, files), *options, "--gravity", f"{array_motion.GRAVITY}+-0", "--json"]
+    assert main(["array", *stated, "-o", str(tmp_path / "out")]) == 0
+    document = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(document["units"][1]["position"], moved()[1].place, atol=3e-4)
+    if len(files) == 1:
+        assert main(["calibrate", *stated[:3]]) == 2
+        assert "several in one log are for jaximu array" in capsys.readouterr().err
+    if layout == "ids":
+        second, corrected = str(tmp_path / "out" / "calibration_2.json"), tmp_path / "corrected.csv"
+        assert main(["compensate", second, str(files[0]), "-o", str(corrected)]) == 0
+        off = read_recording(corrected).accelerometer.values - right[:, :3]
+        assert np.abs(off).max() < 0.5 < np.abs(right - left).max()  # the second unit's own rows
+        assert main(["array", str(files[0])]) == 2
+        assert "--device left,right" in capsys.readouterr().err
+
+
+def names() -> list[str]:
+    return [f"{sensor}_{axis} [{unit}]" for sensor, unit in (("accel", "m/s^2"), ("gyro", "rad/s")) for axis in "xyz"]
+
+
 def test_a_measured_board(data_folder):
     """The board's drawing: unit 5 lies 18.9 mm beside unit 1. Gyroscopes that stop at the end of their range in one
     sample of forty made that 19.6 mm."""

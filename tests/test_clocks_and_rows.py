@@ -37,6 +37,7 @@ def write(path, time, values, name="time [s]", extra=None):
 CLOCKS = {
     "milliseconds in 16 bits": ("ms", 2**16, 1e3, 65_000),
     "microseconds in 32 bits": ("time [us]", 2**32, 1e6, 2**32 - 5_000_000),
+    "microseconds in 16 bits": ("time [us]", 2**16, 1e6, 0),
     "microseconds in 24 bits": ("time [us]", 2**24, 1e6, 0),
     "a time of day past midnight": ("time [s]", 86400.0, 1.0, 86395.0),
     "a week of GPS that ends": ("time [s]", 604800.0, 1.0, 604790.0),
@@ -149,15 +150,48 @@ def test_stamps_that_repeat_are_a_steady_clocks(recording, tmp_path):
     assert any("stamps repeat the one before" in note for note in found.notes)
 
 
-def test_parts_of_a_time_of_day_are_no_clock(recording, tmp_path):
-    """Columns `sec` and `ms` say the time together, and neither alone; one of them alone is the time."""
+@pytest.mark.parametrize(
+    ("seconds", "rest", "per_second"),
+    [
+        ("sec", "ms", 1000),
+        ("Unix Time", "Microseconds", 10**6),
+        ("tv_sec", "tv_usec", 10**6),
+        ("stamp.secs", "stamp.nsecs", 10**9),
+        ("Time [s]", "fraction [us]", 10**6),
+        ("Time", "ms", 1000),
+    ],
+)
+@pytest.mark.parametrize("stated", [False, True])
+def test_seconds_and_what_is_left_of_them_are_one_time(recording, tmp_path, seconds, rest, per_second, stated):
+    """By their names, or as one falls where the other rises; also where --columns names the seconds as the time."""
     time = recording.accelerometer.time
-    parts = {"sec": np.floor(time).astype(int)}
-    path = write(tmp_path / "log.csv", np.round(time % 1 * 1e3).astype(int), values_of(recording), "ms", parts)
-    with pytest.raises(InputError, match="no time column"):
-        read_recording(path)
-    found = read_recording(write(tmp_path / "log.csv", np.round(time * 1e3).astype(int), values_of(recording), "ms"))
-    np.testing.assert_allclose(found.gyroscope.time, time - time[0], atol=1e-3)
+    whole = np.round(time * per_second).astype(np.int64)
+    parts = {rest: whole % per_second}
+    stamps = (whole // per_second + 1_700_000_000).tolist()
+    if seconds == "Time":
+        stamps = [f"13:{at // 60 % 60:02d}:{at % 60:02d}" for at in stamps]
+    path = write(tmp_path / "log.csv", stamps, values_of(recording), seconds, parts)
+    columns = f"time [{'ns' if seconds == 'Time' else 's'}],_,accel [m/s^2],gyro [rad/s]" if stated else None
+    read = read_recording(path, options=ReadOptions(columns=columns))
+    np.testing.assert_allclose(read.gyroscope.time, time - time[0], atol=1.1 / per_second)
+    assert any(f"time is '{seconds}" in note and f"and '{rest}" in note for note in read.notes)
+
+
+def test_milliseconds_alone_are_the_time_and_of_a_second_they_are_none(recording, tmp_path):
+    time, values = recording.accelerometer.time, values_of(recording)
+    read = read_recording(write(tmp_path / "log.csv", np.round(time * 1e3).astype(int), values, "ms"))
+    np.testing.assert_allclose(read.gyroscope.time, time - time[0], atol=1e-3)
+    minutes = {"sec": np.floor(time).astype(int) // 3}  # rises where the other falls, and not everywhere
+    with pytest.raises(InputError, match=r"no time column|goes back"):
+        read_recording(write(tmp_path / "log.csv", np.round(time % 1 * 1e3).astype(int), values, "ms", minutes))
+
+
+@pytest.mark.parametrize("cell", ["{:.3f} sec", "{:.3f}s", "{:.3f} s"])
+def test_cells_may_state_their_unit(recording, tmp_path, cell):
+    time = recording.accelerometer.time
+    stamps = [cell.format(stamp) for stamp in time]
+    read = read_recording(write(tmp_path / "log.csv", stamps, values_of(recording), "time"))
+    np.testing.assert_allclose(read.gyroscope.time, time - time[0], atol=1e-3)
 
 
 def test_gravity_stated_in_three_digits_counts_by_them(recording, tmp_path, capsys):

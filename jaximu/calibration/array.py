@@ -37,7 +37,7 @@ from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.alignment import turning_best
 from jaximu.recordings.observations import Stations
-from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.recording import Reading, Recording, Signal
 from jaximu.recordings.reference import Integral
 from jaximu.recordings.segmentation import rest_statistics
 
@@ -81,11 +81,16 @@ def calibrate_array(
     require_float64()
     if len(recordings) < 2:
         raise InputError("an array has two units or more: give a recording of each, made at the same time.")
-    files = [source.sha256 for recording in recordings for source in recording.sources]
-    if len(set(files)) < len(files):
+    taken = [
+        (source.sha256, reading.device, reading.columns)
+        for recording in recordings
+        for source in recording.sources
+        if (reading := recording.reading or Reading())
+    ]
+    if len(set(taken)) < len(taken):
         raise InputError(
-            "the same file is given twice: an array needs a recording of each unit. Where one file holds several units "
-            "side by side (imu1, imu2), write one file for each."
+            "the same file is given twice: an array needs a recording of each unit. Where one file holds several, "
+            'choose their rows with --device ID,ID or their columns with --columns "…;…".'
         )
     for recording in recordings:
         if recording.gyroscope is None:

@@ -32,7 +32,7 @@ def run(
 
     """
     with progress("reading"):
-        recordings = [log.read(path, STANDARD, alone=True) for path in logs]
+        recordings = [stated.read(path, STANDARD, alone=True) for path, stated in log.spread(logs)]
     with progress("identifying the noise"):
         from jaximu.noise.analysis import analyse_noise
 

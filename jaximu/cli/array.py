@@ -22,16 +22,18 @@ def run(
     """Calibrate several units on one rigid body: rotation, position and clock of each, and which one disturbs.
 
     One LOG per unit, recorded together: poses at rest with turns between them, and some quick turns for the positions.
+    One LOG may hold them all: by the IDs of its rows (--device), or by its columns (--columns "…;…").
     DIR receives array.json, report.html, array.png and each unit's calibration.
 
     Examples:
       jaximu array unit1.csv unit2.csv unit3.csv -o results
+      jaximu array rack.csv --device left,right,rear
       jaximu array unit*.parquet --accel-scale "2048 count/g" --gyro-scale "16.4 count/(deg/s)" --latitude 59.3
 
     """
     gravity = local.value()
     results.prepare()
-    recordings, known = log.read_unit(logs, gravity, noise)
+    recordings, known = log.read_unit(logs, gravity, noise, several=True)
     from jaximu.calibration import calibrate_array
 
     with progress("calibrating"):

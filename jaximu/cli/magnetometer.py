@@ -79,7 +79,10 @@ def run(
         old = None if check is None else load_calibration(check)
         base = None if calibration is None else load_calibration(calibration).inertial()
         log = log.alike(base or old)
-        magnetic_logs = [_read(log, path, mag_log[k] if mag_log else None, mag_columns) for k, path in enumerate(logs)]
+        magnetic_logs = [
+            _read(stated, path, mag_log[k] if mag_log else None, mag_columns)
+            for k, (path, stated) in enumerate(log.spread(logs))
+        ]
     southern = None if local.latitude is None or abs(local.latitude) < _NEAR_THE_EQUATOR else local.latitude < 0
     with progress("calibrating"):
         result, measurement, heading = calibrate_magnetometer(magnetic_logs, strength, base, gravity, southern, effects)

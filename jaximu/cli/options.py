@@ -123,7 +123,8 @@ class LogOptions:
         str | None,
         option(
             "NAMES",
-            'Names of all columns in order, with units: "time [s],accel [m/s^2],gyro [rad/s]"; "_" skips a column.',
+            'Names of all columns in order, with units: "time [s],accel [m/s^2],gyro [rad/s]"; "_" skips a column. '
+            "Of several logs that differ, the names of each, with semicolons between them.",
         ),
     ] = None
     gyro_columns: Annotated[str | None, option("NAMES", "The same for the gyroscope's file.")] = None
@@ -155,7 +156,8 @@ class LogOptions:
     ] = None
     gyro_offset: Annotated[str | None, option("COUNTS", "Counts at zero rate, one number or three.")] = None
     device: Annotated[
-        str | None, option("ID", "Whose rows to take of a table in which several units write in turn.")
+        str | None,
+        option("ID", "Whose rows to take of a table in which several units write in turn; for array ID,ID,…."),
     ] = None
     topic: Annotated[
         str | None,
@@ -210,16 +212,48 @@ class LogOptions:
         return ReadOptions(**stated, gravity=gravity, check=check, alone=alone)
 
     def read_unit(
-        self, paths: tuple[Path, ...], gravity: LocalGravity, noise: NoiseOptions | None = None, alone: bool = False
+        self,
+        paths: tuple[Path, ...],
+        gravity: LocalGravity,
+        noise: NoiseOptions | None = None,
+        alone: bool = False,
+        several: bool = False,
     ) -> tuple[list[Recording], Recording | NoiseModel | None]:
-        """Read the logs of one unit, and its recording at rest, or the noise that is stated, if there is one."""
+        """Read the logs of one unit, and its recording at rest, or the noise that is stated, if there is one.
+
+        With `several` one log may hold several units, by their columns or by the IDs of their rows.
+        """
         if self.gyro_log is not None and len(paths) > 1:
             raise InputError("--gyro-log goes with one LOG; with several, each must hold its own gyroscope.")
         with progress("reading"):
             noise = noise or NOISE
             require_files(*paths, noise.static, noise.noise)
-            recordings = [self.read(path, gravity, alone=alone) for path in paths]
-            return recordings, noise.value(replace(self, gyro_log=None), gravity)  # --gyro-log is LOG's
+            logs = self.spread(paths)
+            if len(logs) > len(paths) and not several:
+                raise InputError(
+                    "--device and --columns choose one unit here; several in one log are for jaximu array."
+                )
+            recordings = [log.read(path, gravity, alone=alone) for path, log in logs]
+            return recordings, noise.value(replace(logs[0][1], gyro_log=None), gravity)  # --gyro-log is LOG's
+
+    def spread(self, paths: tuple[Path, ...]) -> list[tuple[Path, LogOptions]]:
+        """Return each log with its own columns and device, where one is given for each; one log may serve for all.
+
+        Raises `InputError` where their numbers differ.
+        """
+        layouts = [self.columns] if self.columns is None else self.columns.split(";")
+        devices = [self.device] if self.device is None else self.device.split(",")
+        count = max(map(len, (paths, layouts, devices)))
+        for option, parts in (("--columns", layouts), ("--device", devices), ("LOG", paths)):
+            if len(parts) not in (1, count):
+                raise InputError(f"{option}: {len(parts)} are given for {count} recordings; give one, or one for each.")
+        return [
+            (
+                paths[at % len(paths)],
+                replace(self, columns=layouts[at % len(layouts)], device=devices[at % len(devices)]),
+            )
+            for at in range(count)
+        ]
 
 
 @dataclass(frozen=True)

@@ -65,10 +65,11 @@ _FACTORS = {
     "angular rate": {
         "rad/s rads rad/sec radian/s radians/s radians/sec": 1.0,
         "mrad/s": 1e-3,
-        "deg/s dps °/s deg/sec degrees/s degree/s degrees/sec degree/sec": DEGREE,
+        "deg/s dps °/s d/s deg/sec degrees/s degree/s degrees/sec degree/sec": DEGREE,
         "mdeg/s mdps": DEGREE * 1e-3,
         "deg/h dph °/h": DEGREE / 3600.0,
         "rad/h": 1.0 / 3600.0,
+        "rpm rev/min": math.pi / 30.0,
     },
     "time": {
         "s sec secs seconds second": 1.0,

@@ -150,7 +150,8 @@ class Reading:
     rate: stated for a log without a time column, Hz. axes: map to body axes, see `parse_axes`; None: those of the log.
     frame: "FRD" where the format defines its axes as an autopilot's: forward, right, down.
     units: by signal, as the file has them. scales: by triad in counts, counts per SI unit (3,); offsets: counts at zero
-    input (3,); both in the log's axes. topic, instance, stamp: what was taken of a bag or flight log.
+    input (3,); both in the log's axes. topic, instance, stamp: what was taken of a bag or flight log. device: whose
+    rows were taken of a table of several units.
     """
 
     columns: str | None = None
@@ -165,6 +166,7 @@ class Reading:
     topic: str | None = None
     instance: int | None = None
     stamp: str = "header"
+    device: str | None = None
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "Reading":
@@ -514,7 +516,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
             f"{where}: gyro_x, gyro_y, gyro_z read {1.0 / abs(slope):.3g} times the rate at which gravity turns "
             f"in the accelerometer; {_time_advice(gyroscope) or _gyro_advice(gyroscope, abs(slope))}."
         )
-    if len(gyroscope) > 1000 and not _mean_rate(gyroscope) < _FASTEST:
+    if len(gyroscope) > 1000 and (not _mean_rate(gyroscope) < FASTEST or _slowed(recording)):
         raise InputError(f"{where}: {_time_advice(gyroscope)}.")
     if peak > 100.0:
         raise InputError(
@@ -595,7 +597,7 @@ def _step(logarithms: FloatArray) -> tuple[int, float]:
     return result
 
 
-_SLOWEST, _FASTEST = 2.0, 50e3
+SLOWEST, FASTEST = 2.0, 50e3
 """Hz: beyond, the rate of a log of turns is that of stamps in another unit."""
 
 
@@ -604,10 +606,22 @@ def _mean_rate(signal: Signal) -> float:
     return (len(signal) - 1) / float(signal.time[-1] - signal.time[0])
 
 
+def _slowed(recording: Recording) -> bool:
+    """Whether the rates explain how gravity turns only if the stamps, of a slow log, are a thousand times as close."""
+    force, rate = recording.accelerometer, recording.gyroscope
+    if rate is None or _mean_rate(rate) > SLOWEST:
+        return False
+    closer = (
+        turning(force.time * factor, force.values, rate.time * factor, rate.values).correlation
+        for factor in (1e-3, 1e-6)
+    )
+    return max(map(abs, closer)) > CORRELATED
+
+
 def _time_advice(gyroscope: Signal) -> str:
     """What the stamps are likely to be in, where their rate is none of a log of turns."""
     rate = _mean_rate(gyroscope)
-    if _SLOWEST < rate < _FASTEST:
+    if SLOWEST < rate < FASTEST:
         return ""
     return (
         f"the stamps make it {rate:.3g} samples a second: the unit of the time column is wrong "

@@ -22,12 +22,12 @@ from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.alignment import CORRELATED, Turning, turning
-from jaximu.recordings.columns.habits import QUANTITIES, Field, fields_of, sensor_of, words_of
+from jaximu.recordings.columns.habits import Field, fields_of, measures, sensor_of, words_of
 from jaximu.recordings.columns.known import EPOCH
 from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import LogTable
-from jaximu.recordings.recording import Signal
+from jaximu.recordings.recording import FASTEST, SLOWEST, Signal
 
 __all__ = ["Advice", "advise", "without_gravity"]
 
@@ -44,13 +44,15 @@ _COUNTERS = set(
     "status".split()
 )
 _ANGLES = {name: unit_named(name).factor for name in ("rad/s", "deg/s", "mdeg/s", "mrad/s")}
-_PLAIN = set("var column col field data channel ch ans unnamed imu c v x y out simout".split())
+_PLAIN = set("var column col field data channel ch ans unnamed imu c v x y out simout value".split())
 """Words that say nothing of a column."""
 _SHOWN = 3
 _UNIT_LENGTH = 2e-3  # that the norm of a quaternion may be off by, as few digits make it
 _ATTITUDES = {"q", "quat", "quaternion", "orientation", "attitude"}
 _ROUGH = 0.15  # logarithm by which turns may be off what a gyroscope's scale makes of them
 _TURNING = 5.0  # times the scatter in them by which means of a gyroscope at rest do not differ
+_ANOTHER = math.log(2.0)  # logarithm by which a level at rest must miss 1 g for its unit to be another
+_COPY = 0.99  # share of an accelerometer's variance that its own values in another unit explain
 _HOTTEST = 125.0  # °C that a sensor survives
 _TURN = "turn gravity as the accelerometer shows"
 _SINGLE = ("temperature", "ambient_temperature", "current", "table_angle", "table_rate")
@@ -194,6 +196,7 @@ class _Guess:
         self.chosen: dict[int, Column] = {}
         self.time: int | None = None
         self.assumed: float | None = None
+        self.doubted = False  # whether the stamps are not in the unit that they state
         self.rate = self.accel_scale = self.gyro_scale = None
         self.unknown: list[_Triad] = []
         self.refused: list[tuple[_Triad, str]] = []  # triads that are named, and why they are no measurement
@@ -233,6 +236,7 @@ class _Guess:
 
     def advice(self) -> Advice:
         self.time = self._time_column()
+        self._carry_on()
         triads = self._named_triads()
         accel = self._best(triads, "accel") or self._with_gravity()
         gyro = self._best(triads, "gyro")
@@ -263,7 +267,7 @@ class _Guess:
         for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
             if values is None or field.sensor or not rises(values):
                 continue
-            if not _plain(field) and not find_unit(field.unit or "", "time"):
+            if not (_plain(field) or find_unit(field.unit or "", "time") or "time" in field.stem):
                 continue  # a name that says something else: a counter, a tick, an angle
             steps = np.diff(values)
             usual = np.median(steps)
@@ -272,6 +276,16 @@ class _Guess:
             self.reasons.append(f"column {self.table.label(at)} rises steadily, by {usual:.4g} a row: time")
             return at
         return None
+
+    def _carry_on(self) -> None:
+        """Let the time go on where a counter starts again, whatever its end is."""
+        values = None if self.time is None else self.numbers[self.time]
+        if self.time is None or values is None:
+            return
+        steps = np.diff(values)
+        if (steps < 0).any():
+            steps = np.where(steps < 0, np.median(steps[steps > 0]), steps)
+            self.numbers[self.time] = values[0] + np.concatenate([[0.0], np.cumsum(steps)])
 
     def _named_triads(self) -> list[_Triad]:
         """The triads that names show, of whatever sensor."""
@@ -294,9 +308,7 @@ class _Guess:
             named = sensor is not None and bool(stem)
             if sensor is None and not stem and self.file in ("accel", "gyro", "mag"):
                 sensor = self.file
-            if sensor is None and unit and unit != "G" and (measured := find_unit(unit)):
-                sensor = QUANTITIES.get(measured.quantity)  # Trigno x [g]: the word is unknown, the unit is not
-            if sensor is None and not stem and self.file_not:
+            if sensor is None and not measures(unit) and not stem and self.file_not:
                 self.questions.append(f"Does this file hold an accelerometer? By its name it is {self.file_not}.")
                 continue
             triad = self._triad(
@@ -304,6 +316,7 @@ class _Guess:
             )
             if triad is not None:
                 triad.label = " ".join(stem) or "x, y, z"
+                triad.sensor = sensor or measures(unit, triad.level)  # Trigno x [g]: the word is unknown, the unit not
                 triads.append(triad)
         return triads
 
@@ -337,7 +350,8 @@ class _Guess:
         named = [triad for triad in triads if triad.sensor == sensor]
         if not named:
             return None
-        named.sort(key=lambda triad: (sensor == "accel" and triad.gravity_unit is None, triad.plain, triad.places))
+        unsure = {None: 2, "?": 1, "count": 1}
+        named.sort(key=lambda one: (sensor == "accel" and unsure.get(one.gravity_unit, 0), one.plain, one.places))
         first, name = named[0], GROUPS[sensor].field
         if len(named) > 1:
             others = ", ".join(repr(triad.label) for triad in named[1:])
@@ -439,6 +453,7 @@ class _Guess:
 
     def _by_turning(self, free: list[_Triad], accel: _Triad) -> _Triad | None:
         """The triad whose rates turn gravity as the accelerometer says."""
+        free = [triad for triad in free if not _copies(triad, accel)]
         fits = [(abs(fit.correlation), triad) for triad in free if (fit := self._turning(accel, triad))]
         correlation, best = max(fits, key=lambda pair: pair[0], default=(0.0, None))
         if best is not None and correlation > CORRELATED:
@@ -472,7 +487,18 @@ class _Guess:
         return self.assumed
 
     def _stated_time(self) -> Unit | None:
-        return None if self.time is None else find_unit(self.fields[self.time].unit or "", "time")
+        return None if self.time is None or self.doubted else find_unit(self.fields[self.time].unit or "", "time")
+
+    def _stated_rate(self) -> float:
+        """Rows a second (Hz) by the stated unit of the stamps; NaN without one."""
+        stated = self._stated_time()
+        return 1.0 / max(self._step() * stated.factor, 1e-300) if stated else math.nan
+
+    def _doubt_time(self) -> None:
+        self.doubted = True
+        self.reasons.append(
+            f"{self.table.label(self.time or 0)} rises by {self._step():.5g} a row: no rate in its unit"
+        )
 
     def _turning(self, accel: _Triad, gyro: _Triad) -> Turning | None:
         force_time, rate_time = self._stamps(accel), self._stamps(gyro)
@@ -508,16 +534,20 @@ class _Guess:
     def _units(self, accel: _Triad | None, gyro: _Triad | None) -> None:
         if accel is not None:
             self._accel_unit(accel)
-        turned = None
+        turned, rate = None, self._stated_rate()
+        if rate > FASTEST:
+            self._doubt_time()
         if accel is not None and gyro is not None:
-            unclear = self.time is not None and self._stated_time() is None
+            unclear = self.time is not None and (rate < SLOWEST or self._stated_time() is None)
             tried = []
             for factor in [factor for _, factor in self._time_units()] if unclear else [None]:
                 self.assumed = factor
                 if fit := self._turning(accel, gyro):
                     tried.append((abs(fit.correlation), self.assumed, fit))
             if tried:
-                _, self.assumed, turned = max(tried, key=lambda trial: trial[0])
+                correlation, self.assumed, turned = max(tried, key=lambda trial: trial[0])
+                if rate < SLOWEST and correlation > CORRELATED:
+                    self._doubt_time()
         slope = abs(turned.slope) if turned and abs(turned.correlation) > CORRELATED else None
         if self.time is not None:
             slope = self._time_unit(self.time, gyro, slope)
@@ -533,6 +563,8 @@ class _Guess:
             self._take(accel, "accel", None)
             return
         unit = _fitting(accel.unit, "accel")
+        if accel.gravity_unit in _GRAVITY_IN:
+            unit = self._kept(accel, unit, "acceleration", STANDARD_GRAVITY / accel.level, "hold 1 g at rest")
         if unit is None:
             unit = accel.gravity_unit
             if unit == "?":
@@ -564,6 +596,14 @@ class _Guess:
                     f"How many counts are 1 g (--accel-scale)? The accelerometer's norm at rest is {accel.level:.5g}."
                 )
         self._take(accel, "accel", unit)
+
+    def _kept(self, triad: _Triad, unit: str | None, quantity: str, factor: float | None, does: str) -> str | None:
+        """The unit that is stated, None where the values show another one, of which `factor` is about one in SI."""
+        stated = find_unit(unit or "", quantity)
+        if stated is None or factor is None or abs(math.log(factor / stated.factor)) < _ANOTHER:
+            return unit
+        self.reasons.append(f"{triad.label!r} is in {unit} by its name, in which it does not {does}")
+        return None
 
     def _increment(self, accel: _Triad) -> bool:
         """Whether the triad is g times the sampling interval: velocity increments."""
@@ -605,7 +645,7 @@ class _Guess:
 
     def _gyro_unit(self, gyro: _Triad, accel: _Triad | None, slope: float | None, per_sample: float | None) -> None:
         """Decide the gyroscope's unit; `per_sample`: the slope at 100 Hz where the rate is not known."""
-        unit = _fitting(gyro.unit, "gyro")
+        unit = self._kept(gyro, _fitting(gyro.unit, "gyro"), "angular rate", slope, _TURN)
         peak = np.abs(gyro.values).max()
         rest = np.abs(np.median(gyro.values, axis=0)).max()
         resting = accel is not None and accel.still and not accel.posed and not gyro.turns
@@ -700,16 +740,25 @@ class _Guess:
             if name not in _SINGLE or values is None or self._has(name):
                 continue
             unit = _fitting(field.unit, name)
-            if unit is None and "temperature" in name and -60 < np.nanmin(values) <= np.nanmax(values) < _HOTTEST:
-                unit = "degC"
-            elif unit is None and "temperature" in name and np.ptp(values[np.isfinite(values)]) > 0:
-                unit = "count"
-                self.reasons.append(
-                    f"{self.table.label(at)} is between {np.nanmin(values):.6g} and {np.nanmax(values):.6g}, which is "
-                    f"no temperature in °C but a chip's counts: {COUNTS_ADVICE}, for jaximu thermal"
-                )
+            if unit is None and "temperature" in name:
+                unit = self._temperature_unit(self.table.label(at), values[np.isfinite(values)])
             if unit:
                 self.chosen[at] = Column(name, unit)
+
+    def _temperature_unit(self, label: str, values: FloatArray) -> str | None:
+        """°C, or a chip's counts: whole numbers beside sensors in counts, or what no sensor survives."""
+        low, high = values.min(), values.max()
+        counts = any(column.unit == "count" for column in self.chosen.values()) and np.all(values == np.round(values))
+        if -60 < low <= high < _HOTTEST and not counts:
+            self.reasons.append(f"{label} states no unit and is taken to be in °C")
+            return "degC"
+        if low == high:
+            return None
+        self.reasons.append(
+            f"{label} is between {low:.6g} and {high:.6g}, which is no temperature in °C but a chip's counts: "
+            f"{COUNTS_ADVICE}, for jaximu thermal"
+        )
+        return "count"
 
     def _quaternion(self) -> None:
         """An attitude by name, whose four numbers have norm 1."""
@@ -811,8 +860,9 @@ def _plausible(peak: float, bias: float, noise: float | None) -> list[str]:
 
 
 def _fitting(unit: str | None, group: str) -> str | None:
-    """A stated unit, if it is one of what the group's columns measure."""
-    return unit if find_unit(unit or "", GROUPS[group].quantities) else None
+    """A stated unit, if it is one of what the group's columns measure; "count" by whatever name."""
+    stated = find_unit(unit or "", GROUPS[group].quantities)
+    return stated and ("count" if stated.quantity == "raw count" else unit)
 
 
 def _plain(field: Field) -> bool:
@@ -820,10 +870,19 @@ def _plain(field: Field) -> bool:
     return all(word.rstrip("0123456789") in _PLAIN or word.isdigit() for word in field.stem)
 
 
+def _copies(triad: _Triad, accel: _Triad) -> bool:
+    """Whether a triad holds the accelerometer's values once more, in another unit."""
+    if len(triad.values) != len(accel.values):
+        return False
+    pairs = zip(triad.values.T, accel.values.T, strict=True)
+    return all(np.std(a) > 0 and np.std(b) > 0 and np.corrcoef(a, b)[0, 1] ** 2 > _COPY for a, b in pairs)
+
+
 def _alike(one: Field, other: Field) -> bool:
-    """Whether two names differ by a number alone, or are none: columns of one matrix."""
+    """Whether two names differ by a number or their last word alone, or are none: columns of one matrix."""
     words = [[word.rstrip("0123456789") for word in field.stem if not word.isdigit()] for field in (one, other)]
-    return words[0] == words[1] and one.unit == other.unit
+    same = words[0] == words[1] or (len(words[0]) == len(words[1]) > 1 and words[0][:-1] == words[1][:-1])
+    return same and one.unit == other.unit
 
 
 def _lone_gyroscope(table: LogTable) -> str:

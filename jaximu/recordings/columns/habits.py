@@ -10,9 +10,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from jaximu.ground.units import find_unit, parse_column
+from jaximu.ground.units import STANDARD_GRAVITY, find_unit, parse_column
 
-__all__ = ["QUANTITIES", "Field", "fields_of", "sensor_of", "stated_rate", "words_of"]
+__all__ = ["QUANTITIES", "Field", "fields_of", "last_of", "measures", "sensor_of", "stated_rate", "words_of"]
 
 _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
@@ -23,6 +23,7 @@ _SENSORS = {
     "temperature": "temp temperature temperatures temperatur temperatura température tmp",
     "ambient_temperature": "ambient",
 }
+_ACCELERATIONS = {word for word in _SENSORS["accel"].split() if len(word) > 1}
 _WORDS = {word: sensor for sensor, words in _SENSORS.items() for word in words.split()}
 _HELPERS = {"angular": "gyro", "ang": "gyro", "velocity": "gyro", "vel": "gyro", "turn": "gyro", "speed": "gyro"}
 """Words that name no sensor alone: an angular velocity is a gyroscope's, a velocity is not."""
@@ -54,7 +55,8 @@ _REFUSED = {word: reason for reason, words in _REFUSALS.items() for word in word
 _ESTIMATED = {("b", "w"), ("b", "a"), ("b", "g")}
 """How the names of an estimated state's biases begin, as in EuRoC's b_w_RS_S_x."""
 _TIME = set(
-    "t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec zeit".split()
+    "t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec zeit temps "
+    "tiempo unix epoch tow utc".split()
 )
 _TIME_ALONE = set("ms us ns sec secs seconds milliseconds microseconds nanoseconds epoch uptime".split())
 """Words that name a column of time where they are its whole name, and no other names one."""
@@ -63,15 +65,15 @@ _TIME_BESIDE = _NEUTRAL | set(
     "recording phone node chip epoc "
     "startup us ms ns sec nanosec nanoseconds nanos micros microseconds millis milliseconds usec msec nsec "
     "accelerometer "
-    "acc gyro gyroscope logging "
+    "acc gyro gyroscope logging arrival creation gps week whole "
     "absolute relative and date txt".split()
 )
 _UNIT_NAMES = {
     "time": {
         "s": "s, sec, secs, seconds",
         "ms": "ms, msec, msecs, millis, milliseconds",
-        "us": "us, usec, micros, microseconds",
-        "ns": "ns, nsec, nanos, nanosec, nanoseconds",
+        "us": "us, usec, usecs, micros, microseconds",
+        "ns": "ns, nsec, nsecs, nanos, nanosec, nanosecs, nanoseconds",
     },
     "accel": {"g": "g, gs", "mg": "mg", "m/s^2": "ms2, mps2, mss, m s 2, m s2, m s s, m per s2, m s"},
     "gyro": {
@@ -91,11 +93,37 @@ _GLUED = re.compile(
     r"([xyz])"
 )
 _LEADING = re.compile(r"([xyz])(a|acc|accel|acceleration|gyro|gyr|rate|rot|rotation|mag|magn)")
+_WITH, _WITHOUT = {"with", "including", "incl"}, {"without", "no", "excluding", "excl", "minus"}
+"""Words before gravity."""
+_BROWSER = {"beta": "x", "gamma": "y", "alpha": "z"}
+"""Axes of the rotation rate in a browser's DeviceMotion."""
 _TURNS = {"roll": "x", "pitch": "y", "yaw": "z"}
 _INSTANCE = re.compile(r"([a-z]+)\d+")
+_ABOUT = 0.15  # of 1 g, that an accelerometer at rest may be off
+_FIELD = 15.0, 80.0  # uT of the Earth's field, disturbed indoors
+_MIDDLE = re.compile(r"(.*?)\s*[\[(]((?:[^\[\]()]|\([^()]*\))+)[\])]\s*([^\s\[\]()].*)")
+"""A unit that stands within a name: Acceleration - x (m/s²) Run #1."""
 QUANTITIES = {"acceleration": "accel", "angular rate": "gyro", "magnetic field": "mag"}
 """The sensor of a quantity."""
 _OWN = re.compile(r"(ambient_temperature|current|table_angle|table_rate|attitude_[wxyz])")
+
+
+def measures(unit: str | None, level: float | None = None) -> str | None:
+    """The sensor of a unit, None for none. G and mG may be gravity or gauss, as which values of a `level` can be."""
+    measured = find_unit(unit or "")
+    gravity = find_unit(unit or "", "acceleration")
+    if measured and gravity and measured.quantity == "magnetic field":
+        if level is not None and abs(level * gravity.factor / STANDARD_GRAVITY - 1) < _ABOUT:
+            return "accel"
+        return "mag" if level is not None and _FIELD[0] < level * measured.factor < _FIELD[1] else None
+    return QUANTITIES.get(measured.quantity) if measured else None
+
+
+def last_of(name: str) -> tuple[str, str | None]:
+    """What stands before a unit of time that ends a name, and that unit; None where it ends in none."""
+    match = re.fullmatch(r"(.*?)([a-z]+)", name.strip('" #').lower())
+    unit = _UNIT_WORDS["time"].get(match[2]) if match else None
+    return (match[1], unit) if match and unit else (name, None)
 
 
 def words_of(text: str) -> list[str]:
@@ -133,7 +161,10 @@ class Field:
     @classmethod
     def of(cls, name: str) -> Field:
         """Read a column's name."""
-        text, unit = parse_column(name.strip().lstrip("%#"))
+        name = name.strip().lstrip("%#")
+        if (match := _MIDDLE.fullmatch(name)) and find_unit(match[2]):
+            name = f"{match[1]} {match[3]} [{match[2]}]"
+        text, unit = parse_column(name)
         plain = re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")
         if match := _OWN.fullmatch(plain):
             return cls((plain,), None, match[1], unit)
@@ -151,7 +182,7 @@ class Field:
                 short_sensor, reason = sensor_of(short)
                 if tail in _UNIT_WORDS.get(short_sensor or "", {}) and (at or short_sensor == "temperature"):
                     return cls(short, at, short_sensor, unit or _UNIT_WORDS[short_sensor or ""][tail], reason)
-        if axis is None and _time(words):
+        if axis is None and _time(words, unit):
             tail = next((word for word in reversed(words) if word in _UNIT_WORDS["time"] and len(word) > 1), None)
             stated = find_unit(unit or "", "temperature") if words == ["t"] else None
             if stated is None:
@@ -159,9 +190,9 @@ class Field:
             return cls(tuple(words), None, "temperature", unit)  # T (°)
         if axis is None and len(words) == 1 and words[0] in _TIME_ALONE:
             return cls(tuple(words), None, "time", unit or _UNIT_WORDS["time"].get(words[0]))
-        measured = find_unit(unit) if unit and axis and unit != "G" else None
+        measured = find_unit(unit or "") if axis else None
         if measured and not stem and axis in tuple("xyz"):  # X (m/s^2)
-            sensor = QUANTITIES.get(measured.quantity)
+            sensor = measures(unit)
         if not stem and measured and measured.quantity == "time":  # X [s], the abscissa
             return cls((), None, "time", unit)
         if axis and sensor in ("temperature", "ambient_temperature"):
@@ -222,8 +253,10 @@ def _without_prefix(names: Sequence[str]) -> list[str]:
     return left
 
 
-def _time(words: list[str]) -> bool:
-    return any(word in _TIME for word in words) and all(
+def _time(words: list[str], unit: str | None = None) -> bool:
+    """Whether words name a time: by one that says so, or by a unit of time beside others that would fit one."""
+    timed = find_unit(unit or "", "time") or (len(words) > 1 and any(word in _TIME_ALONE for word in words))
+    return (any(word in _TIME for word in words) or bool(words and timed)) and all(
         word in _TIME or word in _TIME_BESIDE or word.isdigit() for word in words
     )
 
@@ -232,6 +265,8 @@ def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
     """The words without the axis among them, and the axis."""
     letters = [at for at, word in enumerate(words) if word in ("x", "y", "z")]
     turns = [at for at, word in enumerate(words) if word in _TURNS]
+    if len(words) > 1 and words[-1] in _BROWSER and words[-2] in ("rate", "rotation"):
+        return tuple(words[:-1]), _BROWSER[words[-1]]
     of_sensor = len(words) > 1 and any(word in _WORDS or word in _HELPERS for word in words)
     for places in (letters, turns if of_sensor else []):
         if len(places) == 1:
@@ -247,11 +282,22 @@ def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
     return tuple(words), None
 
 
+def _gravity_beside(stem: tuple[str, ...]) -> tuple[tuple[str, ...], bool]:
+    """The words without those that say that gravity is in, and whether others say that it is not."""
+    for at, word in enumerate(stem[:-1]):
+        if stem[at + 1] in ("gravity", "g") and word in _WITH | _WITHOUT:
+            return (*stem[:at], *stem[at + 2 :]), word in _WITHOUT
+    return stem, False
+
+
 def sensor_of(stem: tuple[str, ...]) -> tuple[str | None, str | None]:
     """The sensor that the words of a name mean, None for none or more than one, and why it is not its measurement."""
     sensors: set[str] = set()
-    why_not = None
-    for word in stem:
+    stem, without = _gravity_beside(stem)
+    why_not = "gravity is taken out" if without else None
+    for at, word in enumerate(stem):
+        if word == "g" and set(stem[at + 1 :]) & _ACCELERATIONS:
+            continue  # G-Force
         plain = match[1] if (match := _INSTANCE.fullmatch(word)) else word
         if plain in _REFUSED and any(other != "var" and not other.isdigit() for other in stem):  # Var1 says nothing
             why_not = why_not or _REFUSED[plain]

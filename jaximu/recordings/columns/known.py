@@ -10,9 +10,10 @@ from pathlib import PurePath
 import numpy as np
 
 from jaximu.ground.units import find_unit, parse_column
+from jaximu.recordings.columns.habits import fields_of, last_of
 from jaximu.recordings.columns.table import LogTable
 
-__all__ = ["EPOCH", "known_names", "sentence_names", "whole_stamps"]
+__all__ = ["EPOCH", "JOINED", "known_names", "sentence_names", "whole_stamps"]
 
 
 @dataclass(frozen=True)
@@ -80,23 +81,13 @@ _LAYOUTS = [
             "MAVLink SCALED_IMU (ms, mg, mrad/s, mG)",
             "time_boot_ms=time [ms], *acc=accel_* [mg], *gyro=gyro_* [mrad/s], ?*mag=mag_* [mG]",
         ),
-        *(
-            (
-                "a table of sensor_msgs/Imu (rad/s, m/s^2), time being the header's stamp",
-                f"{stamp.format(prefix)}, {prefix}angular_velocity.*=gyro_* [rad/s], "
-                f"{prefix}linear_acceleration.*=accel_* [m/s^2], ?time=received, ?%time=received",
-            )
-            for stamp in (
-                "{0}header.stamp.sec=, {0}header.stamp.nanosec=",
-                "{0}header.stamp.secs=, {0}header.stamp.nsecs=",
-                "{0}header.stamp=time [ns]",
-            )
-            for prefix in ("", "field.", "msg.")
-        ),
     )
 ]
+JOINED = "whole time [ns]"
+"""Name of a column of stamps that was joined from two."""
 _LATEST = 2**33  # s
-_PAIRS = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanoseconds"), ("sec", "nsec"))
+_PARTS = {"ms": 10**3, "us": 10**6, "ns": 10**9}
+_GAPS = 0.1  # of the seconds may begin with a row whose rest does not fall, as after a gap
 _SENSOR_LOGGER = {"time": "time [ns]", "seconds_elapsed": "", "x": "", "y": "", "z": ""}
 
 
@@ -155,9 +146,15 @@ def _of_message(table: LogTable, names: tuple[str, ...]) -> tuple[tuple[str, ...
     known = [titles[match[1]].format(match[2]) if match else name for match, name in zip(matches, names, strict=True)]
     if sum(match is not None for match in matches) != 6 or len(set(known)) < len(known):
         return None
+    stamped = any(".stamp" in name.lower() for name in names)
     for at, (name, column) in enumerate(zip(names, table.columns, strict=True)):
+        plain = name.strip("_% ").lower()
         since = column.dtype.kind == "f" and EPOCH[0] < np.nanmin(column) <= np.nanmax(column) < EPOCH[1]
-        if since and name.strip("_").lower() in ("time", "timestamp", "stamp"):
+        if stamped and plain == "time":
+            known[at] = "received"
+        elif plain.endswith("header.stamp") and column.dtype.kind == "i":
+            known[at] = "time [ns]"
+        elif since and plain in ("time", "timestamp", "stamp"):
             known[at] = "time [s]"
     return tuple(known), (
         "columns and units as sensor_msgs/Imu has them (rad/s, m/s^2): its linear_acceleration holds gravity."
@@ -196,22 +193,46 @@ def _stated(name: str) -> bool:
 
 
 def whole_stamps(table: LogTable) -> LogTable:
-    """The table with its stamps as one column where its header has them as seconds and nanoseconds, as ROS writes them.
+    """The table with its stamps as one column where they are whole seconds in one and the rest of them in another.
 
-    The column of the seconds holds them then, as `time [ns]`; that of the nanoseconds stays.
+    They belong together by their names (sec and nanosec), or because the one falls just where the other rises. The
+    column of the seconds holds both then, in nanoseconds and called `JOINED`; the other stays.
     """
-    plain = [name.strip('" #').lower() for name in table.names or ()]
-    for seconds, rest in _PAIRS:
-        for at, name in enumerate(plain):
-            prefix, separator, _ = name.rpartition(seconds)
-            if not separator or name != prefix + seconds or plain.count(prefix + rest) != 1 or prefix[-1:].isalnum():
-                continue
-            parts = [table.columns[column] for column in (at, plain.index(prefix + rest))]
-            if any(part.dtype.kind != "i" or (part < 0).any() or (part > _LATEST).any() for part in parts):
+    fields = fields_of(table.names or ())
+    for rest, title in enumerate(table.names or ()):
+        prefix, unit = last_of(title)
+        parts = _PARTS.get(fields[rest].unit or unit or "")
+        if parts is None or not _between(table.columns[rest], parts):
+            continue
+        for at, field in enumerate(fields):
+            head, seconds = last_of(table.names[at]) if table.names else ("", None)
+            written = _seconds(table.columns[at]) if at != rest else None
+            alike = seconds == "s" and head == prefix
+            if written is None or not (
+                alike or ((field.sensor == "time" or seconds == "s") and _in_step(written, table.columns[rest]))
+            ):
                 continue
             names = [*(table.names or ())]
-            names[at] = "time [ns]"
-            note = f"time is {name} and {prefix + rest}."
-            stamped = table.with_column(at, parts[0] * 10**9 + parts[1])
-            return replace(stamped, names=tuple(names), notes=(*table.notes, note))
+            names[at] = JOINED
+            joined = table.with_column(at, written * 10**9 + table.columns[rest] * (10**9 // parts))
+            note = f"time is {table.label(at)} and {table.label(rest)}."
+            return replace(joined, names=tuple(names), notes=(*table.notes, note))
     return table
+
+
+def _between(values: np.ndarray, end: int) -> bool:
+    """Whether a column holds whole numbers from 0 to an end."""
+    return bool(values.dtype.kind == "i" and (values >= 0).all() and (values < end).all())
+
+
+def _seconds(values: np.ndarray) -> np.ndarray | None:
+    """A column's whole seconds, also where they are written in nanoseconds; None for anything else."""
+    if values.dtype.kind == "i" and (values % 10**9 == 0).all():
+        values = values // 10**9
+    return values if _between(values, _LATEST) else None
+
+
+def _in_step(seconds: np.ndarray, rest: np.ndarray) -> bool:
+    """Whether seconds rise where what is left of them falls, and hardly anywhere else."""
+    falls, rises = np.diff(rest) < 0, np.diff(seconds) > 0
+    return bool(falls.any() and rises[falls].all() and np.sum(rises & ~falls) <= _GAPS * falls.sum())

@@ -109,8 +109,10 @@ def header_columns(table: LogTable) -> tuple[Column, ...] | None:
 
 
 def rises(values: np.ndarray) -> bool:
-    """Whether a column's numbers rise, with repeats and a few steps back."""
+    """Whether a column's numbers rise, with repeats and a few steps back, such as a counter's at its end."""
     if values.dtype == object or len(values) < 3:
         return False
     steps = np.diff(values[np.isfinite(values)])
-    return bool(len(steps) > 0 and np.mean(steps > 0) > 0.2 and np.mean(steps < 0) < 0.02 and steps.sum() > 0)
+    back = np.sum(steps < 0)
+    ended = steps.sum() > 0 or bool(back and steps[steps < 0].max() < -np.ptp(values[np.isfinite(values)]) / 2)
+    return bool(len(steps) > 0 and np.mean(steps > 0) > 0.2 and back < 0.02 * len(steps) and ended)

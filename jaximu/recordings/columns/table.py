@@ -53,6 +53,7 @@ class LogTable:
     messages: whether the rows are messages as they came in, in which repeats and small disorder are no defect of the
         file. In a table of samples rows out of order and repeated ones are put right, too; the clock is one clock.
     frame: "FRD" where the format defines its axes as an autopilot's. axes: the map that its writer has applied already.
+    device: whose rows these are, where several units wrote into the file.
     """
 
     source: Source
@@ -64,6 +65,7 @@ class LogTable:
     messages: bool = False
     frame: str | None = None
     axes: str | None = None
+    device: str | None = None
 
     @property
     def path(self) -> str:

@@ -1,13 +1,18 @@
-"""Times of day and dates written as text, as stamps."""
+"""Times of day, dates, and numbers with their unit, written as text."""
 
 import re
 
 import numpy as np
 
-__all__ = ["seconds_of"]
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.units import find_unit
+
+__all__ = ["DAY", "measured", "seconds_of"]
 
 _CLOCK = re.compile(r"(?:^|[\sT])(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
-_HALF_DAY, _DAY = 43200, 86400
+_MEASURED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)\s*([^\d\s.].*?)\s*")
+DAY = 86400 * 10**9
+"""ns."""
 
 
 def seconds_of(column: np.ndarray) -> np.ndarray | None:
@@ -23,5 +28,15 @@ def seconds_of(column: np.ndarray) -> np.ndarray | None:
         hours = int(match[1]) % 12 + 12 * (match[5].lower() == "pm") if match[5] else int(match[1])
         seconds = 3600 * hours + 60 * int(match[2]) + int(match[3])
         stamps[at] = seconds * 10**9 + int((match[4] or "").ljust(9, "0"))
-    midnights = np.cumsum(np.diff(stamps, prepend=stamps[:1]) < -_HALF_DAY * 10**9)
-    return stamps + midnights * _DAY * 10**9
+    midnights = np.cumsum(np.diff(stamps, prepend=stamps[:1]) < -DAY // 2)
+    return stamps + midnights * DAY
+
+
+def measured(column: np.ndarray, decimal: str = ".") -> tuple[FloatArray, str] | None:
+    """The numbers of a column of texts such as "0.02 sec", and their unit; None where they have no one unit."""
+    matches = [_MEASURED.fullmatch(str(cell).replace(decimal, ".")) for cell in column if cell is not None]
+    units = {match[2] if match else "" for match in matches}
+    if len(units) != 1 or not find_unit(unit := units.pop()):
+        return None
+    numbers = iter(float(match[1]) for match in matches if match)
+    return np.array([np.nan if cell is None else next(numbers) for cell in column]), unit

@@ -5,7 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate, pairwise
 from os import SEEK_END
@@ -19,12 +19,15 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, stated_rate
 from jaximu.recordings.columns.table import HEAD, LogTable, from_arrow, parse_name
-from jaximu.recordings.readers.clock import seconds_of
+from jaximu.recordings.readers.clock import DAY, measured, seconds_of
 from jaximu.recordings.recording import Source
 
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f"))
 _PIECE = 1 << 22  # bytes parsed at once
 _LOOKED_AT = 200  # lines in which the layout is looked for
+_CUT_OFF = "the file ends in zero bytes, as after a power loss: its last row is left out."
+_NUMBER = r"\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*"
+_VECTOR = re.compile(rf"[\[(]{_NUMBER}[,; ]{_NUMBER}[,; ]{_NUMBER}[\])]|{_NUMBER}\|{_NUMBER}\|{_NUMBER}")
 _SINGLE_BLOCK = 2**31 - 2
 
 
@@ -60,11 +63,14 @@ def read(path: Path, source: Source) -> LogTable:
         table, rows = _read_cleaned(_lines(path.read_bytes() if whole is None else whole), layout, source.path)
         parsed = [from_arrow(column) for column in table.columns], table.schema
     (columns, schema), names = parsed, layout.names or None
+    midnight = 0
     if names:  # a column of dates states its own unit
         names = tuple(
             f"{name} [{kind.type.unit}]" if pa.types.is_timestamp(kind.type) and "[" not in name else name
             for name, kind in zip(names, schema, strict=True)
         )
+    if names and any(column.dtype == object for column in columns):
+        names, columns = _vectors_apart(names, columns)
     for at, column in enumerate(columns):
         if column.dtype != object:
             continue
@@ -74,14 +80,36 @@ def read(path: Path, source: Source) -> LogTable:
             columns[at] = np.array([cell[:-1] for cell in column], object)
         elif (stamps := seconds_of(column)) is not None:
             columns[at] = stamps
+            midnight = int(np.argmax(np.diff(stamps // DAY, prepend=stamps[:1] // DAY) > 0))
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [ns]", *names[at + 1 :])
-    notes = (
-        ()
-        if wide or whole is None
-        else ("the file ends in zero bytes, as after a power loss: its last row is left out.",)
-    )
-    return LogTable(source, names, tuple(columns), rows, layout.rate, notes=notes)
+        elif with_unit := measured(column, layout.decimal):
+            columns[at] = with_unit[0]
+            if names:
+                names = (*names[:at], f"{parse_column(names[at])[0]} [{with_unit[1]}]", *names[at + 1 :])
+    table = LogTable(source, names, tuple(columns), rows, layout.rate)
+    notes = () if wide or whole is None else (_CUT_OFF,)
+    if midnight:
+        notes = (*notes, f"the time of day passes midnight (row {table.row(midnight)}): it goes on from there.")
+    return replace(table, notes=notes)
+
+
+def _vectors_apart(names: tuple[str, ...], columns: Sequence[np.ndarray]) -> tuple[tuple[str, ...], list[np.ndarray]]:
+    """The columns, with x, y and z of their own where each cell holds three numbers, in brackets or with bars."""
+    titles: list[str] = []
+    parts: list[np.ndarray] = []
+    for name, column in zip(names, columns, strict=True):
+        vector = column.dtype == object and _VECTOR.fullmatch(str(column[0]))
+        matches = [_VECTOR.fullmatch(str(cell)) for cell in column] if vector else [None]
+        if not all(matches):
+            titles, parts = [*titles, name], [*parts, column]
+            continue
+        title, unit = parse_column(name)
+        titles += [f"{title}.{axis}" + (f" [{unit}]" if unit else "") for axis in "xyz"]
+        parts += [
+            *np.array([[number for number in match.groups() if number] for match in matches if match], np.float64).T
+        ]
+    return tuple(titles), parts
 
 
 def _without_zeros(path: Path) -> bytes | None:

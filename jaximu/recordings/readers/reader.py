@@ -24,7 +24,7 @@ from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.columns import nominal
 from jaximu.recordings.columns.choose import choose_columns, choose_pair, column_units
 from jaximu.recordings.columns.guess import Advice, advise, without_gravity
-from jaximu.recordings.columns.known import known_names, whole_stamps
+from jaximu.recordings.columns.known import JOINED, known_names, whole_stamps
 from jaximu.recordings.columns.names import (
     COUNTS_ADVICE,
     GROUPS,
@@ -66,7 +66,8 @@ _JITTER = 2.0  # sample periods that stamps may be off a steady clock for their 
 _UNEVEN = 0.1  # of the period, that sorted stamps scatter by where they jitter
 _ENDS = sorted({2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-9, 1e-6, 1e-3)} | {86400.0, 604800.0})
 """Seconds after which clocks start again: counters of 16, 24 and 32 bits, a day, a week of GPS."""
-_COUNTED = 64.0  # samples that a counter tells apart at the least
+_COUNTED, _FEW_COUNTED = 64.0, 4.0  # samples that a counter tells apart, and at the least
+_EVENLY = 0.8, 1.25  # sample intervals across the end of a counter of few samples
 _CARRIED = 10.0  # sample intervals between the last stamp before a clock started again and the first after
 _FEW_SHARED, _FEW_SHARES = 10, 0.02  # rows, and share of them, from which on repeated stamps are a habit
 _SHARED = 0.1  # of the messages may share a stamp
@@ -109,8 +110,7 @@ def read_recording(
         with _noted(tables[0].notes):
             parts = _parts(tables, options)
     else:
-        table, second = _stamped(tables[0], options.columns), _read(gyro_log, options)[0]
-        second = _stamped(second, options.columns or options.gyro_columns)
+        table, second = whole_stamps(tables[0]), whole_stamps(_read(gyro_log, options)[0])
         first_columns, second_columns = choose_pair(table, second, options.columns, options.gyro_columns)
         parts = [
             extract(table, first_columns, options, set(GROUPS) - {"gyro"}),
@@ -130,7 +130,8 @@ def read_recording(
 def _read(path: str | os.PathLike[str], options: ReadOptions) -> list[LogTable]:
     """The tables of a file, with the rows of one unit where several write into it in turn."""
     tables = read_tables(path, MessageSelection(options.topic, options.instance, options.stamp))
-    return [table if table.messages else of_device(table, options.device) for table in tables]
+    usual = (options.like or Reading()).device
+    return [table if table.messages else of_device(table, options.device, usual) for table in tables]
 
 
 def read_frame(frame: Any, options: ReadOptions | None = None) -> Recording:
@@ -220,17 +221,13 @@ def _read_as(
         topic=options.topic,
         instance=options.instance,
         stamp=options.stamp,
+        device=table.device,
     )
-
-
-def _stamped(table: LogTable, columns: str | Sequence[str] | None) -> LogTable:
-    """Return the table with whole stamps, unless options name its columns as they stand."""
-    return table if columns else whole_stamps(table)
 
 
 def _parts(tables: Sequence[LogTable], options: ReadOptions) -> "list[_FilePart]":
     """Return the signals of one file's tables."""
-    first = _stamped(tables[0], options.columns)
+    first = whole_stamps(tables[0])
     named = {column.name for column in header_columns(first) or ()}
     sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
     sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
@@ -245,7 +242,13 @@ def _finished(parts: "Sequence[_FilePart]", table: LogTable, options: ReadOption
         recording = apply_axes(recording, options.axes)
     if options.like is not None:
         options.like.require_alike(recording.reading, recording.name, options.like.units)
-    notes = plausibility(recording, options.gravity) if options.check else ()
+    try:
+        notes = plausibility(recording, options.gravity) if options.check else ()
+    except InputError as error:
+        advice = None if options.columns or table.messages else advise(whole_stamps(table))
+        if advice is None or not (advice.columns and advice.readable):
+            raise
+        raise InputError(f"{error.args[0]} Or, after checking: {advice.sentence()}") from None
     return replace(recording, notes=(*recording.notes, *notes))
 
 
@@ -259,7 +262,7 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     parts, tables = [], _read(path, options)
     for at, table in enumerate(tables):
         options = options if at else _alike(options, table)
-        table = _stamped(table, options.columns)
+        table = whole_stamps(table)
         named = table.messages or len(tables) > 1
         columns = header_columns(table) or () if named else choose_columns(table, options.columns, "mag")
         if options.rate is None and table.rate is None and not any(column.name == TIME for column in columns):
@@ -549,8 +552,12 @@ def extract(
     """The signals of the wanted groups in a table, checked sample by sample."""
     group_of = {name: key for key, group in GROUPS.items() for name in group.columns}
     wanted = [
-        column if column.name == TIME or group_of.get(column.name or "") in groups else Column(None)
-        for column in columns
+        Column(TIME, "ns")
+        if column.name == TIME and title == JOINED
+        else column
+        if column.name == TIME or group_of.get(column.name or "") in groups
+        else Column(None)
+        for column, title in zip(columns, table.header, strict=True)
     ]
     sensor = "gyro" if option == "--gyro-columns" else None
     used = column_units(table, wanted, option, sensor)
@@ -606,12 +613,15 @@ def _carried_on(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[Log
         return table, []
     usual = np.median(steps[steps > 0])
     for seconds in _ENDS:
-        if seconds / unit.factor < _COUNTED * usual:
-            continue
         span = seconds / unit.factor
+        if span < _FEW_COUNTED * usual:
+            continue
+        # one that ends after a few samples must go on as evenly as they come
+        nearest, farthest = (0.0, _CARRIED) if span > _COUNTED * usual else _EVENLY
         full = stamps.dtype.type(round(span) if stamps.dtype.kind == "i" else span)
         back = np.flatnonzero(steps < -full / 2)
-        if not len(back) or not np.all((steps[back] + full > 0) & (steps[back] + full < _CARRIED * usual)):
+        after = (steps[back] + full) / usual
+        if not len(back) or not np.all((after > nearest) & (after < farthest)):
             continue
         turns = np.zeros(len(stamps), stamps.dtype)
         turns[back + 1] = full

@@ -186,10 +186,11 @@ _FEWEST, _MOST_DEVICES, _IN_TURN = 0.02, 64, 0.02
 """Share of the rows that a unit has at the least, number of units, and share of rows after which another one writes."""
 
 
-def of_device(table: LogTable, device: str | None) -> LogTable:
+def of_device(table: LogTable, device: str | None, usual: str | None = None) -> LogTable:
     """A table with the rows of one unit where a column names several that write in turn; any other as it is.
 
-    Raises `InputError` where none of them, or one that is not there, was chosen.
+    usual: the unit to take where none is chosen and it is there. Raises `InputError` where none of them, or one that is
+    not there, was chosen.
     """
     fields = fields_of(table.names or ())
     triads = {field.sensor for field in fields if field.axis} & _TRIADS
@@ -204,15 +205,18 @@ def of_device(table: LogTable, device: str | None) -> LogTable:
             continue
         if not _alike(table, [names == unit for unit in units]):  # rows of several sensors of one unit
             continue
+        device = usual if device is None and usual in units else device
         if device is None:
             raise InputError(
                 f"{table.path}: its rows are of {len(units)} units, which write in turn, by column {table.label(at)}: "
-                f"choose one of them, {', '.join(units[:8])}, with --device."
+                f"choose one of them, {', '.join(units[:8])}, with --device; for jaximu array take all: --device "
+                f"{','.join(units[:8])}{',…' if len(units) > 8 else ''}."
             )
         if device not in units:
             raise InputError(f"{table.path}: --device {device}: column {table.label(at)} holds {', '.join(units[:8])}.")
         taken = table.take(np.flatnonzero(names == device))
-        return replace(taken, notes=(*taken.notes, f"the rows are those of {device}, by column {table.label(at)}."))
+        note = f"the rows are those of {device}, by column {table.label(at)}."
+        return replace(taken, device=device, notes=(*taken.notes, note))
     if device is not None:
         raise InputError(f"{table.path}: --device {device}: no column says which of several units a row is of.")
     return table
