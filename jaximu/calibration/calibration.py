@@ -50,6 +50,7 @@ MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias
 EXACT = 1e-6
 """Share of an error before the fit below which what is left is rounding: as many parameters as conditions."""
 _ROUNDING = 1e-9
+"""Share by which an eigenvalue of a covariance may be negative and count as zero."""
 _VECTORS = ("specific_force", "angular_rate", "angular_acceleration", "magnetic_field")
 _LENGTHS = (
     dict.fromkeys(_VECTORS, 3)

@@ -181,20 +181,20 @@ def about_biases(
     start, stop = np.append(means.start, [begin, end]), np.append(means.stop, [end, 2 * end - begin])
     during, after = np.array(covariance), np.array(covariance)
     biases: dict[str, list[int]] = {}
-    for place, name in enumerate(names):
+    for row, name in enumerate(names):
         if name.part != "bias" or name.effect is not None or getattr(noise, name.owner) is None:
             continue
-        biases.setdefault(name.owner, []).append(place)
+        biases.setdefault(name.owner, []).append(row)
         (axis,) = name.axes
         slow, scale = getattr(noise, name.owner).drift(), means.scale[name.owner][axis]
         of_times = scale**2 * slow.covariance(start, stop)[axis]
         by_outputs = by_conditions @ means.reactions[name.owner][:, :, axis]
         for kept, time in ((during, -2), (after, -1)):
             across = by_outputs @ (first_one * of_times[:-2, time])
-            kept[:, place] -= across
-            kept[place] -= across
-            kept[place, place] += of_times[time, time]
-    return after, {triad: np.sqrt(np.diag(during)[places]) for triad, places in biases.items()}
+            kept[:, row] -= across
+            kept[row] -= across
+            kept[row, row] += of_times[time, time]
+    return after, {triad: np.sqrt(np.diag(during)[rows]) for triad, rows in biases.items()}
 
 
 def _beforehand(priors: Sequence[tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
