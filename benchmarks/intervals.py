@@ -3,7 +3,7 @@
 Units with gains and biases of their own are simulated without drift. A drift that another program would draw (a random
 walk, or flicker noise as a sum of first-order processes, at a sample a quarter of a second) is added to their samples;
 it goes on as long again after the recording ends. Errors are those of gains, of the bias as its mean over the
-recording, and of the bias as its mean over the time after it.
+recording, and of the bias as its mean over the time after it. Numbers that a recording leaves open are left out.
 """
 
 import os
@@ -126,14 +126,19 @@ def errors(kind, protocol, recipe, at_rest, units):
         open_numbers = {name for weak in calibration.weak if not weak.determined for name, _ in weak.parameters}
         for name, triad in calibration.triads().items():
             gain, bias = calibration.sigma(name)
-            known = gain > 0
-            known &= ~np.array([[f"{name}.gain[{i},{j}]" in open_numbers for j in range(3)] for i in range(3)])
-            wrong = (np.asarray(triad.gain) - np.asarray(getattr(imu, name).gain))[known] / gain[known]
-            found = np.asarray(triad.bias)
-            rows.setdefault(f"{name}, gains", []).append(wrong)
-            recorded = (found - during[name]) / calibration.bias_sigma_recording[name]
-            rows.setdefault(f"{name}, bias in the recording", []).append(recorded)
-            rows.setdefault(f"{name}, bias after it", []).append((found - after[name]) / bias)
+            known = (gain > 0) & [[f"{name}.gain[{i},{j}]" not in open_numbers for j in range(3)] for i in range(3)]
+            sure = np.array([f"{name}.bias[{i}]" not in open_numbers for i in range(3)])
+            found, recorded = np.asarray(triad.bias), calibration.bias_sigma_recording[name]
+            groups = {
+                "gains": ((np.asarray(triad.gain) - np.asarray(getattr(imu, name).gain)) / np.where(known, gain, 1))[
+                    known
+                ],
+                "bias in the recording": ((found - during[name]) / recorded)[sure],
+                "bias after it": ((found - after[name]) / bias)[sure],
+            }
+            for group, values in groups.items():
+                if len(values):
+                    rows.setdefault(f"{name}, {group}", []).append(values)
     return rows
 
 

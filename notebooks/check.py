@@ -21,6 +21,8 @@ RELATIVE = 0.02
 """Another machine, or the lower bounds of the stack, round differently, and an iteration may stop one pass sooner."""
 SMALLEST = 1e-9
 """Numbers below this are equal: rounding errors, or probabilities in the tails, which amplify a relative change."""
+COUNT = 100
+"""Whole numbers below this are counts; larger ones may be measured values that were rounded."""
 PICTURE = "(picture)"
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?")
 _POWER = re.compile("[·×]10([⁻⁺]?[⁰¹²³⁴-⁹]+)")
@@ -61,10 +63,14 @@ def alike(one: str, other: str) -> bool:
 
 
 def close(one: str, other: str) -> bool:
-    """Tell whether two numbers as printed are equal: counts exactly, others within the tolerances."""
+    """Tell whether two numbers as printed are equal: small counts exactly, others within the tolerances."""
     first, second = float(one), float(other)
     last = min(last_place(one), last_place(other))
-    allowed = max(RELATIVE * max(abs(first), abs(second)), 1.01 * last, SMALLEST) if last != 1.0 else 0.0
+    allowed = (
+        max(RELATIVE * max(abs(first), abs(second)), 1.01 * last, SMALLEST)
+        if last != 1.0 or min(first, second) >= COUNT
+        else 0.0
+    )
     return abs(first - second) <= allowed
 
 

@@ -129,11 +129,11 @@ class OutputMeans:
         variance: Mapping[str, FloatArray],
     ) -> OutputMeans:
         """Return mean outputs of measured `variance` (o, 3), by triad, in output units squared; NaN where unused."""
-        noise = {"accelerometer": AxisNoise.of_white(0.0)}
+        noise = NoiseModel(AxisNoise.of_white(0.0))
         for triad in reactions:
             density = np.nanmean(variance[triad] * (stop - start)[:, None], axis=0)
-            noise[triad] = AxisNoise.of_white(density / np.square(scale[triad]))
-        return cls(start, stop, recording, reactions, scale, NoiseModel(**noise))
+            noise = replace(noise, **{triad: AxisNoise.of_white(density / np.square(scale[triad]))})
+        return cls(start, stop, recording, reactions, scale, noise)
 
 
 class Handling(NamedTuple):
