@@ -19,7 +19,6 @@ from jaximu.report import figures
 from jaximu.report.evidence import evidence
 from jaximu.report.export import Range
 from jaximu.report.words import direction_words
-from jaximu.simulation.protocols.positions import spiral
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,7 +68,8 @@ def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
         errors = evidence(calibration)
         poses, after = (np.zeros((0, 3)), []) if errors is None else (errors.directions, errors.norm_after)
         names = [f"pose {index}: error {size(error, 'm/s^2', 2)}" for index, error in enumerate(after, 1)]
-        directions = spiral(2000)
+        x, y, points = _map_points()
+        directions = points[:, x**2 + y**2 <= 1].reshape(-1, 3)
         half = Z95 * recorded.uncertainty_of(rest(directions))["accelerometer"].largest
         yield Statement("At rest", " ".join(_at_rest(calibration, directions, half, bool(shift.any()))))
         if np.isfinite(half).any():
@@ -157,6 +157,13 @@ def _panels(calibration: Calibration, extent: Range) -> Iterator[tuple[str, str,
             yield title, "temperature (°C)", f"± 95 % ({unit})", {"": temperatures}, half[None]
 
 
+def _map_points() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the map's grid, x and y (n, n), and its directions (2, n, n, 3) on both halves of the sphere."""
+    ticks = np.linspace(-1, 1, _TICKS)
+    x, y = np.meshgrid(ticks, ticks)
+    return x, y, np.stack([figures.raised_to_sphere(x, y, sign) for sign in (1, -1)])
+
+
 def _curves_figure(panels: list) -> Figure:
     figure = figures.new_figure(2.6 * len(panels), 6.4)
     grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
@@ -196,9 +203,7 @@ def sphere_figure(
 
     figure = figures.new_figure(4.6, 6.8)
     panels, grid = figures.hemispheres(figure, 2, poses, names, s=60, color="white", edgecolors="black", linewidths=0.9)
-    ticks = np.linspace(-1, 1, _TICKS)
-    x, y = np.meshgrid(ticks, ticks)
-    points = np.stack([figures.raised_to_sphere(x, y, sign) for _, sign, *_ in panels])
+    x, y, points = _map_points()
     half = Z95 * known(rest(points.reshape(-1, 3)))["accelerometer"].largest.reshape(points.shape[:-1])
     factor, unit = readable("m/s^2", float(np.max(half[np.isfinite(half)])))
     half = factor * half
