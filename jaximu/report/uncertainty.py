@@ -79,8 +79,9 @@ def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
                 "Map of the uncertainty of the corrected specific force at rest over orientation, with the poses",
                 "The two halves of the sphere of directions that point up in the body, seen along z, areas true. "
                 "Colours: 95 % of the corrected specific force at rest, along the direction in which it is least "
-                "certain; misalignment counts against the body frame. Numbers: the poses. Cross: the worst. "
-                "Noise of single samples is not part of it, nor what the model lacks.",
+                "certain; misalignment counts against the body frame. Cross: the worst. "
+                + "Numbers: the poses. " * bool(len(poses))
+                + "Noise of single samples is not part of it, nor what the model lacks.",
             )
     if "gyroscope" in triads:
         yield Statement("Turning", _turning(recorded, extent))
@@ -91,7 +92,7 @@ def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
             partial(_curves_figure, panels),
             "Uncertainty of the corrected output over rate and temperature",
             "95 % of the corrected output along the direction in which it is least certain, z up while turning; gaps "
-            "are not determined. The gyroscope's bias counts as it was in the recording.",
+            "are not determined. Biases are those after the recording, without another power-on.",
         )
 
 
