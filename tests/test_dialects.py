@@ -157,7 +157,9 @@ def test_a_mistaken_rate_is_not_asserted(tmp_path):
     stamps = np.arange(len(log.time)) * 505_140
     advice = advise_reading(text(tmp_path, ["timestamp", *xyz("acc_{}")], [stamps, log.force]))
     assert advice is not None and advice.columns == "time [?],accel [m/s^2]"
-    assert "1.98 Hz in us, 1980 Hz in ns" in advice.questions[0].text
+    (question,) = advice.questions
+    assert "1.98 Hz in us, 1980 Hz in ns" in question.text
+    assert (question.option, question.blank, question.default) == ("columns", "time [?]", "us")
 
 
 def test_the_file_beside_it_is_named(tmp_path):

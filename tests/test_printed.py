@@ -285,7 +285,8 @@ def test_a_steady_turn_does_not_decide_the_unit(tmp_path):
     names = ["time", *(f"a{axis}" for axis in "xyz"), *(f"g{axis}" for axis in "xyz")]
     advice = advise_reading(written(tmp_path / "log.csv", names, t, a, g))
     assert advice is not None and "gyro [?]" in (advice.columns or "")
-    assert any("deg/s or rad/s" in question.text for question in advice.questions)
+    asked = [question for question in advice.questions if "deg/s or rad/s" in question.text]
+    assert [(one.option, one.blank, one.default) for one in asked] == [("columns", "gyro [?]", "rad/s")]
 
 
 def test_a_hot_sensor_is_a_temperature_and_counts_are_said(made, tmp_path):
