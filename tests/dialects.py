@@ -1095,7 +1095,7 @@ def wrong_line(dialect: Dialect, folder: Path) -> str:
         columns = columns.replace(f"{entry.partition(' ')[0]} [?]", entry)
     held = dialect
     if columns and "gyro" not in columns:
-        if "gyroscope" not in " ".join(advice.questions):
+        if not any("gyroscope" in question.text for question in advice.questions):
             return f"{advice.line()}: the gyroscope is left out"
         held = Dialect(**{**dialect.__dict__, "sensors": frozenset({"accel"})})
     scales = {"accel_scale": advice.accel_scale, "gyro_scale": advice.gyro_scale}

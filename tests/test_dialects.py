@@ -103,7 +103,7 @@ def test_where_columns_stand_proves_nothing(tmp_path, order):
     parts = [[log.time], [log.force / G], [np.degrees(log.rate)]]
     path = text(tmp_path, None, [each for place in order for each in parts[place]])
     advice = advise_reading(path)
-    assert advice is not None and advice.complete
+    assert advice is not None and not advice.questions
     recording = read_recording(path, options=dataclasses.replace(AS_IS, columns=advice.columns))
     np.testing.assert_allclose(recording.accelerometer.values, log.force, atol=1e-4)
     assert recording.gyroscope is not None
@@ -157,7 +157,9 @@ def test_a_mistaken_rate_is_not_asserted(tmp_path):
     stamps = np.arange(len(log.time)) * 505_140
     advice = advise_reading(text(tmp_path, ["timestamp", *xyz("acc_{}")], [stamps, log.force]))
     assert advice is not None and advice.columns == "time [?],accel [m/s^2]"
-    assert "1.98 Hz in us, 1980 Hz in ns" in advice.questions[0]
+    (question,) = advice.questions
+    assert "1.98 Hz in us, 1980 Hz in ns" in question.text
+    assert (question.option, question.blank, question.default) == ("columns", "time [?]", "us")
 
 
 def test_the_file_beside_it_is_named(tmp_path):

@@ -17,13 +17,12 @@ if TYPE_CHECKING:
     from jaximu.recordings.columns.guess import Advice
     from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["ASSUMED_RATE", "Use", "allowed", "describe", "read_openly", "run"]
+__all__ = ["Use", "allowed", "describe", "read_openly", "run"]
 
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
 _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
 _BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
 _CUT = 600.0  # s at rest that are worth cutting out of a log
-ASSUMED_RATE = 100.0  # Hz, of a log that does not say it
 _TABLE, _NEAR_GRAVITY = 200, 0.15
 """Rows, and how far off gravity each of them may be, up to which a file without time may be a table of pose means."""
 _TILTED = 25.0  # degrees from their mean that poses must lie at least to be several orientations
@@ -81,6 +80,8 @@ def run(
 
 def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:
     """The recording, how its columns were understood where the file does not say it, and what other verbs would ask."""
+    from jaximu.recordings.columns.guess import ASSUMED_RATE
+
     options.require_files(path)
     try:
         return log.read(path, check=False, alone=True), None, []
@@ -151,7 +152,12 @@ def describe(
     document = {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings))}
     document["uses"] = [{"verb": use.verb, "why": use.why} for use in uses]
     if advice is not None:
-        document["guess"] = {"line": advice.line(), **{k: getattr(advice, k) for k in ("reasons", "questions", "rows")}}
+        document["guess"] = {
+            "line": advice.line(),
+            "reasons": advice.reasons,
+            "questions": [question.text for question in advice.questions],
+            "rows": advice.rows,
+        }
     return document, uses
 
 

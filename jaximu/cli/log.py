@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json
-import math
 import re
 import shlex
 import sys
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import arg
 
 from jaximu.cli import options
-from jaximu.cli.info import ASSUMED_RATE, Use, describe, read_openly
+from jaximu.cli.info import Use, describe, read_openly
 from jaximu.cli.messages import progress, say
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.quantities import sentence
@@ -28,7 +27,7 @@ from jaximu.ground.reexport import later
 if TYPE_CHECKING:
     from jaximu.ground.document import Document
     from jaximu.ground.page import Page
-    from jaximu.recordings.columns.guess import Advice
+    from jaximu.recordings.columns.guess import Advice, Question
 
 __all__ = ["run"]
 
@@ -38,11 +37,6 @@ _HELD = {"calibrate": ("diagnose", "calibration")}
 """A verb whose result another holds, as which document: it is run alone where that one gives none."""
 _UNFILLED = re.compile(r"\b(NEW_)?LOG\b|\bCALIBRATION\b")
 _COMMAND = re.compile(r"`(jaximu [^`]+)`")
-_ALONE = re.compile(r"magnetometer alone: .* --columns '([^']*)'")
-_GRAVITY = re.compile(r"They hold 1 g in ([^\s,]+),")
-_RATES = re.compile(r"([\d.]+(?:e[+-]?\d+)?) Hz in (\w+)")
-_USUAL_SCALE = "131 count/(deg/s)"  # of a range of 250 deg/s
-_MIDDLE_RATE = 50.0  # Hz; of two rates that stamps may mean, the nearer one is likelier
 _RECORD = (
     "For a calibration, record rests of two seconds or more in nine orientations or more, with turns between them; "
     "for its noise, the unit at rest for an hour or more."
@@ -176,11 +170,12 @@ def _settled(path: Path, log: options.LogOptions, asker: _Asker) -> tuple[option
             log.read(path, check=False, alone=True)
     except JaximuError:
         advice, values = _advised(path, log)
-        for option, blank, question, default in _open_points(values, advice.questions if advice else ()):
+        for question in _open_points(values, advice.questions if advice else ()):
+            option, default = question.option, question.default or ""
             if option == "gyro_scale":
                 default = _scale_by_turning(path, replace(log, **_numbers(values) | {option: default}), default)
-            answer = asker.answer(option.replace("_", "-"), question, default)
-            values[option] = values[option].replace(blank, blank.replace("?", answer))
+            answer = asker.answer(option.replace("_", "-"), question.text, default)
+            values[option] = values[option].replace(question.blank, question.blank.replace("?", answer))
         if any("?" in str(value) for value in values.values()):
             read_openly(log, path)  # which says what is open
         settled = replace(log, **_numbers(values))
@@ -236,34 +231,15 @@ def _scale_by_turning(path: Path, log: options.LogOptions, default: str) -> str:
 _READ_AS = "columns", "gyro_columns", "rate", "accel_scale", "gyro_scale"
 
 
-def _open_points(values: Mapping[str, Any], questions: Sequence[str]) -> Iterator[tuple[str, str, str, str]]:
-    """Yield what reading leaves open and can be assumed: the option, its blank, the question, the default.
+def _open_points(values: Mapping[str, Any], questions: Sequence[Question]) -> Iterator[Question]:
+    """Yield what reading leaves open and can be assumed, first what changes the answer most."""
+    from jaximu.recordings.columns.guess import left_open
 
-    First what changes the answer most.
-    """
-    columns = values["columns"] or ""
-
-    def question(words: str, otherwise: str) -> str:
-        return next((text for text in questions if words in text), otherwise)
-
-    if "gyro [?]" in columns:
-        text = question("in deg/s or rad/s", "Is the gyroscope in deg/s or rad/s?")
-        yield "columns", "gyro [?]", text, "rad/s" if "accel [m/s^2]" in columns else "deg/s"
-    if "time [?]" in columns:
-        text = question("a row: ", "")
-        rates = {unit: abs(math.log(float(rate) / _MIDDLE_RATE)) for rate, unit in _RATES.findall(text)}
-        if rates:
-            yield "columns", "time [?]", text, min(rates, key=lambda unit: rates[unit])
-    if "accel [?]" in columns:
-        text = question("1 g in ", "")
-        if unit := _GRAVITY.search(text):
-            yield "columns", "accel [?]", text, unit[1]
-    if values["rate"] == "?":
-        text = question("(--rate)", "How many samples a second? No column is the time.")
-        yield "rate", "?", text, f"{ASSUMED_RATE:g}"
-    if values["gyro_scale"] == "?":
-        text = question("(--gyro-scale)", "Which scale have the gyroscope's counts?")
-        yield "gyro_scale", "?", text, _USUAL_SCALE
+    asked = {(question.option, question.blank): question for question in questions}
+    for unasked in left_open(values["columns"] or ""):
+        question = asked.get((unasked.option, unasked.blank), unasked)
+        if question.default and question.blank in str(values[question.option]):
+            yield question
 
 
 def _without_inertial(path: Path, log: options.LogOptions) -> _Content | None:
@@ -272,8 +248,8 @@ def _without_inertial(path: Path, log: options.LogOptions) -> _Content | None:
     from jaximu.report.recording import signal_facts
 
     try:
-        if log.columns is None and (advice := advise_reading(path)) and (text := _ALONE.search(advice.sentence())):
-            log = replace(log, columns=text[1])
+        if log.columns is None and (advice := advise_reading(path)):
+            log = replace(log, columns=advice.magnetometer)
         signal, _, _ = read_magnetometer(path, log.reading())
     except JaximuError:
         return None

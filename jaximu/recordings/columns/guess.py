@@ -29,16 +29,21 @@ from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import FASTEST, SLOWEST, Signal
 
-__all__ = ["Advice", "advise", "without_gravity"]
+__all__ = ["ASSUMED_RATE", "Advice", "Question", "advise", "left_open", "without_gravity"]
+
+ASSUMED_RATE = 100.0  # Hz, of a log that does not say it
 
 _GRAVITY_IN = {name: STANDARD_GRAVITY / unit_named(name).factor for name in ("m/s^2", "g", "mg", "cm/s^2")}
 _PLAUSIBLE = 0.5, 8000.0
 _LIKELY = 5.0, 4000.0
 """Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
+_MIDDLE_RATE = 50.0  # Hz; of two rates that stamps may mean, the nearer one on a log scale is likelier
 _STEADY = 0.12
 """Scatter of the norm over poses, of its mean, below which a triad holds something constant."""
 _PER_G = (16384, 8192, 4096, 2048, 1024, 512, 256)
 _PER_DEGREE = (131, 65.5, 32.8, 16.4, 114.2857, 57.1429, 28.5714, 14.2857, 14.375, 262)
+_USUAL_RATE = f"{ASSUMED_RATE:g}"
+_USUAL_SCALE = "131 count/(deg/s)"  # of a range of 250 deg/s
 _COUNTERS = set(
     "counter count packet index sample frame seq number id row line n no iteration loop samples packetcounter "
     "status".split()
@@ -60,12 +65,26 @@ _SINGLE = ("temperature", "ambient_temperature", "current", "table_angle", "tabl
 
 
 @dataclass(frozen=True)
+class Question:
+    """What a table leaves open, for a person to answer.
+
+    option: the one that it is about, as in `ReadOptions`. blank: what stands for the answer in that option's value, its
+    "?" to be replaced; empty where nothing does. default: what one would take, None where nothing can be assumed.
+    """
+
+    text: str
+    option: str = "columns"
+    blank: str = ""
+    default: str | None = None
+
+
+@dataclass(frozen=True)
 class Advice:
     """How to read a table: options to paste, why, what is still to be answered, and the first rows to compare with.
 
     accelerometer: whether one was found.
     columns, rate, accel_scale, gyro_scale: as in `ReadOptions`; None where the file says it itself. A `?` is to be
-    filled in, and `questions` say what is asked.
+    filled in, and `questions` say what is asked. magnetometer: the columns with which a magnetometer alone is read.
     """
 
     columns: str | None = None
@@ -73,14 +92,10 @@ class Advice:
     accel_scale: str | None = None
     gyro_scale: str | None = None
     reasons: tuple[str, ...] = ()
-    questions: tuple[str, ...] = ()
+    questions: tuple[Question, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
     accelerometer: bool = False
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing is left to ask."""
-        return not self.questions
+    magnetometer: str | None = None
 
     @property
     def readable(self) -> bool:
@@ -103,7 +118,7 @@ class Advice:
 
     def sentence(self, option: str = "--columns") -> str:
         """The line, what is asked, and why, in one line of text."""
-        questions = f" Answer first: {' '.join(self.questions)}" if self.questions else ""
+        questions = f" Answer first: {' '.join(question.text for question in self.questions)}" if self.questions else ""
         why = f" Why: {'; '.join(self.reasons)}." if self.reasons else ""
         line = self.line(option)
         return f"{line}.{questions}{why}" if line else f"{questions}{why}".strip()
@@ -173,6 +188,22 @@ class _Triad:
         return best
 
 
+def left_open(columns: str) -> tuple[Question, ...]:
+    """What is asked where options alone leave it open, first what changes the answer most; `columns`: as stated."""
+    return (
+        Question(
+            "Is the gyroscope in deg/s or rad/s?",
+            "columns",
+            "gyro [?]",
+            "rad/s" if "accel [m/s^2]" in columns else "deg/s",
+        ),
+        Question("In which unit is the time?", "columns", "time [?]"),
+        Question("In which unit is the accelerometer?", "columns", "accel [?]"),
+        Question("How many samples a second? No column is the time.", "rate", "?", _USUAL_RATE),
+        Question("Which scale have the gyroscope's counts?", "gyro_scale", "?", _USUAL_SCALE),
+    )
+
+
 def advise(table: LogTable, sensor: str | None = None) -> Advice:
     """Say how to read a table whose header does not say it all. `sensor`: the one that it must hold, if alone."""
     return _Guess(table, sensor).advice()
@@ -192,7 +223,7 @@ class _Guess:
         self.fields = fields_of(table.names) if table.names else [Field((), None, None, None)] * self.width
         self.numbers = [self._numbers(at) for at in range(self.width)]
         self.reasons: list[str] = []
-        self.questions: list[str] = []
+        self.questions: list[Question] = []
         self.chosen: dict[int, Column] = {}
         self.time: int | None = None
         self.assumed: float | None = None
@@ -224,6 +255,9 @@ class _Guess:
     def _off_unit(self, places: Collection[int]) -> FloatArray:
         """How far the length of the numbers in some columns is off one, by row."""
         return np.abs(np.linalg.norm([np.asarray(self.numbers[at]) for at in places], axis=0) - 1)
+
+    def _ask(self, text: str, blank: str = "", default: str | None = None, option: str = "columns") -> None:
+        self.questions.append(Question(text, option, blank, default))
 
     def _has(self, name: str) -> bool:
         return any(column.name == name for column in self.chosen.values())
@@ -309,7 +343,7 @@ class _Guess:
             if sensor is None and not stem and self.file in ("accel", "gyro", "mag"):
                 sensor = self.file
             if sensor is None and not measures(unit) and not stem and self.file_not:
-                self.questions.append(f"Does this file hold an accelerometer? By its name it is {self.file_not}.")
+                self._ask(f"Does this file hold an accelerometer? By its name it is {self.file_not}.")
                 continue
             triad = self._triad(
                 (axes["x"], axes["y"], axes["z"]), sensor=sensor, unit=unit, plain=len(stem), named=named
@@ -438,17 +472,20 @@ class _Guess:
         if len(candidates) == 1:
             one = candidates[0]
             one.unit = "?"
-            size = f"1 g in {unit_text(one.gravity_unit or '')}" if holding else "the same norm in all poses, in counts"
-            self.questions.append(
+            unit = one.gravity_unit or ""
+            size = f"1 g in {unit_text(unit)}" if holding else "the same norm in all poses, in counts"
+            self._ask(
                 f"Are columns {one.label} the accelerometer? They hold {size}, but a magnetometer in some unit would "
-                "look the same; write the unit if they are."
+                "look the same; write the unit if they are.",
+                "accel [?]",
+                unit_text(unit) if unit in _GRAVITY_IN else None,
             )
             return one
         if candidates:
             shown = " or ".join(f"{triad.label} (norm {triad.level:.4g})" for triad in candidates[:4])
-            self.questions.append(f"Which columns are the accelerometer? {shown} could be, or could be a magnetometer.")
+            self._ask(f"Which columns are the accelerometer? {shown} could be, or could be a magnetometer.")
         else:
-            self.questions.append("Which columns are the accelerometer? No three unnamed columns hold 1 g at rest.")
+            self._ask("Which columns are the accelerometer? No three unnamed columns hold 1 g at rest.")
         return None
 
     def _by_turning(self, free: list[_Triad], accel: _Triad) -> _Triad | None:
@@ -467,7 +504,7 @@ class _Guess:
         shown = " or ".join(triad.label for triad in unclear[:3])
         if unclear:
             none = "" if len(unclear) == 1 else ", or none"
-            self.questions.append(f"Are columns {shown} the gyroscope{none}? Too little turns for physics to say.")
+            self._ask(f"Are columns {shown} the gyroscope{none}? Too little turns for physics to say.")
         return unclear[0] if len(unclear) == 1 else None
 
     # --- units
@@ -475,7 +512,7 @@ class _Guess:
     def _stamps(self, triad: _Triad) -> FloatArray:
         """Seconds of a triad's rows, as good as is known: by the time column in a plausible unit, or by 100 Hz."""
         if self.time is None:
-            return triad.rows / (self.table.rate or 100.0)
+            return triad.rows / (self.table.rate or ASSUMED_RATE)
         values = np.asarray(self.numbers[self.time])[triad.rows]
         return (values - values[0]) * self._factor()
 
@@ -553,7 +590,12 @@ class _Guess:
             slope = self._time_unit(self.time, gyro, slope)
         elif not self.table.rate:
             self.rate = "?"
-            self.questions.append("How many samples a second (--rate)? The file has no time column and states no rate.")
+            self._ask(
+                "How many samples a second (--rate)? The file has no time column and states no rate.",
+                "?",
+                _USUAL_RATE,
+                "rate",
+            )
         if gyro is not None:
             known = self.time is not None or self.table.rate is not None
             self._gyro_unit(gyro, accel, slope if known else None, None if known else slope)
@@ -569,9 +611,10 @@ class _Guess:
             unit = accel.gravity_unit
             if unit == "?":
                 unit = None
-                self.questions.append(
+                self._ask(
                     f"Is the accelerometer ({accel.label}) in mg, in cm/s^2, or in counts? Its norm at rest is "
-                    f"{accel.level:.5g}, near 1 g in each."
+                    f"{accel.level:.5g}, near 1 g in each.",
+                    "accel [?]",
                 )
             elif unit and unit != "count":
                 self.reasons.append(
@@ -581,9 +624,10 @@ class _Guess:
                 counts = accel.whole and np.abs(accel.values).max() > 200
                 unit = "count" if counts else "m/s" if self._increment(accel) else None
                 if unit is None:
-                    self.questions.append(
+                    self._ask(
                         f"In which unit is the accelerometer ({accel.label})? Its norm at rest is {accel.level:.4g}, "
-                        "1 g in none that is known; is it an accelerometer?"
+                        "1 g in none that is known; is it an accelerometer?",
+                        "accel [?]",
                     )
         if unit == "count" and not accel.round:
             near = min(_PER_G, key=lambda scale: abs(math.log(accel.level / scale))) if accel.level > 0 else 0
@@ -592,8 +636,10 @@ class _Guess:
                 self.reasons.append(f"the accelerometer holds {accel.level:.5g} counts at rest: {near} to 1 g")
             else:
                 self.accel_scale = "?"
-                self.questions.append(
-                    f"How many counts are 1 g (--accel-scale)? The accelerometer's norm at rest is {accel.level:.5g}."
+                self._ask(
+                    f"How many counts are 1 g (--accel-scale)? The accelerometer's norm at rest is {accel.level:.5g}.",
+                    "?",
+                    option="accel_scale",
                 )
         self._take(accel, "accel", unit)
 
@@ -637,9 +683,11 @@ class _Guess:
             self.reasons.append(f"{label} rises by {step:.5g} a row, {1.0 / (step * factor):.4g} Hz in {unit}{source}")
             self.chosen[time] = Column(TIME, unit)
             return slope
-        rates = ", ".join(f"{1 / (step * factor):.4g} Hz in {unit}" for unit, factor in options)
-        meaning = f": {rates}" if rates else ", a rate of no IMU in any unit; is it a counter?"
-        self.questions.append(f"In which unit is {label}? It rises by {step:.5g} a row{meaning}.")
+        rates = {unit: 1 / (step * factor) for unit, factor in options}
+        shown = ", ".join(f"{rate:.4g} Hz in {unit}" for unit, rate in rates.items())
+        meaning = f": {shown}" if rates else ", a rate of no IMU in any unit; is it a counter?"
+        likely = min(rates, key=lambda unit: abs(math.log(rates[unit] / _MIDDLE_RATE)), default=None)
+        self._ask(f"In which unit is {label}? It rises by {step:.5g} a row{meaning}.", "time [?]", likely)
         self.chosen[time] = Column(TIME, "?")
         return None
 
@@ -670,7 +718,7 @@ class _Guess:
             ]
             if fits:
                 shown = " or ".join(f"{rates[name]:.3g} Hz if it is in {name}" for name in fits)
-                self.questions.append(f"The rates {_TURN} at about {shown}.")
+                self._ask(f"The rates {_TURN} at about {shown}.", option="rate")
             if len(fits) == 1:
                 unit = fits[0]
                 self.reasons.append(f"at a usual sample rate the integrated rates {_TURN} only in {unit}")
@@ -685,9 +733,11 @@ class _Guess:
                 at_rest = f", and at rest {rest:.3g} with a scatter of {gyro.noise:.2g}" if resting else ""
                 self.reasons.append(f"the gyroscope reads up to {peak:.4g}{at_rest}: of a sensor only in {unit}")
         if unit is None:
-            self.questions.append(
+            self._ask(
                 f"Is the gyroscope ({gyro.label}) in deg/s or rad/s? It reads up to {peak:.3g}, and "
-                + ("its turns fit both." if per_sample else "does not turn gravity enough to decide.")
+                + ("its turns fit both." if per_sample else "does not turn gravity enough to decide."),
+                "gyro [?]",
+                "rad/s" if accel_unit == "m/s^2" else "deg/s",
             )
         if unit == "count":
             self._gyro_counts(slope)
@@ -715,7 +765,9 @@ class _Guess:
             fitting = [f"{scale:g}" for scale in _PER_DEGREE if off[scale] < _ROUGH]
         usual = f" Of the usual ones {listed(fitting, 'or')} would fit." if fitting else ""
         self.gyro_scale = "?"
-        self.questions.append(f"How many counts are 1 deg/s (--gyro-scale)? The data sheet says.{usual}")
+        self._ask(
+            f"How many counts are 1 deg/s (--gyro-scale)? The data sheet says.{usual}", "?", _USUAL_SCALE, "gyro_scale"
+        )
 
     def _take(self, triad: _Triad, sensor: str, unit: str | None) -> None:
         for at, name in zip(triad.places, GROUPS[sensor].columns, strict=True):
@@ -778,37 +830,48 @@ class _Guess:
 
     # --- the result
 
-    def _lone_magnetometer(self) -> str:
+    def _lone_magnetometer(self) -> Advice:
         columns = [c if (c.name or "").startswith(("mag_", "time")) else Column(None) for c in self.columns]
         stated = header_columns(self.table) or ()
         known = any(column.name == "mag_x" and column.unit for column in stated)
-        option = "" if known else f" --columns '{column_text(columns)}'"
-        return f"This file holds a magnetometer alone: jaximu magnetometer {self.table.path}{option} calibrates it."
+        text = None if known else column_text(columns)
+        option = f" --columns '{text}'" if text else ""
+        return Advice(
+            reasons=tuple(self.reasons),
+            questions=(
+                Question(
+                    f"This file holds a magnetometer alone: jaximu magnetometer {self.table.path}{option} calibrates "
+                    "it."
+                ),
+            ),
+            magnetometer=text,
+        )
 
     def _result(self, accel: _Triad | None, gyro: _Triad | None) -> Advice:
-        if accel is None and self.role != "gyro" and (sentence := self._without_gravity()):
-            self.questions = [sentence]
-        elif accel is None and gyro is not None and self.role != "gyro":
-            self.questions.append(_lone_gyroscope(self.table))
-        elif accel is None and self.role != "gyro" and not self.questions:
-            self.questions.append("Which columns are the accelerometer?")
-        if gyro is None and self.role == "gyro":
-            self.questions.append("Which columns are the gyroscope?")
+        if accel is None and self.role != "gyro":
+            if sentence := self._without_gravity():
+                self.questions = [Question(sentence)]
+            elif gyro is not None:
+                self._ask(_lone_gyroscope(self.table))
+            elif not self.questions:
+                self._ask("Which columns are the accelerometer?")
+        elif gyro is None and self.role == "gyro":
+            self._ask("Which columns are the gyroscope?")
         if accel is None and gyro is None:
-            if self.attitude or any(why == "an estimated bias" for _, why in self.refused):
-                self.questions = [
-                    f"This is a trajectory (attitude, and position or biases beside it), no sensor's log: give it as "
-                    f"--reference {self.table.path} to `jaximu reference` with the log of the same motion."
-                ]
             if self._has("mag_x"):
-                self.questions = [self._lone_magnetometer()]
-            elif self.table.names is None and self.width == len("xyz") + (self.time is not None):
-                self.questions[:1] = [
-                    f"{' '.join(self.questions[:1])} If they are a magnetometer's, jaximu magnetometer "
-                    f"{self.table.path} --columns calibrates it, with its columns named (mag [uT], or mag [count])."
-                ]
-            self.questions = self.questions[:1]
-            return Advice(reasons=tuple(self.reasons), questions=tuple(self.questions))
+                return self._lone_magnetometer()
+            text = self.questions[0].text
+            if self.attitude or any(why == "an estimated bias" for _, why in self.refused):
+                text = (
+                    "This is a trajectory (attitude, and position or biases beside it), no sensor's log: give it as "
+                    f"--reference {self.table.path} to `jaximu reference` with the log of the same motion."
+                )
+            if self.table.names is None and self.width == len("xyz") + (self.time is not None):
+                text += (
+                    f" If they are a magnetometer's, jaximu magnetometer {self.table.path} --columns calibrates it, "
+                    "with its columns named (mag [uT], or mag [count])."
+                )
+            return Advice(reasons=tuple(self.reasons), questions=(Question(text),))
         stated = header_columns(self.table)
         same = stated is not None and all(
             chosen == named if chosen.name else not named.name
