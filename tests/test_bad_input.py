@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from jaximu.ground import atomic_write
+from jaximu.ground.atomic import atomic_write
 from jaximu.ground.errors import InputError, command_line
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import ReadOptions, read_recording
