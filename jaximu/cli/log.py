@@ -27,7 +27,7 @@ from jaximu.ground.reexport import later
 if TYPE_CHECKING:
     from jaximu.ground.document import Document
     from jaximu.ground.page import Page
-    from jaximu.recordings.columns.guess import Advice, Question
+    from jaximu.recordings.columns.guess import Advice, OpenPoint
 
 __all__ = ["run"]
 
@@ -231,13 +231,13 @@ def _scale_by_turning(path: Path, log: options.LogOptions, default: str) -> str:
 _READ_AS = "columns", "gyro_columns", "rate", "accel_scale", "gyro_scale"
 
 
-def _open_points(values: Mapping[str, Any], questions: Sequence[Question]) -> Iterator[Question]:
+def _open_points(values: Mapping[str, Any], questions: Sequence[OpenPoint]) -> Iterator[OpenPoint]:
     """Yield what reading leaves open and can be assumed, first what changes the answer most."""
     from jaximu.recordings.columns.guess import left_open
 
-    asked = {(question.option, question.blank): question for question in questions}
+    by_blank = {(question.option, question.blank): question for question in questions}
     for unasked in left_open(values["columns"] or ""):
-        question = asked.get((unasked.option, unasked.blank), unasked)
+        question = by_blank.get((unasked.option, unasked.blank), unasked)
         if question.default and question.blank in str(values[question.option]):
             yield question
 

@@ -29,7 +29,7 @@ from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import FASTEST, SLOWEST, Signal
 
-__all__ = ["ASSUMED_RATE", "Advice", "Question", "advise", "left_open", "without_gravity"]
+__all__ = ["ASSUMED_RATE", "Advice", "OpenPoint", "advise", "left_open", "without_gravity"]
 
 ASSUMED_RATE = 100.0  # Hz, of a log that does not say it
 
@@ -65,7 +65,7 @@ _SINGLE = ("temperature", "ambient_temperature", "current", "table_angle", "tabl
 
 
 @dataclass(frozen=True)
-class Question:
+class OpenPoint:
     """What a table leaves open, for a person to answer.
 
     option: the one that it is about, as in `ReadOptions`. blank: what stands for the answer in that option's value, its
@@ -92,7 +92,7 @@ class Advice:
     accel_scale: str | None = None
     gyro_scale: str | None = None
     reasons: tuple[str, ...] = ()
-    questions: tuple[Question, ...] = ()
+    questions: tuple[OpenPoint, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
     accelerometer: bool = False
     magnetometer: str | None = None
@@ -188,19 +188,19 @@ class _Triad:
         return best
 
 
-def left_open(columns: str) -> tuple[Question, ...]:
+def left_open(columns: str) -> tuple[OpenPoint, ...]:
     """What is asked where options alone leave it open, first what changes the answer most; `columns`: as stated."""
     return (
-        Question(
+        OpenPoint(
             "Is the gyroscope in deg/s or rad/s?",
             "columns",
             "gyro [?]",
             "rad/s" if "accel [m/s^2]" in columns else "deg/s",
         ),
-        Question("In which unit is the time?", "columns", "time [?]"),
-        Question("In which unit is the accelerometer?", "columns", "accel [?]"),
-        Question("How many samples a second? No column is the time.", "rate", "?", _USUAL_RATE),
-        Question("Which scale have the gyroscope's counts?", "gyro_scale", "?", _USUAL_SCALE),
+        OpenPoint("In which unit is the time?", "columns", "time [?]"),
+        OpenPoint("In which unit is the accelerometer?", "columns", "accel [?]"),
+        OpenPoint("How many samples a second? No column is the time.", "rate", "?", _USUAL_RATE),
+        OpenPoint("Which scale have the gyroscope's counts?", "gyro_scale", "?", _USUAL_SCALE),
     )
 
 
@@ -223,7 +223,7 @@ class _Guess:
         self.fields = fields_of(table.names) if table.names else [Field((), None, None, None)] * self.width
         self.numbers = [self._numbers(at) for at in range(self.width)]
         self.reasons: list[str] = []
-        self.questions: list[Question] = []
+        self.questions: list[OpenPoint] = []
         self.chosen: dict[int, Column] = {}
         self.time: int | None = None
         self.assumed: float | None = None
@@ -257,7 +257,7 @@ class _Guess:
         return np.abs(np.linalg.norm([np.asarray(self.numbers[at]) for at in places], axis=0) - 1)
 
     def _ask(self, text: str, blank: str = "", default: str | None = None, option: str = "columns") -> None:
-        self.questions.append(Question(text, option, blank, default))
+        self.questions.append(OpenPoint(text, option, blank, default))
 
     def _has(self, name: str) -> bool:
         return any(column.name == name for column in self.chosen.values())
@@ -839,7 +839,7 @@ class _Guess:
         return Advice(
             reasons=tuple(self.reasons),
             questions=(
-                Question(
+                OpenPoint(
                     f"This file holds a magnetometer alone: jaximu magnetometer {self.table.path}{option} calibrates "
                     "it."
                 ),
@@ -850,7 +850,7 @@ class _Guess:
     def _result(self, accel: _Triad | None, gyro: _Triad | None) -> Advice:
         if accel is None and self.role != "gyro":
             if sentence := self._without_gravity():
-                self.questions = [Question(sentence)]
+                self.questions = [OpenPoint(sentence)]
             elif gyro is not None:
                 self._ask(_lone_gyroscope(self.table))
             elif not self.questions:
@@ -871,7 +871,7 @@ class _Guess:
                     f" If they are a magnetometer's, jaximu magnetometer {self.table.path} --columns calibrates it, "
                     "with its columns named (mag [uT], or mag [count])."
                 )
-            return Advice(reasons=tuple(self.reasons), questions=(Question(text),))
+            return Advice(reasons=tuple(self.reasons), questions=(OpenPoint(text),))
         stated = header_columns(self.table)
         same = stated is not None and all(
             chosen == named if chosen.name else not named.name
