@@ -61,7 +61,7 @@ def figures() -> list[tuple[str, str, str, str]]:
         ("recordings with strong drift, outliers, sway, lag, jumps or lost samples, diagnosed rightly",
          f"{share(sum(each['right'] for each in trials), len(trials))} (lag alone: "
          f"{share(sum(each['right'] for each in lag), len(lag))})", "lag 97 %", "diagnosis_trials"),
-        ("95 % intervals of `calibrate` that hold the bias's mean over the recording, accelerometer and gyroscope, flicker",
+        ("95 % intervals of `calibrate` that hold the bias's mean over the recording, both sensors, flicker",
          intervals("flicker", "the recording", "bias in the recording"), "93 to 97 %", "intervals"),
         ("the same after the recording, noise from half an hour at rest (with a random walk)",
          f"{intervals('flicker', 'half an hour at rest', 'bias after it')} "
