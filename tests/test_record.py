@@ -109,10 +109,10 @@ def log(session, tmp_path_factory):
 def test_a_log_played_again_stops_at_the_goal_and_calibrates_as_calibrate_does(log, session, tmp_path, capsys):
     out = tmp_path / "out"
     given_ = ["record", "--from", str(log), "--gravity", f"{GRAVITY}", "--serial", "A-7", "-o", str(out)]
-    assert main([*given_, "--goal", "accelerometer.bias 0.5 mg", "--json"]) == 0
+    assert main([*given_, "--goal", "accelerometer.bias 0.6 mg", "--json"]) == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out)["trace"]["serial"] == "A-7"
-    assert "Next: " in printed.err and "accelerometer.bias 0.5 mg: reached" in printed.err
+    assert "Next: " in printed.err and "accelerometer.bias 0.6 mg: reached" in printed.err
     recorded = read_recording(out / "log.csv")
     whole = session[0].recording()
     assert len(recorded.accelerometer) < 0.9 * len(whole.accelerometer)

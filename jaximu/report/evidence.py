@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.data import forces_and_angles
+from jaximu.data.poses import EXCESS_NAMES
 from jaximu.ground.array_types import FloatArray
 from jaximu.simulation.protocols.positions import spiral
 
@@ -48,12 +49,13 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
     force, angle_after = forces_and_angles(fit.imu, observations)
     length = np.linalg.norm(force, axis=1)
     directions = force / length[:, None]
-    gravity, excess = float(observations.gravity), np.asarray(fit.excess)
+    gravity = float(observations.gravity)
+    of_poses, of_turns = (calibration.excess.get(name, 0.0) for name in EXCESS_NAMES[:2])
 
     # noise of each mean in m/s²: along gravity it reaches the norm, across gravity the direction
     inverse = np.linalg.inv(np.asarray(fit.imu.accelerometer.gain))
     covariance = inverse @ np.asarray(observations.poses.accelerometer_covariance) @ inverse.T
-    extended = covariance + excess[0] * covariance[poses].mean(axis=0)
+    extended = covariance + of_poses * covariance[poses].mean(axis=0)
 
     def along(matrices: FloatArray) -> FloatArray:
         return np.einsum("pi,pij,pj->p", directions, matrices, directions)
@@ -68,7 +70,7 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
         inverse = np.linalg.inv(np.asarray(fit.imu.triads()["gyroscope"].gain))
         density = np.trace(inverse @ np.asarray(observations.turns.noise) @ inverse.T) / 3
         turned = density * np.asarray(observations.turns.interval).sum(axis=1)
-        noise, total = noise + turned, total + turned + excess[1] * turned[used].mean()
+        noise, total = noise + turned, total + turned + of_turns * turned[used].mean()
 
     def limit(variance: FloatArray) -> FloatArray:
         # two components of equal variance: 95 % of the angles lie below sqrt(5.99) of one's sigma
