@@ -109,13 +109,13 @@ def log(session, tmp_path_factory):
 def test_a_log_played_again_stops_at_the_goal_and_calibrates_as_calibrate_does(log, session, tmp_path, capsys):
     out = tmp_path / "out"
     given_ = ["record", "--from", str(log), "--gravity", f"{GRAVITY}", "--serial", "A-7", "-o", str(out)]
-    assert main([*given_, "--goal", "accelerometer.bias 0.6 mg", "--json"]) == 0
+    assert main([*given_, "--goal", "accelerometer.bias 0.5 mg", "--json"]) == 0
     printed = capsys.readouterr()
     assert json.loads(printed.out)["trace"]["serial"] == "A-7"
-    assert "Next: " in printed.err and "accelerometer.bias 0.6 mg: reached" in printed.err
+    assert "Next: " in printed.err and "accelerometer.bias 0.5 mg: reached" in printed.err
     recorded = read_recording(out / "log.csv")
     whole = session[0].recording()
-    assert len(recorded.accelerometer) < 0.9 * len(whole.accelerometer)
+    assert len(recorded.accelerometer) < 0.95 * len(whole.accelerometer)  # a pose earlier at the least
     same = whole.accelerometer.values[: len(recorded.accelerometer)]
     np.testing.assert_allclose(recorded.accelerometer.values, same, rtol=1e-12)
     again = calibrate(recorded, LocalGravity(GRAVITY, 0.0))
