@@ -33,8 +33,8 @@ _FELT = 4.0
 _BENT = 0.05
 """Share by which a band's power may differ from the terms' before they are taken not to follow it."""
 _QUICK, _ALIKE = 20.0, 1.0
-"""Correlation time (s) from which processes are like the two quicker ones, which are slow bias too, and how alike they
-are: by a factor of two or so."""
+"""Correlation time (s) above which processes are slow bias: flicker noise, in which all of them are alike to a factor
+of two or so, and a random walk, which is the slowest of them."""
 
 
 @dataclass(frozen=True)
@@ -153,24 +153,30 @@ def _non_negative(expected: FloatArray, mean: FloatArray, counts: NDArray[np.int
     """Return sizes s ≥ 0 (terms,) for which the mean power of each bin (bins,) is like expected.T @ s.
 
     A mean of c ordinates of power S has the variance S²/c: Fisher scoring for their Gamma likelihood. Of processes so
-    slow that few ordinates feel them, least squares would make one large and its neighbours zero: each is known
-    beforehand to be like the two quicker ones, to `_ALIKE` times their mean.
+    slow that few ordinates feel them, least squares would make one large and its neighbours zero. They are known
+    beforehand to be flicker noise, of one size but for `_ALIKE` times it, and a random walk, which the slowest stands
+    for: two more unknowns, which the ordinates feel through these processes alone.
     """
-    spectrum = mean + np.median(mean) * 1e-3
-    slow = 2 + np.flatnonzero((times > _QUICK) & (np.arange(len(times)) >= 2))
-    sizes, levels = np.zeros(len(expected)), np.zeros(len(slow))
+    terms = len(expected)
+    slow = 2 + np.flatnonzero(times > _QUICK)
+    alike = np.zeros((len(slow), terms + 2))
+    alike[np.arange(len(slow)), slow] = 1
+    alike[:, terms] = -1  # flicker noise
+    alike[-1:, terms + 1] = -1  # a random walk
+    felt = np.concatenate([expected, np.zeros((2, expected.shape[1]))])
+    spectrum, sizes = mean + np.median(mean) * 1e-3, np.zeros(terms)
     for _ in range(60):
         weight = np.sqrt(counts) / spectrum
-        columns, target = (expected * weight).T, mean * weight
-        if levels.any():
-            unit = np.eye(len(expected))
-            alike = unit[slow] - (unit[slow - 1] + unit[slow - 2]) / 2
-            columns = np.concatenate([columns, alike / (_ALIKE * levels[:, None])])
-            target = np.concatenate([target, np.zeros(len(slow))])
+        columns, target = (felt * weight).T, mean * weight
+        if sizes.any():
+            flicker = np.sum(sizes[slow[:-1]]) / max(len(slow) - 1, 1)
+            level = _ALIKE * max(flicker, 1e-3 * np.max(sizes[2:], initial=0.0))
+            columns = np.concatenate([columns, alike / level]) if level else columns
+            target = np.concatenate([target, np.zeros(len(columns) - len(target))])
         scale = np.linalg.norm(columns, axis=0)
-        sizes = scipy.optimize.nnls(columns / scale, target)[0] / scale
+        scale[scale == 0] = 1
+        sizes = (scipy.optimize.nnls(columns / scale, target)[0] / scale)[:terms]
         before, spectrum = spectrum, sizes @ expected
-        levels = np.maximum((sizes[slow - 1] + sizes[slow - 2]) / 2, 1e-3 * np.max(sizes[2:], initial=0.0))
         if np.max(np.abs(spectrum / before - 1)) < 1e-6:
             break
     return sizes
