@@ -84,6 +84,17 @@ def drifted(recording, imu, kind, rng):
     return replace(recording, **signals), during, after
 
 
+def resting(kind, over, rng):
+    """Return a recording at rest of a unit; a walk is as strong as in its other recording, of `over` seconds."""
+    rest, _ = simulate(Imu.nominal(), Static(AT_REST), WHITE, rate=RATE, seed=int(rng.integers(1 << 30)))
+    signals, grid = {}, np.arange(int(np.ceil(AT_REST / STEP)) + 1) * STEP
+    for name in DENSITY:
+        signal, values = rest.signals[name], DENSITY[name] * drift(kind, AT_REST, over, rng)
+        at = np.stack([np.interp(signal.time - signal.time[0], grid, axis) for axis in values.T], axis=1)
+        signals[name] = replace(signal, values=signal.values + at)
+    return replace(rest, **signals)
+
+
 def recipes():
     """Return by name a protocol and how its recordings are calibrated."""
     hand = HandHeld(poses=24)
@@ -104,23 +115,12 @@ def recipes():
 def errors(kind, protocol, recipe, at_rest, units):
     """Return errors in stated sigmas by group of numbers: a row (n,) a unit."""
     rows = {}
-    static = None
-    if at_rest:
-        rng = np.random.default_rng([9, DRIFTS.index(kind)])
-        rest, _ = simulate(Imu.nominal(), Static(AT_REST), WHITE, rate=RATE, seed=77)
-        long = simulate(Imu.nominal(), protocol, {}, rate=RATE, seed=0)[0].accelerometer.time[-1]
-        signals = {}
-        for name in DENSITY:  # a walk is as strong as in the recording, not in half an hour
-            signal = rest.signals[name]
-            grid = np.arange(int(np.ceil(AT_REST / STEP)) + 1) * STEP
-            values = DENSITY[name] * drift(kind, AT_REST, float(long), rng)
-            at = np.stack([np.interp(signal.time - signal.time[0], grid, axis) for axis in values.T], axis=1)
-            signals[name] = replace(signal, values=signal.values + at)
-        static = noise_of(replace(rest, **signals))
+    long = float(simulate(Imu.nominal(), protocol, {}, rate=RATE, seed=0)[0].accelerometer.time[-1])
     for number in range(units):
         rng = np.random.default_rng([number, DRIFTS.index(kind)])
         imu = drawn_unit(rng)
         recording, truth = simulate(imu, protocol, WHITE, rate=RATE, seed=number)
+        static = noise_of(resting(kind, long, rng)) if at_rest else None
         recording, during, after = drifted(recording, imu, kind, rng)
         calibration = recipe(recording, truth, static)
         open_numbers = {name for weak in calibration.weak if not weak.determined for name, _ in weak.parameters}

@@ -9,7 +9,7 @@ from synthetic import recording as posed
 
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model import Noise
-from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
 from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov, Quantisation, RandomWalk, White
 from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings.recording import Recording, Signal
@@ -258,6 +258,16 @@ def test_other_slow_processes_are_modelled_too(process):
             rest = weights[axis] @ other[axis]
             ratios.append(np.sum((rest - q @ (q.T @ rest)) ** 2) / (len(rest) - 1))
     assert np.mean(ratios) == pytest.approx(1.0, abs=4 * np.sqrt(2 / (12 * 49)) + 0.03)
+
+
+def test_half_an_hour_at_rest_tells_how_large_a_random_walk_is():
+    """By the change of a mean from one quarter of an hour to the next, of which few ordinates of the spectrum know."""
+    random, frequency, density = np.random.default_rng(6), 4.0, 0.05
+    steps = random.standard_normal((40, 3, 7200)) / np.sqrt(frequency)
+    values = density * np.cumsum(steps, axis=-1) + random.standard_normal(steps.shape) * np.sqrt(frequency)
+    stated = np.stack([2 * fit_bank(unit, frequency).drift().allan_variance(900.0) for unit in values])
+    truth = density**2 * 2 * 900 / 3
+    assert 0.65 < np.exp(np.mean(np.log(stated / truth)) / 2) < 1.3  # 0.38 where a walk is taken for flicker noise
 
 
 @pytest.mark.parametrize(

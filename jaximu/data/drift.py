@@ -49,6 +49,8 @@ one power-on to the next, which is a few milligravity."""
 _USUAL_EXCESS = 0.3, 2.0
 """The same of what scatters from pose to pose and from turn to turn, over the noise within them: next to nothing is
 known beforehand."""
+_ROUNDING = 1e-6
+"""Of a bias's variance: less cannot be left where two nearly equal numbers are taken from one another."""
 DRIFT_ESTIMATED = (
     "No recording at rest: noise and bias drift were estimated from this recording's rests. A recording at rest "
     "(--static LOG) would determine them better."
@@ -180,21 +182,23 @@ def about_biases(
     begin, end = means.start[first_one].min(), means.stop[first_one].max()
     start, stop = np.append(means.start, [begin, end]), np.append(means.stop, [end, 2 * end - begin])
     during, after = np.array(covariance), np.array(covariance)
-    biases: dict[str, list[int]] = {}
+    known = {triad: getattr(noise, triad) for triad in means.reactions}
+    slow = {triad: one.drift().covariance(start, stop) for triad, one in known.items() if one}
+    biases: dict[str, list[int]] = {triad: [] for triad in slow}
     for row, name in enumerate(names):
-        if name.part != "bias" or name.effect is not None or getattr(noise, name.owner) is None:
+        if name.part != "bias" or name.effect is not None or name.owner not in slow:
             continue
-        biases.setdefault(name.owner, []).append(row)
+        biases[name.owner].append(row)
         (axis,) = name.axes
-        slow, scale = getattr(noise, name.owner).drift(), means.scale[name.owner][axis]
-        of_times = scale**2 * slow.covariance(start, stop)[axis]
+        of_times = means.scale[name.owner][axis] ** 2 * slow[name.owner][axis]
         by_outputs = by_conditions @ means.reactions[name.owner][:, :, axis]
         for kept, time in ((during, -2), (after, -1)):
             across = by_outputs @ (first_one * of_times[:-2, time])
             kept[:, row] -= across
             kept[row] -= across
             kept[row, row] += of_times[time, time]
-    return after, {triad: np.sqrt(np.diag(during)[rows]) for triad, rows in biases.items()}
+    variances = np.maximum(np.diag(during), _ROUNDING * np.diag(after))
+    return after, {triad: np.sqrt(variances[rows]) for triad, rows in biases.items() if rows}
 
 
 def _beforehand(priors: Sequence[tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
