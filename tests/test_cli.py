@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import time
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from jaximu.cli import main, messages
 from jaximu.cli.app import VERBS
 from jaximu.cli.demo import _HIDDEN, _draw_flaw
 from jaximu.cli.messages import progress
+from jaximu.cli.usage import command_of
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
@@ -345,7 +345,7 @@ def test_the_overview_shows_every_verb_in_its_own_words(capsys):
     assert main(["--help"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
     for name in VERBS:
-        first = import_module(f"jaximu.cli.{name}").run.__doc__.partition("\n\n")[0]
+        first = command_of(name).__doc__.partition("\n\n")[0]
         assert f"{name} {' '.join(first.split())}" in printed
     assert "did you mean calibrate?" in refused(capsys, 2, "calibate")
 

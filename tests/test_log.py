@@ -4,12 +4,12 @@ import io
 import json
 import re
 import zipfile
-from importlib import import_module
 
 import numpy as np
 import pytest
 
 from jaximu.cli import main, messages
+from jaximu.cli.usage import command_of
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.page import Page
 from jaximu.recordings import write_recording
@@ -71,20 +71,17 @@ def verbs(monkeypatch):
     """Verbs that only note what they were run on: (verb, logs, arguments)."""
     calls = []
 
-    def stand_in(verb, signature):
-        def run(logs, /, *, results, **arguments):
+    def stand_in(verb):
+        def run(command):
+            (logs, *_), results, arguments = vars(command).values(), command.results, vars(command)
             calls.append((verb, logs, arguments))
             names = ("diagnosis", "calibration") if verb == "diagnose" else ("calibration",)
             results.present(lambda: Page(f"About {verb}", ["It is done."]), **{name: Document() for name in names})
 
-        run.__signature__ = signature
         return run
 
-    import inspect
-
     for verb in ("calibrate", "diagnose", "turntable", "reference", "magnetometer", "allan", "thermal"):
-        module = import_module(f"jaximu.cli.{verb}")
-        monkeypatch.setattr(module, "run", stand_in(verb, inspect.signature(module.run)))
+        monkeypatch.setattr(command_of(verb), "run", stand_in(verb))
     return calls
 
 
@@ -158,14 +155,14 @@ def test_a_log_that_is_three_things_at_once(verbs, tmp_path, capsys):
 
 
 def test_what_refuses_is_a_sentence_unless_nothing_is_left(folder, verbs, monkeypatch, capsys):
-    def refuses(*logs, **arguments):
+    def refuses(command):
         raise NotPossibleError("poses are missing.")
 
-    monkeypatch.setattr("jaximu.cli.diagnose.run", refuses)
+    monkeypatch.setattr(command_of("diagnose"), "run", refuses)
     status, document, _ = answered([folder / "poses.csv"], capsys)
     assert status == 0 and document["verbs"] == ["calibrate"] and verbs[0][0] == "calibrate"
     assert document["refused"] == {"diagnose": "poses are missing."}
-    monkeypatch.setattr("jaximu.cli.calibrate.run", refuses)
+    monkeypatch.setattr(command_of("calibrate"), "run", refuses)
     status, document, _ = answered([folder / "poses.csv"], capsys)
     assert status == 1 and "poses are missing." in document["error"] and "nine orientations" in document["error"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -21,49 +21,13 @@ if TYPE_CHECKING:
     from jaximu.acceptance import Acceptance, Limits, Line
     from jaximu.calibration import Calibration
 
-__all__ = ["limits_of", "run", "write_line"]
+__all__ = ["AcceptCommand", "limits_of", "write_line"]
 
 _STATUS = {"pass": 0, "fail": 3, "undecided": 4}
 
 
-def run(
-    calibrations: Annotated[
-        tuple[Path, ...],
-        Positional,
-        option("CALIBRATION...", "calibration.json, or a fleet's TABLE.parquet.", name="calibrations"),
-    ] = (),
-    /,
-    *,
-    limits: Annotated[
-        Path | None, option("LIMITS.toml", "Limits; or TABLE.parquet of a fleet, whose population sets them.")
-    ] = None,
-    noise: Annotated[
-        Path | None, option("ALLAN.json", "From jaximu allan, for limits of noise and repeatability.")
-    ] = None,
-    trace: Annotated[
-        Path | None,
-        option("TRACE.toml", "Serial number, operator, references …, beside what a calibration says."),
-    ] = None,
-    rule: Annotated[Literal["guarded", "simple"] | None, arg(help="Decision rule, instead of that of LIMITS.")] = None,
-    risk: Annotated[
-        float | None, arg(help="Probability of a wrong decision at most, instead of that of LIMITS (0.05).")
-    ] = None,
-    fail_on: Annotated[
-        Literal["undecided", "fail", "never"],
-        arg(help="Which verdicts end with another exit status than 0: both, fail alone, or none."),
-    ] = "undecided",
-    golden: Annotated[str, option("DEVICE", "Of a table: the unit recorded again and again to watch the line.")] = "",
-    measurements: Annotated[
-        Path | None,
-        option(
-            "FILE",
-            "Also write each limit with value and verdict for a test system: .csv, .xml (JUnit), .json (OpenHTF).",
-        ),
-    ] = None,
-    without_certificate: Annotated[bool, arg(help="Write the verdict alone to DIR.")] = False,
-    explain: Annotated[bool, arg(help="Explain LIMITS.toml and TRACE.toml, and do nothing else.")] = False,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class AcceptCommand:
     """Hold calibrations to limits: pass, fail or undecided, with guard bands from the stated uncertainty; certificate.
 
     DIR receives acceptance.json and, if nothing that it needs is missing, certificate.html; of a fleet's table
@@ -77,37 +41,89 @@ def run(
       jaximu accept results/calibration.json --limits limits.toml --measurements junit.xml
 
     """
-    if explain:
-        _explain()
-        return
-    if not calibrations:
-        raise InputError("name a calibration.json, or a table of jaximu fleet, and its limits: --limits LIMITS.toml.")
-    options.require_files(*calibrations, limits, noise, trace)
-    if measurements is not None:
-        from jaximu.acceptance.interchange import check_measurements
 
-        if limits is None:
-            raise InputError("--measurements lists what was held to limits: --limits LIMITS.toml.")
-        check_measurements(measurements)
-    tables = [path for path in calibrations if path.suffix.lower() == ".parquet"]
-    if tables and len(calibrations) > 1:
-        raise InputError(f"{tables[0]} is a fleet's table: give one table alone, or calibrations.")
-    if tables:
-        unusable = [name for name, value in (("--noise", noise), ("--trace", trace)) if value is not None]
-        if unusable:
-            raise InputError(f"{unusable[0]} belongs to single calibrations, not to a fleet's table.")
-        verdict = _line(tables[0], limits_of(limits, rule, risk) if limits else None, golden, measurements, results)
-    else:
-        if limits is None:
-            raise InputError("name the limits: --limits LIMITS.toml; --explain shows such a file.")
-        if golden:
-            raise InputError("--golden names a device of a fleet's table; these are calibrations.")
-        verdict = _units(
-            calibrations, limits_of(limits, rule, risk), noise, trace, measurements, results, not without_certificate
-        )
-    ends = {"undecided": ("fail", "undecided"), "fail": ("fail",), "never": ()}[fail_on]
-    if verdict in ends:
-        raise SystemExit(_STATUS[verdict])
+    calibrations: Annotated[
+        tuple[Path, ...],
+        Positional,
+        option("CALIBRATION...", "calibration.json, or a fleet's TABLE.parquet.", name="calibrations"),
+    ] = ()
+    limits: Annotated[
+        Path | None, option("LIMITS.toml", "Limits; or TABLE.parquet of a fleet, whose population sets them.")
+    ] = None
+    noise: Annotated[Path | None, option("ALLAN.json", "From jaximu allan, for limits of noise and repeatability.")] = (
+        None
+    )
+    trace: Annotated[
+        Path | None,
+        option("TRACE.toml", "Serial number, operator, references …, beside what a calibration says."),
+    ] = None
+    rule: Annotated[Literal["guarded", "simple"] | None, arg(help="Decision rule, instead of that of LIMITS.")] = None
+    risk: Annotated[
+        float | None, arg(help="Probability of a wrong decision at most, instead of that of LIMITS (0.05).")
+    ] = None
+    fail_on: Annotated[
+        Literal["undecided", "fail", "never"],
+        arg(help="Which verdicts end with another exit status than 0: both, fail alone, or none."),
+    ] = "undecided"
+    golden: Annotated[str, option("DEVICE", "Of a table: the unit recorded again and again to watch the line.")] = ""
+    measurements: Annotated[
+        Path | None,
+        option(
+            "FILE",
+            "Also write each limit with value and verdict for a test system: .csv, .xml (JUnit), .json (OpenHTF).",
+        ),
+    ] = None
+    without_certificate: Annotated[bool, arg(help="Write the verdict alone to DIR.")] = False
+    explain: Annotated[bool, arg(help="Explain LIMITS.toml and TRACE.toml, and do nothing else.")] = False
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        if self.explain:
+            _explain()
+            return
+        if not self.calibrations:
+            raise InputError(
+                "name a calibration.json, or a table of jaximu fleet, and its limits: --limits LIMITS.toml."
+            )
+        options.require_files(*self.calibrations, self.limits, self.noise, self.trace)
+        if self.measurements is not None:
+            from jaximu.acceptance.interchange import check_measurements
+
+            if self.limits is None:
+                raise InputError("--measurements lists what was held to limits: --limits LIMITS.toml.")
+            check_measurements(self.measurements)
+        tables = [path for path in self.calibrations if path.suffix.lower() == ".parquet"]
+        if tables and len(self.calibrations) > 1:
+            raise InputError(f"{tables[0]} is a fleet's table: give one table alone, or calibrations.")
+        if tables:
+            unusable = [name for name, value in (("--noise", self.noise), ("--trace", self.trace)) if value is not None]
+            if unusable:
+                raise InputError(f"{unusable[0]} belongs to single calibrations, not to a fleet's table.")
+            verdict = _line(
+                tables[0],
+                limits_of(self.limits, self.rule, self.risk) if self.limits else None,
+                self.golden,
+                self.measurements,
+                self.results,
+            )
+        else:
+            if self.limits is None:
+                raise InputError("name the limits: --limits LIMITS.toml; --explain shows such a file.")
+            if self.golden:
+                raise InputError("--golden names a device of a fleet's table; these are calibrations.")
+            verdict = _units(
+                self.calibrations,
+                limits_of(self.limits, self.rule, self.risk),
+                self.noise,
+                self.trace,
+                self.measurements,
+                self.results,
+                not self.without_certificate,
+            )
+        ends = {"undecided": ("fail", "undecided"), "fail": ("fail",), "never": ()}[self.fail_on]
+        if verdict in ends:
+            raise SystemExit(_STATUS[verdict])
 
 
 def _explain() -> None:

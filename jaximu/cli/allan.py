@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from jaximu.cli import options
@@ -12,16 +13,11 @@ from jaximu.ground.gravity import STANDARD
 if TYPE_CHECKING:
     from jaximu.noise.analysis import NoiseAnalysis
 
-__all__ = ["document", "run"]
+__all__ = ["AllanCommand", "document"]
 
 
-def run(
-    logs: options.Logs,
-    /,
-    *,
-    log: options.Reading = options.READING,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class AllanCommand:
     """Identify the noise of a unit at rest from its Allan deviation; several LOGs show how repeatable its bias is.
 
     DIR receives allan.json, allan.png, report.html and imu.yaml for Kalibr.
@@ -31,24 +27,31 @@ def run(
       jaximu allan monday.csv tuesday.csv wednesday.csv --json
 
     """
-    with progress("reading"):
-        recordings = [stated.read(path, STANDARD, alone=True) for path, stated in log.spread(logs)]
-    with progress("identifying the noise"):
-        from jaximu.noise.analysis import analyse_noise
 
-        analysis = analyse_noise(recordings)
-        from jaximu.report.allan import kalibr_text, page_of
+    logs: options.Logs
+    log: options.Reading = options.READING
+    results: options.Output = options.RESULTS
 
-        text = json.dumps(document(analysis), indent=1, allow_nan=False)
-        yaml = kalibr_text(analysis).encode("utf-8", "backslashreplace")
-    names = "allan.json, allan.png, report.html and Kalibr's imu.yaml"
-    sources = [source for recording in recordings for source in recording.sources]
-    results.present(
-        lambda: page_of(analysis, sources),
-        names,
-        {"allan.json": (text + "\n").encode(), "imu.yaml": yaml},
-        lambda: text,
-    )
+    def run(self) -> None:
+        """Do what the command line says."""
+        with progress("reading"):
+            recordings = [stated.read(path, STANDARD, alone=True) for path, stated in self.log.spread(self.logs)]
+        with progress("identifying the noise"):
+            from jaximu.noise.analysis import analyse_noise
+
+            analysis = analyse_noise(recordings)
+            from jaximu.report.allan import kalibr_text, page_of
+
+            text = json.dumps(document(analysis), indent=1, allow_nan=False)
+            yaml = kalibr_text(analysis).encode("utf-8", "backslashreplace")
+        names = "allan.json, allan.png, report.html and Kalibr's imu.yaml"
+        sources = [source for recording in recordings for source in recording.sources]
+        self.results.present(
+            lambda: page_of(analysis, sources),
+            names,
+            {"allan.json": (text + "\n").encode(), "imu.yaml": yaml},
+            lambda: text,
+        )
 
 
 def document(analysis: NoiseAnalysis) -> dict[str, Any]:

@@ -1,19 +1,17 @@
 """The entry point: settings of the process, choice of the verb, errors as sentences."""
 
-import functools
 import io
 import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
-from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
 from jaximu._version import __version__
 from jaximu.cli.streams import open_streams
-from jaximu.cli.usage import check_options, completion, help_text, listed, usage_mistake
+from jaximu.cli.usage import check_options, command_of, completion, help_text, listed, usage_mistake
 from jaximu.ground.errors import InputError, JaximuError, command_line
 
 __all__ = ["GROUPS", "VERBS", "command", "main"]
@@ -44,7 +42,7 @@ VERBS = (
     "accept",
     "verify",
 )
-"""One module of this folder each, with a function `run`. It loads what is heavy only when it works."""
+"""One module of this folder each, with a class of options that runs. It loads what is heavy only when it works."""
 GROUPS = {
     "Inspect": "info effects",
     "Calibrate": "calibrate record reference filter array magnetometer compensate export",
@@ -108,10 +106,6 @@ def _say_what_was_not_drawn() -> None:
     warnings.showwarning = handle
 
 
-def _verb(name: str) -> Callable[..., None]:
-    return import_module(f"jaximu.cli.{name.lower()}").run
-
-
 def _names_log(word: str) -> bool:
     """Whether a first word is a log and no mistyped verb: it is there, or looks like the name of a file."""
     return word == LOG or bool(word and (set(word) & set("./\\") or Path(word).exists()))
@@ -126,21 +120,17 @@ def _groups() -> dict[str, list[str]]:
 
 def _parse(name: str, arguments: Sequence[str]) -> Callable[[], None]:
     """Return a verb with its arguments. Raises `InputError` for a mistake in them."""
-    run = _verb(name)
-    line = check_options(name, run, arguments)
+    command = command_of(name)
+    line = check_options(name, command, arguments)
     import tyro  # with what it loads for its checks, it takes as long as all that a mistake above needs
-
-    @functools.wraps(run)
-    def bind(*values, **options) -> Callable[[], None]:
-        return functools.partial(run, *values, **options)
 
     config = tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes
     printed = io.StringIO()
     try:
         with redirect_stderr(printed):
-            return tyro.cli(bind, prog=f"jaximu {name}", args=line, config=config)
+            return tyro.cli(command, prog=f"jaximu {name}", args=line, config=config).run
     except SystemExit:
-        raise usage_mistake(name, run, printed.getvalue()) from None
+        raise usage_mistake(name, command, printed.getvalue()) from None
 
 
 def _common(arguments: Sequence[str]) -> list[str]:
@@ -168,19 +158,19 @@ def _run(arguments: Sequence[str]) -> int:
         name, rest = LOG, [word for word in arguments if word != LOG]
     if name in (*VERBS, LOG):
         if "--help" in rest or "-h" in rest:
-            print(help_text(name, _verb(name)))
+            print(help_text(name, command_of(name)))
             return 0
         work = _parse(name, _common(rest))
         _settings()
         work()
     elif name == "help" and rest and rest[0] in (*VERBS, LOG):
-        print(help_text(rest[0], _verb(rest[0])))
+        print(help_text(rest[0], command_of(rest[0])))
     elif name in ("--help", "-h") or (name == "help" and not rest):
-        print(listed(_groups(), _verb))
+        print(listed(_groups(), command_of))
     elif name in ("--version", "-V", "version"):
         print(f"jaximu {__version__}")
     elif name == "--completion":
-        print(completion(rest[0] if rest else "", VERBS, _verb))
+        print(completion(rest[0] if rest else "", VERBS, command_of))
     elif name:
         import difflib
 
@@ -190,7 +180,7 @@ def _run(arguments: Sequence[str]) -> int:
             f"there is no command {name!r}{f' (did you mean {near[0]}?)' if near else ''}; `jaximu --help` lists them."
         )
     else:
-        print(listed(_groups(), _verb), file=sys.stderr)
+        print(listed(_groups(), command_of), file=sys.stderr)
         return 2
     return 0
 

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 
-__all__ = ["run"]
+__all__ = ["ArrayCommand"]
 
 
-def run(
-    logs: options.Logs,
-    /,
-    *,
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    noise: options.Noise = options.NOISE,
-    loss: options.LossChoice = "linear",
-    repair: options.RepairFlag = False,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class ArrayCommand:
     """Calibrate several units on one rigid body: rotation, position and clock of each, and which one disturbs.
 
     One LOG per unit, recorded together: poses at rest with turns between them, and some quick turns for the positions.
@@ -31,13 +24,24 @@ def run(
       jaximu array unit*.parquet --accel-scale "2048 count/g" --gyro-scale "16.4 count/(deg/s)" --latitude 59.3
 
     """
-    gravity = local.value()
-    results.prepare()
-    recordings, known = log.read_unit(logs, gravity, noise, several=True)
-    from jaximu.calibration import calibrate_array
 
-    with progress("calibrating"):
-        array = calibrate_array(recordings, gravity, static=known, loss=loss, repair=repair)
-    units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(array.units, 1)}
-    names = "array.json, report.html and the calibrations"
-    results.present(array.summary, names, {}, array.text, array=array, **units)
+    logs: options.Logs
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    noise: options.Noise = options.NOISE
+    loss: options.LossChoice = "linear"
+    repair: options.RepairFlag = False
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        gravity = self.local.value()
+        self.results.prepare()
+        recordings, known = self.log.read_unit(self.logs, gravity, self.noise, several=True)
+        from jaximu.calibration import calibrate_array
+
+        with progress("calibrating"):
+            array = calibrate_array(recordings, gravity, static=known, loss=self.loss, repair=self.repair)
+        units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(array.units, 1)}
+        names = "array.json, report.html and the calibrations"
+        self.results.present(array.summary, names, {}, array.text, array=array, **units)

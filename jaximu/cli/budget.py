@@ -3,33 +3,22 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
-__all__ = ["run"]
+__all__ = ["BudgetCommand"]
 
 
-def run(
-    specification_file: Annotated[Path | None, option("SPEC", "TOML file; --explain describes it.")] = None,
-    /,
-    *,
-    goal: Annotated[
-        tuple[str, ...],
-        option("GOAL [GOAL ...]", 'Standard deviations wanted, such as "accelerometer.bias 0.2 mg".'),
-    ] = (),
-    check: Annotated[int, option("N", "Compare with N simulated sessions, each calibrated in full.")] = 0,
-    seed: Annotated[int, option("N", "Random seed of these sessions.")] = 0,
-    explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class BudgetCommand:
     """Compute an error budget: how each error of a set-up reaches each parameter, and what to improve for a goal.
 
     DIR receives budget.json, report.html and budget.png.
@@ -39,21 +28,34 @@ def run(
       jaximu budget setup.toml --goal "accelerometer.bias 0.2 mg" -o budget
 
     """
-    if specification_file is None and not explain:
-        raise InputError("name a specification: jaximu budget SPEC.toml; --explain describes one.")
-    if check < 0 or 0 < check < 50 or seed < 0:
-        raise InputError("--check takes 50 sessions or more (2000 resolve 3 %), --seed a number from 0 up.")
-    options.require_files(specification_file)
-    from jaximu.planning import budget as planning
 
-    if explain or specification_file is None:
-        print(inspect.getdoc(planning))
-        return
-    from jaximu.planning.goals import parse_goal
+    specification_file: Annotated[Path | None, Positional, option("SPEC", "TOML file; --explain describes it.")] = None
+    goal: Annotated[
+        tuple[str, ...],
+        option("GOAL [GOAL ...]", 'Standard deviations wanted, such as "accelerometer.bias 0.2 mg".'),
+    ] = ()
+    check: Annotated[int, option("N", "Compare with N simulated sessions, each calibrated in full.")] = 0
+    seed: Annotated[int, option("N", "Random seed of these sessions.")] = 0
+    explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False
+    results: options.Output = options.RESULTS
 
-    task = planning.read_task(specification_file)
-    task = replace(task, goals=(*task.goals, *map(parse_goal, goal)))
-    results.prepare()
-    with progress("propagating errors"):
-        budget = planning.budget(task, check, seed)
-    results.present(budget.summary, "budget.json, report.html and budget.png", budget=budget)
+    def run(self) -> None:
+        """Do what the command line says."""
+        if self.specification_file is None and not self.explain:
+            raise InputError("name a specification: jaximu budget SPEC.toml; --explain describes one.")
+        if self.check < 0 or 0 < self.check < 50 or self.seed < 0:
+            raise InputError("--check takes 50 sessions or more (2000 resolve 3 %), --seed a number from 0 up.")
+        options.require_files(self.specification_file)
+        from jaximu.planning import budget as planning
+
+        if self.explain or self.specification_file is None:
+            print(inspect.getdoc(planning))
+            return
+        from jaximu.planning.goals import parse_goal
+
+        task = planning.read_task(self.specification_file)
+        task = replace(task, goals=(*task.goals, *map(parse_goal, self.goal)))
+        self.results.prepare()
+        with progress("propagating errors"):
+            budget = planning.budget(task, self.check, self.seed)
+        self.results.present(budget.summary, "budget.json, report.html and budget.png", budget=budget)

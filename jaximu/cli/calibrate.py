@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,30 +16,11 @@ if TYPE_CHECKING:
     from jaximu.estimation.problem import Loss
     from jaximu.ground.gravity import LocalGravity
 
-__all__ = ["run"]
+__all__ = ["CalibrateCommand"]
 
 
-def run(
-    logs: options.Logs,
-    /,
-    *,
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    noise: options.Noise = options.NOISE,
-    method: Annotated[
-        Literal["joint", "two-step", "two-step-rk4", "accelerometer"],
-        arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
-    ] = "joint",
-    loss: options.LossChoice = "linear",
-    effect: options.EffectNames = (),
-    poses: options.Poses = options.POSES,
-    repair: options.RepairFlag = False,
-    means: Annotated[
-        bool, arg(help="LOG is a table with one row of mean outputs per pose, as papers print them.")
-    ] = False,
-    traced: options.Traced = options.TRACED,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class CalibrateCommand:
     """Calibrate a unit from poses at rest and the turns between them, without equipment.
 
     Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
@@ -50,29 +31,56 @@ def run(
       jaximu calibrate log.mat --gyro-log gyro.mat --columns "time [s],accel [g],gyro [deg/s]"
 
     """
-    gravity, trace = local.value(), traced.value(logs)
-    results.prepare(*options.INERTIAL[: 1 if method == "accelerometer" else 2])
-    if means:
-        meant = {
-            "--static": noise.static,
-            "--noise": noise.noise,
-            "--effect": effect,
-            "--threshold": poses.threshold,
-            "--repair": repair,
-            "--gyro-log": log.gyro_log,
-            f"--method {method}": method.startswith("two-step"),
-        }
-        unusable = [name for name, stated in meant.items() if stated]
-        calibration = _calibrated_means(logs, log, gravity, loss, unusable)
-    else:
-        recordings, known = log.read_unit(logs, gravity, noise)
-        choices = {"static": known, "segmentation": poses.value(), "method": method, "loss": loss, "repair": repair}
-        with progress("calibrating"):
-            from jaximu.calibration import calibrate
 
-            calibration = calibrate(recordings, gravity, **choices, **options.effects_of(effect))
-    calibration = replace(calibration, trace=trace)
-    results.present(calibration.summary, calibration=calibration)
+    logs: options.Logs
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    noise: options.Noise = options.NOISE
+    method: Annotated[
+        Literal["joint", "two-step", "two-step-rk4", "accelerometer"],
+        arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
+    ] = "joint"
+    loss: options.LossChoice = "linear"
+    effect: options.EffectNames = ()
+    poses: options.Poses = options.POSES
+    repair: options.RepairFlag = False
+    means: Annotated[bool, arg(help="LOG is a table with one row of mean outputs per pose, as papers print them.")] = (
+        False
+    )
+    traced: options.Traced = options.TRACED
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        gravity, trace = self.local.value(), self.traced.value(self.logs)
+        self.results.prepare(*options.INERTIAL[: 1 if self.method == "accelerometer" else 2])
+        if self.means:
+            meant = {
+                "--static": self.noise.static,
+                "--noise": self.noise.noise,
+                "--effect": self.effect,
+                "--threshold": self.poses.threshold,
+                "--repair": self.repair,
+                "--gyro-log": self.log.gyro_log,
+                f"--method {self.method}": self.method.startswith("two-step"),
+            }
+            unusable = [name for name, stated in meant.items() if stated]
+            calibration = _calibrated_means(self.logs, self.log, gravity, self.loss, unusable)
+        else:
+            recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
+            choices = {
+                "static": known,
+                "segmentation": self.poses.value(),
+                "method": self.method,
+                "loss": self.loss,
+                "repair": self.repair,
+            }
+            with progress("calibrating"):
+                from jaximu.calibration import calibrate
+
+                calibration = calibrate(recordings, gravity, **choices, **options.effects_of(self.effect))
+        calibration = replace(calibration, trace=trace)
+        self.results.present(calibration.summary, calibration=calibration)
 
 
 def _calibrated_means(

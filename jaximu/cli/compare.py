@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,34 +13,11 @@ from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
-__all__ = ["run"]
+__all__ = ["CompareCommand"]
 
 
-def run(
-    calibrations: Annotated[
-        tuple[Path, ...],
-        Positional,
-        option("CALIBRATION CALIBRATION...", "Two calibration.json of a unit, or more.", name="calibrations"),
-    ],
-    /,
-    *,
-    dates: Annotated[
-        str | None,
-        option(
-            "DATES",
-            "Date of each, in their order: 2025-03-04,2026-03-02; default: those they state, else a step apart.",
-        ),
-    ] = None,
-    limits: Annotated[
-        Path | None, option("LIMITS.toml", "Limits, as for jaximu accept: when is each reached at the drift seen?")
-    ] = None,
-    rate: Annotated[str, option("TEXT", "Compare the gyroscope's output up to this rate.")] = "250 deg/s",
-    level: Annotated[float, option("P", "Rate of false alarms, all numbers together.")] = 0.05,
-    fail_on: Annotated[
-        Literal["never", "moved"], arg(help="Whether numbers that moved end with exit status 1, for scripts.")
-    ] = "never",
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class CompareCommand:
     """Compare calibrations of a unit: what moved, what that does to the output, how each number drifts.
 
     DIR receives compare.json, report.html and pictures.
@@ -50,25 +28,50 @@ def run(
       jaximu compare a.json b.json c.json --dates 2024-03-01,2025-03-04,2026-03-02
 
     """
-    if len(calibrations) < 2:
-        raise InputError("name two calibrations of the unit or more: jaximu compare OLD.json NEW.json.")
-    options.require_files(*calibrations, limits)
-    results.prepare()
-    from jaximu.acceptance.history import compare
-    from jaximu.calibration import load_calibration
-    from jaximu.cli.accept import limits_of
-    from jaximu.model.data_sheet import SI_UNITS, parse_quantity
 
-    fastest = parse_quantity(rate, SI_UNITS["angular_rate"]["B"], "--rate")
-    with progress("comparing"):
-        history = compare(
-            *map(load_calibration, calibrations),
-            dates=None if dates is None else [text.strip() for text in dates.split(",")],
-            limits=None if limits is None else limits_of(limits, None, None),
-            rate=fastest,
-            level=level,
-            files=[str(path) for path in calibrations],
-        )
-    results.present(history.summary, "compare.json, report.html and pictures", compare=history)
-    if fail_on == "moved" and history.verdict == "moved":
-        raise SystemExit(1)
+    calibrations: Annotated[
+        tuple[Path, ...],
+        Positional,
+        option("CALIBRATION CALIBRATION...", "Two calibration.json of a unit, or more.", name="calibrations"),
+    ]
+    dates: Annotated[
+        str | None,
+        option(
+            "DATES",
+            "Date of each, in their order: 2025-03-04,2026-03-02; default: those they state, else a step apart.",
+        ),
+    ] = None
+    limits: Annotated[
+        Path | None, option("LIMITS.toml", "Limits, as for jaximu accept: when is each reached at the drift seen?")
+    ] = None
+    rate: Annotated[str, option("TEXT", "Compare the gyroscope's output up to this rate.")] = "250 deg/s"
+    level: Annotated[float, option("P", "Rate of false alarms, all numbers together.")] = 0.05
+    fail_on: Annotated[
+        Literal["never", "moved"], arg(help="Whether numbers that moved end with exit status 1, for scripts.")
+    ] = "never"
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        if len(self.calibrations) < 2:
+            raise InputError("name two calibrations of the unit or more: jaximu compare OLD.json NEW.json.")
+        options.require_files(*self.calibrations, self.limits)
+        self.results.prepare()
+        from jaximu.acceptance.history import compare
+        from jaximu.calibration import load_calibration
+        from jaximu.cli.accept import limits_of
+        from jaximu.model.data_sheet import SI_UNITS, parse_quantity
+
+        fastest = parse_quantity(self.rate, SI_UNITS["angular_rate"]["B"], "--rate")
+        with progress("comparing"):
+            history = compare(
+                *map(load_calibration, self.calibrations),
+                dates=None if self.dates is None else [text.strip() for text in self.dates.split(",")],
+                limits=None if self.limits is None else limits_of(self.limits, None, None),
+                rate=fastest,
+                level=self.level,
+                files=[str(path) for path in self.calibrations],
+            )
+        self.results.present(history.summary, "compare.json, report.html and pictures", compare=history)
+        if self.fail_on == "moved" and history.verdict == "moved":
+            raise SystemExit(1)

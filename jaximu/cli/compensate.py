@@ -1,5 +1,6 @@
 """`jaximu compensate`: apply a calibration to a recording."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -9,14 +10,21 @@ from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option
 
-__all__ = ["run"]
+__all__ = ["CompensateCommand"]
 
 
-def run(
-    calibration: options.CalibrationFile,
-    recording: Annotated[Path, Positional, option("LOG", "The log to correct.")],
-    /,
-    *,
+@dataclass(frozen=True)
+class CompensateCommand:
+    """Apply a calibration to a log; the corrected log is in m/s² and rad/s.
+
+    Examples:
+      jaximu compensate results/calibration.json log.csv -o corrected.parquet
+      jaximu compensate results/calibration.json log.csv -o corrected.mcap
+
+    """
+
+    calibration: options.CalibrationFile
+    recording: Annotated[Path, Positional, option("LOG", "The log to correct.")]
     output: Annotated[
         Path,
         option(
@@ -26,31 +34,26 @@ def run(
             name="output",
             aliases=["-o"],
         ),
-    ],
-    log: options.Reading = options.READING,
-) -> None:
-    """Apply a calibration to a log; the corrected log is in m/s² and rad/s.
+    ]
+    log: options.Reading = options.READING
 
-    Examples:
-      jaximu compensate results/calibration.json log.csv -o corrected.parquet
-      jaximu compensate results/calibration.json log.csv -o corrected.mcap
+    def run(self) -> None:
+        """Do what the command line says."""
+        options.require_files(self.calibration, self.recording)
+        options.require_apart(self.output, self.calibration, self.recording, self.log.gyro_log)
+        from jaximu.calibration import compensate, load_calibration
+        from jaximu.recordings import write_recording
+        from jaximu.report.export import is_messages, write_messages
 
-    """
-    options.require_files(calibration, recording)
-    options.require_apart(output, calibration, recording, log.gyro_log)
-    from jaximu.calibration import compensate, load_calibration
-    from jaximu.recordings import write_recording
-    from jaximu.report.export import is_messages, write_messages
-
-    model = load_calibration(calibration)
-    with progress("compensating"):
-        raw = log.alike(model).read(recording, model.gravity, alone="accelerometer" not in model.triads())
-        written = compensate(model, raw)
-        if is_messages(output):
-            write_messages(model, raw, written, output)
-        else:
-            write_recording(written, output)
-    for note in written.notes:
-        if note.startswith("extrapolated"):
-            say(f"note: {note}.")
-    say(f"Written: {output}")
+        model = load_calibration(self.calibration)
+        with progress("compensating"):
+            raw = self.log.alike(model).read(self.recording, model.gravity, alone="accelerometer" not in model.triads())
+            written = compensate(model, raw)
+            if is_messages(self.output):
+                write_messages(model, raw, written, self.output)
+            else:
+                write_recording(written, self.output)
+        for note in written.notes:
+            if note.startswith("extrapolated"):
+                say(f"note: {note}.")
+        say(f"Written: {self.output}")

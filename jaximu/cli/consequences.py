@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,50 +20,14 @@ if TYPE_CHECKING:
     from jaximu.navigation.trajectory import Place, Trajectory
     from jaximu.noise.stated import SensorNoise
 
-__all__ = ["run"]
+__all__ = ["ConsequencesCommand"]
 
 _LATITUDE = 45.0
 _LIMITS = {"accelerometer": ("--accel-range", "specific_force"), "gyroscope": ("--gyro-range", "angular_rate")}
 
 
-def run(
-    calibration: options.CalibrationFile,
-    /,
-    *,
-    path: Annotated[Path | None, option("SPEC|LOG", "The path (default: ten minutes of level driving).")] = None,
-    noise_file: options.NoiseFile = None,
-    against: Annotated[Path | None, option("CALIBRATION", "Compare with another calibration of the unit.")] = None,
-    duration: Annotated[
-        float | None, option("S", "Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
-    ] = None,
-    temperature: Annotated[
-        float | None, option("DEGC", "Temperature of level driving (default: the calibration's).")
-    ] = None,
-    accel_range: Annotated[str | None, option("TEXT", 'Refuse a path beyond this range, such as "16 g".')] = None,
-    gyro_range: Annotated[str | None, option("TEXT", 'The same, such as "2000 deg/s".')] = None,
-    draws: Annotated[
-        int, option("N", "Simulated flights with all errors drawn, beside the linear budget; 0 for none.")
-    ] = 100,
-    seed: Annotated[int, option("N", "Seed of these draws.")] = 0,
-    noise_for: Annotated[
-        str | None,
-        option(
-            "LIST",
-            "Noise for these estimators, enlarged for the motion of the path: gtsam, vins, openvins, lio-sam, "
-            "kalibr, px4, ardupilot, separated by commas.",
-        ),
-    ] = None,
-    noise_interval: Annotated[
-        float, option("S", "Time between two states (keyframes, fixes) of that estimator.")
-    ] = 1.0,
-    reference: Annotated[
-        Path | None,
-        option("REF", "Attitude (and velocity or position) measured along LOG: noise from the errors seen."),
-    ] = None,
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class ConsequencesCommand:
     """Show how far off position, velocity and attitude get by calibration errors and noise, and which dominates.
 
     DIR receives consequences.json, report.html, budget.png and tracks.png; with --noise-for estimator_noise.json and
@@ -76,65 +40,107 @@ def run(
       jaximu consequences results/calibration.json --path flight.csv --noise noise/allan.json --noise-for vins,gtsam
 
     """
-    options.require_files(calibration, path, noise_file, against, reference)
-    if duration is not None and not 0 < duration < math.inf:
-        raise InputError(f"--duration: {duration:g} is no number of seconds.")
-    if draws < 0 or seed < 0:
-        raise InputError("--draws and --seed count from 0 up.")
-    if temperature is not None and path is not None:
-        raise InputError("--temperature goes with level driving; a SPEC or LOG states the temperature.")
-    targets = _targets(noise_for, noise_file, reference, path)
-    results.prepare()
-    from jaximu.calibration import load_calibration
-    from jaximu.navigation.consequences import consequences
-    from jaximu.navigation.trajectory import Place
 
-    model = load_calibration(calibration)
-    other = None if against is None else load_calibration(against)
-    noise = None if noise_file is None else options.stated_noise(noise_file)
-    _require_densities(targets, noise or {})
-    gravity = model.gravity if local == options.LOCAL else local.value()
-    site = Place(_LATITUDE if local.latitude is None else local.latitude, local.height, gravity)
-    limits = _limits({"accelerometer": accel_range, "gyroscope": gyro_range})
-    measured = None
-    if reference is not None and path is not None:
-        measured = _measured(path, reference, model, site, log)
-    trajectory, stated = _trajectory(path, model, site, duration, temperature, log, measured)
-    trajectory.require_range(stated | limits)
-    with progress("propagating errors"):
-        result = consequences(
-            model, trajectory, noise, draws=draws, seed=seed, against=other, files=(str(calibration), str(against))
+    calibration: options.CalibrationFile
+    path: Annotated[Path | None, option("SPEC|LOG", "The path (default: ten minutes of level driving).")] = None
+    noise_file: options.NoiseFile = None
+    against: Annotated[Path | None, option("CALIBRATION", "Compare with another calibration of the unit.")] = None
+    duration: Annotated[
+        float | None, option("S", "Length of the path; default 600 s, of a LOG 60 s, of a SPEC all.")
+    ] = None
+    temperature: Annotated[
+        float | None, option("DEGC", "Temperature of level driving (default: the calibration's).")
+    ] = None
+    accel_range: Annotated[str | None, option("TEXT", 'Refuse a path beyond this range, such as "16 g".')] = None
+    gyro_range: Annotated[str | None, option("TEXT", 'The same, such as "2000 deg/s".')] = None
+    draws: Annotated[
+        int, option("N", "Simulated flights with all errors drawn, beside the linear budget; 0 for none.")
+    ] = 100
+    seed: Annotated[int, option("N", "Seed of these draws.")] = 0
+    noise_for: Annotated[
+        str | None,
+        option(
+            "LIST",
+            "Noise for these estimators, enlarged for the motion of the path: gtsam, vins, openvins, lio-sam, "
+            "kalibr, px4, ardupilot, separated by commas.",
+        ),
+    ] = None
+    noise_interval: Annotated[float, option("S", "Time between two states (keyframes, fixes) of that estimator.")] = 1.0
+    reference: Annotated[
+        Path | None,
+        option("REF", "Attitude (and velocity or position) measured along LOG: noise from the errors seen."),
+    ] = None
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        options.require_files(self.calibration, self.path, self.noise_file, self.against, self.reference)
+        if self.duration is not None and not 0 < self.duration < math.inf:
+            raise InputError(f"--duration: {self.duration:g} is no number of seconds.")
+        if self.draws < 0 or self.seed < 0:
+            raise InputError("--draws and --seed count from 0 up.")
+        if self.temperature is not None and self.path is not None:
+            raise InputError("--temperature goes with level driving; a SPEC or LOG states the temperature.")
+        targets = _targets(self.noise_for, self.noise_file, self.reference, self.path)
+        self.results.prepare()
+        from jaximu.calibration import load_calibration
+        from jaximu.navigation.consequences import consequences
+        from jaximu.navigation.trajectory import Place
+
+        model = load_calibration(self.calibration)
+        other = None if self.against is None else load_calibration(self.against)
+        noise = None if self.noise_file is None else options.stated_noise(self.noise_file)
+        _require_densities(targets, noise or {})
+        gravity = model.gravity if self.local == options.LOCAL else self.local.value()
+        site = Place(_LATITUDE if self.local.latitude is None else self.local.latitude, self.local.height, gravity)
+        limits = _limits({"accelerometer": self.accel_range, "gyroscope": self.gyro_range})
+        measured = None
+        if self.reference is not None and self.path is not None:
+            measured = _measured(self.path, self.reference, model, site, self.log)
+        trajectory, stated = _trajectory(self.path, model, site, self.duration, self.temperature, self.log, measured)
+        trajectory.require_range(stated | limits)
+        with progress("propagating errors"):
+            result = consequences(
+                model,
+                trajectory,
+                noise,
+                draws=self.draws,
+                seed=self.seed,
+                against=other,
+                files=(str(self.calibration), str(self.against)),
+            )
+        names = "consequences.json, report.html and pictures"
+        if not targets:
+            self.results.present(result.summary, names, consequences=result)
+            return
+        assert noise is not None
+        from jaximu.navigation.estimator_noise import ModelledErrors, estimator_noise
+
+        with progress("finding the estimator's noise"):
+            sources = {"expected": ModelledErrors(model, trajectory, str(self.calibration))}
+            sources |= {} if measured is None else {"measured": measured}
+            estimated = {
+                origin: estimator_noise(source, noise, interval=self.noise_interval, seed=self.seed)
+                for origin, source in sources.items()
+            }
+        final = estimated["expected" if measured is None else "measured"]
+        files = _files(targets, final, site.gravity.value)
+
+        def document() -> str:
+            added = final.document() | {"files": {name: text.decode() for name, text in files.items()}}
+            added |= {} if measured is None else {"expected": estimated["expected"].document()}
+            return json.dumps(result.document() | {"estimator_noise": added}, indent=1, allow_nan=False)
+
+        self.results.present(
+            lambda: later("report.consequences", "page_of")(result, estimated, files),
+            f"{names}, {', '.join(files)}",
+            files,
+            document,
+            consequences=result,
+            estimator_noise=final,
         )
-    names = "consequences.json, report.html and pictures"
-    if not targets:
-        results.present(result.summary, names, consequences=result)
-        return
-    assert noise is not None
-    from jaximu.navigation.estimator_noise import ModelledErrors, estimator_noise
-
-    with progress("finding the estimator's noise"):
-        sources = {"expected": ModelledErrors(model, trajectory, str(calibration))}
-        sources |= {} if measured is None else {"measured": measured}
-        estimated = {
-            origin: estimator_noise(source, noise, interval=noise_interval, seed=seed)
-            for origin, source in sources.items()
-        }
-    final = estimated["expected" if measured is None else "measured"]
-    files = _files(targets, final, site.gravity.value)
-
-    def document() -> str:
-        added = final.document() | {"files": {name: text.decode() for name, text in files.items()}}
-        added |= {} if measured is None else {"expected": estimated["expected"].document()}
-        return json.dumps(result.document() | {"estimator_noise": added}, indent=1, allow_nan=False)
-
-    results.present(
-        lambda: later("report.consequences", "page_of")(result, estimated, files),
-        f"{names}, {', '.join(files)}",
-        files,
-        document,
-        consequences=result,
-        estimator_noise=final,
-    )
 
 
 def _targets(text: str | None, noise_file: Path | None, reference: Path | None, path: Path | None) -> list[str]:

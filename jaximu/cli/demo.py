@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from jaximu.model.effects import Effect
     from jaximu.model.sensor import Imu
 
-__all__ = ["run"]
+__all__ = ["DemoCommand"]
 
 _HIDDEN = {
     "accel.quadratic": 3e-4,
@@ -29,18 +30,8 @@ _HIDDEN = {
 """Effects that the demonstration may hide, and the largest coefficient: a few times what the noise would cover."""
 
 
-def run(
-    *,
-    seed: Annotated[int, option("N", "Random seed of the unit and its noise.")] = 0,
-    effect: Annotated[str | None, option("NAME", "Effect to hide (default: the seed chooses one).")] = None,
-    data: Annotated[
-        Path | None, option("DIR", "Only write a simulated phone's recording there, to try commands on.")
-    ] = None,
-    output: Annotated[Path, option("DIR", "Folder for recording and report.", name="output", aliases=["-o"])] = Path(
-        "jaximu-demo"
-    ),
-    force: options.ForceFlag = False,
-) -> None:
+@dataclass(frozen=True)
+class DemoCommand:
     """Simulate a unit with a hidden flaw, diagnose it and write a report: no recording needed.
 
     Examples:
@@ -49,29 +40,44 @@ def run(
       jaximu demo --data phone
 
     """
-    if data is not None:
-        _write_phone(data)
-        return
-    if seed < 0:
-        raise InputError(f"--seed must not be negative, found {seed}.")
-    if effect is not None and effect not in _HIDDEN:
-        raise InputError(f"the demonstration hides one of {', '.join(_HIDDEN)}, not {effect!r}.")
-    results = options.Results(output, force=force)
-    results.prepare(*options.INERTIAL)
-    with progress("simulating"):
-        from jaximu.simulation import draw_imu
 
-        flaw = _draw_flaw(seed, effect)
-        imu = draw_imu(seed).with_effects(flaw)
-        _simulate(imu, seed, output)
-    with progress("diagnosing"):
-        from jaximu.diagnosis import diagnose
-        from jaximu.recordings.readers import read_recording
+    seed: Annotated[int, option("N", "Random seed of the unit and its noise.")] = 0
+    effect: Annotated[str | None, option("NAME", "Effect to hide (default: the seed chooses one).")] = None
+    data: Annotated[
+        Path | None, option("DIR", "Only write a simulated phone's recording there, to try commands on.")
+    ] = None
+    output: Annotated[Path, option("DIR", "Folder for recording and report.", name="output", aliases=["-o"])] = Path(
+        "jaximu-demo"
+    )
+    force: options.ForceFlag = False
 
-        recording, heldout, rest = (read_recording(output / f"{n}.parquet") for n in ("recording", "heldout", "rest"))
-        diagnosis = diagnose(recording, LocalGravity(9.80665, 0.0), static=rest, heldout=heldout)
-    give_diagnosis(diagnosis, results)
-    _print_truth(imu, flaw)
+    def run(self) -> None:
+        """Do what the command line says."""
+        if self.data is not None:
+            _write_phone(self.data)
+            return
+        if self.seed < 0:
+            raise InputError(f"--seed must not be negative, found {self.seed}.")
+        if self.effect is not None and self.effect not in _HIDDEN:
+            raise InputError(f"the demonstration hides one of {', '.join(_HIDDEN)}, not {self.effect!r}.")
+        results = options.Results(self.output, force=self.force)
+        results.prepare(*options.INERTIAL)
+        with progress("simulating"):
+            from jaximu.simulation import draw_imu
+
+            flaw = _draw_flaw(self.seed, self.effect)
+            imu = draw_imu(self.seed).with_effects(flaw)
+            _simulate(imu, self.seed, self.output)
+        with progress("diagnosing"):
+            from jaximu.diagnosis import diagnose
+            from jaximu.recordings.readers import read_recording
+
+            recording, heldout, rest = (
+                read_recording(self.output / f"{n}.parquet") for n in ("recording", "heldout", "rest")
+            )
+            diagnosis = diagnose(recording, LocalGravity(9.80665, 0.0), static=rest, heldout=heldout)
+        give_diagnosis(diagnosis, results)
+        _print_truth(imu, flaw)
 
 
 def _write_phone(folder: Path) -> None:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import difflib
 import inspect
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
+
+from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.options import option
@@ -16,7 +19,7 @@ from jaximu.ground.reexport import later
 if TYPE_CHECKING:
     from jaximu.model.effects import Effect
 
-__all__ = ["run"]
+__all__ = ["EffectsCommand"]
 
 _SCOPES = {
     "device": "device: belongs to the unit and holds in other recordings",
@@ -26,12 +29,8 @@ _SCOPES = {
 _ACTS_ON = {"input": "what the axes sense, before the gain", "output": "what the axes put out"}
 
 
-def run(
-    name: Annotated[str | None, option("[NAME]", "Show this effect in full.")] = None,
-    /,
-    *,
-    as_json: options.JsonFlag = False,
-) -> None:
+@dataclass(frozen=True)
+class EffectsCommand:
     """List the effects that jaximu knows: formula, unit, scope, what excites each one and what it is mistaken for.
 
     Examples:
@@ -39,18 +38,24 @@ def run(
       jaximu effects gyro.g_sensitivity
 
     """
-    from jaximu.model.effects import CATALOGUE
 
-    if name is not None and name not in CATALOGUE:
-        near = difflib.get_close_matches(name, CATALOGUE, n=3, cutoff=0.4)
-        hint = f"near it are {', '.join(near)}" if near else "`jaximu effects` lists them"
-        raise InputError(f"there is no effect {name!r} in the catalogue; {hint}.")
-    kinds = list(CATALOGUE.values()) if name is None else [CATALOGUE[name]]
-    if as_json:
-        entries = [_entry(kind) for kind in kinds]
-        options.print_json(entries if name is None else entries[0])
-    else:
-        later("report.terminal", "show")(_catalogue(kinds) if name is None else _page(kinds[0]))
+    name: Annotated[str | None, Positional, option("[NAME]", "Show this effect in full.")] = None
+    as_json: options.JsonFlag = False
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        from jaximu.model.effects import CATALOGUE
+
+        if self.name is not None and self.name not in CATALOGUE:
+            near = difflib.get_close_matches(self.name, CATALOGUE, n=3, cutoff=0.4)
+            hint = f"near it are {', '.join(near)}" if near else "`jaximu effects` lists them"
+            raise InputError(f"there is no effect {self.name!r} in the catalogue; {hint}.")
+        kinds = list(CATALOGUE.values()) if self.name is None else [CATALOGUE[self.name]]
+        if self.as_json:
+            entries = [_entry(kind) for kind in kinds]
+            options.print_json(entries if self.name is None else entries[0])
+        else:
+            later("report.terminal", "show")(_catalogue(kinds) if self.name is None else _page(kinds[0]))
 
 
 def _entry(kind: type[Effect]) -> dict[str, Any]:

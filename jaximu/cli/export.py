@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -15,30 +16,11 @@ from jaximu.ground.reexport import later
 from jaximu.report.export.catalogue import WRITERS, writer
 from jaximu.report.export.noise import TARGETS
 
-__all__ = ["run"]
+__all__ = ["ExportCommand"]
 
 
-def run(
-    calibration: options.CalibrationFile,
-    /,
-    *,
-    to: Annotated[str, option("FORMAT", f"One of {', '.join(WRITERS)}.")],
-    output: Annotated[
-        Path | None, option("FILE", "Default: beside CALIBRATION.", name="output", aliases=["-o"])
-    ] = None,
-    noise: Annotated[Path | None, option("IMU.YAML", "Noise densities, as jaximu allan -o DIR writes them.")] = None,
-    axes: Annotated[
-        str | None,
-        option("MAP", "The --axes used for calibration, where CALIBRATION does not say how it was read."),
-    ] = None,
-    instance: Annotated[int, option("N", "Which of the autopilot's sensors, from 0.")] = 0,
-    device: Annotated[int | None, option("ID", "The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None,
-    rate_range: Annotated[float, option("DEG/S", "State the error of what the file leaves out up to this rate.")] = 250,
-    temperature_range: Annotated[
-        str | None, option("LOW,HIGH", "State it between these temperatures in °C (default: ±20 K).")
-    ] = None,
-    as_json: options.JsonFlag = False,
-) -> None:
+@dataclass(frozen=True)
+class ExportCommand:
     """Write a calibration for another tool, with the equation to apply and what the file cannot carry.
 
     Examples:
@@ -46,50 +28,74 @@ def run(
       jaximu export results/calibration.json --to kalibr --noise noise/imu.yaml
 
     """
-    options.require_files(calibration, noise)
-    options.require_apart(output, calibration, noise)
-    if instance < 0:
-        raise InputError(f"--instance: sensors count from 0, found {instance}.")
-    rate, temperatures = _rate(rate_range), _temperatures(temperature_range)
-    from jaximu.calibration import load_calibration
-    from jaximu.recordings.readers.kalibr import read_noise
-    from jaximu.report.export import ExportedUnit, Range, export, losses
 
-    model = load_calibration(calibration)
-    if noise is not None and not getattr(writer(to), "NOISE", False):
-        also = "; `jaximu consequences --noise-for` writes the filter's parameters" if to in TARGETS else ""
-        say(f"{noise} is not used: the {to} file holds a calibration and no noise{also}.")
-    if not getattr(writer(to), "MAGNETIC", False):
-        model = model.inertial()
-    extent = Range.of(model, rate, temperatures)
-    parameters = ExportedUnit.of(model, axes, None if noise is None else read_noise(noise), instance, device)
-    path = output or calibration.with_name(f"{calibration.stem}_{to}{writer(to).SUFFIX}")
-    written, paths = export(parameters, to, path)
-    lost = losses(parameters, written, extent)
-    axes = (written.parameters or parameters).axes
-    left = [
-        effect.title for triad in model.imu.triads().values() for effect in triad.effects if effect.scope != "device"
-    ]
-    if as_json:
-        options.print_json(
-            {
-                "format": to,
-                "files": [str(path) for path in paths],
-                "axes": axes,
-                "convention": written.convention,
-                "equation": written.equation,
-                "range": extent.text(),
-                "losses": [vars(loss) for loss in lost],
-            }
+    calibration: options.CalibrationFile
+    to: Annotated[str, option("FORMAT", f"One of {', '.join(WRITERS)}.")]
+    output: Annotated[Path | None, option("FILE", "Default: beside CALIBRATION.", name="output", aliases=["-o"])] = None
+    noise: Annotated[Path | None, option("IMU.YAML", "Noise densities, as jaximu allan -o DIR writes them.")] = None
+    axes: Annotated[
+        str | None,
+        option("MAP", "The --axes used for calibration, where CALIBRATION does not say how it was read."),
+    ] = None
+    instance: Annotated[int, option("N", "Which of the autopilot's sensors, from 0.")] = 0
+    device: Annotated[int | None, option("ID", "The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None
+    rate_range: Annotated[float, option("DEG/S", "State the error of what the file leaves out up to this rate.")] = 250
+    temperature_range: Annotated[
+        str | None, option("LOW,HIGH", "State it between these temperatures in °C (default: ±20 K).")
+    ] = None
+    as_json: options.JsonFlag = False
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        options.require_files(self.calibration, self.noise)
+        options.require_apart(self.output, self.calibration, self.noise)
+        if self.instance < 0:
+            raise InputError(f"--instance: sensors count from 0, found {self.instance}.")
+        rate, temperatures = _rate(self.rate_range), _temperatures(self.temperature_range)
+        from jaximu.calibration import load_calibration
+        from jaximu.recordings.readers.kalibr import read_noise
+        from jaximu.report.export import ExportedUnit, Range, export, losses
+
+        model = load_calibration(self.calibration)
+        if self.noise is not None and not getattr(writer(self.to), "NOISE", False):
+            also = "; `jaximu consequences --noise-for` writes the filter's parameters" if self.to in TARGETS else ""
+            say(f"{self.noise} is not used: the {self.to} file holds a calibration and no noise{also}.")
+        if not getattr(writer(self.to), "MAGNETIC", False):
+            model = model.inertial()
+        extent = Range.of(model, rate, temperatures)
+        parameters = ExportedUnit.of(
+            model, self.axes, None if self.noise is None else read_noise(self.noise), self.instance, self.device
         )
-        return
-    costs = [loss.text() for loss in lost]
-    costs += [f"{', '.join(left)}: of one session, not of the unit, and never exported."] if left else []
-    parts: list[Part] = [f"Convention: {written.convention}", Section("Apply:", (Code(written.equation),))]
-    if costs:
-        parts.append(Section(f"Not in the file, and what that costs over {extent.text()}:", (Items(costs),)))
-    later("report.terminal", "show")(Page(f"Calibration for {to}", (axes,), first=parts))
-    say(f"Written: {', '.join(map(str, paths))}")
+        path = self.output or self.calibration.with_name(f"{self.calibration.stem}_{self.to}{writer(self.to).SUFFIX}")
+        written, paths = export(parameters, self.to, path)
+        lost = losses(parameters, written, extent)
+        equation = (written.parameters or parameters).axes
+        left = [
+            effect.title
+            for triad in model.imu.triads().values()
+            for effect in triad.effects
+            if effect.scope != "device"
+        ]
+        if self.as_json:
+            options.print_json(
+                {
+                    "format": self.to,
+                    "files": [str(path) for path in paths],
+                    "axes": equation,
+                    "convention": written.convention,
+                    "equation": written.equation,
+                    "range": extent.text(),
+                    "losses": [vars(loss) for loss in lost],
+                }
+            )
+            return
+        costs = [loss.text() for loss in lost]
+        costs += [f"{', '.join(left)}: of one session, not of the unit, and never exported."] if left else []
+        parts: list[Part] = [f"Convention: {written.convention}", Section("Apply:", (Code(written.equation),))]
+        if costs:
+            parts.append(Section(f"Not in the file, and what that costs over {extent.text()}:", (Items(costs),)))
+        later("report.terminal", "show")(Page(f"Calibration for {self.to}", (equation,), first=parts))
+        say(f"Written: {', '.join(map(str, paths))}")
 
 
 def _rate(value: float) -> float:

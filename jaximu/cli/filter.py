@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,44 +18,11 @@ from jaximu.ground.reexport import later
 if TYPE_CHECKING:
     pass
 
-__all__ = ["run"]
+__all__ = ["FilterCommand"]
 
 
-def run(
-    log_path: Annotated[Path, Positional, option("LOG", "A recording that begins at rest.", name="log")],
-    /,
-    *,
-    online: Annotated[
-        Path | None,
-        option(
-            "CALIBRATION",
-            "Follow this calibrated unit through LOG, sample by sample: what changes, and is it this unit?",
-        ),
-    ] = None,
-    reference: Annotated[
-        Path | None,
-        option(
-            "REF",
-            "A measured attitude as a further measurement, with its own clock: a table with time and quaternion, "
-            "Euler angles, rotation vectors or a table's angles (table_angle_z, table_angle_x …, outermost axis first) "
-            "and velocity or position if known; may be LOG itself.",
-        ),
-    ] = None,
-    magnetometer: Annotated[
-        Path | None,
-        option(
-            "CALIBRATION",
-            "A calibration of the magnetometer in LOG (`jaximu magnetometer`): the Earth's field as a further "
-            "measurement, which shows the heading of every rest.",
-        ),
-    ] = None,
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    noise: options.Noise = options.NOISE,
-    effect: options.EffectNames = (),
-    repair: options.RepairFlag = False,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class FilterCommand:
     """Calibrate from all of a recording, motion included, by a Kalman filter; or follow a calibrated unit in use.
 
     For good units and sequences of positions; for a consumer unit turned by hand use `jaximu calibrate`. DIR receives
@@ -70,32 +38,67 @@ def run(
       jaximu filter log.csv --online results/calibration.json --magnetometer results/magnetometer/calibration.json
 
     """
-    gravity = local.value()
-    if online is not None and effect:
-        raise InputError("--effect is for a calibration: with --online the effects are those of CALIBRATION.")
-    options.require_files(online, reference, magnetometer)
-    results.prepare(*options.INERTIAL)
-    from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
-    from jaximu.noise.at_rest import noise_of
 
-    old = None if online is None else load_calibration(online).inertial()
-    compass = None if magnetometer is None else load_calibration(magnetometer)
-    (recording,), known = log.alike(old or compass).read_unit((log_path,), gravity, noise)
-    attitude = None if reference is None else read_reference(reference, log_path, recording)
-    with progress("filtering" if old is None else "following"):
-        if old is None:
-            calibration, history = calibrate_by_filter(
-                recording,
-                gravity,
-                attitude=attitude,
-                latitude=local.latitude,
-                static=known,
-                repair=repair,
-                magnetometer=compass,
-                **options.effects_of(effect),
-            )
-        else:
-            stated = gravity if local != options.LOCAL else None
-            calibration, history = followed_in_use(old, recording, noise_of(known), stated, attitude, compass)
-    page_of = later("report.filter", "page_of")
-    results.present(lambda: page_of(calibration, history), calibration=calibration)
+    log_path: Annotated[Path, Positional, option("LOG", "A recording that begins at rest.", name="log")]
+    online: Annotated[
+        Path | None,
+        option(
+            "CALIBRATION",
+            "Follow this calibrated unit through LOG, sample by sample: what changes, and is it this unit?",
+        ),
+    ] = None
+    reference: Annotated[
+        Path | None,
+        option(
+            "REF",
+            "A measured attitude as a further measurement, with its own clock: a table with time and quaternion, "
+            "Euler angles, rotation vectors or a table's angles (table_angle_z, table_angle_x …, outermost axis first) "
+            "and velocity or position if known; may be LOG itself.",
+        ),
+    ] = None
+    magnetometer: Annotated[
+        Path | None,
+        option(
+            "CALIBRATION",
+            "A calibration of the magnetometer in LOG (`jaximu magnetometer`): the Earth's field as a further "
+            "measurement, which shows the heading of every rest.",
+        ),
+    ] = None
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    noise: options.Noise = options.NOISE
+    effect: options.EffectNames = ()
+    repair: options.RepairFlag = False
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        gravity = self.local.value()
+        if self.online is not None and self.effect:
+            raise InputError("--effect is for a calibration: with --online the effects are those of CALIBRATION.")
+        options.require_files(self.online, self.reference, self.magnetometer)
+        self.results.prepare(*options.INERTIAL)
+        from jaximu.calibration import calibrate_by_filter, followed_in_use, load_calibration
+        from jaximu.noise.at_rest import noise_of
+
+        old = None if self.online is None else load_calibration(self.online).inertial()
+        compass = None if self.magnetometer is None else load_calibration(self.magnetometer)
+        (recording,), known = self.log.alike(old or compass).read_unit((self.log_path,), gravity, self.noise)
+        attitude = None if self.reference is None else read_reference(self.reference, self.log_path, recording)
+        with progress("filtering" if old is None else "following"):
+            if old is None:
+                calibration, history = calibrate_by_filter(
+                    recording,
+                    gravity,
+                    attitude=attitude,
+                    latitude=self.local.latitude,
+                    static=known,
+                    repair=self.repair,
+                    magnetometer=compass,
+                    **options.effects_of(self.effect),
+                )
+            else:
+                stated = gravity if self.local != options.LOCAL else None
+                calibration, history = followed_in_use(old, recording, noise_of(known), stated, attitude, compass)
+        page_of = later("report.filter", "page_of")
+        self.results.present(lambda: page_of(calibration, history), calibration=calibration)

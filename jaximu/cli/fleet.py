@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -21,43 +21,14 @@ if TYPE_CHECKING:
     from jaximu.fleets.population import Fleet
     from jaximu.ground.page import Page
 
-__all__ = ["run"]
+__all__ = ["FleetCommand"]
 
 _EVERY = 10.0
 """Seconds between two lines of progress where stderr is no terminal."""
 
 
-def run(
-    logs: Annotated[
-        tuple[str, ...],
-        Positional,
-        option("LOGS...", "Logs, folders, patterns in quotes, or a manifest (CSV).", name="logs"),
-    ],
-    /,
-    *,
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    output: Annotated[
-        Path | None, option("TABLE.parquet", "The table to write.", name="output", aliases=["-o"])
-    ] = None,
-    static: Annotated[
-        Path | None,
-        option(
-            "LOG|DIR", "A recording at rest to measure the noise, or a folder of them, each named after its device."
-        ),
-    ] = None,
-    diagnose: Annotated[bool, arg(help="Also diagnose each recording.")] = False,
-    engine: Annotated[Literal["local", "ray"], arg(help="Processes on this machine, or a Ray cluster.")] = "local",
-    workers: Annotated[int | None, option("N", "Number of processes (default: one per core).")] = None,
-    field: options.FieldText = None,
-    poses: options.Poses = options.POSES,
-    limits: Annotated[
-        Path | None,
-        option("LIMITS.toml", "Hold every unit to these limits, and follow the line; see jaximu accept --explain."),
-    ] = None,
-    golden: Annotated[str, option("DEVICE", "With --limits: the unit that watches the line.")] = "",
-    as_json: options.JsonFlag = False,
-) -> None:
+@dataclass(frozen=True)
+class FleetCommand:
     """Calibrate many units: one row per recording in one Parquet table, and a report on the population.
 
     A magnetometer in a log gets its hard and soft iron from the rests; --field states the strength where all were.
@@ -73,68 +44,97 @@ def run(
       jaximu fleet manifest.csv -o fleet.parquet --engine ray
 
     """
-    if output is None:
-        raise InputError("name the table to write: jaximu fleet LOGS -o TABLE.parquet.")
-    if output.suffix.lower() != ".parquet":
-        raise InputError(f"{output}: the table is written as Parquet; let its name end in .parquet.")
-    if workers is not None and workers < 1:
-        raise InputError(f"--workers must be 1 or more, not {workers}.")
-    if golden and limits is None:
-        raise InputError("--golden goes with --limits.")
-    held = None
-    if limits is not None:
-        from jaximu.cli.accept import limits_of
 
-        options.require_files(limits)
-        held = limits_of(limits, None, None)  # found out before anything is computed
-    from jaximu.fleets import Settings, find_jobs, run_fleet
-    from jaximu.fleets.store import kept_rows
+    logs: Annotated[
+        tuple[str, ...],
+        Positional,
+        option("LOGS...", "Logs, folders, patterns in quotes, or a manifest (CSV).", name="logs"),
+    ]
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    output: Annotated[Path | None, option("TABLE.parquet", "The table to write.", name="output", aliases=["-o"])] = None
+    static: Annotated[
+        Path | None,
+        option(
+            "LOG|DIR", "A recording at rest to measure the noise, or a folder of them, each named after its device."
+        ),
+    ] = None
+    diagnose: Annotated[bool, arg(help="Also diagnose each recording.")] = False
+    engine: Annotated[Literal["local", "ray"], arg(help="Processes on this machine, or a Ray cluster.")] = "local"
+    workers: Annotated[int | None, option("N", "Number of processes (default: one per core).")] = None
+    field: options.FieldText = None
+    poses: options.Poses = options.POSES
+    limits: Annotated[
+        Path | None,
+        option("LIMITS.toml", "Hold every unit to these limits, and follow the line; see jaximu accept --explain."),
+    ] = None
+    golden: Annotated[str, option("DEVICE", "With --limits: the unit that watches the line.")] = ""
+    as_json: options.JsonFlag = False
 
-    jobs = find_jobs(logs, output, static)
-    if static is not None and (without := sum(not job.static for job in jobs)):
-        say(f"{without} of {len(jobs)} have no recording at rest: their noise is estimated from their own poses.")
-    stated = {option.name: getattr(log, option.name) for option in fields(log)}
-    settings = Settings(
-        options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
-        gravity=local.value(),
-        diagnose=diagnose,
-        segmentation=poses.value(),
-        field=options.field_strength(field),
-    )
-    try:
-        with _progress(len(jobs)) as show:
-            statuses = run_fleet(jobs, output, settings, engine, workers, show)
-    except KeyboardInterrupt:
-        say(f"{kept_rows(output)} of {len(jobs)} rows are kept: the same command goes on from there.")
-        raise
-    from jaximu.fleets.field import field_words
-    from jaximu.fleets.population import read_fleet  # only now: what it imports takes a second
-    from jaximu.report.fleet import page_of
+    def run(self) -> None:
+        """Do what the command line says."""
+        if self.output is None:
+            raise InputError("name the table to write: jaximu fleet LOGS -o TABLE.parquet.")
+        if self.output.suffix.lower() != ".parquet":
+            raise InputError(f"{self.output}: the table is written as Parquet; let its name end in .parquet.")
+        if self.workers is not None and self.workers < 1:
+            raise InputError(f"--workers must be 1 or more, not {self.workers}.")
+        if self.golden and self.limits is None:
+            raise InputError("--golden goes with --limits.")
+        held = None
+        if self.limits is not None:
+            from jaximu.cli.accept import limits_of
 
-    with progress("questioning the fleet"):
-        fleet = read_fleet(output)
-    page, html = page_of(fleet, field_words(output)), output.with_suffix(".html")
-    written = options.draw(lambda: _write(fleet, page, output), html)
-    line = None
-    if held is not None and statuses["ok"]:
-        from jaximu.acceptance.line import follow, read_table
-        from jaximu.cli.accept import write_line
+            options.require_files(self.limits)
+            held = limits_of(self.limits, None, None)  # found out before anything is computed
+        from jaximu.fleets import Settings, find_jobs, run_fleet
+        from jaximu.fleets.store import kept_rows
 
-        with progress("following the line"):
-            line = follow(read_table(output), held, golden)
-        line_html, document = (output.with_suffix(f".acceptance{suffix}") for suffix in (".html", ".json"))
-        line.save(document)
-        written += [*options.draw(lambda: write_line(line, line_html, output)[-1:], line_html), document]
-    if as_json:
-        options.print_json(fleet.document() | ({"acceptance": line.document()} if line else {}))
-        return
-    from jaximu.report.terminal import show as show_page
+        jobs = find_jobs(self.logs, self.output, self.static)
+        if self.static is not None and (without := sum(not job.static for job in jobs)):
+            say(f"{without} of {len(jobs)} have no recording at rest: their noise is estimated from their own poses.")
+        stated = {option.name: getattr(self.log, option.name) for option in fields(self.log)}
+        settings = Settings(
+            options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
+            gravity=self.local.value(),
+            diagnose=self.diagnose,
+            segmentation=self.poses.value(),
+            field=options.field_strength(self.field),
+        )
+        try:
+            with _progress(len(jobs)) as show:
+                statuses = run_fleet(jobs, self.output, settings, self.engine, self.workers, show)
+        except KeyboardInterrupt:
+            say(f"{kept_rows(self.output)} of {len(jobs)} rows are kept: the same command goes on from there.")
+            raise
+        from jaximu.fleets.field import field_words
+        from jaximu.fleets.population import read_fleet  # only now: what it imports takes a second
+        from jaximu.report.fleet import page_of
 
-    show_page(page)
-    if line is not None:
-        print()
-        show_page(line.summary())
-    print(f"Written: {', '.join(map(str, (output, *written)))}")
+        with progress("questioning the fleet"):
+            fleet = read_fleet(self.output)
+        page, html = page_of(fleet, field_words(self.output)), self.output.with_suffix(".html")
+        written = options.draw(lambda: _write(fleet, page, self.output), html)
+        line = None
+        if held is not None and statuses["ok"]:
+            from jaximu.acceptance.line import follow, read_table
+            from jaximu.cli.accept import write_line
+
+            with progress("following the line"):
+                line = follow(read_table(self.output), held, self.golden)
+            line_html, document = (self.output.with_suffix(f".acceptance{suffix}") for suffix in (".html", ".json"))
+            line.save(document)
+            written += [*options.draw(lambda: write_line(line, line_html, self.output)[-1:], line_html), document]
+        if self.as_json:
+            options.print_json(fleet.document() | ({"acceptance": line.document()} if line else {}))
+            return
+        from jaximu.report.terminal import show as show_page
+
+        show_page(page)
+        if line is not None:
+            print()
+            show_page(line.summary())
+        print(f"Written: {', '.join(map(str, (self.output, *written)))}")
 
 
 def _write(fleet: Fleet, page: Page, table: Path) -> tuple[Path, ...]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaximu.recordings.columns.guess import Advice
     from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["Use", "allowed", "describe", "read_openly", "run"]
+__all__ = ["InfoCommand", "Use", "allowed", "describe", "read_openly"]
 
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
 _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
@@ -48,13 +48,8 @@ class Use:
         return f"jaximu {self.verb}{self.before} {shlex.quote(str(path))}{stated}{self.after}"
 
 
-def run(
-    logs: options.Logs,
-    /,
-    *,
-    log: options.Reading = options.READING,
-    as_json: options.JsonFlag = False,
-) -> None:
+@dataclass(frozen=True)
+class InfoCommand:
     """Show what is in a log: sensors, units, rate, rests, what it can be used for, and which command to run next.
 
     Examples:
@@ -63,19 +58,26 @@ def run(
       jaximu info raw.txt --columns "time [ms],accel [mg],gyro [mdps]"
 
     """
-    stated = [log.with_gyroscope(path) for path in logs]
-    described = [describe(*read_openly(*pair)) for pair in zip(stated, logs, strict=True)]
-    if as_json:
-        documents = [document for document, _ in described]
-        options.print_json(documents[0] if len(documents) == 1 else documents)
-        return
-    from jaximu.report.recording import log_page
-    from jaximu.report.terminal import show
 
-    for path, (document, uses), reading in zip(logs, described, stated, strict=True):
-        guess = document.get("guess")
-        line = f" {guess['line']}" if guess else reading.line()
-        show(log_page(document, [use.line(path, line) for use in uses]))
+    logs: options.Logs
+    log: options.Reading = options.READING
+    as_json: options.JsonFlag = False
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        stated = [self.log.with_gyroscope(path) for path in self.logs]
+        described = [describe(*read_openly(*pair)) for pair in zip(stated, self.logs, strict=True)]
+        if self.as_json:
+            documents = [document for document, _ in described]
+            options.print_json(documents[0] if len(documents) == 1 else documents)
+            return
+        from jaximu.report.recording import log_page
+        from jaximu.report.terminal import show
+
+        for path, (document, uses), reading in zip(self.logs, described, stated, strict=True):
+            guess = document.get("guess")
+            line = f" {guess['line']}" if guess else reading.line()
+            show(log_page(document, [use.line(path, line) for use in uses]))
 
 
 def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice | None, list[str]]:

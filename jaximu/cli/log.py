@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -20,6 +18,7 @@ from tyro.conf import arg
 from jaximu.cli import options
 from jaximu.cli.info import Use, describe, read_openly
 from jaximu.cli.messages import progress, say
+from jaximu.cli.usage import command_of
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.quantities import sentence
 from jaximu.ground.reexport import later
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from jaximu.ground.page import Page
     from jaximu.recordings.columns.guess import Advice, OpenPoint
 
-__all__ = ["run"]
+__all__ = ["LogCommand"]
 
 _ORDER = ("calibrate", "diagnose", "turntable", "reference", "magnetometer", "allan", "thermal")
 """Verbs that need no more than logs."""
@@ -43,16 +42,8 @@ _RECORD = (
 )
 
 
-def run(
-    logs: options.Logs,
-    /,
-    *,
-    yes: Annotated[bool, arg(help="Ask nothing: take the default for what the logs leave open, and say so.")] = False,
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    noise: options.Noise = options.NOISE,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class LogCommand:
     """Run all that LOGs allow, in one report: calibration, diagnosis, noise, temperature and more.
 
     LOGs are files, a phone's folder or its ZIP archive: recordings of one unit. One of them at rest states the noise
@@ -65,22 +56,32 @@ def run(
       jaximu poses.csv rest.csv --yes --latitude 48.1 -o results
 
     """
-    if not logs:
-        raise InputError("no log was given: name one or more files.")
-    options.require_files(*logs, log.gyro_log, noise.static, noise.noise)
-    local.value()  # a mistake in it is said before any work
-    results.prepare()
-    asker = _Asker(yes)
-    from jaximu.recordings.readers.reader import tables_kept
 
-    with tables_kept():
-        contents, references = _contents_of(logs, log, asker)
-        outcomes, refused = _run_all(_jobs(contents, references, {"local": local, "noise": noise}))
-    if not outcomes:
-        raise NotPossibleError(f"{_names(logs)}: {' '.join(_reasons(contents, refused))} {_RECORD}")
-    stated = "".join(map(options.typed, (log, local, noise)))
-    report = _Report(logs, contents, outcomes, refused, asker.assumed, stated, results)
-    report.give()
+    logs: options.Logs
+    yes: Annotated[bool, arg(help="Ask nothing: take the default for what the logs leave open, and say so.")] = False
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    noise: options.Noise = options.NOISE
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        if not self.logs:
+            raise InputError("no log was given: name one or more files.")
+        options.require_files(*self.logs, self.log.gyro_log, self.noise.static, self.noise.noise)
+        self.local.value()  # a mistake in it is said before any work
+        self.results.prepare()
+        asker = _Asker(self.yes)
+        from jaximu.recordings.readers.reader import tables_kept
+
+        with tables_kept():
+            contents, references = _contents_of(self.logs, self.log, asker)
+            outcomes, refused = _run_all(_jobs(contents, references, {"local": self.local, "noise": self.noise}))
+        if not outcomes:
+            raise NotPossibleError(f"{_names(self.logs)}: {' '.join(_reasons(contents, refused))} {_RECORD}")
+        stated = "".join(map(options.typed, (self.log, self.local, self.noise)))
+        report = _Report(self.logs, contents, outcomes, refused, asker.assumed, stated, self.results)
+        report.give()
 
 
 # --- what is in the logs
@@ -350,12 +351,12 @@ def _ordered(by_verb: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _outcome(job: _Job) -> _Outcome:
-    run = import_module(f"jaximu.cli.{job.verb}").run
-    accepted = inspect.signature(run).parameters
+    command = command_of(job.verb)
+    accepted = {part.name for part in fields(command)}
     collected = _Collected()
     arguments = {**job.arguments, "results": collected}
     log = job.paths if "logs" in accepted else job.paths[0]
-    run(log, **{name: value for name, value in arguments.items() if name in accepted})
+    command(log, **{name: value for name, value in arguments.items() if name in accepted}).run()
     return collected.outcomes[0]
 
 

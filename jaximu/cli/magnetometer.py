@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,41 +19,13 @@ if TYPE_CHECKING:
     from jaximu.calibration import FieldStrength, MagneticLog
     from jaximu.model.effects import Effect
 
-__all__ = ["run"]
+__all__ = ["MagnetometerCommand"]
 
 _NEAR_THE_EQUATOR = 20.0  # degrees of latitude within which the field may point up or down
 
 
-def run(
-    logs: options.Logs,
-    /,
-    *,
-    mag_log: Annotated[
-        tuple[Path, ...],
-        UseAppendAction,
-        option("LOG", "The magnetometer's own file, if it is not in LOG; once per LOG."),
-    ] = (),
-    mag_columns: Annotated[str | None, option("NAMES", "Its columns in order, as for --columns.")] = None,
-    field: options.FieldText = None,
-    longitude: Annotated[
-        float | None,
-        option("DEG", "With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field."),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        option("FILE", "Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."),
-    ] = None,
-    check: Annotated[Path | None, option("FILE", "Check whether this old calibration is still valid.")] = None,
-    effect: Annotated[
-        tuple[str, ...],
-        UseAppendAction,
-        option("NAME[:onset=S]", "Also fit this effect: mag.lag, mag.temperature … May be repeated."),
-    ] = (),
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    traced: options.Traced = options.TRACED,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class MagnetometerCommand:
     """Calibrate a magnetometer while the unit is turned about: scale, hard and soft iron, alignment.
 
     Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
@@ -65,37 +37,73 @@ def run(
       jaximu magnetometer new.csv --check results/calibration.json
 
     """
-    options.require_files(*logs, *mag_log, calibration, check)
-    if mag_log and len(mag_log) != len(logs):
-        raise InputError(f"{len(logs)} logs need as many --mag-log, found {len(mag_log)}.")
-    effects = [_effect(text) for text in effect]
-    gravity, trace = local.value(), traced.value(logs)
-    strength = _strength(field, local, longitude, trace)
-    results.prepare()
-    from jaximu.calibration import calibrate_magnetometer, load_calibration
-    from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
 
-    with progress("reading"):
-        old = None if check is None else load_calibration(check)
-        base = None if calibration is None else load_calibration(calibration).inertial()
-        log = log.alike(base or old)
-        magnetic_logs = [
-            _read(stated, path, mag_log[k] if mag_log else None, mag_columns)
-            for k, (path, stated) in enumerate(log.spread(logs))
-        ]
-    southern = None if local.latitude is None or abs(local.latitude) < _NEAR_THE_EQUATOR else local.latitude < 0
-    with progress("calibrating"):
-        result, measurement, heading = calibrate_magnetometer(magnetic_logs, strength, base, gravity, southern, effects)
-    shift = None if old is None else check_magnetometer(old, result)
-    with progress("asking for effects"):
-        diagnosis = diagnose_magnetometer(result, measurement)
-    result = replace(
-        result, trace=trace, diagnosis=diagnosis.document() | ({} if shift is None else {"check": shift.document()})
-    )
+    logs: options.Logs
+    mag_log: Annotated[
+        tuple[Path, ...],
+        UseAppendAction,
+        option("LOG", "The magnetometer's own file, if it is not in LOG; once per LOG."),
+    ] = ()
+    mag_columns: Annotated[str | None, option("NAMES", "Its columns in order, as for --columns.")] = None
+    field: options.FieldText = None
+    longitude: Annotated[
+        float | None,
+        option("DEG", "With --latitude and --date: strength and dip of the World Magnetic Model, instead of --field."),
+    ] = None
+    calibration: Annotated[
+        Path | None,
+        option("FILE", "Calibration of accelerometer and gyroscope (default: estimated from LOG if possible)."),
+    ] = None
+    check: Annotated[Path | None, option("FILE", "Check whether this old calibration is still valid.")] = None
+    effect: Annotated[
+        tuple[str, ...],
+        UseAppendAction,
+        option("NAME[:onset=S]", "Also fit this effect: mag.lag, mag.temperature … May be repeated."),
+    ] = ()
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    traced: options.Traced = options.TRACED
+    results: options.Output = options.RESULTS
 
-    remarks = [part.text() for part in filter(None, (shift, *diagnosis.causes))]
-    page_of = later("report.magnetometer", "page_of")
-    results.present(lambda: page_of(result, measurement, heading, remarks), calibration=result)
+    def run(self) -> None:
+        """Do what the command line says."""
+        options.require_files(*self.logs, *self.mag_log, self.calibration, self.check)
+        if self.mag_log and len(self.mag_log) != len(self.logs):
+            raise InputError(f"{len(self.logs)} logs need as many --mag-log, found {len(self.mag_log)}.")
+        effects = [_effect(text) for text in self.effect]
+        gravity, trace = self.local.value(), self.traced.value(self.logs)
+        strength = _strength(self.field, self.local, self.longitude, trace)
+        self.results.prepare()
+        from jaximu.calibration import calibrate_magnetometer, load_calibration
+        from jaximu.diagnosis import check_magnetometer, diagnose_magnetometer
+
+        with progress("reading"):
+            old = None if self.check is None else load_calibration(self.check)
+            base = None if self.calibration is None else load_calibration(self.calibration).inertial()
+            alike = self.log.alike(base or old)
+            magnetic_logs = [
+                _read(stated, path, self.mag_log[k] if self.mag_log else None, self.mag_columns)
+                for k, (path, stated) in enumerate(alike.spread(self.logs))
+            ]
+        southern = (
+            None
+            if self.local.latitude is None or abs(self.local.latitude) < _NEAR_THE_EQUATOR
+            else self.local.latitude < 0
+        )
+        with progress("calibrating"):
+            result, measurement, heading = calibrate_magnetometer(
+                magnetic_logs, strength, base, gravity, southern, effects
+            )
+        shift = None if old is None else check_magnetometer(old, result)
+        with progress("asking for effects"):
+            diagnosis = diagnose_magnetometer(result, measurement)
+        result = replace(
+            result, trace=trace, diagnosis=diagnosis.document() | ({} if shift is None else {"check": shift.document()})
+        )
+
+        remarks = [part.text() for part in filter(None, (shift, *diagnosis.causes))]
+        page_of = later("report.magnetometer", "page_of")
+        self.results.present(lambda: page_of(result, measurement, heading, remarks), calibration=result)
 
 
 def _strength(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -17,44 +17,11 @@ from jaximu.ground.errors import InputError
 if TYPE_CHECKING:
     from jaximu.planning import Known
 
-__all__ = ["run"]
+__all__ = ["PlanCommand"]
 
 
-def run(
-    source: Annotated[Path, Positional, option("CALIBRATION|LOG|SPEC", "What is known about the unit.")],
-    /,
-    *,
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    equipment: Annotated[
-        Literal["hands", "table", "dividing-head", "robot"],
-        arg(help="What turns the unit. robot: a robot, or anything whose attitude is tracked."),
-    ] = "hands",
-    purpose: Annotated[
-        Literal["fit", "filter"],
-        arg(name="for", help="What evaluates it. filter: a sequence of positions on a table, for `jaximu filter`."),
-    ] = "fit",
-    effect: options.EffectNames = (),
-    poses: Annotated[int | None, option("N", "Number of poses (default: 12, and 19 positions for the filter).")] = None,
-    turns: Annotated[int | None, option("N", "Number of turns of the table (default: as many as poses).")] = None,
-    criterion: Annotated[
-        Literal["D", "A"], arg(help="What to minimise. D: the volume of the uncertainty; A: the mean variance.")
-    ] = "D",
-    parameter: Annotated[
-        str | None,
-        option("NAME", "Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."),
-    ] = None,
-    rest: Annotated[float | None, option("S", "Seconds at rest in each pose.")] = None,
-    turn: Annotated[float | None, option("S", "Seconds of each turn.")] = None,
-    fastest: Annotated[float | None, option("DEG/S", "Largest rate of the table or robot.")] = None,
-    accuracy: Annotated[
-        float | None,
-        option("DEG", "Noise (1 σ, each axis) of the attitude that the robot or tracker reports."),
-    ] = None,
-    step: Annotated[float | None, option("DEG", "Round angles to multiples of this.")] = None,
-    seed: Annotated[int, option("N", "Random seed of the search.")] = 0,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class PlanCommand:
     """Plan which poses and turns to record next, to reduce the largest uncertainties.
 
     A LOG is calibrated first; of a SPEC, as for `jaximu simulate`, only the data sheet is known. DIR receives
@@ -68,43 +35,88 @@ def run(
       jaximu plan unit.toml --for filter --effect accel.size_effect
 
     """
-    options.require_files(source)
-    from jaximu.planning import EQUIPMENT, FILTERED, propose, propose_sequence
 
-    filtered = purpose == "filter"
-    if filtered and (equipment in ("dividing-head", "robot") or turns is not None or step is not None):
-        raise InputError(
-            "--for filter plans rotations by 90° and 180° of a table, one after each position: leave --turns, --step "
-            "and other equipment out."
-        )
-    if effect and not filtered:
-        raise InputError("--effect names states of the filter: add --for filter.")
-    chosen = FILTERED if filtered else EQUIPMENT[equipment]
-    poses = (19 if filtered else 12) if poses is None else poses
-    stated = {"rest": rest, "turn": turn, "fastest": fastest, "step": step, "accuracy": accuracy}
-    if fastest is not None and (chosen.by_hand or not 0 < fastest < math.inf):
-        raise InputError("--fastest is the largest rate of a table, in °/s: greater than zero, and not for hands.")
-    if accuracy is not None and chosen.accuracy is None:
-        raise InputError("--accuracy is of the attitude that a robot or tracker reports: add --equipment robot.")
-    if turns is not None and chosen.chained:
-        how = "by hand" if chosen.by_hand else "on a robot"
-        raise InputError(f"--turns goes with a table: {how} each pose but the first is reached by one turn.")
-    chosen = replace(chosen, **{name: value for name, value in stated.items() if value is not None})
-    results.prepare()
-    known, magnetometer = _known(source, log, local)
-    if known is None:  # a magnetometer by itself
-        print(magnetometer)
-        return
-    with progress("planning") as report:
-        if filtered:
-            effects = options.effects_of(effect)["effects"]
-            proposal = propose_sequence(known, chosen, poses, criterion, parameter, effects, report=report)
-        else:
-            proposal = propose(known, chosen, poses, criterion, parameter, turns, seed, report)
-    if magnetometer is not None:
-        proposal = replace(proposal, notes=(*proposal.notes, magnetometer))
-    files = {} if chosen.by_hand else {"schedule.csv": proposal.schedule.encode()}
-    results.present(proposal.summary, "plan.json, report.html and the poses drawn", files, plan=proposal)
+    source: Annotated[Path, Positional, option("CALIBRATION|LOG|SPEC", "What is known about the unit.")]
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    equipment: Annotated[
+        Literal["hands", "table", "dividing-head", "robot"],
+        arg(help="What turns the unit. robot: a robot, or anything whose attitude is tracked."),
+    ] = "hands"
+    purpose: Annotated[
+        Literal["fit", "filter"],
+        arg(name="for", help="What evaluates it. filter: a sequence of positions on a table, for `jaximu filter`."),
+    ] = "fit"
+    effect: options.EffectNames = ()
+    poses: Annotated[int | None, option("N", "Number of poses (default: 12, and 19 positions for the filter).")] = None
+    turns: Annotated[int | None, option("N", "Number of turns of the table (default: as many as poses).")] = None
+    criterion: Annotated[
+        Literal["D", "A"], arg(help="What to minimise. D: the volume of the uncertainty; A: the mean variance.")
+    ] = "D"
+    parameter: Annotated[
+        str | None,
+        option("NAME", "Minimise the uncertainty of this parameter instead: accelerometer.gain[1,0]."),
+    ] = None
+    rest: Annotated[float | None, option("S", "Seconds at rest in each pose.")] = None
+    turn: Annotated[float | None, option("S", "Seconds of each turn.")] = None
+    fastest: Annotated[float | None, option("DEG/S", "Largest rate of the table or robot.")] = None
+    accuracy: Annotated[
+        float | None,
+        option("DEG", "Noise (1 σ, each axis) of the attitude that the robot or tracker reports."),
+    ] = None
+    step: Annotated[float | None, option("DEG", "Round angles to multiples of this.")] = None
+    seed: Annotated[int, option("N", "Random seed of the search.")] = 0
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        options.require_files(self.source)
+        from jaximu.planning import EQUIPMENT, FILTERED, propose, propose_sequence
+
+        filtered = self.purpose == "filter"
+        if filtered and (
+            self.equipment in ("dividing-head", "robot") or self.turns is not None or self.step is not None
+        ):
+            raise InputError(
+                "--for filter plans rotations by 90° and 180° of a table, one after each position: leave --turns, "
+                "--step and other equipment out."
+            )
+        if self.effect and not filtered:
+            raise InputError("--effect names states of the filter: add --for filter.")
+        chosen = FILTERED if filtered else EQUIPMENT[self.equipment]
+        count = (19 if filtered else 12) if self.poses is None else self.poses
+        stated = {
+            "rest": self.rest,
+            "turn": self.turn,
+            "fastest": self.fastest,
+            "step": self.step,
+            "accuracy": self.accuracy,
+        }
+        if self.fastest is not None and (chosen.by_hand or not 0 < self.fastest < math.inf):
+            raise InputError("--fastest is the largest rate of a table, in °/s: greater than zero, and not for hands.")
+        if self.accuracy is not None and chosen.accuracy is None:
+            raise InputError("--accuracy is of the attitude that a robot or tracker reports: add --equipment robot.")
+        if self.turns is not None and chosen.chained:
+            how = "by hand" if chosen.by_hand else "on a robot"
+            raise InputError(f"--turns goes with a table: {how} each pose but the first is reached by one turn.")
+        chosen = replace(chosen, **{name: value for name, value in stated.items() if value is not None})
+        self.results.prepare()
+        known, magnetometer = _known(self.source, self.log, self.local)
+        if known is None:  # a magnetometer by itself
+            print(magnetometer)
+            return
+        with progress("planning") as report:
+            if filtered:
+                effects = options.effects_of(self.effect)["effects"]
+                proposal = propose_sequence(
+                    known, chosen, count, self.criterion, self.parameter, effects, report=report
+                )
+            else:
+                proposal = propose(known, chosen, count, self.criterion, self.parameter, self.turns, self.seed, report)
+        if magnetometer is not None:
+            proposal = replace(proposal, notes=(*proposal.notes, magnetometer))
+        files = {} if chosen.by_hand else {"schedule.csv": proposal.schedule.encode()}
+        self.results.present(proposal.summary, "plan.json, report.html and the poses drawn", files, plan=proposal)
 
 
 def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[Known | None, str | None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jaximu.recordings.readers.stream import Lines
     from jaximu.recordings.recording import Recording
 
-__all__ = ["run"]
+__all__ = ["RecordCommand"]
 
 _FIRST = 100  # lines before the log is read for the first time
 _EARLY = 1000  # lines from which on a log that cannot be read is a mistake
@@ -27,32 +27,8 @@ _EVERY = 0.5  # s of recording between two looks at it
 _LOG = "log.csv"
 
 
-def run(
-    *,
-    source: Annotated[
-        str,
-        option(
-            "COMMAND|PORT|FILE|-",
-            "Where lines come from: a command's output, a serial port, a file to play again, or standard input.",
-            name="from",
-        ),
-    ],
-    baud: Annotated[int, option("N", "Speed of a serial port.")] = 115200,
-    goal: Annotated[
-        tuple[str, ...],
-        UseAppendAction,
-        option(
-            "GOAL",
-            'Record until this standard uncertainty is reached, as "accelerometer.bias 0.2 mg" or '
-            '"gyroscope.scale 0.1 %"; may be repeated. Default: a dozen poses.',
-        ),
-    ] = (),
-    rest: Annotated[float, option("S", "How long a pose must rest to count, in seconds.")] = 4.0,
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    traced: options.Traced = options.TRACED,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class RecordCommand:
     """Record with guidance: which way to hold the unit next, which poses count, and when it is enough.
 
     Lines are CSV with a header, or described by --columns. DIR receives log.csv line by line, then calibration.json and
@@ -64,42 +40,69 @@ def run(
       jaximu record --from old/log.csv -o again
 
     """
-    if results.output is None:
-        raise InputError("name a folder for the recording and its calibration: -o DIR.")
-    path = results.output / _LOG
-    if path.exists():
-        raise InputError(f"{path} exists; name another folder.")
-    gravity = local.value()
-    from jaximu.planning.guide import Guide
-    from jaximu.recordings.readers.stream import Lines
 
-    guide = Guide(goal, gravity, rest)
-    with Lines(source, baud) as lines:
-        results.prepare(*options.INERTIAL)
-        say(f"Hold the unit still for {rest:g} s in each pose, then turn it to the next.")
-        try:
-            done = _record(lines, path, log, guide)
-        except KeyboardInterrupt:
-            say("Stopped.")
-            done = False
-        except InputError as error:
-            kept = (
-                f" {path} has what was recorded: `jaximu calibrate {path}`."
-                if path.exists() and path.stat().st_size
-                else ""
-            )
-            raise InputError(f"{error.args[0]}{kept}") from None
-    for text in (lines.stopped, f"{lines.garbled} garbled lines were left out." if lines.garbled else ""):
-        if text:
-            say(text)
-    if not done:
-        say("The recording ended before the goal was reached; what there is is calibrated.")
-    with progress("calibrating"):
-        from jaximu.calibration import calibrate
+    source: Annotated[
+        str,
+        option(
+            "COMMAND|PORT|FILE|-",
+            "Where lines come from: a command's output, a serial port, a file to play again, or standard input.",
+            name="from",
+        ),
+    ]
+    baud: Annotated[int, option("N", "Speed of a serial port.")] = 115200
+    goal: Annotated[
+        tuple[str, ...],
+        UseAppendAction,
+        option(
+            "GOAL",
+            'Record until this standard uncertainty is reached, as "accelerometer.bias 0.2 mg" or '
+            '"gyroscope.scale 0.1 %"; may be repeated. Default: a dozen poses.',
+        ),
+    ] = ()
+    rest: Annotated[float, option("S", "How long a pose must rest to count, in seconds.")] = 4.0
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    traced: options.Traced = options.TRACED
+    results: options.Output = options.RESULTS
 
-        calibration = calibrate(log.read(path, gravity), gravity)
-    calibration = replace(calibration, trace=traced.value((path,)))
-    results.present(calibration.summary, calibration=calibration)
+    def run(self) -> None:
+        """Do what the command line says."""
+        if self.results.output is None:
+            raise InputError("name a folder for the recording and its calibration: -o DIR.")
+        path = self.results.output / _LOG
+        if path.exists():
+            raise InputError(f"{path} exists; name another folder.")
+        gravity = self.local.value()
+        from jaximu.planning.guide import Guide
+        from jaximu.recordings.readers.stream import Lines
+
+        guide = Guide(self.goal, gravity, self.rest)
+        with Lines(self.source, self.baud) as lines:
+            self.results.prepare(*options.INERTIAL)
+            say(f"Hold the unit still for {self.rest:g} s in each pose, then turn it to the next.")
+            try:
+                done = _record(lines, path, self.log, guide)
+            except KeyboardInterrupt:
+                say("Stopped.")
+                done = False
+            except InputError as error:
+                kept = (
+                    f" {path} has what was recorded: `jaximu calibrate {path}`."
+                    if path.exists() and path.stat().st_size
+                    else ""
+                )
+                raise InputError(f"{error.args[0]}{kept}") from None
+        for text in (lines.stopped, f"{lines.garbled} garbled lines were left out." if lines.garbled else ""):
+            if text:
+                say(text)
+        if not done:
+            say("The recording ended before the goal was reached; what there is is calibrated.")
+        with progress("calibrating"):
+            from jaximu.calibration import calibrate
+
+            calibration = calibrate(self.log.read(path, gravity), gravity)
+        calibration = replace(calibration, trace=self.traced.value((path,)))
+        self.results.present(calibration.summary, calibration=calibration)
 
 
 def _record(lines: Lines, path: Path, log: options.LogOptions, guide: Guide) -> bool:

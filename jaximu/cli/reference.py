@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,30 +17,11 @@ if TYPE_CHECKING:
     from jaximu.recordings.attitude import Attitude
     from jaximu.recordings.recording import Recording
 
-__all__ = ["read_reference", "run"]
+__all__ = ["ReferenceCommand", "read_reference"]
 
 
-def run(
-    log_path: Annotated[Path, Positional, option("LOG", "The recording of the unit.", name="log")],
-    /,
-    *,
-    reference: Annotated[
-        Path | None,
-        option(
-            "REF",
-            "The reference: a table with time and quaternion, Euler angles, rotation vectors or a table's angles "
-            "(table_angle_z, table_angle_x …, outermost axis first), and velocity or position if known; LOG itself if "
-            "left out. Clocks, mounting and sense are found from the data.",
-        ),
-    ] = None,
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    noise: options.Noise = options.NOISE,
-    effect: options.EffectNames = (),
-    loss: options.LossChoice = "linear",
-    repair: options.RepairFlag = False,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class ReferenceCommand:
     """Calibrate a unit against a measured attitude (optics, an inertial system, a robot) that has its own clock.
 
     DIR receives calibration.json, report.html and pictures.
@@ -50,19 +31,46 @@ def run(
       jaximu reference session.mat -o results
 
     """
-    gravity = local.value()
-    options.require_files(reference)
-    results.prepare(*options.INERTIAL)
-    (recording,), known = log.read_unit((log_path,), gravity, noise)
-    from jaximu.calibration import calibrate_against_attitude
 
-    attitude = read_reference(log_path if reference is None else reference, log_path, recording)
-    with progress("calibrating"):
-        calibration, measurement = calibrate_against_attitude(
-            recording, attitude, gravity, static=known, loss=loss, repair=repair, **options.effects_of(effect)
-        )
-    page_of = later("report.attitude", "page_of")
-    results.present(lambda: page_of(calibration, measurement), calibration=calibration)
+    log_path: Annotated[Path, Positional, option("LOG", "The recording of the unit.", name="log")]
+    reference: Annotated[
+        Path | None,
+        option(
+            "REF",
+            "The reference: a table with time and quaternion, Euler angles, rotation vectors or a table's angles "
+            "(table_angle_z, table_angle_x …, outermost axis first), and velocity or position if known; LOG itself if "
+            "left out. Clocks, mounting and sense are found from the data.",
+        ),
+    ] = None
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    noise: options.Noise = options.NOISE
+    effect: options.EffectNames = ()
+    loss: options.LossChoice = "linear"
+    repair: options.RepairFlag = False
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        gravity = self.local.value()
+        options.require_files(self.reference)
+        self.results.prepare(*options.INERTIAL)
+        (recording,), known = self.log.read_unit((self.log_path,), gravity, self.noise)
+        from jaximu.calibration import calibrate_against_attitude
+
+        attitude = read_reference(self.log_path if self.reference is None else self.reference, self.log_path, recording)
+        with progress("calibrating"):
+            calibration, measurement = calibrate_against_attitude(
+                recording,
+                attitude,
+                gravity,
+                static=known,
+                loss=self.loss,
+                repair=self.repair,
+                **options.effects_of(self.effect),
+            )
+        page_of = later("report.attitude", "page_of")
+        self.results.present(lambda: page_of(calibration, measurement), calibration=calibration)
 
 
 def read_reference(path: Path, log_path: Path, recording: Recording) -> Attitude:

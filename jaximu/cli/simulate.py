@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import inspect
 import json
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
@@ -17,21 +17,11 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.page import Code, Page, Section
 from jaximu.ground.reexport import later
 
-__all__ = ["run"]
+__all__ = ["SimulateCommand"]
 
 
-def run(
-    specification_file: Annotated[Path | None, option("SPEC", "TOML file; --explain describes it.")] = None,
-    /,
-    *,
-    output: Annotated[
-        Path | None,
-        option("LOG", "Recording to write; the suffix sets the format.", name="output", aliases=["-o"]),
-    ] = None,
-    protocols: Annotated[bool, arg(help="List the protocols with their keys and exit.")] = False,
-    explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False,
-    as_json: options.JsonFlag = False,
-) -> None:
+@dataclass(frozen=True)
+class SimulateCommand:
     """Simulate recordings from a specification: motion, sensor, effects and noise.
 
     The truth is written beside the recording, LOG.truth.json. Several units or recordings are numbered:
@@ -42,43 +32,55 @@ def run(
       jaximu simulate unit.toml -o log.parquet
 
     """
-    if explain:
-        from jaximu.simulation import specification
 
-        print(inspect.getdoc(specification))
-        return
-    if protocols:
-        later("report.terminal", "show")(_protocols())
-        return
-    if specification_file is None or output is None:
-        raise InputError("name a specification and where to write: jaximu simulate SPEC.toml -o LOG.parquet.")
-    options.require_files(specification_file)
-    from jaximu.recordings.write import check_suffix
-    from jaximu.simulation import read_specification, write_case
+    specification_file: Annotated[Path | None, Positional, option("SPEC", "TOML file; --explain describes it.")] = None
+    output: Annotated[
+        Path | None,
+        option("LOG", "Recording to write; the suffix sets the format.", name="output", aliases=["-o"]),
+    ] = None
+    protocols: Annotated[bool, arg(help="List the protocols with their keys and exit.")] = False
+    explain: Annotated[bool, arg(help="Describe the specification and exit.")] = False
+    as_json: options.JsonFlag = False
 
-    check_suffix(output)
-    task = read_specification(specification_file)
-    cases = task.cases()  # all of them are checked before anything is written
-    if not output.parent.is_dir():
-        raise InputError(f"{output}: the folder {output.parent} does not exist.")
-    written = []
-    for unit, recordings in enumerate(cases):
-        for number, case in enumerate(recordings):
-            path = _numbered(output, unit if task.units > 1 else None, number if task.recordings > 1 else None)
-            with progress(f"simulating {path}"):
-                truth = write_case(case, path)
-            truth.save(f"{path}.truth.json")
-            if "attitude" in case.plan.columns:
-                truth.save_schedule(f"{path}.schedule.csv")
-            for note in truth.notes:
-                say(f"{path}: {note}")
-            duration, notes = case.plan.motion.length, list(truth.notes)
-            entry = {"file": str(path), "truth": f"{path}.truth.json", "samples": case.samples}
-            written.append(entry | {"duration": duration, "notes": notes})
-            if not as_json:
-                say(f"{path}: {case.samples} samples, {duration:g} s")
-    if as_json:
-        options.print_json({"specification": str(specification_file), "recordings": written})
+    def run(self) -> None:
+        """Do what the command line says."""
+        if self.explain:
+            from jaximu.simulation import specification
+
+            print(inspect.getdoc(specification))
+            return
+        if self.protocols:
+            later("report.terminal", "show")(_protocols())
+            return
+        if self.specification_file is None or self.output is None:
+            raise InputError("name a specification and where to write: jaximu simulate SPEC.toml -o LOG.parquet.")
+        options.require_files(self.specification_file)
+        from jaximu.recordings.write import check_suffix
+        from jaximu.simulation import read_specification, write_case
+
+        check_suffix(self.output)
+        task = read_specification(self.specification_file)
+        cases = task.cases()  # all of them are checked before anything is written
+        if not self.output.parent.is_dir():
+            raise InputError(f"{self.output}: the folder {self.output.parent} does not exist.")
+        written = []
+        for unit, recordings in enumerate(cases):
+            for number, case in enumerate(recordings):
+                path = _numbered(self.output, unit if task.units > 1 else None, number if task.recordings > 1 else None)
+                with progress(f"simulating {path}"):
+                    truth = write_case(case, path)
+                truth.save(f"{path}.truth.json")
+                if "attitude" in case.plan.columns:
+                    truth.save_schedule(f"{path}.schedule.csv")
+                for note in truth.notes:
+                    say(f"{path}: {note}")
+                duration, notes = case.plan.motion.length, list(truth.notes)
+                entry = {"file": str(path), "truth": f"{path}.truth.json", "samples": case.samples}
+                written.append(entry | {"duration": duration, "notes": notes})
+                if not self.as_json:
+                    say(f"{path}: {case.samples} samples, {duration:g} s")
+        if self.as_json:
+            options.print_json({"specification": str(self.specification_file), "recordings": written})
 
 
 def _numbered(output: Path, unit: int | None, recording: int | None) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,34 +19,11 @@ if TYPE_CHECKING:
     from jaximu.model.noise_model import NoiseModel
     from jaximu.recordings.recording import Recording
 
-__all__ = ["run"]
+__all__ = ["ThermalCommand"]
 
 
-def run(
-    logs: options.Logs,
-    /,
-    *,
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    noise: options.Noise = options.NOISE,
-    calibration: Annotated[
-        Path | None, option("CALIBRATION", "Add the thermal part to this calibration of the unit.")
-    ] = None,
-    block: Annotated[
-        float | None, option("SECONDS", "Average over blocks this long (default: about 600 blocks).")
-    ] = None,
-    to: Annotated[
-        tuple[Literal["px4", "ardupilot"], ...],
-        UseAppendAction,
-        arg(help="Also write an autopilot's parameters into DIR, and report what they lose. May be repeated."),
-    ] = (),
-    sensor: Annotated[
-        int | None, option("N", "The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot.")
-    ] = None,
-    accel_id: Annotated[int, option("ID", "PX4's device ID of the accelerometer.")] = 0,
-    gyro_id: Annotated[int, option("ID", "PX4's device ID of the gyroscope.")] = 0,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class ThermalCommand:
     """Fit bias over temperature from LOGs of a unit at rest while its temperature changes.
 
     LOGs of poses and turns by hand while the temperature changes give bias, scale and misalignment over temperature.
@@ -57,40 +35,69 @@ def run(
       jaximu thermal oven.csv --to px4 --accel-id 1310988 --gyro-id 1310988 -o px4
 
     """
-    if to and results.output is None:
-        raise InputError("--to writes into a folder: name it with -o DIR.")
-    gravity = local.value()
-    results.prepare(*options.INERTIAL)
-    options.require_files(calibration)
-    from jaximu.calibration import calibrate_thermal, load_calibration
-    from jaximu.diagnosis.thermal_hand_held import turned_by_hand
-    from jaximu.recordings.flags import without_flagged
-    from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
 
-    base = None if calibration is None else load_calibration(calibration).inertial()
-    recordings, known = log.alike(base).read_unit(logs, gravity, noise)
-    recordings = [without_flagged(recording, path) for recording, path in zip(recordings, logs, strict=True)]
-    by_hand = [turned_by_hand(recording) for recording in recordings]
-    if all(by_hand):
-        if base is not None or block is not None or to:
-            raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
-        _give_by_hand(recordings, known, gravity, results)
-        return
-    if any(by_hand):
-        first = str(logs[by_hand.index(True)])
-        raise InputError(f"{first} is poses by hand and others are a unit at rest: give one kind at a time.")
-    with progress("fitting"):
-        thermal = calibrate_thermal(recordings, static=known, base=base, block=block)
-        exports = {"px4.params": px4_parameters(thermal, sensor or 0, accel_id, gyro_id)} if "px4" in to else {}
-        if "ardupilot" in to:
-            exports["ardupilot.param"] = ardupilot_parameters(thermal, 1 if sensor is None else sensor)
-    results.present(
-        lambda: later("report.thermal", "page_of")(thermal, (*exports.values(),)),
-        files={name: export.text.encode() for name, export in exports.items()},
-        text=thermal.text,
-        calibration=thermal.calibration,
-        thermal=thermal,
+    logs: options.Logs
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    noise: options.Noise = options.NOISE
+    calibration: Annotated[
+        Path | None, option("CALIBRATION", "Add the thermal part to this calibration of the unit.")
+    ] = None
+    block: Annotated[float | None, option("SECONDS", "Average over blocks this long (default: about 600 blocks).")] = (
+        None
     )
+    to: Annotated[
+        tuple[Literal["px4", "ardupilot"], ...],
+        UseAppendAction,
+        arg(help="Also write an autopilot's parameters into DIR, and report what they lose. May be repeated."),
+    ] = ()
+    sensor: Annotated[
+        int | None, option("N", "The sensor's number on the autopilot: 0 to 3 for PX4, 1 to 3 for ArduPilot.")
+    ] = None
+    accel_id: Annotated[int, option("ID", "PX4's device ID of the accelerometer.")] = 0
+    gyro_id: Annotated[int, option("ID", "PX4's device ID of the gyroscope.")] = 0
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        if self.to and self.results.output is None:
+            raise InputError("--to writes into a folder: name it with -o DIR.")
+        gravity = self.local.value()
+        self.results.prepare(*options.INERTIAL)
+        options.require_files(self.calibration)
+        from jaximu.calibration import calibrate_thermal, load_calibration
+        from jaximu.diagnosis.thermal_hand_held import turned_by_hand
+        from jaximu.recordings.flags import without_flagged
+        from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
+
+        base = None if self.calibration is None else load_calibration(self.calibration).inertial()
+        recordings, known = self.log.alike(base).read_unit(self.logs, gravity, self.noise)
+        recordings = [without_flagged(recording, path) for recording, path in zip(recordings, self.logs, strict=True)]
+        by_hand = [turned_by_hand(recording) for recording in recordings]
+        if all(by_hand):
+            if base is not None or self.block is not None or self.to:
+                raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
+            _give_by_hand(recordings, known, gravity, self.results)
+            return
+        if any(by_hand):
+            first = str(self.logs[by_hand.index(True)])
+            raise InputError(f"{first} is poses by hand and others are a unit at rest: give one kind at a time.")
+        with progress("fitting"):
+            thermal = calibrate_thermal(recordings, static=known, base=base, block=self.block)
+            exports = (
+                {"px4.params": px4_parameters(thermal, self.sensor or 0, self.accel_id, self.gyro_id)}
+                if "px4" in self.to
+                else {}
+            )
+            if "ardupilot" in self.to:
+                exports["ardupilot.param"] = ardupilot_parameters(thermal, 1 if self.sensor is None else self.sensor)
+        self.results.present(
+            lambda: later("report.thermal", "page_of")(thermal, (*exports.values(),)),
+            files={name: export.text.encode() for name, export in exports.items()},
+            text=thermal.text,
+            calibration=thermal.calibration,
+            thermal=thermal,
+        )
 
 
 def _give_by_hand(

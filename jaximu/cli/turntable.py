@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -18,42 +18,11 @@ if TYPE_CHECKING:
     from jaximu.recordings.recording import Recording
     from jaximu.recordings.reference import Entry
 
-__all__ = ["references_of", "run"]
+__all__ = ["TurntableCommand", "references_of"]
 
 
-def run(
-    logs: options.Logs,
-    /,
-    *,
-    reference: Annotated[
-        tuple[Path, ...],
-        UseAppendAction,
-        option(
-            "REF",
-            "A schedule (CSV), named sections (JSON, or a column part), or a file with "
-            "reference columns; once for each LOG. Without it the log's own reference columns are used.",
-        ),
-    ] = (),
-    log: options.Reading = options.READING,
-    local: options.Local = options.LOCAL,
-    noise: options.Noise = options.NOISE,
-    fit: Annotated[
-        tuple[str, ...],
-        UseAppendAction,
-        option("EFFECT", "Also fit this effect, such as setup.table_tilt or accel.quadratic. May be repeated."),
-    ] = (),
-    earth_rotation: Annotated[
-        Literal["known", "fit"] | None,
-        arg(
-            help="Earth rotation: known from --latitude and the headings (x east, y north), or fitted "
-            "(default: not modelled)."
-        ),
-    ] = None,
-    loss: options.LossChoice = "linear",
-    repair: options.RepairFlag = False,
-    traced: options.Traced = options.TRACED,
-    results: options.Output = options.RESULTS,
-) -> None:
+@dataclass(frozen=True)
+class TurntableCommand:
     """Calibrate a unit on a rate table, a dividing head or in known positions.
 
     Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
@@ -64,31 +33,64 @@ def run(
       jaximu turntable log.csv --reference schedule.csv --fit setup.table_tilt
 
     """
-    gravity, trace = local.value(), traced.value(logs)
-    if earth_rotation == "known" and local.latitude is None:
-        raise InputError("--earth-rotation known needs --latitude.")
-    if reference and len(reference) != len(logs):
-        raise InputError(f"{len(logs)} logs need as many --reference, found {len(reference)}.")
-    results.prepare(*options.INERTIAL)
-    recordings, known = log.read_unit(logs, gravity, noise, alone=True)
-    references = references_of(recordings, reference)
-    with progress("calibrating"):
-        from jaximu.calibration.turntable import calibrate_turntable
-        from jaximu.model.effects.earth_rotation import GyroEarthRotation
 
-        wanted = (*fit, GyroEarthRotation.name) if earth_rotation == "fit" else fit
-        calibration = calibrate_turntable(
-            recordings,
-            references,
-            gravity,
-            static=known,
-            effects=list(dict.fromkeys(wanted)),
-            latitude=local.latitude if earth_rotation == "known" else None,
-            loss=loss,
-            repair=repair,
-        )
-    calibration = replace(calibration, trace=trace)
-    results.present(calibration.summary, calibration=calibration)
+    logs: options.Logs
+    reference: Annotated[
+        tuple[Path, ...],
+        UseAppendAction,
+        option(
+            "REF",
+            "A schedule (CSV), named sections (JSON, or a column part), or a file with "
+            "reference columns; once for each LOG. Without it the log's own reference columns are used.",
+        ),
+    ] = ()
+    log: options.Reading = options.READING
+    local: options.Local = options.LOCAL
+    noise: options.Noise = options.NOISE
+    fit: Annotated[
+        tuple[str, ...],
+        UseAppendAction,
+        option("EFFECT", "Also fit this effect, such as setup.table_tilt or accel.quadratic. May be repeated."),
+    ] = ()
+    earth_rotation: Annotated[
+        Literal["known", "fit"] | None,
+        arg(
+            help="Earth rotation: known from --latitude and the headings (x east, y north), or fitted "
+            "(default: not modelled)."
+        ),
+    ] = None
+    loss: options.LossChoice = "linear"
+    repair: options.RepairFlag = False
+    traced: options.Traced = options.TRACED
+    results: options.Output = options.RESULTS
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        gravity, trace = self.local.value(), self.traced.value(self.logs)
+        if self.earth_rotation == "known" and self.local.latitude is None:
+            raise InputError("--earth-rotation known needs --latitude.")
+        if self.reference and len(self.reference) != len(self.logs):
+            raise InputError(f"{len(self.logs)} logs need as many --reference, found {len(self.reference)}.")
+        self.results.prepare(*options.INERTIAL)
+        recordings, known = self.log.read_unit(self.logs, gravity, self.noise, alone=True)
+        references = references_of(recordings, self.reference)
+        with progress("calibrating"):
+            from jaximu.calibration.turntable import calibrate_turntable
+            from jaximu.model.effects.earth_rotation import GyroEarthRotation
+
+            wanted = (*self.fit, GyroEarthRotation.name) if self.earth_rotation == "fit" else self.fit
+            calibration = calibrate_turntable(
+                recordings,
+                references,
+                gravity,
+                static=known,
+                effects=list(dict.fromkeys(wanted)),
+                latitude=self.local.latitude if self.earth_rotation == "known" else None,
+                loss=self.loss,
+                repair=self.repair,
+            )
+        calibration = replace(calibration, trace=trace)
+        self.results.present(calibration.summary, calibration=calibration)
 
 
 def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Sequence[Entry]]:

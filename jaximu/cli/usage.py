@@ -1,4 +1,4 @@
-"""What a verb takes, read from the signature of its `run`: its help, completion, and mistakes in its options."""
+"""What a verb takes, read from the fields of its class: its help, completion, and mistakes in its options."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import shutil
 import textwrap
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from importlib import import_module
 from pathlib import Path
 from types import UnionType
+from typing import Any
 
 from jaximu.cli.messages import say
 from jaximu.ground.errors import InputError
@@ -22,6 +24,7 @@ __all__ = [
     "EXIT_STATUS",
     "OptionHelp",
     "check_options",
+    "command_of",
     "completion",
     "help_text",
     "listed",
@@ -66,27 +69,31 @@ COMMON = (
 """What every verb takes."""
 
 
-def options_of(run: Callable[..., None]) -> list[OptionHelp]:
-    """Return what a verb takes, in the order of its signature."""
-    hints = typing.get_type_hints(run, include_extras=True)
+def command_of(verb: str) -> type[Any]:
+    """Return the class of a verb, of the module of its name: its fields are the options, `run` does the work."""
+    return getattr(import_module(f"jaximu.cli.{verb.lower()}"), f"{verb.capitalize()}Command")
+
+
+def options_of(command: type[Any]) -> list[OptionHelp]:
+    """Return what a verb takes, in the order of its fields."""
+    hints = typing.get_type_hints(command, include_extras=True)
     helps: list[OptionHelp] = []
-    for name, parameter in inspect.signature(run).parameters.items():
-        default = parameter.default
+    for part in fields(command):
+        name, default = part.name, part.default
         if is_dataclass(default):
             group_hints = typing.get_type_hints(type(default), include_extras=True)
             title = getattr(default, "title", "Options")
             options = [field for field in fields(default) if field.repr]  # the others are no options
             helps += [_option(field.name, group_hints[field.name], field.default, title) for field in options]
         else:
-            positional = parameter.kind is inspect.Parameter.POSITIONAL_ONLY
-            helps.append(_option(name, hints[name], default, "Output" if name in _IN_OUTPUT else "Options", positional))
+            helps.append(_option(name, hints[name], default, "Output" if name in _IN_OUTPUT else "Options"))
     return helps
 
 
-def _option(name: str, hint: object, default: object, group: str, positional: bool = False) -> OptionHelp:
+def _option(name: str, hint: object, default: object, group: str) -> OptionHelp:
     arguments = typing.get_args(hint) if typing.get_origin(hint) is typing.Annotated else (hint,)
     stated = next((argument for argument in arguments[1:] if hasattr(argument, "metavar")), None)
-    positional |= any(
+    positional = any(
         getattr(argument, "__name__", "") == "Positional" or str(argument) == "Positional" for argument in arguments[1:]
     )
     option = "--" + str(getattr(stated, "name", None) or name).replace("_", "-")
@@ -105,11 +112,11 @@ def _metavariable(hint: object) -> str:
     return _KINDS.get(typing.cast(type, hint), "TEXT")
 
 
-def help_text(name: str, run: Callable[..., None]) -> str:
+def help_text(name: str, command: type[Any]) -> str:
     """Return the help of a verb: what it does, its arguments, its options by group, examples, exit status."""
     width = min(shutil.get_terminal_size().columns, 100)
-    text, _, examples = (inspect.getdoc(run) or "").partition("\n\nExamples:\n")
-    options = options_of(run)
+    text, _, examples = (inspect.getdoc(command) or "").partition("\n\nExamples:\n")
+    options = options_of(command)
     positional = [option for option in options if option.positional]
     places = [option.metavar for option in positional]
     verb = [] if places and places[0].startswith(name) else [name]  # a log stands in place of a verb
@@ -123,7 +130,7 @@ def help_text(name: str, run: Callable[..., None]) -> str:
         if shown:
             lines.append(f"{group}:")
             for option in shown:
-                stated = option.default not in (None, False, (), inspect.Parameter.empty)
+                stated = option.default not in (None, False, (), MISSING)
                 default = f" (default: {option.default})" if stated else ""
                 lines += _lines(f"{', '.join(option.names)} {option.metavar}".rstrip(), option.help + default, width)
             lines.append("")
@@ -139,7 +146,7 @@ def _lines(left: str, text: str, width: int, indent: int = 26) -> list[str]:
     return [f"  {left:<{indent - 2}}{wrapped[0]}".rstrip(), *(f"{'':{indent}}{line}" for line in wrapped[1:])]
 
 
-def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], Callable[..., None]]) -> str:
+def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], type[Any]]) -> str:
     """Return the overview: the usage, and by group what each verb does in its own words."""
     width = min(shutil.get_terminal_size().columns, 100)
     lines = [
@@ -172,12 +179,12 @@ def listed(groups: Mapping[str, Sequence[str]], verb: Callable[[str], Callable[.
     return "\n".join([*lines, *textwrap.wrap(EXIT_STATUS, width)])
 
 
-def check_options(name: str, run: Callable[..., None], arguments: Sequence[str]) -> list[str]:
+def check_options(name: str, command: type[Any], arguments: Sequence[str]) -> list[str]:
     """Return the command line, with `--option=value` where a value begins with a minus, as the axes -x,-y,z do.
 
     Raises `InputError` for an option that the verb has not, naming the nearest that it has, and for one that it needs.
     """
-    options = (*options_of(run), *COMMON)
+    options = (*options_of(command), *COMMON)
     known = [text for option in options for text in option.names]
     valued = [text for option in options if option.metavar for text in option.names if text.startswith("--")]
     line: list[str] = []
@@ -205,7 +212,7 @@ def _require_all(name: str, options: Sequence[OptionHelp], line: Sequence[str]) 
         return
     valued = {text for option in options if option.metavar for text in option.names}
     words = sum(before not in valued and text[:1] != "-" for before, text in itertools.pairwise(["", *line]))
-    needed = [option for option in options if option.default is inspect.Parameter.empty]
+    needed = [option for option in options if option.default is MISSING]
     missing = [option.metavar.split()[0].strip(".") for option in needed if option.positional][words:]
     missing += [
         f"{option.names[-1]} {option.metavar}"
@@ -219,7 +226,7 @@ def _require_all(name: str, options: Sequence[OptionHelp], line: Sequence[str]) 
 _VALUE = re.compile(r"Error parsing (?P<option>\S+): .*? from \[(?P<value>.*?)\]\.")
 
 
-def usage_mistake(name: str, run: Callable[..., None], printed: str) -> InputError:
+def usage_mistake(name: str, command: type[Any], printed: str) -> InputError:
     """Return what is wrong with a command line as one sentence, from what the parser printed in a box."""
     lines = [line.strip("│╭╮╰╯ ") for line in printed.splitlines()]
     _, *lines = [line for line in lines if line]  # a title, and perhaps a rule; what follows the next rule is advice
@@ -228,14 +235,14 @@ def usage_mistake(name: str, run: Callable[..., None], printed: str) -> InputErr
     message = list(itertools.takewhile(lambda line: not rule.fullmatch(line), lines))
     text = " ".join(message)
     if match := _VALUE.search(text):
-        kinds = {spelling: option.metavar for option in options_of(run) for spelling in option.names}
+        kinds = {spelling: option.metavar for option in options_of(command) for spelling in option.names}
         kind = "a number" if "FLOAT" in text or "INT" in text else kinds.get(match["option"], "what it takes")
         text = f"{match['option']}: {match['value']} is not {kind}."
     text = re.sub(r"Unrecognized options: (.*)", r"unexpected: \1.", text)
     return InputError(f"{text} See `jaximu {name} --help`.")
 
 
-def completion(shell: str, verbs: Sequence[str], verb: Callable[[str], Callable[..., None]]) -> str:
+def completion(shell: str, verbs: Sequence[str], verb: Callable[[str], type[Any]]) -> str:
     """Return a script for bash, zsh or fish that completes verbs, options and files."""
     if shell not in ("bash", "zsh", "fish"):
         raise InputError(f"--completion: {shell!r} is none of bash, zsh, fish.")
@@ -261,5 +268,5 @@ def completion(shell: str, verbs: Sequence[str], verb: Callable[[str], Callable[
 complete -o default -F _jaximu jaximu"""
 
 
-def _names(run: Callable[..., None]) -> Iterator[str]:
-    return (name for option in (*options_of(run), *COMMON) for name in option.names if name.startswith("--"))
+def _names(command: type[Any]) -> Iterator[str]:
+    return (name for option in (*options_of(command), *COMMON) for name in option.names if name.startswith("--"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -12,20 +13,11 @@ from jaximu.cli.options import option
 from jaximu.ground.page import Page, Table
 from jaximu.ground.reexport import later
 
-__all__ = ["run"]
+__all__ = ["VerifyCommand"]
 
 
-def run(
-    documents: Annotated[
-        tuple[Path, ...],
-        Positional,
-        option("DOCUMENT [DOCUMENT ...]", "calibration.json or acceptance.json.", name="documents"),
-    ],
-    /,
-    *,
-    folder: Annotated[Path | None, option("DIR", "Look for moved recordings here, too.")] = None,
-    as_json: options.JsonFlag = False,
-) -> None:
+@dataclass(frozen=True)
+class VerifyCommand:
     """Check a calibration.json or an acceptance.json, and every file behind it, against the hashes they carry.
 
     The exit status is 0 if all is intact, 3 if a file was changed, 4 if some cannot be checked and none was changed.
@@ -35,24 +27,35 @@ def run(
       jaximu verify accepted/acceptance.json --folder archive/
 
     """
-    options.require_files(*documents)
-    from jaximu.acceptance.verify import CHANGED, INTACT, verify
 
-    links = [link for document in documents for link in verify(document, folder)]
-    states = {link.state for link in links}
-    changed = CHANGED in states
-    verdict = "changed" if changed else "intact" if states == {INTACT} else "incomplete"
-    if as_json:
-        options.print_json({"verdict": verdict, "files": [vars(link) for link in links]})
-    else:
-        rows = [(link.state, link.what, link.file) for link in links]
-        marked = [index for index, link in enumerate(links) if link.state == CHANGED]
-        table = Table(("state", "what", "file"), rows, marked=marked)
-        titles = {
-            "changed": "Changed: at least one file is not what it was when the result was written.",
-            "intact": "Intact: every file is what it was.",
-            "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
-        }
-        later("report.terminal", "show")(Page(titles[verdict], (), first=(table,)))
-    if verdict != "intact":
-        raise SystemExit(3 if changed else 4)
+    documents: Annotated[
+        tuple[Path, ...],
+        Positional,
+        option("DOCUMENT [DOCUMENT ...]", "calibration.json or acceptance.json.", name="documents"),
+    ]
+    folder: Annotated[Path | None, option("DIR", "Look for moved recordings here, too.")] = None
+    as_json: options.JsonFlag = False
+
+    def run(self) -> None:
+        """Do what the command line says."""
+        options.require_files(*self.documents)
+        from jaximu.acceptance.verify import CHANGED, INTACT, verify
+
+        links = [link for document in self.documents for link in verify(document, self.folder)]
+        states = {link.state for link in links}
+        changed = CHANGED in states
+        verdict = "changed" if changed else "intact" if states == {INTACT} else "incomplete"
+        if self.as_json:
+            options.print_json({"verdict": verdict, "files": [vars(link) for link in links]})
+        else:
+            rows = [(link.state, link.what, link.file) for link in links]
+            marked = [index for index, link in enumerate(links) if link.state == CHANGED]
+            table = Table(("state", "what", "file"), rows, marked=marked)
+            titles = {
+                "changed": "Changed: at least one file is not what it was when the result was written.",
+                "intact": "Intact: every file is what it was.",
+                "incomplete": "Not changed as far as can be checked; --folder DIR names where missing files are.",
+            }
+            later("report.terminal", "show")(Page(titles[verdict], (), first=(table,)))
+        if verdict != "intact":
+            raise SystemExit(3 if changed else 4)
