@@ -76,14 +76,7 @@ class ConsequencesCommand:
 
     def run(self) -> None:
         """Do what the command line says."""
-        options.require_files(self.calibration, self.path, self.noise_file, self.against, self.reference)
-        if self.duration is not None and not 0 < self.duration < math.inf:
-            raise InputError(f"--duration: {self.duration:g} is no number of seconds.")
-        if self.draws < 0 or self.seed < 0:
-            raise InputError("--draws and --seed count from 0 up.")
-        if self.temperature is not None and self.path is not None:
-            raise InputError("--temperature goes with level driving; a SPEC or LOG states the temperature.")
-        targets = _targets(self.noise_for, self.noise_file, self.reference, self.path)
+        targets = self._targets()
         self.results.prepare()
         from jaximu.calibration import load_calibration
         from jaximu.navigation.consequences import consequences
@@ -96,10 +89,8 @@ class ConsequencesCommand:
         gravity = model.gravity if self.local == options.LOCAL else self.local.value()
         site = Place(_LATITUDE if self.local.latitude is None else self.local.latitude, self.local.height, gravity)
         limits = _limits({"accelerometer": self.accel_range, "gyroscope": self.gyro_range})
-        measured = None
-        if self.reference is not None and self.path is not None:
-            measured = _measured(self.path, self.reference, model, site, self.log)
-        trajectory, stated = _trajectory(self.path, model, site, self.duration, self.temperature, self.log, measured)
+        measured = self._measured(model, site)
+        trajectory, stated = self._trajectory(model, site, measured)
         trajectory.require_range(stated | limits)
         with progress("propagating errors"):
             result = consequences(
@@ -142,24 +133,68 @@ class ConsequencesCommand:
             estimator_noise=final,
         )
 
+    def _targets(self) -> list[str]:
+        """Return the estimators asked for. Raises `InputError` where options contradict each other or lack one."""
+        options.require_files(self.calibration, self.path, self.noise_file, self.against, self.reference)
+        if self.duration is not None and not 0 < self.duration < math.inf:
+            raise InputError(f"--duration: {self.duration:g} is no number of seconds.")
+        if self.draws < 0 or self.seed < 0:
+            raise InputError("--draws and --seed count from 0 up.")
+        if self.temperature is not None and self.path is not None:
+            raise InputError("--temperature goes with level driving; a SPEC or LOG states the temperature.")
+        from jaximu.report.export.noise import target
 
-def _targets(text: str | None, noise_file: Path | None, reference: Path | None, path: Path | None) -> list[str]:
-    """Return the estimators asked for. Raises `InputError` where what they need is not stated."""
-    from jaximu.report.export.noise import target
+        if self.reference is not None and (self.noise_for is None or self.path is None or options.is_toml(self.path)):
+            raise InputError(
+                "--reference goes with --path LOG and --noise-for: it is what was measured along that log."
+            )
+        if self.noise_for is None:
+            return []
+        targets = list(dict.fromkeys(target(name) for name in self.noise_for.split(",") if name.strip()))
+        if not targets:
+            raise InputError("--noise-for names no estimator.")
+        if self.noise_file is None:
+            raise InputError(
+                "--noise-for multiplies known noise: give --noise allan.json, which `jaximu allan LOG -o DIR` writes, "
+                "or a Kalibr imu.yaml with the data sheet's figures."
+            )
+        return targets
 
-    if reference is not None and (text is None or path is None or options.is_toml(path)):
-        raise InputError("--reference goes with --path LOG and --noise-for: it is what was measured along that log.")
-    if text is None:
-        return []
-    targets = list(dict.fromkeys(target(name) for name in text.split(",") if name.strip()))
-    if not targets:
-        raise InputError("--noise-for names no estimator.")
-    if noise_file is None:
-        raise InputError(
-            "--noise-for multiplies known noise: give --noise allan.json, which `jaximu allan LOG -o DIR` writes, or a "
-            "Kalibr imu.yaml with the data sheet's figures."
-        )
-    return targets
+    def _measured(self, model: Calibration, site: Place) -> MeasuredErrors | None:
+        """Return the errors of the calibrated unit along a log against what a reference measured; None without one."""
+        if self.reference is None or self.path is None:
+            return None
+        from jaximu.navigation.estimator_noise import MeasuredErrors
+        from jaximu.recordings.readers import read_attitude
+
+        with progress("comparing with the reference"):
+            recording = self.log.alike(model).read(self.path, site.gravity)
+            return MeasuredErrors.of(model.inertial().imu, recording, read_attitude(self.reference), site.gravity)
+
+    def _trajectory(
+        self, model: Calibration, site: Place, measured: MeasuredErrors | None
+    ) -> tuple[Trajectory, dict[str, float]]:
+        """Return the path, and the ranges that it states."""
+        from jaximu.navigation.trajectory import level_driving, of_recording, of_specification
+        from jaximu.recordings.recording import Signal
+
+        if self.path is None:
+            reference = model.inertial().imu.accelerometer.temperature_reference
+            return level_driving(
+                site, self.duration or 600.0, reference if self.temperature is None else self.temperature
+            ), {}
+        with progress("reading the path"):
+            if options.is_toml(self.path):
+                from jaximu.simulation import read_specification
+
+                return of_specification(read_specification(self.path), site, self.duration)
+            try:
+                recording = self.log.alike(model).read(self.path, site.gravity)
+            except InputError as error:
+                raise InputError(f"{self.path} is no specification, and as a log: {error}") from error
+            if measured is not None and recording.attitude is None:
+                recording = replace(recording, attitude=Signal(measured.stamp, measured.rotation, ""))
+            return of_recording(recording, model, site, self.duration or 60.0), {}
 
 
 def _require_densities(targets: list[str], noise: SensorNoise) -> None:
@@ -172,16 +207,6 @@ def _require_densities(targets: list[str], noise: SensorNoise) -> None:
         known |= {f"{triad}_random_walk": float("K" in terms or "B" in terms)}
     for name in targets:
         noise_values(name, known, 1.0)
-
-
-def _measured(path: Path, reference: Path, model: Calibration, site: Place, log: options.LogOptions) -> MeasuredErrors:
-    """Return the errors of the calibrated unit along a log against what a reference measured."""
-    from jaximu.navigation.estimator_noise import MeasuredErrors
-    from jaximu.recordings.readers import read_attitude
-
-    with progress("comparing with the reference"):
-        recording = log.alike(model).read(path, site.gravity)
-        return MeasuredErrors.of(model.inertial().imu, recording, read_attitude(reference), site.gravity)
 
 
 def _files(targets: list[str], noise: EstimatorNoise, gravity: float) -> dict[str, bytes]:
@@ -208,33 +233,3 @@ def _limits(stated: dict[str, str | None]) -> dict[str, float]:
             if not 0 < limits[triad] < math.inf:
                 raise InputError(f"{option}: {text!r} is no range.")
     return limits
-
-
-def _trajectory(
-    path: Path | None,
-    model: Calibration,
-    site: Place,
-    duration: float | None,
-    temperature: float | None,
-    log: options.LogOptions,
-    measured: MeasuredErrors | None,
-) -> tuple[Trajectory, dict[str, float]]:
-    """Return the path, and the ranges that it states."""
-    from jaximu.navigation.trajectory import level_driving, of_recording, of_specification
-    from jaximu.recordings.recording import Signal
-
-    if path is None:
-        reference = model.inertial().imu.accelerometer.temperature_reference
-        return level_driving(site, duration or 600.0, reference if temperature is None else temperature), {}
-    with progress("reading the path"):
-        if options.is_toml(path):
-            from jaximu.simulation import read_specification
-
-            return of_specification(read_specification(path), site, duration)
-        try:
-            recording = log.alike(model).read(path, site.gravity)
-        except InputError as error:
-            raise InputError(f"{path} is no specification, and as a log: {error}") from error
-        if measured is not None and recording.attitude is None:
-            recording = replace(recording, attitude=Signal(measured.stamp, measured.rotation, ""))
-        return of_recording(recording, model, site, duration or 60.0), {}

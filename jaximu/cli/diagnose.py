@@ -16,6 +16,7 @@ from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.diagnosis import Diagnosis
+    from jaximu.ground.gravity import LocalGravity
 
 __all__ = ["DiagnoseCommand", "give_diagnosis"]
 
@@ -73,47 +74,11 @@ class DiagnoseCommand:
 
     def run(self) -> None:
         """Do what the command line says."""
-        gravity = self.local.value()
-        if self.thermal and self.reference is not None:
-            raise InputError("--thermal is for recordings at rest, --reference for poses and turns: give one of them.")
-        if self.reference is not None and len(self.logs) != 1:
-            raise InputError(f"--reference goes with one LOG, found {len(self.logs)}.")
-        others = {"--thermal": self.thermal, "--reference": self.reference, "--heldout": self.heldout}
-        if self.by is not None and (stated := [name for name, value in others.items() if value]):
-            raise InputError(f"--by compares recordings with each other: leave {stated[0]} out.")
-        options.require_files(self.reference)
-        from jaximu.recordings.readers import holds_attitude
-
-        measured = self.reference is not None and holds_attitude(self.reference)
-        if measured and (self.heldout is not None or self.heldout_reference is not None):
-            raise InputError("with a measured attitude the gain is measured on parts of LOG left out: omit --heldout.")
-        if self.reference is not None and (self.heldout is None) != (self.heldout_reference is None):
-            raise InputError("with --reference, --heldout LOG and --heldout-reference REF go together.")
-        if self.reference is None and self.heldout_reference is not None:
-            raise InputError("--heldout-reference goes with --reference.")
+        gravity, measured = self.local.value(), self._measured()
         self.results.prepare(*(options.INERTIAL if self.by is None else ()))
         if self.by is not None:
-            from jaximu.diagnosis import places_of
-
-            places_of(list(map(str, self.logs)), self.by)
+            return self._attribute(self.by, gravity)
         recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
-        if self.by is not None:
-            from jaximu.diagnosis import attribute
-
-            with progress("diagnosing", every=0.0) as report:
-                attribution = attribute(
-                    recordings,
-                    self.by,
-                    gravity,
-                    report=report,
-                    static=known,
-                    segmentation=self.poses.value(),
-                    repair=self.repair,
-                )
-            self.results.present(
-                attribution.summary, "diagnosis.json and report.html", {}, attribution.text, diagnosis=attribution
-            )
-            return end(attribution.verdict, self.fail_on)
         other = None if self.heldout is None else self.log.read(self.heldout, gravity)
         from jaximu.diagnosis import diagnose, diagnose_against_attitude, diagnose_thermal, diagnose_turntable
 
@@ -144,13 +109,49 @@ class DiagnoseCommand:
             with progress("looking for a recording that would separate the causes"):
                 diagnosis = advised(diagnosis)
         give_diagnosis(diagnosis, self.results)
-        end(diagnosis.verdict, self.fail_on)
+        self._end(diagnosis.verdict)
 
+    def _measured(self) -> bool:
+        """Whether the reference is a measured attitude. Raises `InputError` where options contradict each other."""
+        if self.thermal and self.reference is not None:
+            raise InputError("--thermal is for recordings at rest, --reference for poses and turns: give one of them.")
+        if self.reference is not None and len(self.logs) != 1:
+            raise InputError(f"--reference goes with one LOG, found {len(self.logs)}.")
+        others = {"--thermal": self.thermal, "--reference": self.reference, "--heldout": self.heldout}
+        if self.by is not None and (stated := [name for name, value in others.items() if value]):
+            raise InputError(f"--by compares recordings with each other: leave {stated[0]} out.")
+        options.require_files(self.reference)
+        from jaximu.recordings.readers import holds_attitude
 
-def end(verdict: str, fail_on: str) -> None:
-    """End with exit status 1 where a verdict is one that a script is to fail on."""
-    if fail_on != "never" and verdict in ("unexplained", fail_on):
-        raise SystemExit(1)
+        measured = self.reference is not None and holds_attitude(self.reference)
+        if measured and (self.heldout is not None or self.heldout_reference is not None):
+            raise InputError("with a measured attitude the gain is measured on parts of LOG left out: omit --heldout.")
+        if self.reference is not None and (self.heldout is None) != (self.heldout_reference is None):
+            raise InputError("with --reference, --heldout LOG and --heldout-reference REF go together.")
+        if self.reference is None and self.heldout_reference is not None:
+            raise InputError("--heldout-reference goes with --reference.")
+        return measured
+
+    def _attribute(self, pattern: str, gravity: LocalGravity) -> None:
+        """Tell what belongs to a unit, to a session or to all."""
+        from jaximu.diagnosis import attribute, places_of
+
+        places_of(list(map(str, self.logs)), pattern)
+        recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
+        poses, repair = self.poses.value(), self.repair
+        with progress("diagnosing", every=0.0) as report:
+            attribution = attribute(
+                recordings, pattern, gravity, report=report, static=known, segmentation=poses, repair=repair
+            )
+        self.results.present(
+            attribution.summary, "diagnosis.json and report.html", {}, attribution.text, diagnosis=attribution
+        )
+        self._end(attribution.verdict)
+
+    def _end(self, verdict: str) -> None:
+        """End with exit status 1 where a verdict is one that a script is to fail on."""
+        if self.fail_on != "never" and verdict in ("unexplained", self.fail_on):
+            raise SystemExit(1)
 
 
 def give_diagnosis(diagnosis: Diagnosis, results: options.Results) -> None:

@@ -18,6 +18,8 @@ from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
+    from jaximu.acceptance.limits import Limits
+    from jaximu.fleets.jobs import Settings
     from jaximu.fleets.population import Fleet
     from jaximu.ground.page import Page
 
@@ -73,58 +75,37 @@ class FleetCommand:
 
     def run(self) -> None:
         """Do what the command line says."""
-        if self.output is None:
-            raise InputError("name the table to write: jaximu fleet LOGS -o TABLE.parquet.")
-        if self.output.suffix.lower() != ".parquet":
-            raise InputError(f"{self.output}: the table is written as Parquet; let its name end in .parquet.")
-        if self.workers is not None and self.workers < 1:
-            raise InputError(f"--workers must be 1 or more, not {self.workers}.")
-        if self.golden and self.limits is None:
-            raise InputError("--golden goes with --limits.")
-        held = None
-        if self.limits is not None:
-            from jaximu.cli.accept import limits_of
-
-            options.require_files(self.limits)
-            held = limits_of(self.limits, None, None)  # found out before anything is computed
-        from jaximu.fleets import Settings, find_jobs, run_fleet
+        output, held, settings = self._table(), self._limits(), self._settings()
+        from jaximu.fleets import find_jobs, run_fleet
         from jaximu.fleets.store import kept_rows
 
-        jobs = find_jobs(self.logs, self.output, self.static)
+        jobs = find_jobs(self.logs, output, self.static)
         if self.static is not None and (without := sum(not job.static for job in jobs)):
             say(f"{without} of {len(jobs)} have no recording at rest: their noise is estimated from their own poses.")
-        stated = {option.name: getattr(self.log, option.name) for option in fields(self.log)}
-        settings = Settings(
-            options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
-            gravity=self.local.value(),
-            diagnose=self.diagnose,
-            segmentation=self.poses.value(),
-            field=options.field_strength(self.field),
-        )
         try:
             with _progress(len(jobs)) as show:
-                statuses = run_fleet(jobs, self.output, settings, self.engine, self.workers, show)
+                statuses = run_fleet(jobs, output, settings, self.engine, self.workers, show)
         except KeyboardInterrupt:
-            say(f"{kept_rows(self.output)} of {len(jobs)} rows are kept: the same command goes on from there.")
+            say(f"{kept_rows(output)} of {len(jobs)} rows are kept: the same command goes on from there.")
             raise
         from jaximu.fleets.field import field_words
         from jaximu.fleets.population import read_fleet  # only now: what it imports takes a second
         from jaximu.report.fleet import page_of
 
         with progress("questioning the fleet"):
-            fleet = read_fleet(self.output)
-        page, html = page_of(fleet, field_words(self.output)), self.output.with_suffix(".html")
-        written = options.draw(lambda: _write(fleet, page, self.output), html)
+            fleet = read_fleet(output)
+        page, html = page_of(fleet, field_words(output)), output.with_suffix(".html")
+        written = options.draw(lambda: _write(fleet, page, output), html)
         line = None
         if held is not None and statuses["ok"]:
             from jaximu.acceptance.line import follow, read_table
             from jaximu.cli.accept import write_line
 
             with progress("following the line"):
-                line = follow(read_table(self.output), held, self.golden)
-            line_html, document = (self.output.with_suffix(f".acceptance{suffix}") for suffix in (".html", ".json"))
+                line = follow(read_table(output), held, self.golden)
+            line_html, document = (output.with_suffix(f".acceptance{suffix}") for suffix in (".html", ".json"))
             line.save(document)
-            written += [*options.draw(lambda: write_line(line, line_html, self.output)[-1:], line_html), document]
+            written += [*options.draw(lambda: write_line(line, line_html, output)[-1:], line_html), document]
         if self.as_json:
             options.print_json(fleet.document() | ({"acceptance": line.document()} if line else {}))
             return
@@ -134,7 +115,41 @@ class FleetCommand:
         if line is not None:
             print()
             show_page(line.summary())
-        print(f"Written: {', '.join(map(str, (self.output, *written)))}")
+        print(f"Written: {', '.join(map(str, (output, *written)))}")
+
+    def _table(self) -> Path:
+        """Return the table to write. Raises `InputError` where options contradict each other or it is not named."""
+        if self.output is None:
+            raise InputError("name the table to write: jaximu fleet LOGS -o TABLE.parquet.")
+        if self.output.suffix.lower() != ".parquet":
+            raise InputError(f"{self.output}: the table is written as Parquet; let its name end in .parquet.")
+        if self.workers is not None and self.workers < 1:
+            raise InputError(f"--workers must be 1 or more, not {self.workers}.")
+        if self.golden and self.limits is None:
+            raise InputError("--golden goes with --limits.")
+        return self.output
+
+    def _limits(self) -> Limits | None:
+        """Return the limits, before anything is computed."""
+        if self.limits is None:
+            return None
+        from jaximu.cli.accept import limits_of
+
+        options.require_files(self.limits)
+        return limits_of(self.limits, None, None)
+
+    def _settings(self) -> Settings:
+        """Return what holds for every unit."""
+        from jaximu.fleets import Settings
+
+        stated = {option.name: getattr(self.log, option.name) for option in fields(self.log)}
+        return Settings(
+            options=tuple(sorted((name, str(value)) for name, value in stated.items() if value is not None)),
+            gravity=self.local.value(),
+            diagnose=self.diagnose,
+            segmentation=self.poses.value(),
+            field=options.field_strength(self.field),
+        )
 
 
 def _write(fleet: Fleet, page: Page, table: Path) -> tuple[Path, ...]:
