@@ -100,6 +100,11 @@ _ALIKE_ERRORS = (
     "the field's strength differs from its mean for seconds at a time, as beside iron or where a sensor drifts: the "
     "intervals allow for it."
 )
+_OTHER_DIP = (
+    "the field points {off:.2g}° off the stated dip of {dip:.3g}°: iron nearby bends it, or the place is another. The "
+    "dip was not used, and the strength is taken to be off by as much ({strength:.2g} µT, one standard deviation): "
+    "--field states it."
+)
 
 
 @dataclass(frozen=True)
@@ -130,6 +135,14 @@ class Heading:
     sigma: FloatArray
     before: FloatArray
     scatter: float
+
+    def document(self) -> dict[str, Any]:
+        """Return root mean squares over the headings of a level unit and largest errors of any attitude, degrees."""
+        return {
+            "rms": float(np.sqrt(np.mean(self.sigma[0] ** 2) + self.scatter**2)),
+            "worst": float(np.hypot(self.sigma.max(), self.scatter)),
+            "before": {"rms": float(np.sqrt(np.mean(self.before[0] ** 2))), "worst": float(self.before.max())},
+        }
 
 
 def calibrate_magnetometer(
@@ -217,11 +230,7 @@ def _calibrated(
         fit, windows, stretches = _undisturbed(fit.imu, whole, field, full)
         off = abs((_dip(windows, fit)[0] or 0.0) - np.radians(stated))
         field = replace(field, sigma=float(np.hypot(field.sigma, known * off)))
-        notes.append(
-            f"the field points {np.degrees(off):.2g}° off the stated dip of {stated:.3g}°: iron nearby bends it, or "
-            "the place is another. The dip was not used, and the strength is taken to be off by as much "
-            f"({known * off:.2g} µT, one standard deviation): --field states it."
-        )
+        notes.append(_OTHER_DIP.format(off=np.degrees(off), dip=stated, strength=known * off))
     if fit.finite:  # along directions left open a fit may creep until its steps run out
         _require_covered(fit, windows, where)
         if not fit.converged:
@@ -268,15 +277,7 @@ def _calibrated(
             "strength": {"value": known, "sigma": field.sigma, "unit": "uT"},
             "dip": None if dip is None else {"value": np.degrees(dip), "sigma": np.degrees(dip_sigma), "unit": "deg"},
         },
-        "heading_error": None
-        if heading is None
-        else {
-            "rms": float(np.sqrt(np.mean(heading.sigma[0] ** 2) + heading.scatter**2)),
-            "worst": float(np.hypot(heading.sigma.max(), heading.scatter)),
-            "before": {"rms": float(np.sqrt(np.mean(heading.before[0] ** 2))), "worst": float(heading.before.max())},
-            "left_out": headings,
-            "unit": "deg",
-        },
+        "heading_error": None if heading is None else heading.document() | {"left_out": headings, "unit": "deg"},
         "coverage": coverage(fit.imu, windows),
         "norm_spread": {**spreads, "noise": windows.noise / _scale_of(start) / known},
         "gyroscope_bias": _gyroscope_bias(calibration),

@@ -26,7 +26,7 @@ def find(samples: Samples) -> list[Finding]:
 
 
 def _stuck(sensor: Sensor) -> list[Finding]:
-    change = sensor.difference != 0
+    change = np.asarray(sensor.difference != 0)
     if not change.any():
         row = ", ".join(f"{value:.6g}" for value in sensor.values[0])
         return [
@@ -39,48 +39,48 @@ def _stuck(sensor: Sensor) -> list[Finding]:
                 refuses=sensor.name,
             )
         ]
-    length = max(20, round(_STUCK * sensor.rate))
-    findings = []
-    for axis in range(3):
-        values = sensor.values[:, axis]
-        if sensor.coarse[axis] is not None:
-            continue
-        others = change[:, [k for k in range(3) if k != axis]].any(axis=1)
-        candidates = [run for run in runs_of(~change[:, axis]) if run[1] - run[0] >= length]
-        if not candidates:
-            continue
-        limits = [tuple(run) for extreme in (values.max(), values.min()) for run in stops(values, extreme)]
-        long = [
-            run
-            for run in candidates
-            if others[run[0] : run[1]].mean() > 0.5 and not any(a <= run[0] and run[1] < b for a, b in limits)
-        ]
-        if long:
-            first = np.array([run[0] for run in long])
-            rows = np.concatenate([np.arange(run[0] + 1, run[1] + 1) for run in long])
-            total = len(rows) / sensor.rate
-            most = len(rows) > 0.5 * len(sensor)
-            # without noise every axis repeats itself at rest, and nothing is wrong with that
-            noisy = float(np.mean(~change[:, axis])) < 1.5 * len(rows) / len(sensor) + 0.2
-            text = (
-                f"{sensor.name} {'xyz'[axis]}: it repeats one value for {total:.3g} s in all, first after "
-                f"{sensor.at(int(first[0]))}, while the other axes move on."
-            )
-            if most:
-                text += " The axis is dead for most of the recording: check its wiring, and record again."
-            elif noisy:
-                text += " These rows are left out."
-            findings.append(
-                Finding(
-                    "data.stuck_axis",
-                    sensor.rows(first),
-                    text,
-                    spoils=most and noisy,
-                    without={sensor.name: rows} if noisy and not most else {},
-                )
-            )
+    axes = [axis for axis in range(3) if sensor.coarse[axis] is None]
+    findings = [finding for axis in axes if (finding := _stuck_axis(sensor, change, axis)) is not None]
     if held_at(sensor) is not None or sensor.dead_band is not None:
         return findings
+    return findings + _repeated_rows(sensor, change)
+
+
+def _stuck_axis(sensor: Sensor, change: NDArray[np.bool_], axis: int) -> Finding | None:
+    """Return where an axis repeats itself, not at an end of its range, while the others move; `change` (n − 1, 3)."""
+    values, length = sensor.values[:, axis], max(20, round(_STUCK * sensor.rate))
+    others = change[:, [k for k in range(3) if k != axis]].any(axis=1)
+    candidates = [run for run in runs_of(~change[:, axis]) if run[1] - run[0] >= length]
+    if not candidates:
+        return None
+    limits = [tuple(run) for extreme in (values.max(), values.min()) for run in stops(values, extreme)]
+    long = [
+        run
+        for run in candidates
+        if others[run[0] : run[1]].mean() > 0.5 and not any(a <= run[0] and run[1] < b for a, b in limits)
+    ]
+    if not long:
+        return None
+    first = np.array([run[0] for run in long])
+    rows = np.concatenate([np.arange(run[0] + 1, run[1] + 1) for run in long])
+    most = len(rows) > 0.5 * len(sensor)
+    # without noise every axis repeats itself at rest, and nothing is wrong with that
+    noisy = float(np.mean(~change[:, axis])) < 1.5 * len(rows) / len(sensor) + 0.2
+    text = (
+        f"{sensor.name} {'xyz'[axis]}: it repeats one value for {len(rows) / sensor.rate:.3g} s in all, first after "
+        f"{sensor.at(int(first[0]))}, while the other axes move on."
+    )
+    if most:
+        text += " The axis is dead for most of the recording: check its wiring, and record again."
+    elif noisy:
+        text += " These rows are left out."
+    without = {sensor.name: rows} if noisy and not most else {}
+    return Finding("data.stuck_axis", sensor.rows(first), text, spoils=most and noisy, without=without)
+
+
+def _repeated_rows(sensor: Sensor, change: NDArray[np.bool_]) -> list[Finding]:
+    """Return where all axes repeat a row: for long, so that the sensor hung, and now and then; `change` (n − 1, 3)."""
+    findings = []
     same = ~change.any(axis=1) & ~at_limits(sensor)[1:]
     coarse = [step is not None for step in sensor.coarse]
     hung = [] if all(coarse) else _hung(sensor, same)

@@ -139,25 +139,14 @@ def deviation(
     differences.
     """
     difference = _kind(kind)
+    data = np.asarray(values, float)
+    _require_sense(data, rate, difference, phase, confidence)
     if resolution not in RESOLUTIONS:
         raise InputError(f"the resolution must be one of {', '.join(RESOLUTIONS)}, found {resolution!r}.")
     multi = resolution == "multi"
     if multi and kind != "overlapping":
         raise InputError(f"the multi-resolution deviation is the overlapping Allan deviation, not the {kind} one.")
-    data = np.asarray(values, float)
-    if data.ndim < 1 or data.shape[-1] < 3:
-        raise NotPossibleError(f"a deviation needs at least three samples, found shape {data.shape}.")
-    if not (np.isfinite(rate) and rate > 0):
-        raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
-    if not 0 < confidence < 1:
-        raise InputError(f"the confidence must lie between 0 and 1, found {confidence}.")
-    rows = data.reshape(-1, data.shape[-1])
-    if np.isinf(rows).any():
-        raise InputError("the signal holds infinite values.")
-    if (difference.total or phase) and np.isnan(rows).any():
-        what = "the total deviation mirrors the recording at its ends" if difference.total else "a phase is one curve"
-        raise InputError(f"{what} and cannot be taken over gaps (NaN).")
-    samples = data.shape[-1] - phase
+    rows, samples = data.reshape(-1, data.shape[-1]), data.shape[-1] - phase
     chosen = averaging_factors(samples, kind) if factors is None else np.unique(np.asarray(factors, np.int64))
     if not len(chosen) or chosen[0] < 1 or chosen[-1] > _longest(samples, kind):
         raise NotPossibleError(
@@ -195,6 +184,21 @@ def deviation(
         array.reshape(shape) for array in (value, value * low, value * high, count, alpha, freedom)
     )
     return Deviation(kind, tau, grid.factor, value, low, high, count, alpha, freedom, confidence)
+
+
+def _require_sense(data: FloatArray, rate: float, difference: _DeviationKind, phase: bool, confidence: float) -> None:
+    """Raise `InputError` or `NotPossibleError` for a signal or numbers of which no deviation can be taken."""
+    if data.ndim < 1 or data.shape[-1] < 3:
+        raise NotPossibleError(f"a deviation needs at least three samples, found shape {data.shape}.")
+    if not (np.isfinite(rate) and rate > 0):
+        raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
+    if not 0 < confidence < 1:
+        raise InputError(f"the confidence must lie between 0 and 1, found {confidence}.")
+    if np.isinf(data).any():
+        raise InputError("the signal holds infinite values.")
+    if (difference.total or phase) and np.isnan(data).any():
+        what = "the total deviation mirrors the recording at its ends" if difference.total else "a phase is one curve"
+        raise InputError(f"{what} and cannot be taken over gaps (NaN).")
 
 
 def _processors() -> int:
