@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from jaximu.cli import options
 from jaximu.cli.messages import say
@@ -31,7 +31,17 @@ def run(
         str | None,
         option("MAP", "The --axes used for calibration, where CALIBRATION does not say how it was read."),
     ] = None,
-    instance: Annotated[int, option("N", "Which of the autopilot's sensors, from 0.")] = 0,
+    in_force: Annotated[
+        Path | None,
+        option(
+            "FILE", "The autopilot's parameters now (.ulg, .bin, a parameter file): compose, and show what changes."
+        ),
+    ] = None,
+    log_was: Annotated[
+        Literal["raw", "corrected"] | None,
+        option("{raw,corrected}", "Whether the calibrated log was corrected by these parameters, if it does not show."),
+    ] = None,
+    instance: Annotated[int | None, option("N", "Which of the autopilot's sensors, from 0 (default: 0).")] = None,
     device: Annotated[int | None, option("ID", "The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None,
     rate_range: Annotated[float, option("DEG/S", "State the error of what the file leaves out up to this rate.")] = 250,
     temperature_range: Annotated[
@@ -43,27 +53,39 @@ def run(
 
     Examples:
       jaximu export results/calibration.json --to px4
+      jaximu export results/calibration.json --to px4 --in-force flight.ulg
       jaximu export results/calibration.json --to kalibr --noise noise/imu.yaml
 
     """
-    options.require_files(calibration, noise)
-    options.require_apart(output, calibration, noise)
-    if instance < 0:
+    options.require_files(calibration, noise, in_force)
+    options.require_apart(output, calibration, noise, in_force)
+    if (instance or 0) < 0:
         raise InputError(f"--instance: sensors count from 0, found {instance}.")
     rate, temperatures = _rate(rate_range), _temperatures(temperature_range)
     from jaximu.calibration import load_calibration
     from jaximu.recordings.readers.kalibr import read_noise
-    from jaximu.report.export import ExportedUnit, Range, export, losses
+    from jaximu.recordings.readers.parameters import read_parameters
+    from jaximu.report.export import Composition, ExportedUnit, Range, export, losses
 
     model = load_calibration(calibration)
     if noise is not None and not getattr(writer(to), "NOISE", False):
         also = "; `jaximu consequences --noise-for` writes the filter's parameters" if to in TARGETS else ""
         say(f"{noise} is not used: the {to} file holds a calibration and no noise{also}.")
-    if not getattr(writer(to), "MAGNETIC", False):
+    if in_force is not None and model.magnetic is not None:
+        say("The magnetometer is left out: --in-force is for accelerometers and gyroscopes.")
+    if not getattr(writer(to), "MAGNETIC", False) or (in_force is not None and model.magnetic is not None):
         model = model.inertial()
     extent = Range.of(model, rate, temperatures)
     parameters = ExportedUnit.of(model, axes, None if noise is None else read_noise(noise), instance, device)
+    composition = None
+    if in_force is not None:
+        stated = None if log_was is None else log_was == "corrected"
+        composition = Composition.of(parameters, to, read_parameters(in_force), stated)
+        parameters = composition.unit
+    elif model.reading is not None and model.reading.corrected and hasattr(writer(to), "FIRMWARE"):
+        say("The calibrated log was corrected by the autopilot's parameters: give those in force (--in-force FILE).")
     path = output or calibration.with_name(f"{calibration.stem}_{to}{writer(to).SUFFIX}")
+    options.require_apart(path, in_force)
     written, paths = export(parameters, to, path)
     lost = losses(parameters, written, extent)
     axes = (written.parameters or parameters).axes
@@ -80,12 +102,15 @@ def run(
                 "equation": written.equation,
                 "range": extent.text(),
                 "losses": [vars(loss) for loss in lost],
+                **({} if composition is None else {"in_force": composition.document()}),
             }
         )
         return
     costs = [loss.text() for loss in lost]
     costs += [f"{', '.join(left)}: of one session, not of the unit, and never exported."] if left else []
     parts: list[Part] = [f"Convention: {written.convention}", Section("Apply:", (Code(written.equation),))]
+    if composition is not None:
+        parts.append(composition.section())
     if costs:
         parts.append(Section(f"Not in the file, and what that costs over {extent.text()}:", (Items(costs),)))
     later("report.terminal", "show")(Page(f"Calibration for {to}", (axes,), first=parts))

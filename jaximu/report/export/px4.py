@@ -9,7 +9,13 @@ beside it (xy, xz, yz), R the rotation ROT (Magnetometer.hpp, `Correct`).
 
 from __future__ import annotations
 
-from jaximu.report.export.autopilot import Autopilot
+from collections.abc import Mapping
+
+import numpy as np
+
+from jaximu.ground.array_types import FloatArray
+from jaximu.recordings.readers.parameters import ParameterFile
+from jaximu.report.export.autopilot import Autopilot, Firmware, cubic, need_temperature, rotation_of
 from jaximu.report.export.base import ExportedUnit, Written, comments, text_file
 
 SUFFIX = ".params"
@@ -17,23 +23,71 @@ SUMMARY = "PX4: CAL_ACC*, CAL_GYRO* (offset; scale of the accelerometer), CAL_MA
 MAGNETIC = True
 _REAL, _INTEGER = 9, 6  # MAV_PARAM_TYPE
 _SENSORS = {"accelerometer": "ACC", "gyroscope": "GYRO", "magnetometer": "MAG"}
+_MOST = 4  # sensors of a kind
+
+
+class PX4(Firmware):
+    """PX4 since it has `CAL_ACCn_ROT`: before, it numbered rotations and ordered corrections in other ways.
+
+    R is the level adjustment SENS_BOARD_X_OFF, Y_OFF, Z_OFF after the rotation: that of the board, SENS_BOARD_ROT, or
+    of an external sensor, CAL_ACCn_ROT, which is -1 otherwise (Accelerometer.cpp, `set_rotation`, `ParametersUpdate`).
+    t is that of the TC_ parameters with the sensor's ID (temperature_compensation, `calc_thermal_offsets_3D`).
+    """
+
+    name = "PX4"
+
+    def tool(self, number: int) -> Autopilot:
+        """CAL_ACCn_XOFF and so on."""
+        return Autopilot(
+            {name: f"CAL_{sensor}{number}_{{axis}}{{word}}" for name, sensor in _SENSORS.items()},
+            "OFF",
+            "SCALE",
+            ("OFF", "SCALE", "ODIAG"),
+            f"CAL_MAG{number}_ROT",
+            ("gauss", 0.01),
+            rotated=False,
+        )
+
+    def identities(self, file: ParameterFile, triad: str) -> dict[int, int]:
+        """Those of CAL_ACCn_ID."""
+        ids = {number: int(file.value(f"CAL_{_SENSORS[triad]}{number}_ID", 0.0)) for number in range(_MOST)}
+        return {number: identity for number, identity in ids.items() if identity}
+
+    def of_log(self, identities: Mapping[int, int], sensor: int) -> int | None:
+        """The one with this ID."""
+        return next((number for number, identity in identities.items() if identity == sensor), None)
+
+    def rotation(self, file: ParameterFile, triad: str, number: int) -> FloatArray:
+        """The level adjustment after the rotation."""
+        parameter = f"CAL_{_SENSORS[triad]}{number}_ROT"
+        if (index := file.value(parameter)) == -1:
+            index = file.value(parameter := "SENS_BOARD_ROT")
+        level = file.vector(f"SENS_BOARD_{axis}_OFF" for axis in "XYZ")
+        return rotation_of(*level) @ self.numbered(file, parameter, index)
+
+    def thermal(self, file: ParameterFile, triad: str, number: int, celsius: float | None) -> FloatArray:
+        """X0 + X1 d + X2 d² + X3 d³, d = T − TREF."""
+        letter, identity = _SENSORS[triad][0], self.identities(file, triad)[number]
+        stems = (f"TC_{letter}{at}_" for at in range(_MOST))
+        stem = next((stem for stem in stems if file.value(f"{stem}ID", 0.0) == identity), None)
+        if stem is None or file.value(f"TC_{letter}_ENABLE", 0.0) != 1:
+            return np.zeros(3)
+        celsius = need_temperature(file, f"TC_{letter}_ENABLE", celsius)
+        powers = np.array([file.vector(f"{stem}X{power}_{axis}" for axis in range(3)) for power in range(4)])
+        return cubic(
+            powers, *(file.value(f"{stem}TREF"), celsius), *file.vector(f"{stem}T{end}" for end in ("MIN", "MAX"))
+        )
+
+
+FIRMWARE = PX4()
 
 
 def write(parameters: ExportedUnit) -> Written:
     """Write offsets and scales of sensor `instance`; its device's ID only if it was stated."""
     parameters = parameters.for_autopilot("PX4")
     parameters.require_si("PX4")
-    number = parameters.instance
-    tool = Autopilot(
-        {name: f"CAL_{sensor}{number}_{{axis}}{{word}}" for name, sensor in _SENSORS.items()},
-        "OFF",
-        "SCALE",
-        ("OFF", "SCALE", "ODIAG"),
-        f"CAL_MAG{number}_ROT",
-        ("gauss", 0.01),
-        rotated=False,
-    )
-    values, equation, corrections, rotation = tool.values(parameters)
+    number = parameters.instance or 0
+    values, equation, corrections, rotation = FIRMWARE.tool(number).values(parameters)
     devices = [_SENSORS[name] for name in ("accelerometer", "gyroscope") if name in parameters.triads]
     mine = devices or ["MAG"]  # a magnetometer is a device of its own
     left = [] if parameters.device is not None else [*mine]
@@ -44,8 +98,11 @@ def write(parameters: ExportedUnit) -> Written:
     head = [comments(parameters), "# Vehicle-Id Component-Id Name Value Type"]
     convention = (
         "PX4 subtracts the offset, then scales, in the sensor's own axes before its rotation; parameters are single "
-        "precision (6e-8 of a value). They replace those in the vehicle, so they hold for a calibration made from the "
-        "topics sensor_accel, sensor_gyro and sensor_mag, which PX4 has not corrected."
+        "precision (6e-8 of a value). "
+    )
+    convention += parameters.composition or (
+        "They replace those in the vehicle, so they hold for a calibration made from the topics sensor_accel, "
+        "sensor_gyro and sensor_mag, which PX4 has not corrected; for any other give those in force (--in-force)."
     )
     convention += rotation
     if left:
@@ -53,4 +110,5 @@ def write(parameters: ExportedUnit) -> Written:
             f" PX4 uses them only where {' and '.join(f'CAL_{sensor}{number}_ID' for sensor in left)} are the sensor's:"
             " these are left as they are; state --device to write one device's."
         )
-    return Written(text_file([*head, *rows]), convention, equation, corrections, parameters=parameters)
+    text = text_file([*head, *rows])
+    return Written(text, convention, equation, corrections, parameters=parameters, values=dict(values))
