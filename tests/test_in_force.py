@@ -208,11 +208,11 @@ def round_trip(tmp_path, to, before, equation, corrected: bool, seed: int, more=
 
     rotation = rotation_of(before, to)
     calibration = calibration_of(
-        (logged(0), logged(1)), corrected, seed, corrected=corrected,
+        (logged(0), logged(1)), corrected, seed, corrected=corrected if corrected or to == "px4" else None,
         sensors=dict.fromkeys(("accelerometer", "gyroscope"), 1310988 if to == "px4" else 0),
     )  # fmt: skip
     path = written(tmp_path / "now.params", before, to == "px4")
-    composition = Composition.of(ExportedUnit.of(calibration), to, read_parameters(path))
+    composition = Composition.of(ExportedUnit.of(calibration), to, read_parameters(path), corrected)
     content = writer(to).write(composition.unit).files[""].decode()
     rows = [re.split(r"[\t,]", line)[-4 if to == "px4" else 0 :] for line in content.splitlines() if line[0] != "#"]
     after = before | (
@@ -230,7 +230,7 @@ def rotation_of(values, to):
 
 CASES = [
     *(("px4", rotation, corrected) for rotation in PX4 for corrected in (False, True)),
-    *(("ardupilot", rotation, True) for rotation in ARDUPILOT),
+    *(("ardupilot", rotation, corrected) for rotation in ARDUPILOT for corrected in (False, True)),
 ]
 
 
@@ -343,7 +343,8 @@ def test_a_log_shows_whether_it_was_corrected_and_of_which_sensor(tmp_path):
     (tmp_path / "a.csv").write_text("time [s],accel_x [m/s^2],accel_y [m/s^2],accel_z [m/s^2]\n" + "".join(
         f"{at / 100},{0.1 * (at % 3)},{0.1 * (at % 5)},{9.8 + 0.01 * (at % 2)}\n" for at in range(300)))  # fmt: skip
     assert read_recording(tmp_path / "a.csv").reading.corrected is None
-    assert Reading.from_document(json.loads(json.dumps(vars(raw)))) == raw
+    kept = Reading.from_document(json.loads(json.dumps(vars(raw))))
+    assert (kept.corrected, kept.sensors) == (raw.corrected, raw.sensors)
 
 
 # --- the command line
@@ -383,8 +384,8 @@ def test_what_is_printed_and_what_json_has(tmp_path, capsys):
         assert changes[f"CAL_GYRO0_{name}OFF"]["half_width"] == pytest.approx(1.96 * SIGMA_ZERO, rel=1e-3)
         change = changes[f"CAL_ACC0_{name}OFF"]
         new_scale = changes[f"CAL_ACC0_{name}SCALE"]["new"]
-        assert change["force"] == pytest.approx(new_scale * (change["in_force"] - change["new"]))
-        assert change["horizon"] == pytest.approx(abs(change["force"]) / G)
+        assert change["at_rest"]["force"] == pytest.approx(new_scale * (change["in_force"] - change["new"]))
+        assert change["at_rest"]["horizon"] == pytest.approx(abs(change["at_rest"]["force"]) / G)
     assert set(document["in_force"]["at_rest"]) == {"force", "horizon", "rate"}
 
 

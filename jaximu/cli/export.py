@@ -71,9 +71,7 @@ def run(
     if noise is not None and not getattr(writer(to), "NOISE", False):
         also = "; `jaximu consequences --noise-for` writes the filter's parameters" if to in TARGETS else ""
         say(f"{noise} is not used: the {to} file holds a calibration and no noise{also}.")
-    if in_force is not None and model.magnetic is not None:
-        say("The magnetometer is left out: --in-force is for accelerometers and gyroscopes.")
-    if not getattr(writer(to), "MAGNETIC", False) or (in_force is not None and model.magnetic is not None):
+    if in_force is not None or not getattr(writer(to), "MAGNETIC", False):
         model = model.inertial()
     extent = Range.of(model, rate, temperatures)
     parameters = ExportedUnit.of(model, axes, None if noise is None else read_noise(noise), instance, device)

@@ -10,7 +10,7 @@ import difflib
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,8 +22,7 @@ from jaximu.recordings.readers import dataflash, ulog
 
 __all__ = ["ParameterFile", "read_parameters"]
 
-_HEAD = 64  # bytes in which a log shows
-_ROW = re.compile(r"(?:\d+\s+\d+\s+)?([A-Z]\w*)[\s,=]+(\S+?)(?:[\s,@#].*)?")
+_ROW = re.compile(r"^(?:\d+\s+\d+\s+)?([A-Z]\w*)[\s,=]+(\S+?)(?:[\s,@#].*)?$")
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class ParameterFile:
 
         Raises `InputError` where it is not there and there is no `default`, it changes in the file, or is not finite.
         """
-        values: Sequence[float] = self.values.get(name, [] if default is None else [default])
+        values = list(self.values.get(name, ())) or ([] if default is None else [default])
         if not values:
             near = difflib.get_close_matches(name, self.values, 1, 0.8)
             raise InputError(f"{self.path}: has no parameter {name}{f'; the nearest is {near[0]}' if near else ''}.")
@@ -61,7 +60,7 @@ def read_parameters(path: str | os.PathLike[str]) -> ParameterFile:
     name, file = name_of(path), Path(path)
     with readable(name):
         with file.open("rb") as opened:
-            head = opened.read(_HEAD)
+            head = opened.read(4)
         rows = None if head.startswith((b"ULog", b"\xa3\x95", b"FMT,")) else file.read_bytes()
     try:
         if rows is None:
@@ -88,10 +87,10 @@ def _of_text(name: str, text: str) -> Iterator[tuple[str, float]]:
     for number, line in enumerate(text.splitlines(), 1):
         if not (line.strip() and line.lstrip()[0] not in "#;"):
             continue
-        parts = _ROW.fullmatch(line.strip())
         try:
-            yield parts[1], float(parts[2])  # pyright: ignore[reportOptionalSubscript]
-        except (TypeError, ValueError):
+            ((key, value),) = _ROW.findall(line.strip())
+            yield key, float(value)
+        except ValueError:
             raise InputError(
                 f"{name}, row {number}: expected a parameter's name and value, such as CAL_ACC0_XOFF 0.1, found "
                 f"{line.strip()[:60]!r}."

@@ -23,9 +23,6 @@ SUFFIX = ".param"
 SUMMARY = "ArduPilot: INS_ACC*, INS_GYR* (offset; scale of the accelerometer), COMPASS_*"
 MAGNETIC = True
 _SHORT = {"accelerometer": "ACC", "gyroscope": "GYR"}
-_MOST = 3  # sensors of a kind that are named in this way
-_REFERENCE = 35.0  # °C
-_CUSTOM = {100: ("AHRS_CUSTOM_", "PIT"), 101: ("CUST_ROT1_", "PITCH"), 102: ("CUST_ROT2_", "PITCH")}
 
 
 class ArduPilot(Firmware):
@@ -38,6 +35,8 @@ class ArduPilot(Firmware):
 
     name = "ArduPilot"
     rotations: ClassVar = {38: (90.0, 68.8, 293.3), 41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}
+    custom: ClassVar = {100: ("AHRS_CUSTOM_", "PIT"), 101: ("CUST_ROT1_", "PITCH"), 102: ("CUST_ROT2_", "PITCH")}
+    reference = 35.0  # °C
 
     def tool(self, number: int) -> Autopilot:
         """INS_ACCOFFS_X, INS_ACC2OFFS_X and so on."""
@@ -52,7 +51,7 @@ class ArduPilot(Firmware):
 
     def identities(self, file: ParameterFile, triad: str) -> dict[int, int]:
         """Those of INS_ACC_ID, INS_ACC2_ID …"""
-        ids = {number: int(file.value(f"INS_{_SHORT[triad]}{_digit(number)}_ID", 0.0)) for number in range(_MOST)}
+        ids = {number: int(file.value(f"INS_{_SHORT[triad]}{_digit(number)}_ID", 0.0)) for number in range(3)}
         return {number: identity for number, identity in ids.items() if identity}
 
     def of_log(self, identities: Mapping[int, int], sensor: int) -> int | None:
@@ -62,8 +61,8 @@ class ArduPilot(Firmware):
     def rotation(self, file: ParameterFile, triad: str, number: int) -> FloatArray:
         """That of the board; a sensor's own comes before its offsets."""
         index = file.value("AHRS_ORIENTATION")
-        if index in _CUSTOM:
-            stem, pitch = _CUSTOM[int(index)]
+        if index in self.custom:
+            stem, pitch = self.custom[int(index)]
             return rotation_of(*file.vector(f"{stem}{angle}" for angle in ("ROLL", pitch, "YAW")))
         return self.numbered(file, "AHRS_ORIENTATION", index)
 
@@ -76,8 +75,8 @@ class ArduPilot(Firmware):
         powers = [file.vector(f"{stem}{short}{power}_{axis}" for axis in "XYZ") for power in range(1, 4)]
         ends = file.vector(f"{stem}T{end}" for end in ("MIN", "MAX"))
         coefficients = 1e-6 * np.array([np.zeros(3), *powers])
-        then, now = file.value(f"INS_{short}{number + 1}_CALTEMP"), celsius
-        return cubic(coefficients, _REFERENCE, now, *ends) - cubic(coefficients, _REFERENCE, then, *ends)
+        then = file.value(f"INS_{short}{number + 1}_CALTEMP")
+        return cubic(coefficients, self.reference, celsius, *ends) - cubic(coefficients, self.reference, then, *ends)
 
 
 FIRMWARE = ArduPilot()
@@ -92,7 +91,7 @@ def write(parameters: ExportedUnit) -> Written:
     parameters = parameters.for_autopilot("ArduPilot")
     parameters.require_si("ArduPilot")
     number = parameters.instance or 0
-    if number not in range(_MOST):
+    if number not in range(3):
         raise InputError(f"--instance: ArduPilot names its sensors 0, 1 and 2 here, not {number}.")
     values, equation, corrections, rotation = FIRMWARE.tool(number).values(parameters)
     rows = [f"{name},{value!r}" for name, value in values]

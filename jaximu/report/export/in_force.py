@@ -8,7 +8,6 @@ temperature correction stays in force (PX4-Autopilot issues 9736 and 14717 are a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -25,47 +24,11 @@ from jaximu.recordings.recording import Reading
 from jaximu.report.export.autopilot import MARKS, Firmware
 from jaximu.report.export.base import ExportedUnit, Logged
 from jaximu.report.export.catalogue import writer
+from jaximu.report.export.cost import Range
 
-__all__ = ["Change", "Composition"]
+__all__ = ["Composition"]
 
-_STEP = 1e-6  # of a gain or bias, for derivatives
-_DIRECTIONS = 2000  # of gravity
-
-
-@dataclass(frozen=True)
-class Change:
-    """A parameter in force and its new value, in its own unit, with 1 sigma (None where no recording determined it).
-
-    force: what it changes of the specific force at rest, m/s², where that is most; horizon: of its direction, rad, at
-    most; rate: of the angular rate, rad/s.
-    """
-
-    parameter: str
-    in_force: float
-    new: float
-    sigma: float | None
-    force: float = 0.0
-    horizon: float = 0.0
-    rate: float = 0.0
-
-    def document(self) -> dict[str, float | str | None]:
-        """As JSON has it, with half the 95 % interval."""
-        half = None if self.sigma is None else Z95 * self.sigma
-        return {key: value for key, value in vars(self).items() if key != "sigma"} | {"half_width": half}
-
-    def row(self) -> tuple[str, str, str, str]:
-        """As a table has it."""
-        new = f"{number(self.new, 6)} (not determined)" if self.sigma is None else with_interval(self.new, self.sigma)
-        return self.parameter, number(self.in_force, 6), new, _amounts(vars(self))
-
-
-def _amounts(values: Mapping[str, Any]) -> str:
-    """What changes at rest, in words."""
-    if values["rate"]:
-        return size(values["rate"], "rad/s")
-    return (
-        f"{size(values['force'], 'm/s^2')}, horizon {size(values['horizon'], 'rad')}" if values["force"] else "nothing"
-    )
+_HELD = {True: "what the autopilot had corrected by them", False: "raw outputs"}
 
 
 @dataclass(frozen=True)
@@ -96,7 +59,7 @@ class Composition:
         reading = unit.calibration.reading
         known = None if reading is None else reading.corrected
         if known is not None and corrected not in (None, known):
-            raise InputError(f"--log-was: the calibrated log held {_words(known)}, as it shows; leave --log-was out.")
+            raise InputError(f"--log-was: the calibrated log held {_HELD[known]}, as it shows; leave --log-was out.")
         corrected = corrected if known is None else known
         if corrected is None:
             raise InputError(
@@ -109,67 +72,69 @@ class Composition:
         if len(set(numbers.values())) != 1:
             listed = ", ".join(f"{name} {at}" for name, at in numbers.items())
             raise InputError(f"{file.path}: the sensors have different numbers ({listed}): state --instance.")
-        words = f"They are composed with those in force in {file.path}: the calibrated log held {_words(corrected)}"
+        words = f"They are composed with those in force in {file.path}: the calibrated log held {_HELD[corrected]}"
         words += f", {'as stated' if known is None else 'as it shows'}; temperature corrections stay in force."
         composition = cls(replace(unit, instance=numbers.popitem()[1], composition=words), to, file)
         logged = {name: composition._logged(name, corrected) for name in unit.triads}
         return replace(composition, unit=replace(composition.unit, logged=logged))
 
-    def changes(self) -> tuple[Change, ...]:
-        """Return how each parameter changes, and what that amounts to at rest."""
+    def changes(self) -> list[dict[str, Any]]:
+        """Return how each parameter changes, as JSON has it: `parameter`, `in_force`, `new`, `half_width`, `at_rest`.
+
+        half_width: of the 95 % interval of `new`; None where no recording determined it. at_rest: what it changes at
+        rest, where that is most: `force` (m/s²) and `horizon` (rad), or `rate` (rad/s).
+        """
         changes, gravity = [], self.unit.calibration.gravity.value
         data_sheet = self.unit.calibration.from_data_sheet
         for name in self.unit.triads:
-            _, scale_before = self._correction(name, self._in_force)
-            _, scale = self._correction(name, self._new)
+            (_, scale_before), (_, scale) = self._correction(name, self.file), self._correction(name, self._new)
             for part, parameters in zip(("bias", "gain"), self._parameters(name), strict=False):
                 for axis, parameter in enumerate(parameters):
-                    before, after = self.file.value(parameter), self._values[parameter]
-                    sigma = None if f"{name} {part}" in data_sheet else self._sigmas[parameter]
+                    before, after = self.file.value(parameter), self._new.value(parameter)
                     if part == "gain":  # gravity along the axis; at 45° to it, half of the change is across
                         ratio = after / scale_before[axis] - 1.0
-                        amounts = {"force": gravity * ratio, "horizon": abs(ratio) / 2}
+                        at_rest = _at_rest(name, gravity * ratio, abs(ratio) / 2)
                     else:
                         shift = scale[axis] * (before - after)
-                        amounts = _shifted(name, shift, abs(shift) / gravity)
-                    changes.append(Change(parameter, before, after, sigma, **amounts))
-        return tuple(changes)
+                        at_rest = _at_rest(name, shift, abs(shift) / gravity)
+                    half = None if f"{name} {part}" in data_sheet else Z95 * self._sigmas[parameter]
+                    keys = ("parameter", "in_force", "new", "half_width", "at_rest")
+                    changes.append(dict(zip(keys, (parameter, before, after, half, at_rest), strict=True)))
+        return changes
 
     def at_rest(self) -> dict[str, float]:
-        """Return what all changes amount to together at rest, at most over all attitudes: as `Change` has it."""
-        count = np.arange(_DIRECTIONS) + 0.5
-        height, angle = 1.0 - 2.0 * count / _DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * count
-        across = np.sqrt(1.0 - height**2)
-        up = np.stack([across * np.cos(angle), across * np.sin(angle), height], 1)
-        gravity = self.unit.calibration.gravity.value
-        amounts: dict[str, float] = {"force": 0.0, "horizon": 0.0, "rate": 0.0}
+        """Return what all changes amount to together at rest, at most over all attitudes, as in `changes`."""
+        gravity, amounts = self.unit.calibration.gravity.value, {}
+        up = np.asarray(Range.of(self.unit.calibration).paths()[0].specific_force) / gravity
         for name in self.unit.triads:
-            (offset, scale), (new_offset, new_scale) = (
-                self._correction(name, of) for of in (self._in_force, self._new)
-            )
+            (offset, scale), (new_offset, new_scale) = (self._correction(name, of) for of in (self.file, self._new))
             change = gravity * (new_scale / scale - 1.0) * up + new_scale * (offset - new_offset)
             level = change - np.sum(change * up, axis=1, keepdims=True) * up
             most, tilted = (float(np.linalg.norm(part, axis=1).max()) for part in (change, level))
-            amounts |= _shifted(name, most, tilted / gravity)
+            amounts |= _at_rest(name, most, tilted / gravity)
         return amounts
 
     def section(self) -> Section:
         """Return the changes as a page has them."""
-        amounts = self.at_rest()
-        parts = [_amounts(amounts | {"rate": 0.0}), _amounts(amounts | {"force": 0.0})]
+        rows = [
+            (
+                change["parameter"],
+                number(change["in_force"], 6),
+                with_interval(change["new"], change["half_width"] / Z95)
+                if change["half_width"]
+                else f"{number(change['new'], 6)} (not determined)",
+                _words(change["at_rest"]),
+            )
+            for change in self.changes()
+        ]
+        caption = f"Offsets in m/s² and rad/s. All together, at most at rest: {_words(self.at_rest())}."
         headers = ("Parameter", "In force", "New (± 95 %)", "Changes at rest")
-        caption = f"Offsets in m/s² and rad/s. All together, at most at rest: {'; '.join(dict.fromkeys(parts))}."
-        return Section("What changes:", (Table(headers, [change.row() for change in self.changes()], caption),))
+        return Section("What changes:", (Table(headers, rows, caption),))
 
     def document(self) -> dict[str, Any]:
         """Return the changes as JSON has them."""
-        changes = [change.document() for change in self.changes()]
-        return {
-            "file": self.file.path,
-            "composition": self.unit.composition,
-            "changes": changes,
-            "at_rest": self.at_rest(),
-        }
+        shared = {"file": self.file.path, "composition": self.unit.composition}
+        return shared | {"changes": self.changes(), "at_rest": self.at_rest()}
 
     def _parameters(self, name: str) -> list[list[str]]:
         """The names of a triad's offsets, and of its scales if it has some."""
@@ -177,20 +142,14 @@ class Composition:
         words = [tool.offset, *([tool.scale] if name == "accelerometer" else [])]
         return [[tool.patterns[name].format(word=word, axis=axis) for axis in "XYZ"] for word in words]
 
-    def _in_force(self, names: list[str]) -> FloatArray:
-        return self.file.vector(names)
-
-    def _new(self, names: list[str]) -> FloatArray:
-        return np.array([self._values[name] for name in names])
-
-    def _correction(self, name: str, take: Any) -> tuple[FloatArray, FloatArray]:
-        """(3,) offset and (3,) scale of a triad, of what `take` has of their names."""
-        offset, *scale = map(take, self._parameters(name))
+    def _correction(self, name: str, file: ParameterFile) -> tuple[FloatArray, FloatArray]:
+        """(3,) offset and (3,) scale of a triad."""
+        offset, *scale = map(file.vector, self._parameters(name))
         return offset, scale[0] if scale else np.ones(3)
 
     def _logged(self, name: str, corrected: bool) -> Logged:
         firmware, calibration, index = _firmware(self.to), self.unit.calibration, self.unit.instance or 0
-        offset, scale = self._correction(name, self._in_force)
+        offset, scale = self._correction(name, self.file)
         turn = firmware.rotation(self.file, name, index)
         if not np.all(scale > 0):
             raise InputError(f"{self.file.path}: a scale of the {name} in force is {scale.min():g}, which is none.")
@@ -208,13 +167,13 @@ class Composition:
         return Logged(offset=-firmware.thermal(self.file, name, index, celsius))
 
     @cached_property
-    def _values(self) -> Mapping[str, float]:
-        return writer(self.to).write(self.unit).values
+    def _new(self) -> ParameterFile:
+        return ParameterFile("new", {name: (value,) for name, value in writer(self.to).write(self.unit).values.items()})
 
     @cached_property
     def _sigmas(self) -> dict[str, float]:
         """One sigma of each parameter: by central differences over the calibration's gains and biases."""
-        calibration, write = self.unit.calibration, writer(self.to).write
+        calibration, write, small = self.unit.calibration, writer(self.to).write, 1e-6
         numbers, names = np.asarray(flatten(calibration.imu), np.float64), names_of(calibration.imu)
         free = [name for name in calibration.names if name.effect is None and name.owner in self.unit.triads]
 
@@ -223,10 +182,10 @@ class Composition:
             moved_unit = replace(self.unit, calibration=replace(calibration, imu=unflatten(calibration.imu, moved)))
             return np.array(list(write(moved_unit).values.values()))
 
-        slopes = [(values(row, _STEP) - values(row, -_STEP)) / (2 * _STEP) for row in map(names.index, free)]
-        slope = np.reshape(slopes, (len(free), len(self._values)))
+        slopes = [(values(row, small) - values(row, -small)) / (2 * small) for row in map(names.index, free)]
+        slope = np.reshape(slopes, (len(free), len(self._new.values)))
         variances = np.einsum("ik,ij,jk->k", slope, calibration.covariance_of(free), slope)
-        return dict(zip(self._values, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
+        return dict(zip(self._new.values, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
 
 
 def _firmware(to: str) -> Firmware:
@@ -236,13 +195,14 @@ def _firmware(to: str) -> Firmware:
     return firmware
 
 
-def _words(corrected: bool) -> str:
-    return "what the autopilot had corrected by them" if corrected else "raw outputs"
-
-
-def _shifted(name: str, change: float, horizon: float) -> dict[str, float]:
-    """A change of a triad's values at rest as `Change` has it."""
+def _at_rest(name: str, change: float, horizon: float) -> dict[str, float]:
+    """A change of a triad's values at rest."""
     return {"force": change, "horizon": horizon} if name == "accelerometer" else {"rate": change}
+
+
+def _words(at_rest: dict[str, float]) -> str:
+    units = {"force": "m/s^2", "horizon": "rad", "rate": "rad/s"}
+    return ", ".join("horizon " * (key == "horizon") + size(value, units[key]) for key, value in at_rest.items())
 
 
 def _number(unit: ExportedUnit, firmware: Firmware, file: ParameterFile, name: str) -> int:

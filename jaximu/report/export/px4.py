@@ -23,7 +23,6 @@ SUMMARY = "PX4: CAL_ACC*, CAL_GYRO* (offset; scale of the accelerometer), CAL_MA
 MAGNETIC = True
 _REAL, _INTEGER = 9, 6  # MAV_PARAM_TYPE
 _SENSORS = {"accelerometer": "ACC", "gyroscope": "GYRO", "magnetometer": "MAG"}
-_MOST = 4  # sensors of a kind
 
 
 class PX4(Firmware):
@@ -50,7 +49,7 @@ class PX4(Firmware):
 
     def identities(self, file: ParameterFile, triad: str) -> dict[int, int]:
         """Those of CAL_ACCn_ID."""
-        ids = {number: int(file.value(f"CAL_{_SENSORS[triad]}{number}_ID", 0.0)) for number in range(_MOST)}
+        ids = {number: int(file.value(f"CAL_{_SENSORS[triad]}{number}_ID", 0.0)) for number in range(4)}
         return {number: identity for number, identity in ids.items() if identity}
 
     def of_log(self, identities: Mapping[int, int], sensor: int) -> int | None:
@@ -68,7 +67,7 @@ class PX4(Firmware):
     def thermal(self, file: ParameterFile, triad: str, number: int, celsius: float | None) -> FloatArray:
         """X0 + X1 d + X2 d² + X3 d³, d = T − TREF."""
         letter, identity = _SENSORS[triad][0], self.identities(file, triad)[number]
-        stems = (f"TC_{letter}{at}_" for at in range(_MOST))
+        stems = (f"TC_{letter}{at}_" for at in range(4))
         stem = next((stem for stem in stems if file.value(f"{stem}ID", 0.0) == identity), None)
         if stem is None or file.value(f"TC_{letter}_ENABLE", 0.0) != 1:
             return np.zeros(3)
