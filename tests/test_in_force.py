@@ -212,7 +212,12 @@ def round_trip(tmp_path, to, before, equation, corrected: bool, seed: int, more=
         sensors=dict.fromkeys(("accelerometer", "gyroscope"), 1310988 if to == "px4" else 0),
     )  # fmt: skip
     path = written(tmp_path / "now.params", before, to == "px4")
-    composition = Composition.of(ExportedUnit.of(calibration), to, read_parameters(path), corrected)
+    composition = Composition.of(
+        ExportedUnit.of(calibration),
+        to,
+        read_parameters(path),
+        None if to == "px4" else "corrected" if corrected else "raw",
+    )
     content = writer(to).write(composition.unit).files[""].decode()
     rows = [re.split(r"[\t,]", line)[-4 if to == "px4" else 0 :] for line in content.splitlines() if line[0] != "#"]
     after = before | (
@@ -370,7 +375,7 @@ def test_what_is_printed_and_what_json_has(tmp_path, capsys):
     printed = " ".join(capsys.readouterr().out.split())
     assert "composed with those in force" in printed and "what the autopilot had corrected by them" in printed
     assert "as it shows" in printed and "temperature corrections stay in force" in printed
-    assert "What changes:" in printed and re.search(r"CAL_ACC0_XOFF 0\.310000 0\.\d+ ± 0\.\d+ .*m/s², horizon", printed)
+    assert "What changes:" in printed and re.search(r"CAL_ACC0_XOFF 0\.31 0\.\d+ ± 0\.\d+ .*m/s², horizon", printed)
     assert re.search(r"CAL_GYRO0_ZOFF .* °/s", printed) and "All together, at most at rest" in printed
     exported(tmp_path, px4_in_force(2), "--json", corrected=True)
     document = json.loads(capsys.readouterr().out)
@@ -425,7 +430,7 @@ BAD = [
     (without(px4_in_force(), "CAL_ACC0_XOFF") | {"CAL_ACC0_XOF": 1}, [], "no parameter CAL_ACC0_XOFF; .* CAL_ACC0_XOF"),
     (px4_in_force() | {"CAL_ACC0_XOFF": np.nan}, [], "CAL_ACC0_XOFF is nan, not a finite number"),
     (px4_in_force() | {"CAL_ACC0_YSCALE": 0.0}, [], "a scale of the accelerometer in force is 0"),
-    (without(px4_in_force(), "CAL_ACC0_ROT"), [], "has no parameter CAL_ACC0_ROT"),
+    (without(px4_in_force(), "CAL_ACC0_ROT"), [], "has no CAL_ACC0_ROT, so the sensor's rotation is not known"),
     (without(px4_in_force(), "SENS_BOARD_ROT"), [], "has no parameter SENS_BOARD_ROT"),
     (without(px4_in_force(), "SENS_BOARD_Y_OFF"), [], "has no parameter SENS_BOARD_Y_OFF"),
     (px4_in_force(41), [], "SENS_BOARD_ROT is 41, which is no rotation that PX4 lists"),

@@ -34,7 +34,7 @@ def run(
     in_force: Annotated[
         Path | None,
         option(
-            "FILE", "The autopilot's parameters now (.ulg, .bin, a parameter file): compose, and show what changes."
+            "FILE", "The autopilot's parameters during the log (.ulg, .bin, .params …): compose, and show what changes."
         ),
     ] = None,
     log_was: Annotated[
@@ -77,8 +77,7 @@ def run(
     parameters = ExportedUnit.of(model, axes, None if noise is None else read_noise(noise), instance, device)
     composition = None
     if in_force is not None:
-        stated = None if log_was is None else log_was == "corrected"
-        composition = Composition.of(parameters, to, read_parameters(in_force), stated)
+        composition = Composition.of(parameters, to, read_parameters(in_force), log_was)
         parameters = composition.unit
     elif model.reading is not None and model.reading.corrected and hasattr(writer(to), "FIRMWARE"):
         say("The calibrated log was corrected by the autopilot's parameters: give those in force (--in-force FILE).")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from jaximu.estimation.problem import flatten, names_of, unflatten
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.page import Section, Table
-from jaximu.ground.quantities import Z95, number, size, with_interval
+from jaximu.ground.quantities import Z95, plain, size, with_interval
 from jaximu.recordings.readers.parameters import ParameterFile
 from jaximu.recordings.recording import Reading
 from jaximu.report.export.autopilot import MARKS, Firmware
@@ -40,10 +40,12 @@ class Composition:
     file: ParameterFile
 
     @classmethod
-    def of(cls, unit: ExportedUnit, to: str, file: ParameterFile, corrected: bool | None = None) -> Composition:
+    def of(
+        cls, unit: ExportedUnit, to: str, file: ParameterFile, log_was: Literal["raw", "corrected"] | None = None
+    ) -> Composition:
         """Compose a unit with the parameters in force.
 
-        **Arguments:** `corrected`: whether the calibrated log held values that the autopilot had corrected, where the
+        **Arguments:** `log_was`: whether the calibrated log held values that the autopilot had corrected, where the
         calibration does not say so.
 
         Raises `InputError` for a tool without such parameters, parameters of another firmware, without those that are
@@ -57,10 +59,11 @@ class Composition:
             marks = ", ".join(f"{mark}…" for mark in MARKS[firmware.name])
             raise InputError(f"{file.path}: expected parameters of {firmware.name} ({marks}), found {held}.")
         reading = unit.calibration.reading
+        stated = None if log_was is None else log_was == "corrected"
         known = None if reading is None else reading.corrected
-        if known is not None and corrected not in (None, known):
+        if known is not None and stated not in (None, known):
             raise InputError(f"--log-was: the calibrated log held {_HELD[known]}, as it shows; leave --log-was out.")
-        corrected = corrected if known is None else known
+        corrected = stated if known is None else known
         if corrected is None:
             raise InputError(
                 "the calibration does not say whether its log held the sensors' raw outputs or what the autopilot had "
@@ -119,10 +122,10 @@ class Composition:
         rows = [
             (
                 change["parameter"],
-                number(change["in_force"], 6),
+                plain(change["in_force"]),
                 with_interval(change["new"], change["half_width"] / Z95)
                 if change["half_width"]
-                else f"{number(change['new'], 6)} (not determined)",
+                else f"{plain(change['new'])} (not determined)",
                 _words(change["at_rest"]),
             )
             for change in self.changes()

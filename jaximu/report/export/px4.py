@@ -14,6 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
 from jaximu.recordings.readers.parameters import ParameterFile
 from jaximu.report.export.autopilot import Autopilot, Firmware, cubic, need_temperature, rotation_of
 from jaximu.report.export.base import ExportedUnit, Written, comments, text_file
@@ -59,6 +60,11 @@ class PX4(Firmware):
     def rotation(self, file: ParameterFile, triad: str, number: int) -> FloatArray:
         """The level adjustment after the rotation."""
         parameter = f"CAL_{_SENSORS[triad]}{number}_ROT"
+        if parameter not in file.values:
+            raise InputError(
+                f"{file.path}: has no {parameter}, so the sensor's rotation is not known: a PX4 without it numbers "
+                "rotations and orders corrections in other ways."
+            )
         if (index := file.value(parameter)) == -1:
             index = file.value(parameter := "SENS_BOARD_ROT")
         level = file.vector(f"SENS_BOARD_{axis}_OFF" for axis in "XYZ")
