@@ -23,9 +23,11 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.readers.parameters import read_parameters
-from jaximu.recordings.recording import Reading, axis_matrix
+from jaximu.recordings.recording import Reading, apply_axes, axis_matrix
 from jaximu.report.export import Composition, ExportedUnit, Range, losses
 from jaximu.report.export.catalogue import writer
+from jaximu.simulation import consumer_noise, simulate
+from jaximu.simulation.protocols import HandHeld
 
 G = 9.80665
 CELSIUS = 41.0
@@ -504,3 +506,28 @@ def test_bad_files(tmp_path, capsys):
     assert (tmp_path / "calibration_px4.params").read_bytes() == before
     assert main(["export", str(calibration), "--to", "px4"]) == 0
     assert "give those in force (--in-force FILE)" in capsys.readouterr().err
+
+
+def test_from_a_flight_log_to_parameters_by_the_command_line(tmp_path, capsys):
+    """A log that PX4 has corrected wrongly holds all that the round trip needs: calibrate, then export."""
+    pytest.importorskip("pyulog")
+    recording, truth = simulate(Imu.nominal(), HandHeld(12, 1.5), consumer_noise(), seed=[4, 1])
+    vehicle = apply_axes(recording, "FRD")
+    before = px4_in_force(13)
+    turn = rotation_of(before, "px4")
+    y = outputs(vehicle.accelerometer.values @ turn, vehicle.gyroscope.values @ turn)
+    corrected = px4_equation(before, *y, CELSIUS)
+    rows = [("sensor_combined", 0, (round(1e6 * time) + 10**6, *rate, 0, *force))
+            for time, force, rate in zip(vehicle.accelerometer.time, *corrected, strict=True)]  # fmt: skip
+    log = write_ulog(tmp_path / "flight.ulg", {"sensor_combined": COMBINED}, rows, before)
+    assert main(["calibrate", str(log), "--axes", "FRD", "-o", str(tmp_path), "--quiet"]) == 0
+    capsys.readouterr()
+    line = ["export", str(tmp_path / "calibration.json"), "--to", "px4", "--in-force", str(log)]
+    assert main([*line, "-o", str(tmp_path / "new.params"), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["in_force"]["changes"]) == 9
+    after = before | {name: value for name, (value,) in read_parameters(tmp_path / "new.params").values.items()}
+    new = px4_equation(after, *y, CELSIUS)
+    frame = np.diag([1.0, -1.0, -1.0])
+    assert np.abs(np.mean(new[0] - truth.stimulus.specific_force @ frame, axis=0)).max() < 0.02
+    assert np.abs(np.mean(new[1] - truth.stimulus.angular_rate @ frame, axis=0)).max() < 2e-3
+    assert np.abs(np.mean(corrected[0] - truth.stimulus.specific_force @ frame, axis=0)).max() > 0.2
