@@ -531,3 +531,14 @@ def test_from_a_flight_log_to_parameters_by_the_command_line(tmp_path, capsys):
     assert np.abs(np.mean(new[0] - truth.stimulus.specific_force @ frame, axis=0)).max() < 0.02
     assert np.abs(np.mean(new[1] - truth.stimulus.angular_rate @ frame, axis=0)).max() < 2e-3
     assert np.abs(np.mean(corrected[0] - truth.stimulus.specific_force @ frame, axis=0)).max() > 0.2
+
+
+@pytest.mark.parametrize("reading", [{"corrected": "yes"}, {"sensors": [7]}, {"sensors": {"accelerometer": "x"}}])
+def test_a_reading_that_is_none(tmp_path, capsys, reading):
+    path = tmp_path / "calibration.json"
+    plain().save(path)
+    document = json.loads(path.read_text())
+    document["reading"] |= reading
+    path.write_text(json.dumps(document))
+    assert main(["export", str(path), "--to", "px4"]) == 2
+    assert "Traceback" not in capsys.readouterr().err

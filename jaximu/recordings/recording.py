@@ -179,7 +179,10 @@ class Reading:
         counts = np.array([*reading.scales.values(), *reading.offsets.values()], float).reshape(-1, 3)
         if not (reading.maps and np.isfinite([*counts.ravel(), reading.rate or 1.0]).all()):
             raise ValueError("the reading's scales, offsets and rate must be finite numbers")
-        return replace(reading, units=dict(reading.units), sensors=dict(reading.sensors))
+        if reading.corrected not in (None, True, False):
+            raise ValueError("the reading's `corrected` must be true, false or null")
+        sensors = {name: int(sensor) for name, sensor in reading.sensors.items()}
+        return replace(reading, units=dict(reading.units), sensors=sensors)
 
     @property
     def maps(self) -> dict[str, FloatArray]:

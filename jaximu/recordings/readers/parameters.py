@@ -39,7 +39,7 @@ class ParameterFile:
         """
         values = list(self.values.get(name, ())) or ([] if default is None else [default])
         if not values:
-            near = difflib.get_close_matches(name, self.values, 1, 0.8)
+            near = difflib.get_close_matches(name, self.values, 1)
             raise InputError(f"{self.path}: has no parameter {name}{f'; the nearest is {near[0]}' if near else ''}.")
         if len(values) > 1:
             listed = ", then ".join(f"{value:.7g}" for value in values)

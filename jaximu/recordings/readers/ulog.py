@@ -18,6 +18,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import counted
+from jaximu.ground.units import SENSORS
 from jaximu.recordings.columns.table import LogTable, MessageSelection
 from jaximu.recordings.recording import Source
 
@@ -81,7 +82,6 @@ _SOURCES = {
     ),
 }
 """By `--topic`: the messages of accelerometer and gyroscope, the raw ones first."""
-_DEVICES = {"accelerometer": "accel", "gyroscope": "gyro"}
 
 
 def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
@@ -135,7 +135,7 @@ def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTa
         tables.append(_table(source, heat["timestamp"], {"temperature [degC]": heat["temperature"]}))
     sensors = {
         sensor: int(logged[name, instance][field][-1])
-        for (sensor, prefix), (name, _) in zip(_DEVICES.items(), _SOURCES[topic], strict=True)
+        for (prefix, sensor), (name, _) in zip(SENSORS.items(), _SOURCES[topic], strict=False)
         for field in ("device_id", f"{prefix}_device_id")
         if field in logged[name, instance]
     }

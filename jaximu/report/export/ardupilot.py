@@ -8,7 +8,6 @@ diagonal and ODI beside it (xy, xz, yz), after its rotation ORIENT (AP_Compass_B
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -33,7 +32,7 @@ class ArduPilot(Firmware):
     temperatures held in its range (AP_InertialSensor_tempcal.cpp, `correct_sensor`). Logs hold corrected values alone.
     """
 
-    name = "ArduPilot"
+    name, sensors, logs_numbers = "ArduPilot", 3, True
     rotations: ClassVar = {38: (90.0, 68.8, 293.3), 41: (0.0, 7.0, 0.0), 42: (45.0, 0.0, 0.0), 43: (315.0, 0.0, 0.0)}
     custom: ClassVar = {100: ("AHRS_CUSTOM_", "PIT"), 101: ("CUST_ROT1_", "PITCH"), 102: ("CUST_ROT2_", "PITCH")}
     reference = 35.0  # °C
@@ -49,14 +48,9 @@ class ArduPilot(Firmware):
         orient = f"COMPASS_ORIENT{digit}"
         return Autopilot(patterns, "OFFS", "SCAL", ("OFS", "DIA", "ODI"), orient, ("mGauss", 10.0), rotated=True)
 
-    def identities(self, file: ParameterFile, triad: str) -> dict[int, int]:
-        """Those of INS_ACC_ID, INS_ACC2_ID …"""
-        ids = {number: int(file.value(f"INS_{_SHORT[triad]}{_digit(number)}_ID", 0.0)) for number in range(3)}
-        return {number: identity for number, identity in ids.items() if identity}
-
-    def of_log(self, identities: Mapping[int, int], sensor: int) -> int | None:
-        """The one of this number."""
-        return sensor if sensor in identities else None
+    def identity(self, triad: str, number: int) -> str:
+        """INS_ACC_ID, INS_ACC2_ID …"""
+        return f"INS_{_SHORT[triad]}{_digit(number)}_ID"
 
     def rotation(self, file: ParameterFile, triad: str, number: int) -> FloatArray:
         """That of the board; a sensor's own comes before its offsets."""
@@ -91,7 +85,7 @@ def write(parameters: ExportedUnit) -> Written:
     parameters = parameters.for_autopilot("ArduPilot")
     parameters.require_si("ArduPilot")
     number = parameters.instance or 0
-    if number not in range(3):
+    if number not in range(FIRMWARE.sensors):
         raise InputError(f"--instance: ArduPilot names its sensors 0, 1 and 2 here, not {number}.")
     values, equation, corrections, rotation = FIRMWARE.tool(number).values(parameters)
     rows = [f"{name},{value!r}" for name, value in values]

@@ -98,11 +98,14 @@ class Firmware(ABC):
     """Where a firmware keeps its parameters, and in what order it corrects and turns.
 
     u = R S (y − t(T) − o): o the offset, S the accelerometer's scale on its diagonal, R the board's rotation, t the
-    temperature correction. name: as people call it. rotations: roll, pitch and yaw in degrees of those that it numbers
+    temperature correction. name: as people call it. sensors: how many of a kind it names; logs_numbers: whether its
+    logs call a sensor by its number, not by its ID. rotations: roll, pitch and yaw in degrees of those that it numbers
     in another way than MAVLink, by number.
     """
 
     name: ClassVar[str]
+    sensors: ClassVar[int]
+    logs_numbers: ClassVar[bool]
     rotations: ClassVar[Mapping[int, tuple[float, float, float]]] = {}
 
     @abstractmethod
@@ -110,12 +113,8 @@ class Firmware(ABC):
         """The names of the parameters of sensor `number`, from 0."""
 
     @abstractmethod
-    def identities(self, file: ParameterFile, triad: str) -> dict[int, int]:
-        """The device IDs of a triad's sensors, by number; those that are not there have none."""
-
-    @abstractmethod
-    def of_log(self, identities: Mapping[int, int], sensor: int) -> int | None:
-        """The number of the sensor that a flight log calls `sensor`; None where it is none of them."""
+    def identity(self, triad: str, number: int) -> str:
+        """The parameter with a sensor's device ID."""
 
     @abstractmethod
     def rotation(self, file: ParameterFile, triad: str, number: int) -> FloatArray:
@@ -124,6 +123,11 @@ class Firmware(ABC):
     @abstractmethod
     def thermal(self, file: ParameterFile, triad: str, number: int, celsius: float | None) -> FloatArray:
         """(3,) t at a temperature, SI; zero unless enabled. Raises `InputError` where it must be known and is not."""
+
+    def identities(self, file: ParameterFile, triad: str) -> dict[int, int]:
+        """The device IDs of a triad's sensors, by number; those that are not there have none."""
+        ids = {number: int(file.value(self.identity(triad, number), 0.0)) for number in range(self.sensors)}
+        return {number: identity for number, identity in ids.items() if identity}
 
     def numbered(self, file: ParameterFile, parameter: str, number: float) -> FloatArray:
         """(3, 3) the rotation of a number. Raises `InputError` for one that the firmware does not list."""

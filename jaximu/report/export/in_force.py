@@ -212,14 +212,14 @@ def _number(unit: ExportedUnit, firmware: Firmware, file: ParameterFile, name: s
     """Which of the autopilot's sensors a triad is."""
     identities = firmware.identities(file, name)
     sensor = (unit.calibration.reading or Reading()).sensors.get(name)
-    if unit.instance is not None:
-        numbers = [index for index in identities if index == unit.instance]
-    elif unit.device is not None:
-        numbers = [index for index, identity in identities.items() if identity == unit.device]
-    elif sensor is not None:
-        numbers = [index for index in identities if index == firmware.of_log(identities, sensor)]
-    else:
-        numbers = list(identities)
+    by_number, by_identity = (sensor, None) if firmware.logs_numbers else (None, sensor)
+    if unit.instance is not None or unit.device is not None:
+        by_number, by_identity = unit.instance, None if unit.instance is not None else unit.device
+    numbers = [
+        index
+        for index, identity in identities.items()
+        if by_number in (None, index) and by_identity in (None, identity)
+    ]
     if len(numbers) != 1:
         listed = ", ".join(f"{index} (ID {identity})" for index, identity in identities.items()) or "none"
         stated = "" if sensor is None else f" (the log says {sensor})"

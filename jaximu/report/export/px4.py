@@ -9,8 +9,6 @@ beside it (xy, xz, yz), R the rotation ROT (Magnetometer.hpp, `Correct`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
@@ -34,7 +32,7 @@ class PX4(Firmware):
     t is that of the TC_ parameters with the sensor's ID (temperature_compensation, `calc_thermal_offsets_3D`).
     """
 
-    name = "PX4"
+    name, sensors, logs_numbers = "PX4", 4, False
 
     def tool(self, number: int) -> Autopilot:
         """CAL_ACCn_XOFF and so on."""
@@ -48,14 +46,9 @@ class PX4(Firmware):
             rotated=False,
         )
 
-    def identities(self, file: ParameterFile, triad: str) -> dict[int, int]:
-        """Those of CAL_ACCn_ID."""
-        ids = {number: int(file.value(f"CAL_{_SENSORS[triad]}{number}_ID", 0.0)) for number in range(4)}
-        return {number: identity for number, identity in ids.items() if identity}
-
-    def of_log(self, identities: Mapping[int, int], sensor: int) -> int | None:
-        """The one with this ID."""
-        return next((number for number, identity in identities.items() if identity == sensor), None)
+    def identity(self, triad: str, number: int) -> str:
+        """CAL_ACCn_ID."""
+        return f"CAL_{_SENSORS[triad]}{number}_ID"
 
     def rotation(self, file: ParameterFile, triad: str, number: int) -> FloatArray:
         """The level adjustment after the rotation."""
@@ -73,15 +66,14 @@ class PX4(Firmware):
     def thermal(self, file: ParameterFile, triad: str, number: int, celsius: float | None) -> FloatArray:
         """X0 + X1 d + X2 d² + X3 d³, d = T − TREF."""
         letter, identity = _SENSORS[triad][0], self.identities(file, triad)[number]
-        stems = (f"TC_{letter}{at}_" for at in range(4))
+        stems = (f"TC_{letter}{at}_" for at in range(self.sensors))
         stem = next((stem for stem in stems if file.value(f"{stem}ID", 0.0) == identity), None)
         if stem is None or file.value(f"TC_{letter}_ENABLE", 0.0) != 1:
             return np.zeros(3)
         celsius = need_temperature(file, f"TC_{letter}_ENABLE", celsius)
         powers = np.array([file.vector(f"{stem}X{power}_{axis}" for axis in range(3)) for power in range(4)])
-        return cubic(
-            powers, *(file.value(f"{stem}TREF"), celsius), *file.vector(f"{stem}T{end}" for end in ("MIN", "MAX"))
-        )
+        about, low, high = file.vector(f"{stem}T{end}" for end in ("REF", "MIN", "MAX"))
+        return cubic(powers, about, celsius, low, high)
 
 
 FIRMWARE = PX4()
