@@ -97,8 +97,17 @@ def imu_messages(
 # --- PX4
 
 
-def write_ulog(path: Path, messages: dict[str, list[tuple[str, str]]], rows: list[tuple[str, int, tuple]]) -> Path:
-    """A ULog: formats {name: [(type, field)]}, then rows (name, instance, values), by the published file format."""
+def write_ulog(
+    path: Path,
+    messages: dict[str, list[tuple[str, str]]],
+    rows: list[tuple[str, int, tuple]],
+    parameters: dict[str, float] | None = None,
+    changed: dict[str, float] | None = None,
+) -> Path:
+    """A ULog: formats {name: [(type, field)]}, then rows (name, instance, values), by the published file format.
+
+    parameters: those that it begins with; changed: those that change after the rows.
+    """
     codes = {"uint64_t": "Q", "float": "f", "float[3]": "3f", "int32_t": "i", "uint32_t": "I", "uint16_t": "H",
              "uint8_t": "B", "int16_t[32]": "32h"}  # fmt: skip
 
@@ -108,6 +117,12 @@ def write_ulog(path: Path, messages: dict[str, list[tuple[str, str]]], rows: lis
     out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message(b"B", bytes(40))]
     for name, fields in messages.items():
         out.append(message(b"F", f"{name}:{''.join(f'{kind} {field};' for kind, field in fields)}".encode()))
+
+    def parameter(name: str, value: float) -> bytes:
+        key, code = (f"int32_t {name}", "i") if isinstance(value, int) else (f"float {name}", "f")
+        return message(b"P", struct.pack("<B", len(key)) + key.encode() + struct.pack(f"<{code}", value))
+
+    out += [parameter(*pair) for pair in (parameters or {}).items()]
     ids: dict[tuple[str, int], int] = {}
     for name, place, values in rows:
         if (name, place) not in ids:
@@ -115,6 +130,7 @@ def write_ulog(path: Path, messages: dict[str, list[tuple[str, str]]], rows: lis
             out.append(message(b"A", struct.pack("<BH", place, ids[name, place]) + name.encode()))
         layout = "<H" + "".join(codes[kind] for kind, _ in messages[name])
         out.append(message(b"D", struct.pack(layout, ids[name, place], *values)))
+    out += [parameter(*pair) for pair in (changed or {}).items()]
     path.write_bytes(b"".join(out))
     return path
 
@@ -140,7 +156,7 @@ def px4(path: Path) -> Path:
 
 def write_dataflash(path: Path, formats: dict[str, tuple[str, str]], rows: list[tuple[str, tuple]]) -> Path:
     """A DataFlash log: formats {name: (letters, columns)}, then rows, by the published layout of its messages."""
-    struct_of = {"Q": "Q", "f": "f", "I": "I", "B": "B", "H": "H"}
+    struct_of = {"Q": "Q", "f": "f", "I": "I", "B": "B", "H": "H", "N": "16s"}
     head = b"\xa3\x95"
 
     def form(kind: int, length: int, name: str, letters: str, columns: str) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from jaximu.cli import options
 from jaximu.cli.messages import say
@@ -25,6 +25,7 @@ class ExportCommand:
 
     Examples:
       jaximu export results/calibration.json --to px4
+      jaximu export results/calibration.json --to px4 --in-force flight.ulg
       jaximu export results/calibration.json --to kalibr --noise noise/imu.yaml
 
     """
@@ -37,7 +38,17 @@ class ExportCommand:
         str | None,
         option("MAP", "The --axes used for calibration, where CALIBRATION does not say how it was read."),
     ] = None
-    instance: Annotated[int, option("N", "Which of the autopilot's sensors, from 0.")] = 0
+    in_force: Annotated[
+        Path | None,
+        option(
+            "FILE", "The autopilot's parameters during the log (.ulg, .bin, .params …): compose, and show what changes."
+        ),
+    ] = None
+    log_was: Annotated[
+        Literal["raw", "corrected"] | None,
+        option("{raw,corrected}", "Whether the calibrated log was corrected by these parameters, if it does not show."),
+    ] = None
+    instance: Annotated[int | None, option("N", "Which of the autopilot's sensors, from 0 (default: 0).")] = None
     device: Annotated[int | None, option("ID", "The sensor's ID in PX4's parameters CAL_ACCn_ID.")] = None
     rate_range: Annotated[float, option("DEG/S", "State the error of what the file leaves out up to this rate.")] = 250
     temperature_range: Annotated[
@@ -47,29 +58,38 @@ class ExportCommand:
 
     def run(self) -> None:
         """Do what the command line says."""
-        options.require_files(self.calibration, self.noise)
-        options.require_apart(self.output, self.calibration, self.noise)
-        if self.instance < 0:
+        options.require_files(self.calibration, self.noise, self.in_force)
+        options.require_apart(self.output, self.calibration, self.noise, self.in_force)
+        if (self.instance or 0) < 0:
             raise InputError(f"--instance: sensors count from 0, found {self.instance}.")
         rate, temperatures = _rate(self.rate_range), _temperatures(self.temperature_range)
         from jaximu.calibration import load_calibration
         from jaximu.recordings.readers.kalibr import read_noise
-        from jaximu.report.export import ExportedUnit, Range, export, losses
+        from jaximu.recordings.readers.parameters import read_parameters
+        from jaximu.report.export import Composition, ExportedUnit, Range, export, losses
 
         model = load_calibration(self.calibration)
+        noise = None if self.noise is None else read_noise(self.noise)
         if self.noise is not None and not getattr(writer(self.to), "NOISE", False):
             also = "; `jaximu consequences --noise-for` writes the filter's parameters" if self.to in TARGETS else ""
             say(f"{self.noise} is not used: the {self.to} file holds a calibration and no noise{also}.")
-        if not getattr(writer(self.to), "MAGNETIC", False):
+        if self.in_force is not None or not getattr(writer(self.to), "MAGNETIC", False):
             model = model.inertial()
         extent = Range.of(model, rate, temperatures)
-        parameters = ExportedUnit.of(
-            model, self.axes, None if self.noise is None else read_noise(self.noise), self.instance, self.device
-        )
+        parameters = ExportedUnit.of(model, self.axes, noise, self.instance, self.device)
+        composition = None
+        if self.in_force is not None:
+            composition = Composition.of(parameters, self.to, read_parameters(self.in_force), self.log_was)
+            parameters = composition.unit
+        elif model.reading is not None and model.reading.corrected and hasattr(writer(self.to), "FIRMWARE"):
+            say(
+                "The calibrated log was corrected by the autopilot's parameters: give those in force (--in-force FILE)."
+            )
         path = self.output or self.calibration.with_name(f"{self.calibration.stem}_{self.to}{writer(self.to).SUFFIX}")
+        options.require_apart(path, self.in_force)
         written, paths = export(parameters, self.to, path)
         lost = losses(parameters, written, extent)
-        equation = (written.parameters or parameters).axes
+        axes_words = (written.parameters or parameters).axes
         left = [
             effect.title
             for triad in model.imu.triads().values()
@@ -77,24 +97,24 @@ class ExportCommand:
             if effect.scope != "device"
         ]
         if self.as_json:
-            options.print_json(
-                {
-                    "format": self.to,
-                    "files": [str(path) for path in paths],
-                    "axes": equation,
-                    "convention": written.convention,
-                    "equation": written.equation,
-                    "range": extent.text(),
-                    "losses": [vars(loss) for loss in lost],
-                }
-            )
-            return
+            document = {
+                "format": self.to,
+                "files": [str(path) for path in paths],
+                "axes": axes_words,
+                "convention": written.convention,
+                "equation": written.equation,
+                "range": extent.text(),
+                "losses": [vars(loss) for loss in lost],
+            }
+            return options.print_json(document | ({} if composition is None else {"in_force": composition.document()}))
         costs = [loss.text() for loss in lost]
         costs += [f"{', '.join(left)}: of one session, not of the unit, and never exported."] if left else []
         parts: list[Part] = [f"Convention: {written.convention}", Section("Apply:", (Code(written.equation),))]
+        if composition is not None:
+            parts.append(composition.section())
         if costs:
             parts.append(Section(f"Not in the file, and what that costs over {extent.text()}:", (Items(costs),)))
-        later("report.terminal", "show")(Page(f"Calibration for {self.to}", (equation,), first=parts))
+        later("report.terminal", "show")(Page(f"Calibration for {self.to}", (axes_words,), first=parts))
         say(f"Written: {', '.join(map(str, paths))}")
 
 

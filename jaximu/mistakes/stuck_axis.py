@@ -49,7 +49,7 @@ def _stuck(sensor: Sensor) -> list[Finding]:
 def _stuck_axis(sensor: Sensor, change: NDArray[np.bool_], axis: int) -> Finding | None:
     """Return where an axis repeats itself, not at an end of its range, while the others move; `change` (n − 1, 3)."""
     values, length = sensor.values[:, axis], max(20, round(_STUCK * sensor.rate))
-    others = change[:, [k for k in range(3) if k != axis]].any(axis=1)
+    others = np.any(change[:, [k for k in range(3) if k != axis]], axis=1)
     candidates = [run for run in runs_of(~change[:, axis]) if run[1] - run[0] >= length]
     if not candidates:
         return None
@@ -57,7 +57,7 @@ def _stuck_axis(sensor: Sensor, change: NDArray[np.bool_], axis: int) -> Finding
     long = [
         run
         for run in candidates
-        if others[run[0] : run[1]].mean() > 0.5 and not any(a <= run[0] and run[1] < b for a, b in limits)
+        if np.mean(others[slice(*run)]) > 0.5 and not any(a <= run[0] and run[1] < b for a, b in limits)
     ]
     if not long:
         return None

@@ -151,7 +151,9 @@ class Reading:
     frame: "FRD" where the format defines its axes as an autopilot's: forward, right, down.
     units: by signal, as the file has them. scales: by triad in counts, counts per SI unit (3,); offsets: counts at zero
     input (3,); both in the log's axes. topic, instance, stamp: what was taken of a bag or flight log. device: whose
-    rows were taken of a table of several units.
+    rows were taken of a table of several units. corrected: whether the values are what an autopilot has made of its
+    sensors' outputs by its parameters; None where the format leaves it open. sensors: by triad, the sensor in a flight
+    log: PX4's device ID, ArduPilot's number.
     """
 
     columns: str | None = None
@@ -167,6 +169,8 @@ class Reading:
     instance: int | None = None
     stamp: str = "header"
     device: str | None = None
+    corrected: bool | None = None
+    sensors: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> "Reading":
@@ -175,7 +179,10 @@ class Reading:
         counts = np.array([*reading.scales.values(), *reading.offsets.values()], float).reshape(-1, 3)
         if not (reading.maps and np.isfinite([*counts.ravel(), reading.rate or 1.0]).all()):
             raise ValueError("the reading's scales, offsets and rate must be finite numbers")
-        return replace(reading, units=dict(reading.units))
+        if reading.corrected not in (None, True, False):
+            raise ValueError("the reading's `corrected` must be true, false or null")
+        sensors = {name: int(sensor) for name, sensor in reading.sensors.items()}
+        return replace(reading, units=dict(reading.units), sensors=sensors)
 
     @property
     def maps(self) -> dict[str, FloatArray]:

@@ -1,7 +1,7 @@
 """The intermediate of all readers: columns as the file has them, before names, units and sensors are understood."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,7 @@ class LogTable:
         file. In a table of samples rows out of order and repeated ones are put right, too; the clock is one clock.
     frame: "FRD" where the format defines its axes as an autopilot's. axes: the map that its writer has applied already.
     device: whose rows these are, where several units wrote into the file.
+    corrected, sensors: as `Reading` has them.
     """
 
     source: Source
@@ -66,6 +67,8 @@ class LogTable:
     frame: str | None = None
     axes: str | None = None
     device: str | None = None
+    corrected: bool | None = None
+    sensors: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def path(self) -> str:

@@ -30,19 +30,8 @@ _KINDS = {"IMU": _ACCEL | _GYRO | {"T": "temperature [degC]"}, "ACC": _ACCEL, "G
 
 def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
     """The tables in a DataFlash log. Raises InputError for a message or an instance that it does not have."""
-    from pymavlink.DFReader import DFReader_binary, DFReader_text
-
-    with path.open("rb") as file:
-        binary = file.read(1) == b"\xa3"
-    with _silent() as silent:
-        kind = DFReader_binary if binary else DFReader_text
-        log: Any = kind.__new__(kind)  # in two steps: it opens the file, and may fail thereafter
-        try:
-            log.__init__(str(path))
-            rows = _rows(log)
-        finally:
-            if hasattr(log, "filehandle"):
-                log.filehandle.close()
+    with _opened(path) as (log, silent):
+        rows = _rows(log)
     instances = sorted({instance for _, instance in rows})
     instance = selection.instance if selection.instance is not None else (instances or [0])[0]
     counts = {kind: len(rows[kind, instance]) for kind in _KINDS if (kind, instance) in rows}
@@ -76,7 +65,33 @@ def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTa
     if topic != "IMU" and ("IMU", instance) in rows:  # the temperature is there alone
         heat = rows["IMU", instance]
         tables.append(_table(source, heat[:, 0], {"temperature [degC]": heat[:, -1]}))
-    return replace(tables[0], notes=tuple(notes), frame="FRD"), *tables[1:]
+    sensors = {"accelerometer": instance, "gyroscope": instance}
+    first = replace(tables[0], notes=tuple(notes), frame="FRD", corrected=True, sensors=sensors)
+    return first, *tables[1:]
+
+
+def parameters(path: Path) -> list[tuple[str, float]]:
+    """Return name and value of the parameters in a DataFlash log (`PARM`), in the order in which they came."""
+    with _opened(path) as (log, _):
+        return [(message.Name, float(message.Value)) for message in iter(lambda: log.recv_match(type="PARM"), None)]
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, io.StringIO]]:
+    """The log, and what pymavlink prints while it is open."""
+    from pymavlink.DFReader import DFReader_binary, DFReader_text
+
+    with path.open("rb") as file:
+        binary = file.read(1) == b"\xa3"
+    with _silent() as silent:
+        kind = DFReader_binary if binary else DFReader_text
+        log: Any = kind.__new__(kind)  # in two steps: it opens the file, and may fail thereafter
+        try:
+            log.__init__(str(path))
+            yield log, silent
+        finally:
+            if hasattr(log, "filehandle"):
+                log.filehandle.close()
 
 
 @contextmanager

@@ -222,6 +222,8 @@ def _read_as(
         instance=options.instance,
         stamp=options.stamp,
         device=table.device,
+        corrected=table.corrected,
+        sensors=table.sensors,
     )
 
 

@@ -7,7 +7,7 @@ Units and axes as PX4's message definitions state them: µs, m/s², rad/s, °C, 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import redirect_stdout
 from dataclasses import replace
 from functools import partial
@@ -18,6 +18,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import counted
+from jaximu.ground.units import SENSORS
 from jaximu.recordings.columns.table import LogTable, MessageSelection
 from jaximu.recordings.recording import Source
 
@@ -85,12 +86,7 @@ _SOURCES = {
 
 def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
     """The tables in a ULog. Raises InputError for a topic or an instance that it does not have."""
-    from pyulog import ULog
-
-    names = {name for messages in _SOURCES.values() for name, _ in messages}
-    with path.open("rb") as head, path.open("rb") as file, redirect_stdout(io.StringIO()):  # pyulog prints its findings
-        _check_formats(ULog(head, parse_header_only=True).message_formats)
-        log = ULog(file, list(names))
+    log = _opened(path, {name for messages in _SOURCES.values() for name, _ in messages})
     logged = {
         (dataset.name, dataset.multi_id): dataset.data
         for dataset in log.data_list
@@ -137,7 +133,30 @@ def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTa
     heat = logged.get(("sensor_accel", instance), {})
     if "temperature" in heat:
         tables.append(_table(source, heat["timestamp"], {"temperature [degC]": heat["temperature"]}))
-    return replace(tables[0], notes=tuple(notes), frame="FRD"), *tables[1:]
+    sensors = {
+        sensor: int(logged[name, instance][field][-1])
+        for (prefix, sensor), (name, _) in zip(SENSORS.items(), _SOURCES[topic], strict=False)
+        for field in ("device_id", f"{prefix}_device_id")
+        if field in logged[name, instance]
+    }
+    corrected = topic in ("sensor_combined", "vehicle_imu")
+    first = replace(tables[0], notes=tuple(notes), frame="FRD", corrected=corrected, sensors=sensors)
+    return first, *tables[1:]
+
+
+def parameters(path: Path) -> Iterator[tuple[str, float]]:
+    """Yield name and value of the parameters that a ULog began with, and of those that changed in it."""
+    log = _opened(path, {"parameter_update"})
+    yield from log.initial_parameters.items()
+    yield from ((name, value) for _, name, value in log.changed_parameters)
+
+
+def _opened(path: Path, names: Collection[str]) -> Any:
+    from pyulog import ULog
+
+    with path.open("rb") as head, path.open("rb") as file, redirect_stdout(io.StringIO()):  # pyulog prints its findings
+        _check_formats(ULog(head, parse_header_only=True).message_formats)
+        return ULog(file, list(names))
 
 
 def _samples(data: _Fields) -> int:

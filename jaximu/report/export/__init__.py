@@ -8,10 +8,12 @@ if TYPE_CHECKING:
     from jaximu.report.export.base import Correction, ExportedUnit, Written
     from jaximu.report.export.catalogue import WRITERS, export
     from jaximu.report.export.cost import Loss, Range, losses
+    from jaximu.report.export.in_force import Composition
     from jaximu.report.export.messages import is_messages, write_messages
 
 __all__ = [
     "WRITERS",
+    "Composition",
     "Correction",
     "ExportedUnit",
     "Loss",
@@ -29,6 +31,7 @@ __getattr__ = lazily(
         "jaximu.report.export.base": "Correction, ExportedUnit, Written",
         "jaximu.report.export.catalogue": "WRITERS, export",
         "jaximu.report.export.cost": "Loss, Range, losses",
+        "jaximu.report.export.in_force": "Composition",
         "jaximu.report.export.messages": "is_messages, write_messages",
     },
 )

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import scipy
 
-from jaximu.report.export.base import Correction, ExportedUnit, LinearTriad, matrix_text, vector_text
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.recordings.readers.parameters import ParameterFile
+from jaximu.report.export.base import Correction, ExportedUnit, LinearTriad, Logged, matrix_text, vector_text
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,9 @@ class Autopilot:
         accelerometer: u = (y − offset) ∘ scale; gyroscope: u = y − offset; magnetometer: h = S (y − offset).
         """
         values, equation, corrections, words = [], [], {}, ""
-        for name, triad in parameters.triads.items():
+        for name, of_log in parameters.triads.items():
+            logged = parameters.logged.get(name, Logged())
+            triad = logged.of_sensor(of_log)
             if name == "magnetometer":
                 axes = signed_axes(triad)
                 matrix, shift = symmetric_matrix(triad, axes), self.unit[1] * triad.bias
@@ -62,12 +69,88 @@ class Autopilot:
                 written = {self.offset: triad.bias}
                 corrections[name] = Correction(np.eye(3), triad.bias)
                 equation += [f"w = y - {self.offset}", f"{self.offset} = {vector_text(triad.bias)}"]
+            corrections[name] = logged.correction(corrections[name])
             values += [
                 (self.patterns[name].format(word=word, axis=axis), float(value))
                 for word, part in written.items()
                 for axis, value in zip("XYZ", part, strict=True)
             ]
         return values, "\n".join(equation), corrections, words
+
+
+_ROTATIONS = (
+    "0 0 0,0 0 45,0 0 90,0 0 135,0 0 180,0 0 225,0 0 270,0 0 315,180 0 0,180 0 45,180 0 90,180 0 135,0 180 0,180 0 225,"
+    "180 0 270,180 0 315,90 0 0,90 0 45,90 0 90,90 0 135,270 0 0,270 0 45,270 0 90,270 0 135,0 90 0,0 270 0,0 180 90,"
+    "0 180 270,90 90 0,180 90 0,270 90 0,90 180 0,270 180 0,90 270 0,180 270 0,270 270 0,90 180 90,90 0 270,90 68 293,"
+    "0 315 0,90 315 0"
+)
+"""Roll, pitch and yaw in degrees of the rotations that both firmwares number as MAVLink's MAV_SENSOR_ORIENTATION."""
+MARKS = {"PX4": ("CAL_ACC", "CAL_GYRO", "SENS_BOARD"), "ArduPilot": ("INS_ACC", "INS_GYR", "AHRS_")}
+"""How the names of a firmware's own parameters begin."""
+
+
+def rotation_of(roll: float, pitch: float, yaw: float) -> FloatArray:
+    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll), degrees: from the board's axes to the vehicle's."""
+    return scipy.spatial.transform.Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
+
+
+class Firmware(ABC):
+    """Where a firmware keeps its parameters, and in what order it corrects and turns.
+
+    u = R S (y − t(T) − o): o the offset, S the accelerometer's scale on its diagonal, R the board's rotation, t the
+    temperature correction. name: as people call it. sensors: how many of a kind it names; logs_numbers: whether its
+    logs call a sensor by its number, not by its ID. rotations: roll, pitch and yaw in degrees of those that it numbers
+    in another way than MAVLink, by number.
+    """
+
+    name: ClassVar[str]
+    sensors: ClassVar[int]
+    logs_numbers: ClassVar[bool]
+    rotations: ClassVar[Mapping[int, tuple[float, float, float]]] = {}
+
+    @abstractmethod
+    def tool(self, number: int) -> Autopilot:
+        """The names of the parameters of sensor `number`, from 0."""
+
+    @abstractmethod
+    def identity(self, triad: str, number: int) -> str:
+        """The parameter with a sensor's device ID."""
+
+    @abstractmethod
+    def rotation(self, file: ParameterFile, triad: str, number: int) -> FloatArray:
+        """(3, 3) R. Raises `InputError` where the parameters do not say it."""
+
+    @abstractmethod
+    def thermal(self, file: ParameterFile, triad: str, number: int, celsius: float | None) -> FloatArray:
+        """(3,) t at a temperature, SI; zero unless enabled. Raises `InputError` where it must be known and is not."""
+
+    def identities(self, file: ParameterFile, triad: str) -> dict[int, int]:
+        """The device IDs of a triad's sensors, by number; those that are not there have none."""
+        ids = {number: int(file.value(self.identity(triad, number), 0.0)) for number in range(self.sensors)}
+        return {number: identity for number, identity in ids.items() if identity}
+
+    def numbered(self, file: ParameterFile, parameter: str, number: float) -> FloatArray:
+        """(3, 3) the rotation of a number. Raises `InputError` for one that the firmware does not list."""
+        known = dict(enumerate(tuple(map(float, angles.split())) for angles in _ROTATIONS.split(",")))
+        angles = (known | dict(self.rotations)).get(int(number))
+        if angles is None or number != int(number):
+            raise InputError(f"{file.path}: {parameter} is {number:g}, which is no rotation that {self.name} lists.")
+        return rotation_of(*angles)
+
+
+def cubic(coefficients: FloatArray, about: float, celsius: float, low: float, high: float) -> FloatArray:
+    """(3,) the cubic of each axis, coefficients (4, 3) constant first, the temperature held between `low`, `high`."""
+    return np.vander([np.clip(celsius, low, high) - about], 4, increasing=True)[0] @ coefficients
+
+
+def need_temperature(file: ParameterFile, parameter: str, celsius: float | None) -> float:
+    """The calibration's temperature. Raises `InputError` where it is not known."""
+    if celsius is None:
+        raise InputError(
+            f"{file.path}: {parameter} is on, and the calibration does not say its temperature: calibrate a log that "
+            "has it, or calibrate what the autopilot has corrected (sensor_combined, vehicle_imu, IMU)."
+        )
+    return celsius
 
 
 def diagonal_scale(triad: LinearTriad) -> np.ndarray:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -67,6 +66,27 @@ class Correction:
 
 
 @dataclass(frozen=True)
+class Logged:
+    """A log's values z as the sensor's output after its temperature correction: matrix·z + offset; by default they are.
+
+    frame: (3, 3) from the log's axes to the sensor's.
+    """
+
+    matrix: FloatArray = field(default_factory=lambda: np.eye(3))
+    offset: FloatArray = field(default_factory=lambda: np.zeros(3))
+    frame: FloatArray = field(default_factory=lambda: np.eye(3))
+
+    def of_sensor(self, triad: LinearTriad) -> LinearTriad:
+        """The sensor's linear part in its own axes, of that of the log's values."""
+        return LinearTriad(self.matrix @ triad.gain @ self.frame.T, self.matrix @ triad.bias + self.offset, triad.unit)
+
+    def correction(self, correction: Correction) -> Correction:
+        """What a correction of the sensor's output makes of the log's values, in the log's axes."""
+        offset = np.linalg.solve(self.matrix, correction.offset - self.offset)
+        return replace(correction, matrix=self.frame.T @ correction.matrix @ self.matrix, offset=offset)
+
+
+@dataclass(frozen=True)
 class Written:
     """What a writer made.
 
@@ -74,7 +94,7 @@ class Written:
     convention: sentences on signs, frames and units of the file. equation: how to apply it, with the numbers in it.
     corrections: what the other tool makes of it, by triad; a triad that is missing is not corrected at all.
     carried: names of effects that the file holds. uncertainty: whether it holds standard deviations.
-    parameters: what it was written from, where the tool has axes of its own.
+    parameters: what it was written from, where the tool has axes of its own. values: an autopilot's, by name.
     """
 
     files: Mapping[str, bytes]
@@ -84,6 +104,7 @@ class Written:
     carried: frozenset[str] = frozenset()
     uncertainty: bool = False
     parameters: ExportedUnit | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -93,7 +114,9 @@ class ExportedUnit:
     maps: (3, 3) from the axes of the outputs, the logger's, to the body's, by triad; frames: the same of the answers.
     `triads` are gain and bias from the latter to the former. axes: a sentence on both.
     noise: Kalibr's four continuous densities (`KALIBR_UNITS`), as far as they are known. instance: which of several
-    sensors the file is for, counted from 0. device: its identifier, where the tool asks for one.
+    sensors the file is for, counted from 0; None where that was not stated. device: its identifier, where the tool
+    asks for one. logged: by triad, how the log's values depend on an autopilot's parameters in force; composition: a
+    sentence on that, "" where these are not known.
     """
 
     calibration: Calibration
@@ -102,8 +125,10 @@ class ExportedUnit:
     frames: Mapping[str, FloatArray]
     axes: str
     noise: Mapping[str, float] = field(default_factory=dict)
-    instance: int = 0
+    instance: int | None = None
     device: int | None = None
+    logged: Mapping[str, Logged] = field(default_factory=dict)
+    composition: str = ""
 
     @classmethod
     def of(
@@ -111,7 +136,7 @@ class ExportedUnit:
         calibration: Calibration,
         axes: str | None = None,
         noise: Mapping[str, float] | None = None,
-        instance: int = 0,
+        instance: int | None = None,
         device: int | None = None,
     ) -> ExportedUnit:
         """Take the linear parts out of a calibration, for the outputs as the logger has them.
@@ -134,14 +159,11 @@ class ExportedUnit:
         if shared and "accelerometer" in calibration.triads() and not np.array_equal(maps["accelerometer"], first):
             words += "; the log's accelerometer has minus specific force, and the answer is specific force"
         frames = dict.fromkeys(maps, first if shared else np.eye(3))
-        return cls._in(calibration, maps, frames, f"Axes: {words}.", noise or {}, instance, device)
+        return cls(calibration, {}, {}, {}, "", noise or {}, instance, device)._in(maps, frames, f"Axes: {words}.")
 
-    @classmethod
-    def _in(
-        cls, calibration: Calibration, maps: Mapping[str, FloatArray], frames: Mapping[str, FloatArray], *more: Any
-    ) -> ExportedUnit:
+    def _in(self, maps: Mapping[str, FloatArray], frames: Mapping[str, FloatArray], axes: str) -> ExportedUnit:
         """Make them for outputs and answers in these axes: y = Aᵀ y_body and u = Fᵀ u_body, so the gain is AᵀKF."""
-        sensitivity = np.asarray(calibration.imu.coefficients(GyroGSensitivity), np.float64).reshape(3, 3)
+        sensitivity = np.asarray(self.calibration.imu.coefficients(GyroGSensitivity), np.float64).reshape(3, 3)
         triads = {
             name: LinearTriad(
                 maps[name].T @ np.asarray(triad.gain, np.float64) @ frames[name],
@@ -149,22 +171,22 @@ class ExportedUnit:
                 triad.output_unit,
                 (name == GyroGSensitivity.owner) * maps[name].T @ sensitivity @ frames["accelerometer"],
             )
-            for name, triad in calibration.triads().items()
+            for name, triad in self.calibration.triads().items()
         }
-        return cls(calibration, triads, maps, frames, *more)
+        return replace(self, triads=triads, maps=maps, frames=frames, axes=axes)
 
     def for_autopilot(self, name: str) -> ExportedUnit:
         """Return the same in the axes of an autopilot: forward, right, down; as in its own log, if it is of that."""
         reading = self.calibration.reading
         if reading is None:  # as the log was, then
-            return self._in(self.calibration, self.maps, self.maps, self.axes, self.noise, self.instance, self.device)
+            return self._in(self.maps, self.maps, self.axes)
         words = f"Axes: {name}'s own, forward, right, down, "
         if reading.frame is None:
             words += "with the calibration's body axes taken as forward, left, up."
         else:
             words += "as the log has them."
         maps = reading.autopilot_maps
-        return self._in(self.calibration, maps, maps, words, self.noise, self.instance, self.device)
+        return self._in(maps, maps, words)
 
     @property
     def accelerometer(self) -> LinearTriad:

@@ -9,7 +9,12 @@ beside it (xy, xz, yz), R the rotation ROT (Magnetometer.hpp, `Correct`).
 
 from __future__ import annotations
 
-from jaximu.report.export.autopilot import Autopilot
+import numpy as np
+
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.errors import InputError
+from jaximu.recordings.readers.parameters import ParameterFile
+from jaximu.report.export.autopilot import Autopilot, Firmware, cubic, need_temperature, rotation_of
 from jaximu.report.export.base import ExportedUnit, Written, comments, text_file
 
 SUFFIX = ".params"
@@ -19,21 +24,67 @@ _REAL, _INTEGER = 9, 6  # MAV_PARAM_TYPE
 _SENSORS = {"accelerometer": "ACC", "gyroscope": "GYRO", "magnetometer": "MAG"}
 
 
+class PX4(Firmware):
+    """PX4 since it has `CAL_ACCn_ROT`: before, it numbered rotations and ordered corrections in other ways.
+
+    R is the level adjustment SENS_BOARD_X_OFF, Y_OFF, Z_OFF after the rotation: that of the board, SENS_BOARD_ROT, or
+    of an external sensor, CAL_ACCn_ROT, which is -1 otherwise (Accelerometer.cpp, `set_rotation`, `ParametersUpdate`).
+    t is that of the TC_ parameters with the sensor's ID (temperature_compensation, `calc_thermal_offsets_3D`).
+    """
+
+    name, sensors, logs_numbers = "PX4", 4, False
+
+    def tool(self, number: int) -> Autopilot:
+        """CAL_ACCn_XOFF and so on."""
+        return Autopilot(
+            {name: f"CAL_{sensor}{number}_{{axis}}{{word}}" for name, sensor in _SENSORS.items()},
+            "OFF",
+            "SCALE",
+            ("OFF", "SCALE", "ODIAG"),
+            f"CAL_MAG{number}_ROT",
+            ("gauss", 0.01),
+            rotated=False,
+        )
+
+    def identity(self, triad: str, number: int) -> str:
+        """CAL_ACCn_ID."""
+        return f"CAL_{_SENSORS[triad]}{number}_ID"
+
+    def rotation(self, file: ParameterFile, triad: str, number: int) -> FloatArray:
+        """The level adjustment after the rotation."""
+        parameter = f"CAL_{_SENSORS[triad]}{number}_ROT"
+        if parameter not in file.values:
+            raise InputError(
+                f"{file.path}: has no {parameter}, so the sensor's rotation is not known: a PX4 without it numbers "
+                "rotations and orders corrections in other ways."
+            )
+        if (index := file.value(parameter)) == -1:
+            index = file.value(parameter := "SENS_BOARD_ROT")
+        level = file.vector(f"SENS_BOARD_{axis}_OFF" for axis in "XYZ")
+        return rotation_of(*level) @ self.numbered(file, parameter, index)
+
+    def thermal(self, file: ParameterFile, triad: str, number: int, celsius: float | None) -> FloatArray:
+        """X0 + X1 d + X2 d² + X3 d³, d = T − TREF."""
+        letter, identity = _SENSORS[triad][0], self.identities(file, triad)[number]
+        stems = (f"TC_{letter}{at}_" for at in range(self.sensors))
+        stem = next((stem for stem in stems if file.value(f"{stem}ID", 0.0) == identity), None)
+        if stem is None or file.value(f"TC_{letter}_ENABLE", 0.0) != 1:
+            return np.zeros(3)
+        celsius = need_temperature(file, f"TC_{letter}_ENABLE", celsius)
+        powers = np.array([file.vector(f"{stem}X{power}_{axis}" for axis in range(3)) for power in range(4)])
+        about, low, high = file.vector(f"{stem}T{end}" for end in ("REF", "MIN", "MAX"))
+        return cubic(powers, about, celsius, low, high)
+
+
+FIRMWARE = PX4()
+
+
 def write(parameters: ExportedUnit) -> Written:
     """Write offsets and scales of sensor `instance`; its device's ID only if it was stated."""
     parameters = parameters.for_autopilot("PX4")
     parameters.require_si("PX4")
-    number = parameters.instance
-    tool = Autopilot(
-        {name: f"CAL_{sensor}{number}_{{axis}}{{word}}" for name, sensor in _SENSORS.items()},
-        "OFF",
-        "SCALE",
-        ("OFF", "SCALE", "ODIAG"),
-        f"CAL_MAG{number}_ROT",
-        ("gauss", 0.01),
-        rotated=False,
-    )
-    values, equation, corrections, rotation = tool.values(parameters)
+    number = parameters.instance or 0
+    values, equation, corrections, rotation = FIRMWARE.tool(number).values(parameters)
     devices = [_SENSORS[name] for name in ("accelerometer", "gyroscope") if name in parameters.triads]
     mine = devices or ["MAG"]  # a magnetometer is a device of its own
     left = [] if parameters.device is not None else [*mine]
@@ -44,8 +95,11 @@ def write(parameters: ExportedUnit) -> Written:
     head = [comments(parameters), "# Vehicle-Id Component-Id Name Value Type"]
     convention = (
         "PX4 subtracts the offset, then scales, in the sensor's own axes before its rotation; parameters are single "
-        "precision (6e-8 of a value). They replace those in the vehicle, so they hold for a calibration made from the "
-        "topics sensor_accel, sensor_gyro and sensor_mag, which PX4 has not corrected."
+        "precision (6e-8 of a value). "
+    )
+    convention += parameters.composition or (
+        "They replace those in the vehicle, so they hold for a calibration made from the topics sensor_accel, "
+        "sensor_gyro and sensor_mag, which PX4 has not corrected; for any other give those in force (--in-force)."
     )
     convention += rotation
     if left:
@@ -53,4 +107,5 @@ def write(parameters: ExportedUnit) -> Written:
             f" PX4 uses them only where {' and '.join(f'CAL_{sensor}{number}_ID' for sensor in left)} are the sensor's:"
             " these are left as they are; state --device to write one device's."
         )
-    return Written(text_file([*head, *rows]), convention, equation, corrections, parameters=parameters)
+    text = text_file([*head, *rows])
+    return Written(text, convention, equation, corrections, parameters=parameters, values=dict(values))
