@@ -437,7 +437,7 @@ BAD = [
     (without(px4_in_force(), "SENS_BOARD_Y_OFF"), [], "has no parameter SENS_BOARD_Y_OFF"),
     (px4_in_force(41), [], "SENS_BOARD_ROT is 41, which is no rotation that PX4 lists"),
     (px4_in_force() | {"SENS_BOARD_ROT": 1.5}, [], "SENS_BOARD_ROT is 1.5"),
-    (px4_in_force() | {"CAL_ACC0_ID": 0}, [], "which of its sensors the accelerometer is .* with an ID: none"),
+    (px4_in_force() | {"CAL_ACC0_ID": 0}, [], "which of them the accelerometer is.* with an ID: none"),
     (SEVERAL, [], r"with an ID: 0 \(ID 1310988\), 1 \(ID 7\)\. State it by --instance or --device"),
     (SEVERAL, ["--instance", "2"], "State it by --instance or --device"),
     (SEVERAL, ["--device", "8"], "State it by --instance or --device"),

@@ -224,7 +224,7 @@ def _number(unit: ExportedUnit, firmware: Firmware, file: ParameterFile, name: s
         listed = ", ".join(f"{index} (ID {identity})" for index, identity in identities.items()) or "none"
         stated = "" if sensor is None else f" (the log says {sensor})"
         raise InputError(
-            f"{file.path}: which of its sensors the {name} is{stated} is not known; those with an ID: {listed}. State "
-            "it by --instance or --device."
+            f"{file.path} has several sensors, and it is not known which of them the {name} is{stated}; those with an "
+            f"ID: {listed}. State it by --instance or --device."
         )
     return numbers[0]
