@@ -259,8 +259,8 @@ def _noise(
         data = Whitened(blocks, name, noise, shapes)
         model = richest(data, identifiability)[0]
         columns += [shapes.column(term) for term in model[0] if term.name in (*HISTORY, SCALE)]
-        white = [data.solve(axis, terms)[1] for axis, terms in enumerate(model)]
-        residuals[name] = np.linalg.solve(data.root, np.stack(white)[:, :, None])[:, :, 0].T
+        white = np.stack([data.residual(axis, terms) for axis, terms in enumerate(model)])
+        residuals[name] = np.linalg.solve(data.root, white[:, :, None])[:, :, 0].T
     return own_noise(blocks, np.concatenate(columns).T) if known is None else noise, residuals
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.identifiability import Identifiability
-from jaximu.calibration.thermal_linear import Held, ReducedTerms, Whitened
+from jaximu.calibration.thermal_linear import Held, Whitened
 from jaximu.calibration.thermal_shapes import GRID, ThermalShapes
 from jaximu.calibration.thermal_terms import (
     BESIDE,
@@ -27,9 +27,11 @@ from jaximu.calibration.thermal_terms import (
     at_inner,
     history,
     memories,
+    net_of,
 )
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import PREFIXES
+from jaximu.model.effects.network import WEIGHTS
 
 __all__ = [
     "CUBIC",
@@ -106,9 +108,13 @@ class Candidate:
 
 
 def parameters_of(terms: Sequence[ThermalTerm]) -> float:
-    """Coefficients of an axis and its inner parameters; that pieces of a curve were picked from all counts as well."""
-    pieces = sum(term.name == LEARNED for term in terms)
-    return len(terms) + len(memories(term.name for term in terms)) + _PICKED * log(comb(SPLINES, pieces))
+    """Return how many numbers of an axis the data determine: coefficients, inner parameters, weights of a network.
+
+    That pieces of a curve were picked from all counts as well.
+    """
+    pieces, net = sum(term.name == LEARNED for term in terms), net_of(terms)
+    weights = 0.0 if net is None else WEIGHTS - net.determined
+    return len(terms) - weights + len(memories(term.name for term in terms)) + _PICKED * log(comb(SPLINES, pieces))
 
 
 def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArray) -> Model:
@@ -116,13 +122,13 @@ def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArr
 
     What acts at once stays beside what has a memory: without it another time constant takes its place.
     """
-    offered = ReducedTerms(data, [term for terms in model for term in terms])
+    misfit = data.reduced([term for terms in model for term in terms])
     penalty = float(np.log(len(data.blocks)))
     kept = []
     for axis, full in enumerate(model):
 
         def criterion(chosen: Sequence[ThermalTerm], axis: int = axis) -> float:
-            return offered.misfit(axis, chosen) / scale[axis] + penalty * parameters_of(chosen)
+            return misfit(axis, chosen) / scale[axis] + penalty * parameters_of(chosen)
 
         def stays(term: ThermalTerm, kept: Sequence[ThermalTerm]) -> bool:
             return term.name in fixed or (term.name in _AT_ONCE and bool(memories(other.name for other in kept)))
@@ -174,11 +180,11 @@ def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
                 spacing[name] **= 2 / (GRID - 1)
             options = shapes.prepare(tried)
         others = [at_inner(term, {leader: option}) for term, leader in beside for option in options[leader]]
-        offered = ReducedTerms(data, [*plain, *(term for terms in options.values() for term in terms), *others])
+        misfit = data.reduced([*plain, *(term for terms in options.values() for term in terms), *others])
 
-        def cost(chosen: tuple[ThermalTerm, ...], offered: ReducedTerms = offered) -> float:
+        def cost(chosen: tuple[ThermalTerm, ...], misfit=misfit) -> float:
             tuned_model = at(chosen)
-            return sum(offered.misfit(axis, tuned_model[axis]) / scale[axis] for axis in touched)
+            return sum(misfit(axis, tuned_model[axis]) / scale[axis] for axis in touched)
 
         best = min(product(*options.values()), key=cost)
     return at(best)
@@ -276,15 +282,10 @@ def best_by_axis(candidates: Sequence[Candidate]) -> list[int]:
 
 
 def candidate_of(
-    data: Whitened,
-    family: str,
-    model: Model,
-    folds: Sequence[NDArray[np.int64]],
-    scale: FloatArray,
-    determined: float | None = None,
+    data: Whitened, family: str, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray
 ) -> Candidate:
-    """Return a model with how it did; `determined`: how many numbers of an axis the data determine, where not all."""
-    numbers = np.array([parameters_of(terms) if determined is None else determined for terms in model])
+    """Return a model with how it did where folds were left out; `scale` (3,): of the noise's variance."""
+    numbers = np.array([parameters_of(terms) for terms in model])
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(model)])
     costs = misfit / scale + float(np.log(len(data.blocks))) * numbers
     return Candidate(family, model, numbers, costs, data.held_out(model, folds, scale))

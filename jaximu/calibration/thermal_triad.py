@@ -40,7 +40,7 @@ from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import PREFIXES
 from jaximu.model.effects import CATALOGUE, Effect
-from jaximu.model.effects.network import UNITS, WEIGHTS
+from jaximu.model.effects.network import UNITS
 from jaximu.model.sensor import Imu
 
 __all__ = ["TriadFit", "fit_triad"]
@@ -182,15 +182,15 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
     used, known = set(), {}
     for axis, terms in enumerate(model):
         for term, value in zip(terms, data.coefficients(axis, terms), strict=True):
-            shape = term.shape or 0
-            unit = signal.nominal_scale[axis] if term.net is None or shape < UNITS else 1.0  # inside tanh there is none
-            index = axis * kinds[term.name].size // 3 + shape
+            inside = term.net is not None and term.shape >= UNITS  # of tanh, where there is no unit
+            unit = 1.0 if inside else signal.nominal_scale[axis]
+            index = axis * kinds[term.name].size // 3 + term.shape
             number = Name(name, "coefficients", (index,), order.index(term.name))
             used.add(number)
             values[term.name][index] = value * unit
             inner[term.name] |= dict(term.inner)
             if term.net is not None:
-                known[number] = np.reshape(term.net.prior, (3, WEIGHTS))[axis, shape] * np.sqrt(scale[axis]) * unit
+                known[number] = term.net.prior[axis, term.shape] * np.sqrt(scale[axis]) * unit
 
     def free(number: Name) -> bool:
         if number.effect is None:

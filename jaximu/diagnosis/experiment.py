@@ -18,6 +18,7 @@ from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.shapes import imitated_shapes, shapes_without_cause
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import Linear, Prior, effect_numbers, fit, linearise
+from jaximu.estimation.leave_out import off
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import added
@@ -300,7 +301,7 @@ class Experiment(Data):
             return False
         white = state.weights @ self.data.change_by_averaging(state.linear.details)[self.used]
         basis = np.linalg.svd(state.evidence.jacobian, full_matrices=False)[0]
-        white -= basis @ (basis.T @ white)
+        white = off(basis, white)
         length = float(white @ white)
         return length > _SURE**2 and abs(float(white @ state.evidence.residual) / length - 1) < 0.5
 
