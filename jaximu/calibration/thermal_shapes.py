@@ -63,6 +63,10 @@ class ThermalShapes:
         self._columns: dict[ThermalTerm, FloatArray] = {}
         none, curve = np.zeros((1, 0)), np.array([[self.bounds["low"], self.bounds["high"]]])
         self._add(dict.fromkeys((*POWERS, *RATES, SCALE), none) | {LEARNED: curve})
+        learned = CATALOGUE[f"accel.{LEARNED}"].dormant(low=curve[0, 0], high=curve[0, 1])
+        there = np.asarray(learned.shapes(np.asarray(reference + ZERO_CELSIUS)))
+        for k, value in enumerate(there):  # a curve need not be zero at the reference
+            self._columns[ThermalTerm(LEARNED, (), k)] -= value
         self.prepare({})
         celsius, rates = np.append(blocks.temperature, reference), np.append(blocks.rate, 0.0)
         inputs = np.stack([(2 * celsius - low - high) / (high - low), rates / max(fastest, 1e-12)], axis=1)
@@ -78,20 +82,14 @@ class ThermalShapes:
         return {name: [history(name, value) for value in values] for name, values in tried.items()}
 
     def _add(self, grids: Mapping[str, FloatArray]) -> None:
-        """Take the shapes of effects at inner parameters (G, i), counted from the reference: a curve's, too."""
-        zero, reference = np.float64(0.0), np.float64(self.reference)
-        origin = Stimulus(
-            np.zeros(3), temperature=reference, temperature_rate=zero, time=zero, temperature_reference=self.reference
-        )
+        """Take the shapes of effects at inner parameters (G, i)."""
         for name, grid in grids.items():
-            kind = CATALOGUE[f"accel.{name}"]
-            for shape, coefficients in enumerate(np.tile(np.eye(kind.size // 3), 3)):
+            for shape, coefficients in enumerate(np.tile(np.eye(CATALOGUE[f"accel.{name}"].size // 3), 3)):
                 numbers = np.column_stack([np.tile(coefficients, (len(grid), 1)), grid])
                 (values,) = over_blocks(name, numbers, self.tracks, len(self.blocks))
                 for inner, column in zip(grid, values, strict=True):
-                    there = kind(coefficients, **dict(zip(kind.inner, inner, strict=True))).term(origin)
                     term = history(name, inner[0]) if memories([name]) else ThermalTerm(name)
-                    self._columns[term._replace(shape=shape)] = (column - there).T
+                    self._columns[term._replace(shape=shape)] = column.T
 
     def column(self, term: ThermalTerm) -> FloatArray:
         """Return the shape (3, n) of a term, axis by axis."""
