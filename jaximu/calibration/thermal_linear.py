@@ -88,7 +88,7 @@ class Whitened:
         unique, levels = list(dict.fromkeys(terms)), range(self.blocks.levels)
         columns = {term: len(levels) + k for k, term in enumerate(unique)}
         both = [np.column_stack([self.design(axis, unique), self.output[axis]]) for axis in range(3)]
-        triangles = [np.linalg.qr(one, mode="r") for one in both]
+        triangles = [np.asarray(np.linalg.qr(one, mode="r")) for one in both]
 
         def misfit(axis: int, terms: Sequence[ThermalTerm]) -> float:
             inside = triangles[axis][:, [*levels, *(columns[term] for term in terms)]]

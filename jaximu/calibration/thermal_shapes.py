@@ -25,7 +25,7 @@ from jaximu.data.rest_blocks import RestBlocks
 from jaximu.estimation.track import Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects import CATALOGUE
-from jaximu.model.effects.learned import ZERO_CELSIUS
+from jaximu.model.effects.learned import ZERO_CELSIUS, AccelLearnedTemperature
 from jaximu.model.effects.network import WEIGHTS
 from jaximu.model.stimulus import Stimulus
 
@@ -63,7 +63,7 @@ class ThermalShapes:
         self._columns: dict[ThermalTerm, FloatArray] = {}
         none, curve = np.zeros((1, 0)), np.array([[self.bounds["low"], self.bounds["high"]]])
         self._add(dict.fromkeys((*POWERS, *RATES, SCALE), none) | {LEARNED: curve})
-        learned = CATALOGUE[f"accel.{LEARNED}"].dormant(low=curve[0, 0], high=curve[0, 1])
+        learned = AccelLearnedTemperature(np.zeros(3 * SPLINES), *curve[0])
         there = np.asarray(learned.shapes(np.asarray(reference + ZERO_CELSIUS)))
         for k, value in enumerate(there):  # a curve need not be zero at the reference
             self._columns[ThermalTerm(LEARNED, (), k)] -= value

@@ -83,7 +83,7 @@ class TriadFit:
         }
 
 
-def fit_triad(data: Whitened, identifiability: Identifiability, asked: Sequence[str] | None = None) -> TriadFit:
+def fit_triad(data: Whitened, identifiability: Identifiability, wanted: Sequence[str] | None = None) -> TriadFit:
     """Fit every family of models, choose for each axis by what was left out, and return the choice, with uncertainty.
 
     Inner parameters are those of the model that is best for all axes together: each axis then chooses its terms at
@@ -94,7 +94,7 @@ def fit_triad(data: Whitened, identifiability: Identifiability, asked: Sequence[
     offered = {
         family: effects
         for family, effects in families_of(identifiability.told, beyond).items()
-        if family == "constant" or asked is None or family in asked
+        if family == "constant" or wanted is None or family in wanted
     }
     models: dict[str, Model] = {}
     for family, (names, fixed) in offered.items():
@@ -115,9 +115,9 @@ def fit_triad(data: Whitened, identifiability: Identifiability, asked: Sequence[
                 models[family] = stepwise(data, (terms,) * 3, fixed, scale)
                 tried[family] = candidate(family)
     candidates = list(tried.values())
-    if asked is None or "network" in asked:
+    if wanted is None or "network" in wanted:
         best = tuple(candidates[k].model[axis] for axis, k in enumerate(best_by_axis(candidates)))
-        if asked is not None or patterned(data, best, scale):
+        if wanted is not None or patterned(data, best, scale):
             rated = any(name in identifiability.told for name in RATES)
             network, scale = with_network(data, beyond, rated, folds, scale)
             candidates = [*map(candidate, models), network]
@@ -130,7 +130,7 @@ def fit_triad(data: Whitened, identifiability: Identifiability, asked: Sequence[
     if not vague:
         return fit
     observable = tuple(name for name in identifiability.told if name not in vague)
-    return fit_triad(data, replace(identifiability, told=observable), asked)
+    return fit_triad(data, replace(identifiability, told=observable), wanted)
 
 
 def _concluded(
