@@ -154,39 +154,34 @@ def exchanged(
 
 def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
     """Return the model with its inner parameters, which the axes share, at the least misfit: a grid, refined."""
-    used = {term.name for terms in model for term in terms}
-    names = [name for name in HISTORY if name in memories(used)]
-    if not names:
+    used = memories(term.name for terms in model for term in terms)
+    grids = {name: grid for name, grid in data.shapes.grids.items() if name in used}
+    if not grids:
         return model
-    shapes = data.shapes
-    bounds = {name: (grid[0], grid[-1]) for name, grid in shapes.grids.items()}
-    options = {name: [history(name, value) for value in shapes.grids[name]] for name in names}
-    spacing = {name: float(grid[1] / grid[0]) for name, grid in shapes.grids.items()}
+    spacing = {name: float(grid[1] / grid[0]) for name, grid in grids.items()}
     touched = [axis for axis, terms in enumerate(model) if memories(term.name for term in terms)]
-    plain = [term for axis in touched for term in model[axis] if not memories([term.name])]
-    beside = [(ThermalTerm(name), leader) for name, leader in BESIDE.items() if name in used]
+    terms = [term for axis in touched for term in model[axis]]
     best: tuple[ThermalTerm, ...] = ()
 
     def at(chosen: tuple[ThermalTerm, ...]) -> Model:
         by_name = {term.name: term for term in chosen}
         return tuple(tuple(at_inner(term, by_name) for term in terms) for terms in model)
 
-    for zoom in range(_ZOOMS):
-        if zoom:
-            tried = {}
-            for term in best:
-                name, value = term.name, term.inner[0][1]
-                tried[name] = np.clip(value * np.geomspace(1 / spacing[name], spacing[name], GRID), *bounds[name])
-                spacing[name] **= 2 / (GRID - 1)
-            options = shapes.prepare(tried)
-        others = [at_inner(term, {leader: option}) for term, leader in beside for option in options[leader]]
-        misfit = data.reduced([*plain, *(term for terms in options.values() for term in terms), *others])
+    for _ in range(_ZOOMS):
+        options = data.shapes.prepare(grids)
+        offered = [(term, options.get(BESIDE.get(term.name, term.name), [term])) for term in terms]
+        misfit = data.reduced([term._replace(inner=one.inner) for term, values in offered for one in values])
 
         def cost(chosen: tuple[ThermalTerm, ...], misfit=misfit) -> float:
             tuned_model = at(chosen)
             return sum(misfit(axis, tuned_model[axis]) / scale[axis] for axis in touched)
 
         best = min(product(*options.values()), key=cost)
+        for term in best:
+            name, bounds = term.name, data.shapes.grids[term.name][[0, -1]]
+            around = np.geomspace(1 / spacing[name], spacing[name], GRID)
+            grids[name] = np.clip(term.inner[0][1] * around, *bounds)
+            spacing[name] **= 2 / (GRID - 1)
     return at(best)
 
 

@@ -67,7 +67,7 @@ class ThermalShapes:
         there = np.asarray(learned.shapes(np.asarray(reference + ZERO_CELSIUS)))
         for k, value in enumerate(there):  # a curve need not be zero at the reference
             self._columns[ThermalTerm(LEARNED, (), k)] -= value
-        self.prepare({})
+        self.prepare(self.grids)
         celsius, rates = np.append(blocks.temperature, reference), np.append(blocks.rate, 0.0)
         inputs = np.stack([(2 * celsius - low - high) / (high - low), rates / max(fastest, 1e-12)], axis=1)
         inputs = np.clip(inputs, -1.0, 1.0)
@@ -76,9 +76,9 @@ class ThermalShapes:
 
     def prepare(self, tried: Mapping[str, FloatArray]) -> dict[str, list[ThermalTerm]]:
         """Return terms of effects with memory at values (12,) of their inner parameters."""
-        values = {**self.grids, **tried}
-        values |= {name: values[leader] for name, leader in BESIDE.items()}
-        self._add({name: grid[:, None] for name, grid in values.items()})
+        values = {**tried, **{name: tried[leader] for name, leader in BESIDE.items() if leader in tried}}
+        missing = {name: grid for name, grid in values.items() if history(name, grid[GRID // 2]) not in self._columns}
+        self._add({name: grid[:, None] for name, grid in missing.items()})
         return {name: [history(name, value) for value in values] for name, values in tried.items()}
 
     def _add(self, grids: Mapping[str, FloatArray]) -> None:
