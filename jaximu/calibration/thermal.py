@@ -1,4 +1,11 @@
-"""From recordings at rest over temperature to a calibration whose biases know the temperature."""
+"""From recordings at rest over temperature to a calibration whose biases know the temperature.
+
+The way: `rest_blocks` makes means over blocks of time, `ThermalShapes` what every effect would add to them. Noise that
+is not known is what no function of temperature explains (`own_noise`), and blocks are parted where what is left jumps.
+`identifiable` says which effects the path of temperature tells apart. `fit_triad` tries families of terms on the
+whitened blocks, chooses for each axis by what `leave_out` says of ways left out, and gives the choice to the one `fit`.
+Effects and covariance then join the unit, the data sheet's or that of a calibration.
+"""
 
 from __future__ import annotations
 

@@ -79,8 +79,7 @@ def _by_kind(state: State, experiment: Experiment) -> list[Check]:
     root = np.linalg.inv(state.weights)
     evidence = state.evidence
     residual = root @ evidence.residual
-    basis = np.linalg.svd(evidence.jacobian, full_matrices=False)[0]
-    left = root @ (np.eye(len(residual)) - basis @ basis.T) @ root.T
+    left = root @ evidence.off_base(root.T)
     checks = []
     for index, kind in enumerate(experiment.real.kinds):
         plain = kind.name.replace("_", " ")

@@ -18,7 +18,6 @@ from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.shapes import imitated_shapes, shapes_without_cause
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import Linear, Prior, effect_numbers, fit, linearise
-from jaximu.estimation.leave_out import off
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import added
@@ -299,9 +298,8 @@ class Experiment(Data):
         """
         if self.data.averaged() is None:
             return False
-        white = state.weights @ self.data.change_by_averaging(state.linear.details)[self.used]
-        basis = np.linalg.svd(state.evidence.jacobian, full_matrices=False)[0]
-        white = off(basis, white)
+        change = self.data.change_by_averaging(state.linear.details)[self.used]
+        white = state.evidence.off_base(state.weights @ change)
         length = float(white @ white)
         return length > _SURE**2 and abs(float(white @ state.evidence.residual) / length - 1) < 0.5
 
