@@ -476,6 +476,6 @@ def steady(
         temperature_rate=np.full((len(ends), 2), rate),
         time=time,
         temperature_reference=reference,
-    )  # pyright: ignore[reportArgumentType]
+    )
     now = np.minimum(np.arange(len(ends)), count)
     return mean_terms(effects, [Track(stimulus, np.stack([np.full(len(ends), count), now], axis=1))], count)

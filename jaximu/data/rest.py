@@ -71,7 +71,7 @@ class RestOverTemperature(OfOneUnit):
         used[:, : self.weights.shape[1]] = 1.0
         factors = tuple((used * axis[:, None]).ravel() for axis in np.eye(3))
         group = np.repeat(np.arange(3), self._length)
-        self.covariance = Covariance(np.ones(3 * self._length), factors, used.ravel(), group)  # pyright: ignore[reportArgumentType]
+        self.covariance = Covariance(np.ones(3 * self._length), factors, used.ravel(), group)
         self.bias = self._white(np.tile(np.eye(3), (len(output), 1, 1)))
 
     def about_one(self, imu: Imu) -> About:
@@ -79,7 +79,7 @@ class RestOverTemperature(OfOneUnit):
         added, slopes = mean_terms(tuple(imu.all_effects().values()), self.paths, len(self.output))
         output = self._white((self.output - added)[:, :, None])[:, 0]
         gyroscope = np.int64(self.triad == "gyroscope")
-        conditions = _WhiteOutputs(output, self.bias, np.float64(0.0), gyroscope)  # pyright: ignore[reportCallIssue]
+        conditions = _WhiteOutputs(output, self.bias, np.float64(0.0), gyroscope)
         return About(conditions, self.covariance, self._white(-slopes))
 
     def _white(self, values: FloatArray) -> FloatArray:
