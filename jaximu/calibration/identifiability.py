@@ -10,7 +10,7 @@ import numpy as np
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.calibration.thermal_terms import HISTORY, LEARNED, POWERS, RATES, SCALE, ThermalTerm, history
 from jaximu.data.rest_blocks import Leg, RestBlocks
-from jaximu.estimation.leave_out import orthonormal
+from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
 
@@ -77,22 +77,18 @@ def separated(shapes: ThermalShapes) -> dict[str, Separation]:
     separations = {}
     for name, options in columns.items():
         # a rate counts from standing still, a lag and a play, like temperature, from wherever they are
-        whole = [_length(option if name in RATES else _off(mean, option)) for option in options]
-        alone = max(_length(_off(base, option)) / size for option, size in zip(options, whole, strict=True))
-        others = np.stack([_off(base, column) for other, column in middle.items() if other != name], axis=1)
+        whole = [_length(option if name in RATES else off(mean, option)) for option in options]
+        alone = max(_length(off(base, option)) / size for option, size in zip(options, whole, strict=True))
+        others = np.stack([off(base, column) for other, column in middle.items() if other != name], axis=1)
         # what rounding leaves of a shape is no shape
         others = others[:, np.linalg.norm(others, axis=0) > 1e-9 * max(map(_length, middle.values()))]
-        left = _length(_off(orthonormal(others), _off(base, middle[name])))
+        left = _length(off(orthonormal(others), off(base, middle[name])))
         separations[name] = Separation(alone, left / whole[len(options) // 2], left**2)
     return separations
 
 
 def _length(column: FloatArray) -> float:
     return max(float(np.linalg.norm(column)), 1e-300)
-
-
-def _off(basis: FloatArray, column: FloatArray) -> FloatArray:
-    return column - basis @ (basis.T @ column)
 
 
 def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
@@ -135,9 +131,7 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
         words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
     base = orthonormal(np.concatenate([np.eye(blocks.levels)[blocks.level], shapes.smooth()], axis=1))
     mean = orthonormal(np.eye(blocks.levels)[blocks.level])
-    scale = max(
-        _length(_off(base, column)) / _length(_off(mean, column)) for column in shapes.column(ThermalTerm(SCALE))
-    )
+    scale = max(_length(off(base, column)) / _length(off(mean, column)) for column in shapes.column(ThermalTerm(SCALE)))
     if scale > _TOLD and blocks.several_poses:
         observable.append(SCALE)
     else:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaximu.estimation.fitting import Fit, Prior
+from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import UNDETERMINED
@@ -84,7 +85,7 @@ def refuse_undetermined(fitted: Fit, prior: Prior | None = None, wholly: bool = 
         if not members.any() or any(name in known for name, mine in zip(fitted.names, members, strict=True) if mine):
             continue
         columns, others = jacobian[:, members], jacobian[:, ~members]
-        left = columns - others @ np.linalg.lstsq(others, columns, rcond=1e-10)[0]
+        left = off(orthonormal(others), columns)
         least = np.linalg.svd(left, compute_uv=False)[0 if wholly else -1]
         if not least > 1e-6 * np.linalg.norm(columns):
             raise NotPossibleError(

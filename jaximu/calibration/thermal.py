@@ -1,4 +1,11 @@
-"""From recordings at rest over temperature to a calibration whose biases know the temperature."""
+"""From recordings at rest over temperature to a calibration whose biases know the temperature.
+
+The way: `rest_blocks` makes means over blocks of time, `ThermalShapes` what every effect would add to them. Noise that
+is not known is what no function of temperature explains (`own_noise`), and blocks are parted where what is left jumps.
+`identifiable` says which effects the path of temperature tells apart. `fit_triad` tries families of terms on the
+whitened blocks, chooses for each axis by what `leave_out` says of ways left out, and gives the choice to the one `fit`.
+Effects and covariance then join the unit, the data sheet's or that of a calibration.
+"""
 
 from __future__ import annotations
 
@@ -169,16 +176,7 @@ def calibrate_thermal(
     """
     require_float64()
     blocks = rest_blocks(recordings, block)
-    low, high = blocks.range
-    reference = REFERENCE_TEMPERATURE
-    if not low <= reference <= high:
-        reference = float(np.round((low + high) / 2))
-    if base is not None:
-        reference = base.imu.accelerometer.temperature_reference
-        if base.imu.gyroscope is None and "gyroscope" in blocks.means:
-            raise InputError("the calibration has no gyroscope, but the recording has one.")
-        for name in base.triads().keys() & blocks.means:
-            base.triad_of(name, blocks.recordings[0])
+    reference = _reference(blocks, base)
     known = noise_of(static)
     missing = [] if known is None else [name for name in blocks.means if getattr(known, name) is None]
     if missing:
@@ -211,6 +209,18 @@ def calibrate_thermal(
     times = tuple((int(blocks.log[edge]), float(blocks.start[edge])) for edge in edges)
     calibration = replace(calibration, notes=notes)
     return ThermalCalibration(calibration, blocks, noise, identifiability, fits, reference, notes, times)
+
+
+def _reference(blocks: RestBlocks, base: Calibration | None) -> float:
+    """Return the °C from which effects count: the calibration's, if it is of this unit, or one of the recordings'."""
+    if base is None:
+        low, high = blocks.range
+        return REFERENCE_TEMPERATURE if low <= REFERENCE_TEMPERATURE <= high else float(np.round((low + high) / 2))
+    if base.imu.gyroscope is None and "gyroscope" in blocks.means:
+        raise InputError("the calibration has no gyroscope, but the recording has one.")
+    for name in base.triads().keys() & blocks.means:
+        base.triad_of(name, blocks.recordings[0])
+    return base.imu.accelerometer.temperature_reference
 
 
 def _notes(name: str, fit: TriadFit, parts: str) -> list[str]:
@@ -259,8 +269,8 @@ def _noise(
         data = Whitened(blocks, name, noise, shapes)
         model = richest(data, identifiability)[0]
         columns += [shapes.column(term) for term in model[0] if term.name in (*HISTORY, SCALE)]
-        white = [data.solve(axis, terms)[1] for axis, terms in enumerate(model)]
-        residuals[name] = np.linalg.solve(data.root, np.stack(white)[:, :, None])[:, :, 0].T
+        white = np.stack([data.residual(axis, terms) for axis, terms in enumerate(model)])
+        residuals[name] = np.linalg.solve(data.root, white[:, :, None])[:, :, 0].T
     return own_noise(blocks, np.concatenate(columns).T) if known is None else noise, residuals
 
 
@@ -310,19 +320,14 @@ def _calibration(
     """Put the fitted terms into a unit: the base calibration's, or the data sheet's."""
     recording, notes = blocks.recordings[0], []
     unit = nominal_imu(recording)[0] if base is None else base.imu
-    names: list[Name] = []
-    covariances = []
-    if base is not None:
-        names, rest = _kept_numbers(base, fits)
-        covariances.append(rest)
+    names, covariance = ([], np.zeros((0, 0))) if base is None else _kept_numbers(base, fits)
+    covariances = [covariance]
     triads: dict[str, Any] = {}
     for name, fit in fits.items():
-        triad = unit.triads()[name]
+        triad, of_fit = unit.triads()[name], base is None and name == "gyroscope"  # its bias is that of the fit
         kept = tuple(effect for effect in triad.effects if effect.plain not in THERMAL)
-        if base is None and name == "gyroscope":
-            bias = fit.fit.imu.triads()[name].bias
-        else:
-            temperature = reference
+        bias, temperature = fit.fit.imu.triads()[name].bias, reference
+        if not of_fit:
             if base is not None and len(kept) == len(triad.effects):
                 temperature = float(base.data.get("temperature", reference))
                 if "temperature" not in base.data:
@@ -332,9 +337,7 @@ def _calibration(
                     )
             bias = triad.bias - steady(fit.effects, temperature, 0.0, reference)[0][0]
         triads[name] = replace(triad, bias=bias, effects=(*kept, *fit.effects), temperature_reference=reference)
-        numbers, covariance = _numbers(
-            fit, base is None and name == "gyroscope", recording.signals[name], blocks.levels
-        )
+        numbers, covariance = _numbers(fit, of_fit, recording.signals[name], blocks.levels)
         names += [
             number if number.effect is None else Name(name, number.part, number.axes, len(kept) + number.effect)
             for number in numbers
@@ -346,15 +349,6 @@ def _calibration(
             "gain and the accelerometer's bias are the data sheet's: a recording at rest does not determine them. "
             "--calibration CALIBRATION adds the thermal part to a calibration of the unit."
         )
-    data = provenance(blocks.recordings) | {
-        "nominal_offset": {name: recording.signals[name].nominal_offset.tolist() for name in fits},
-        "poses": blocks.levels,
-        "turns": 0,
-        "blocks": len(blocks),
-        **_ranges(blocks),
-    }
-    if base is not None:
-        data["base"] = {key: base.data[key] for key in ("file", "sha256", "temperature") if key in base.data}
     norms = {
         name: (float(np.linalg.norm(fit.before)), float(np.linalg.norm(fit.after)), SENSOR_UNITS[name])
         for name, fit in fits.items()
@@ -372,9 +366,24 @@ def _calibration(
         weak=() if base is None else base.weak,
         excess={name: float(np.max(fit.fit.excess)) for name, fit in fits.items()},
         solver=next((failure for failure in ended if failure is not Failure.NONE), Failure.NONE).value,
-        data=data,
+        data=_data(blocks, base),
         reading=recording.reading if base is None or base.reading is None else base.reading,
     ), notes
+
+
+def _data(blocks: RestBlocks, base: Calibration | None) -> dict[str, Any]:
+    """Return where a calibration comes from, as `Calibration.data` has it."""
+    signals = blocks.recordings[0].signals
+    data = provenance(blocks.recordings) | {
+        "nominal_offset": {name: signals[name].nominal_offset.tolist() for name in blocks.means},
+        "poses": blocks.levels,
+        "turns": 0,
+        "blocks": len(blocks),
+        **_ranges(blocks),
+    }
+    if base is not None:
+        data["base"] = {key: base.data[key] for key in ("file", "sha256", "temperature") if key in base.data}
+    return data
 
 
 def _kept_numbers(base: Calibration, fits: Mapping[str, TriadFit]) -> tuple[list[Name], FloatArray]:
@@ -467,6 +476,6 @@ def steady(
         temperature_rate=np.full((len(ends), 2), rate),
         time=time,
         temperature_reference=reference,
-    )  # pyright: ignore[reportArgumentType]
+    )
     now = np.minimum(np.arange(len(ends)), count)
     return mean_terms(effects, [Track(stimulus, np.stack([np.full(len(ends), count), now], axis=1))], count)

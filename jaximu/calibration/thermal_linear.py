@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.calibration.thermal_terms import Model, ThermalTerm, net_of
 from jaximu.data.rest_blocks import RestBlocks
-from jaximu.estimation.leave_out import LeftOut, leave_out
+from jaximu.estimation.leave_out import LeftOut, leave_out, off, orthonormal
 from jaximu.ground.array_types import FloatArray
-from jaximu.model.effects.network import WEIGHTS
 from jaximu.model.noise_model import NoiseModel
 
-__all__ = ["Held", "ReducedTerms", "Whitened"]
+__all__ = ["Held", "Whitened"]
 
 
 @dataclass(frozen=True)
@@ -40,10 +39,9 @@ class Whitened:
     """A triad's blocks, whitened by the covariance of its noise, axis by axis."""
 
     def __init__(self, blocks: RestBlocks, name: str, noise: NoiseModel, shapes: ThermalShapes):
-        self.covariance = blocks.covariance(getattr(noise, name))
         self.blocks, self.name, self.shapes = blocks, name, shapes
         self.means = blocks.means[name]
-        self.root = np.linalg.inv(np.linalg.cholesky(self.covariance))  # (3, n, n)
+        self.root = np.linalg.inv(np.linalg.cholesky(blocks.covariance(getattr(noise, name))))  # (3, n, n)
         self.levels = self.root @ np.eye(blocks.levels)[blocks.level]
         self.output = (self.root @ self.means.T[:, :, None])[..., 0]
         self._columns: dict[ThermalTerm, FloatArray] = {}
@@ -57,59 +55,60 @@ class Whitened:
     def design(self, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
         """Return an axis's whitened levels and shapes (n + p, L + k): then a row for each weight known before."""
         data = np.column_stack([self.levels[axis], *(self.column(term)[axis] for term in terms)])
-        known = [(k, term) for k, term in enumerate(terms, self.blocks.levels) if term.net is not None]
-        rows = np.zeros((len(known), data.shape[1]))
-        for row, (k, term) in enumerate(known):
-            assert term.net is not None and term.shape is not None
-            rows[row, k] = 1 / np.reshape(term.net.prior, (3, WEIGHTS))[axis, term.shape]
-        return np.concatenate([data, rows])
+        known = [0.0 if term.net is None else 1 / term.net.prior[axis, term.shape] for term in terms]
+        known = np.array([0.0] * self.blocks.levels + known)
+        return np.concatenate([data, np.diag(known)[known > 0]])
 
     def target(self, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
-        """Return what the design times levels and coefficients should be (n + p,)."""
-        known = sum(term.net is not None for term in terms)
-        output = self.output[axis]
-        if known:
-            output = output - self.root[axis] @ self.shapes.offset(terms)[axis]
-        return np.pad(output, (0, known))
-
-    def solve(self, axis: int, terms: Sequence[ThermalTerm]) -> tuple[FloatArray, FloatArray]:
-        """Return an axis's levels and coefficients (L + k,) and whitened residuals (n,)."""
-        return self._solve(self.design(axis, terms), self.target(axis, terms))
+        """Return what the design times levels and coefficients should be (n + p,): weights count from the network's."""
+        net = net_of(terms)
+        if net is None:
+            return self.output[axis]
+        beyond = self.output[axis] - self.root[axis] @ self.shapes.network(net)[0][axis]
+        return np.concatenate([beyond, -net.weights[axis] / net.prior[axis]])
 
     def coefficients(self, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
         """Return an axis's coefficients (k,); the weights of a network are those about which it is linear."""
-        net = net_of(terms)
-        if net is None:
-            return self.solve(axis, terms)[0][self.blocks.levels :]
-        output = self.output[axis] - self.root[axis] @ self.shapes.network(net)[0][axis]
-        beside = self._solve(self.design(axis, terms[:-WEIGHTS]), output)[0][self.blocks.levels :]
-        return np.concatenate([beside, np.reshape(net.weights, (3, WEIGHTS))[axis]])
+        net, plain = net_of(terms), [term for term in terms if term.net is None]
+        design = self.design(axis, plain)
+        size = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+        numbers = np.linalg.lstsq(design / size, self.target(axis, terms)[: len(design)], rcond=1e-10)[0] / size
+        return np.concatenate([numbers[self.blocks.levels :], np.zeros(0) if net is None else net.weights[axis]])
+
+    def residual(self, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:
+        """Return what least squares leaves of an axis's whitened outputs (n,)."""
+        return off(orthonormal(self.design(axis, terms)), self.target(axis, terms))[: len(self.blocks)]
 
     def misfit(self, axis: int, terms: Sequence[ThermalTerm]) -> float:
         """Return the sum of squares that least squares leaves of an axis."""
-        return float(np.sum(self.solve(axis, terms)[1] ** 2))
+        return float(np.sum(self.residual(axis, terms) ** 2))
 
-    def _solve(self, design: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray]:
-        size = np.linalg.norm(design, axis=0)
-        size = np.where(size > 0, size, 1.0)
-        solved = np.linalg.lstsq(design / size, target, rcond=1e-10)[0]
-        return solved / size, (target - design @ (solved / size))[: len(self.blocks)]
+    def reduced(self, terms: Sequence[ThermalTerm]) -> Callable[[int, Sequence[ThermalTerm]], float]:
+        """Return the misfit of any few of many terms, as a function that works on the triangle of their columns."""
+        unique, levels = list(dict.fromkeys(terms)), range(self.blocks.levels)
+        columns = {term: len(levels) + k for k, term in enumerate(unique)}
+        both = [np.column_stack([self.design(axis, unique), self.output[axis]]) for axis in range(3)]
+        triangles = [np.asarray(np.linalg.qr(one, mode="r")) for one in both]
+
+        def misfit(axis: int, terms: Sequence[ThermalTerm]) -> float:
+            inside = triangles[axis][:, [*levels, *(columns[term] for term in terms)]]
+            return float(np.sum(off(orthonormal(inside), triangles[axis][:, -1]) ** 2))
+
+        return misfit
 
     def held_out(self, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray) -> Held:
         """Predict each fold from all other blocks, noise that they share included; `scale` (3,): of its variance."""
-        likelihood = np.zeros(3)
-        errors = np.full((3, len(self.blocks)), np.nan)
+        count, levels = len(self.blocks), self.blocks.levels
+        likelihood, errors = np.zeros(3), np.full((3, count), np.nan)
         for axis, terms in enumerate(model):
-            offset = self.shapes.offset(terms)[axis]
-            shapes = np.array([self.shapes.column(term)[axis] for term in terms]).reshape(len(terms), len(offset))
+            net = net_of(terms)
+            about = 0.0 if net is None else self.shapes.network(net)[0][axis]
+            shapes = np.array([self.shapes.column(term)[axis] for term in terms]).reshape(len(terms), count)
             for part in self.left_out(axis, terms, folds):
-                added = offset[part.rows] + part.numbers[self.blocks.levels :] @ shapes[:, part.rows]
-                errors[axis, part.rows] = self.means[part.rows, axis] - added
-                chi, values = part.chi_squared / scale[axis], part.precisions
-                likelihood[axis] += 0.5 * (
-                    float(np.sum(np.log(values))) - chi - len(values) * np.log(2 * np.pi * scale[axis])
-                )
-        for level in range(self.blocks.levels):
+                left = self.means[:, axis] - about - part.numbers[levels:] @ shapes
+                errors[axis, part.rows] = left[part.rows]
+                likelihood[axis] += part.log_likelihood(scale[axis])
+        for level in range(levels):
             inside = self.blocks.level == level
             if not np.isnan(errors[:, inside]).all():
                 errors[:, inside] -= np.nanmean(errors[:, inside], axis=1)[:, None]
@@ -120,27 +119,3 @@ class Whitened:
     ) -> Iterator[LeftOut]:
         """Yield how all other blocks predict each fold; numbers: levels, then coefficients."""
         return leave_out(self.root[axis], self.design(axis, terms), self.target(axis, terms), folds)
-
-
-class ReducedTerms:
-    """Many terms' columns, reduced to a triangle: what any subset of them leaves is found from a few dozen numbers."""
-
-    def __init__(self, data: Whitened, terms: Sequence[ThermalTerm]):
-        unique = list(dict.fromkeys(terms))
-        self.levels = data.blocks.levels
-        self.place = {term: self.levels + k for k, term in enumerate(unique)}
-        self.factor, self.target, self.rest = [], [], []
-        for axis in range(3):
-            columns = data.design(axis, unique)
-            q, r = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))
-            product = q.T @ data.output[axis]
-            self.factor.append(r)
-            self.target.append(product)
-            self.rest.append(float(np.sum((data.output[axis] - q @ product) ** 2)))
-
-    def misfit(self, axis: int, terms: Sequence[ThermalTerm]) -> float:
-        """Return the sum of squares that least squares leaves of an axis."""
-        inside = [*range(self.levels), *(self.place[term] for term in terms)]
-        columns = self.factor[axis][:, inside]
-        solved = np.linalg.lstsq(columns, self.target[axis], rcond=1e-10)[0]
-        return self.rest[axis] + float(np.sum((self.target[axis] - columns @ solved) ** 2))

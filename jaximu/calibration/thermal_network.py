@@ -23,10 +23,10 @@ from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
 
 from jaximu.calibration.thermal_linear import Whitened
-from jaximu.calibration.thermal_selection import Candidate, candidate_of
+from jaximu.calibration.thermal_selection import Candidate, candidate_of, parameters_of
 from jaximu.calibration.thermal_terms import NETWORK, POWERS, Model, Net, ThermalTerm
 from jaximu.data.rest import padded_count
-from jaximu.estimation.leave_out import orthonormal
+from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.solver import solve
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
@@ -54,7 +54,7 @@ def patterned(data: Whitened, model: Model, scale: FloatArray) -> bool:
     """Whether the best model leaves anything that a smooth function of temperature and its rate could follow."""
     for axis, terms in enumerate(model):
         free = _functions(data, axis, terms)
-        statistic = float(np.sum((free.T @ data.solve(axis, terms)[1]) ** 2)) / scale[axis]
+        statistic = float(np.sum((free.T @ data.residual(axis, terms)) ** 2)) / scale[axis]
         if float(chi2_sf(np.array(statistic), free.shape[1])) < _PATTERN:
             return True
     return False
@@ -70,15 +70,14 @@ def with_network(
     plain = (ThermalTerm(POWERS[0]), *(ThermalTerm(name) for name in more))
     scale, left, freedom = float(np.mean(scales)), np.zeros(3), 1.0
     for _ in range(_ROUNDS):
-        net, determined = _fitted(data, plain, scale, rated)
+        net = _fitted(data, plain, scale, rated)
         left = np.array([data.misfit(axis, _about(plain, net)) for axis in range(3)])
-        before, freedom = scale, len(data.blocks) - data.blocks.levels - len(plain) - determined / 3
+        before, freedom = scale, len(data.blocks) - data.blocks.levels - parameters_of(_about(plain, net))
         scale = float(np.clip(left.sum() / (3 * freedom), 1.0, scale))
         if scale > 0.7 * before:
             break
     scales = np.minimum(scales, np.maximum(left / freedom, 1.0))
-    model = (_about(plain, net),) * 3
-    return candidate_of(data, "network", model, folds, scales, len(plain) + determined / 3), scales
+    return candidate_of(data, "network", (_about(plain, net),) * 3, folds, scales), scales
 
 
 def _about(plain: Sequence[ThermalTerm], net: Net) -> tuple[ThermalTerm, ...]:
@@ -96,8 +95,7 @@ def _functions(data: Whitened, axis: int, terms: Sequence[ThermalTerm]) -> Float
     ]
     white = data.root[axis] @ np.stack(both, axis=1)
     base = orthonormal(data.design(axis, terms))
-    free = orthonormal(white - base @ (base.T @ white))
-    return free - base @ (base.T @ free)
+    return off(base, orthonormal(off(base, white)))
 
 
 class _Axis(eqx.Module):
@@ -127,11 +125,9 @@ def _solved(matrix, target, prior, start, inputs, origin):
     return jax.lax.map(one, (matrix, target, prior, start))
 
 
-def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: bool) -> tuple[Net, float]:
+def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: bool) -> Net:
     """Fit a network to each axis beside plain terms: from several starts to smooth functions, as stiff as the evidence
     says, then from the best to all of the data.
-
-    **Returns:** the networks, and how many numbers the data determine.
     """
     count = len(data.blocks)
     missing = padded_count(count) - count
@@ -152,12 +148,11 @@ def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: b
         modes = _functions(data, axis, plain)[:, :_MODES]
         smooth.append(np.pad(modes.T @ data.root[axis], ((0, _MODES - modes.shape[1]), (0, 0))))
         base = orthonormal(data.design(axis, plain))
-        apart = data.root[axis] - base @ (base.T @ data.root[axis])  # from levels and plain terms
+        apart = off(base, data.root[axis])  # from levels and plain terms
         whole.append(np.pad(apart, ((0, missing), (0, 0))))
         columns = [data.shapes.column(term)[axis] for term in plain]
         basis = np.linalg.qr(np.column_stack([np.eye(data.blocks.levels)[data.blocks.level], *columns]))[0]
-        beside = data.means[:, axis] - basis @ (basis.T @ data.means[:, axis])
-        size.append(max(float(np.std(beside)), _LEAST_SIZE))
+        size.append(max(float(np.std(off(basis, data.means[:, axis]))), _LEAST_SIZE))
     starts = 0.5 * np.random.default_rng(_SEED).normal(size=(_STARTS, WEIGHTS))
     priors = np.array(
         [
@@ -172,5 +167,4 @@ def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: b
     z, evidence, _ = solved(smooth, priors, np.tile(starts, (3, len(_PRIORS), 1)))
     best = range(3), np.argmax(evidence[..., 0], axis=1)
     z, _, determined = solved(whole, priors[best][:, None], z[best][:, None])
-    weights, prior = priors[best] * z[:, 0], priors[best] / np.sqrt(scale)
-    return Net(tuple(weights.ravel().tolist()), tuple(prior.ravel().tolist())), float(np.sum(determined))
+    return Net(priors[best] * z[:, 0], priors[best] / np.sqrt(scale), float(np.sum(determined)) / 3)

@@ -56,7 +56,7 @@ class _Windows(Data):
     def about(self, imu: Imu) -> About:
         """Return the norms about one unit, the leading axis."""
         one = np.ones((1, len(self.conditions.celsius)))
-        covariance = Covariance(_NOISE**2 * one, (_NOISE * one,), one, np.zeros(one.shape, int))  # pyright: ignore[reportArgumentType]
+        covariance = Covariance(_NOISE**2 * one, (_NOISE * one,), one, np.zeros(one.shape, int))
         return About(jax.tree.map(lambda leaf: leaf[None], self.conditions), covariance, np.zeros((*one.shape, 0)))
 
 
@@ -80,7 +80,7 @@ def calibrate_norms(
     unit = Imu.nominal()
     triad = replace(unit.accelerometer, temperature_reference=reference)
     unit = replace(unit, accelerometer=triad).with_effects(*map(effect_named, effects))
-    measured = _Windows(_Norms(np.asarray(means, float), np.asarray(celsius, float), np.asarray(gravity)))  # pyright: ignore
+    measured = _Windows(_Norms(np.asarray(means, float), np.asarray(celsius, float), np.asarray(gravity)))
 
     def free(name: Name) -> bool:
         return name.owner == "accelerometer" and (name.part == "coefficients" or without_equipment(name))

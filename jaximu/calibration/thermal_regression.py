@@ -8,7 +8,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from jaximu.calibration.thermal_selection import exchanged
-from jaximu.estimation.leave_out import leave_out
+from jaximu.estimation.leave_out import leave_out, off, orthonormal
 from jaximu.ground.array_types import FloatArray
 
 __all__ = ["multifactor"]
@@ -31,7 +31,7 @@ def multifactor(factors: Mapping[str, FloatArray], truth: FloatArray) -> tuple[l
         return np.stack([columns[term] for term in terms], axis=1)
 
     def criterion(terms: Sequence[str]) -> float:
-        left = truth - matrix(terms) @ np.linalg.lstsq(matrix(terms), truth, rcond=1e-10)[0]
+        left = off(orthonormal(matrix(terms)), truth)
         return count * np.log(max(float(left @ left), 1e-300) / count) + len(terms) * np.log(count)
 
     def stays(term: str, kept: Sequence[str]) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.identifiability import Identifiability
-from jaximu.calibration.thermal_linear import Held, ReducedTerms, Whitened
+from jaximu.calibration.thermal_linear import Held, Whitened
 from jaximu.calibration.thermal_shapes import GRID, ThermalShapes
 from jaximu.calibration.thermal_terms import (
     BESIDE,
@@ -27,9 +27,11 @@ from jaximu.calibration.thermal_terms import (
     at_inner,
     history,
     memories,
+    net_of,
 )
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import PREFIXES
+from jaximu.model.effects.network import WEIGHTS
 
 __all__ = [
     "CUBIC",
@@ -106,9 +108,13 @@ class Candidate:
 
 
 def parameters_of(terms: Sequence[ThermalTerm]) -> float:
-    """Coefficients of an axis and its inner parameters; that pieces of a curve were picked from all counts as well."""
-    pieces = sum(term.name == LEARNED for term in terms)
-    return len(terms) + len(memories(term.name for term in terms)) + _PICKED * log(comb(SPLINES, pieces))
+    """Return how many numbers of an axis the data determine: coefficients, inner parameters, weights of a network.
+
+    That pieces of a curve were picked from all counts as well.
+    """
+    pieces, net = sum(term.name == LEARNED for term in terms), net_of(terms)
+    weights = 0.0 if net is None else WEIGHTS - net.determined
+    return len(terms) - weights + len(memories(term.name for term in terms)) + _PICKED * log(comb(SPLINES, pieces))
 
 
 def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArray) -> Model:
@@ -116,13 +122,13 @@ def stepwise(data: Whitened, model: Model, fixed: Sequence[str], scale: FloatArr
 
     What acts at once stays beside what has a memory: without it another time constant takes its place.
     """
-    offered = ReducedTerms(data, [term for terms in model for term in terms])
+    misfit = data.reduced([term for terms in model for term in terms])
     penalty = float(np.log(len(data.blocks)))
     kept = []
     for axis, full in enumerate(model):
 
         def criterion(chosen: Sequence[ThermalTerm], axis: int = axis) -> float:
-            return offered.misfit(axis, chosen) / scale[axis] + penalty * parameters_of(chosen)
+            return misfit(axis, chosen) / scale[axis] + penalty * parameters_of(chosen)
 
         def stays(term: ThermalTerm, kept: Sequence[ThermalTerm]) -> bool:
             return term.name in fixed or (term.name in _AT_ONCE and bool(memories(other.name for other in kept)))
@@ -148,39 +154,34 @@ def exchanged(
 
 def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
     """Return the model with its inner parameters, which the axes share, at the least misfit: a grid, refined."""
-    used = {term.name for terms in model for term in terms}
-    names = [name for name in HISTORY if name in memories(used)]
-    if not names:
+    used = memories(term.name for terms in model for term in terms)
+    grids = {name: grid for name, grid in data.shapes.grids.items() if name in used}
+    if not grids:
         return model
-    shapes = data.shapes
-    bounds = {name: (grid[0], grid[-1]) for name, grid in shapes.grids.items()}
-    options = {name: [history(name, value) for value in shapes.grids[name]] for name in names}
-    spacing = {name: float(grid[1] / grid[0]) for name, grid in shapes.grids.items()}
+    spacing = {name: float(grid[1] / grid[0]) for name, grid in grids.items()}
     touched = [axis for axis, terms in enumerate(model) if memories(term.name for term in terms)]
-    plain = [term for axis in touched for term in model[axis] if not memories([term.name])]
-    beside = [(ThermalTerm(name), leader) for name, leader in BESIDE.items() if name in used]
+    terms = [term for axis in touched for term in model[axis]]
     best: tuple[ThermalTerm, ...] = ()
 
     def at(chosen: tuple[ThermalTerm, ...]) -> Model:
         by_name = {term.name: term for term in chosen}
         return tuple(tuple(at_inner(term, by_name) for term in terms) for terms in model)
 
-    for zoom in range(_ZOOMS):
-        if zoom:
-            tried = {}
-            for term in best:
-                name, value = term.name, term.inner[0][1]
-                tried[name] = np.clip(value * np.geomspace(1 / spacing[name], spacing[name], GRID), *bounds[name])
-                spacing[name] **= 2 / (GRID - 1)
-            options = shapes.prepare(tried)
-        others = [at_inner(term, {leader: option}) for term, leader in beside for option in options[leader]]
-        offered = ReducedTerms(data, [*plain, *(term for terms in options.values() for term in terms), *others])
+    for _ in range(_ZOOMS):
+        options = data.shapes.prepare(grids)
+        offered = [(term, options.get(BESIDE.get(term.name, term.name), [term])) for term in terms]
+        misfit = data.reduced([term._replace(inner=one.inner) for term, values in offered for one in values])
 
-        def cost(chosen: tuple[ThermalTerm, ...], offered: ReducedTerms = offered) -> float:
+        def cost(chosen: tuple[ThermalTerm, ...], misfit=misfit) -> float:
             tuned_model = at(chosen)
-            return sum(offered.misfit(axis, tuned_model[axis]) / scale[axis] for axis in touched)
+            return sum(misfit(axis, tuned_model[axis]) / scale[axis] for axis in touched)
 
         best = min(product(*options.values()), key=cost)
+        for term in best:
+            name, bounds = term.name, data.shapes.grids[term.name][[0, -1]]
+            around = np.geomspace(1 / spacing[name], spacing[name], GRID)
+            grids[name] = np.clip(term.inner[0][1] * around, *bounds)
+            spacing[name] **= 2 / (GRID - 1)
     return at(best)
 
 
@@ -276,15 +277,10 @@ def best_by_axis(candidates: Sequence[Candidate]) -> list[int]:
 
 
 def candidate_of(
-    data: Whitened,
-    family: str,
-    model: Model,
-    folds: Sequence[NDArray[np.int64]],
-    scale: FloatArray,
-    determined: float | None = None,
+    data: Whitened, family: str, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray
 ) -> Candidate:
-    """Return a model with how it did; `determined`: how many numbers of an axis the data determine, where not all."""
-    numbers = np.array([parameters_of(terms) if determined is None else determined for terms in model])
+    """Return a model with how it did where folds were left out; `scale` (3,): of the noise's variance."""
+    numbers = np.array([parameters_of(terms) for terms in model])
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(model)])
     costs = misfit / scale + float(np.log(len(data.blocks))) * numbers
     return Candidate(family, model, numbers, costs, data.held_out(model, folds, scale))

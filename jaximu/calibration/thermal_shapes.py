@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaximu.calibration.thermal_terms import (
@@ -22,15 +19,13 @@ from jaximu.calibration.thermal_terms import (
     ThermalTerm,
     history,
     memories,
-    net_of,
 )
-from jaximu.data.rest import mean_terms, padded_count
+from jaximu.data.rest import mean_terms, over_blocks, padded_count
 from jaximu.data.rest_blocks import RestBlocks
 from jaximu.estimation.track import Track
-from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects import CATALOGUE
-from jaximu.model.effects.learned import ZERO_CELSIUS
+from jaximu.model.effects.learned import ZERO_CELSIUS, AccelLearnedTemperature
 from jaximu.model.effects.network import WEIGHTS
 from jaximu.model.stimulus import Stimulus
 
@@ -38,34 +33,6 @@ __all__ = ["GRID", "ThermalShapes"]
 
 GRID = 12
 """Values of an inner parameter that are tried at once."""
-
-
-def _shapes(names: Sequence[str], count: int, track: Track, *grids):
-    """Return of each effect the mean shapes over `count` blocks, (G, n, 3, k), at inner parameters (G, i).
-
-    They count from the reference temperature, those of a curve, too.
-    """
-    celsius = track.stimulus.temperature_reference
-    reference = Stimulus(
-        jnp.zeros(3),
-        temperature=jnp.asarray(celsius),
-        temperature_rate=jnp.zeros(()),
-        time=jnp.zeros(()),
-        temperature_reference=celsius,
-    )
-
-    def at(kind, values):
-        def of(share):
-            effect = kind(jnp.tile(share, 3), **dict(zip(kind.inner, values, strict=True)))
-            return track.means(effect.term(track.stimulus) - effect.term(reference), count)
-
-        return jax.vmap(of, out_axes=-1)(jnp.eye(kind.size // 3))
-
-    kinds = [CATALOGUE[f"accel.{name}"] for name in names]
-    return tuple(
-        at(kind, grid[0])[None] if len(grid) == 1 else jax.lax.map(partial(at, kind), grid)
-        for kind, grid in zip(kinds, grids, strict=True)
-    )
 
 
 class ThermalShapes:
@@ -96,7 +63,11 @@ class ThermalShapes:
         self._columns: dict[ThermalTerm, FloatArray] = {}
         none, curve = np.zeros((1, 0)), np.array([[self.bounds["low"], self.bounds["high"]]])
         self._add(dict.fromkeys((*POWERS, *RATES, SCALE), none) | {LEARNED: curve})
-        self.prepare({})
+        learned = AccelLearnedTemperature(np.zeros(3 * SPLINES), *curve[0])
+        there = np.asarray(learned.shapes(np.asarray(reference + ZERO_CELSIUS)))
+        for k, value in enumerate(there):  # a curve need not be zero at the reference
+            self._columns[ThermalTerm(LEARNED, (), k)] -= value
+        self.prepare(self.grids)
         celsius, rates = np.append(blocks.temperature, reference), np.append(blocks.rate, 0.0)
         inputs = np.stack([(2 * celsius - low - high) / (high - low), rates / max(fastest, 1e-12)], axis=1)
         inputs = np.clip(inputs, -1.0, 1.0)
@@ -105,22 +76,20 @@ class ThermalShapes:
 
     def prepare(self, tried: Mapping[str, FloatArray]) -> dict[str, list[ThermalTerm]]:
         """Return terms of effects with memory at values (12,) of their inner parameters."""
-        values = {**self.grids, **tried}
-        values |= {name: values[leader] for name, leader in BESIDE.items()}
-        self._add({name: grid[:, None] for name, grid in values.items()})
+        values = {**tried, **{name: tried[leader] for name, leader in BESIDE.items() if leader in tried}}
+        missing = {name: grid for name, grid in values.items() if history(name, grid[GRID // 2]) not in self._columns}
+        self._add({name: grid[:, None] for name, grid in missing.items()})
         return {name: [history(name, value) for value in values] for name, values in tried.items()}
 
     def _add(self, grids: Mapping[str, FloatArray]) -> None:
         """Take the shapes of effects at inner parameters (G, i)."""
-        count, names = len(self.blocks), tuple(grids)
-        rows = padded_count(count)
-        of, key = partial(_shapes, names, rows), f"thermal {','.join(names)} {rows}"
-        recordings = [stored.call(of, key, track, *grids.values()) for track in self.tracks]
-        for name, grid, *parts in zip(names, grids.values(), *recordings, strict=True):
-            for values, columns in zip(grid, np.sum([part[:, :count] for part in parts], axis=0), strict=True):
-                term = history(name, values[0]) if memories([name]) else ThermalTerm(name)
-                for shape, column in enumerate(columns.T):  # (3, n)
-                    self._columns[term._replace(shape=shape) if name == LEARNED else term] = column
+        for name, grid in grids.items():
+            for shape, coefficients in enumerate(np.tile(np.eye(CATALOGUE[f"accel.{name}"].size // 3), 3)):
+                numbers = np.column_stack([np.tile(coefficients, (len(grid), 1)), grid])
+                (values,) = over_blocks(name, numbers, self.tracks, len(self.blocks))
+                for inner, column in zip(grid, values, strict=True):
+                    term = history(name, inner[0]) if memories([name]) else ThermalTerm(name)
+                    self._columns[term._replace(shape=shape)] = column.T
 
     def column(self, term: ThermalTerm) -> FloatArray:
         """Return the shape (3, n) of a term, axis by axis."""
@@ -136,20 +105,11 @@ class ThermalShapes:
             blocks, missing = self.blocks, padded_count(len(self.blocks)) - len(self.blocks)
             celsius, rate = (np.pad(values, (0, missing), "edge") for values in (blocks.temperature, blocks.rate))
             stimulus = Stimulus(temperature=celsius, temperature_rate=rate, temperature_reference=self.reference)
-            effect = CATALOGUE[f"accel.{NETWORK}"](np.array(net.weights), **self.bounds)
-            track = Track(stimulus, np.arange(len(celsius)))
-            value, slopes = mean_terms([effect], [track], len(blocks))
+            effect = CATALOGUE[f"accel.{NETWORK}"](net.weights.ravel(), **self.bounds)
+            value, slopes = mean_terms([effect], [Track(stimulus, np.arange(len(celsius)))], len(blocks))
             by_axis = [slopes[:, axis, axis * WEIGHTS : (axis + 1) * WEIGHTS] for axis in range(3)]
             self._nets[net] = value.T, np.stack(by_axis)
         return self._nets[net]
-
-    def offset(self, terms: Sequence[ThermalTerm]) -> FloatArray:
-        """Return what a network linearised among the terms is beside weights times shapes, (3, n), SI."""
-        net = net_of(terms)
-        if net is None:
-            return np.zeros((3, len(self.blocks)))
-        value, slope = self.network(net)
-        return value - np.einsum("ank,ak->an", slope, np.reshape(net.weights, (3, WEIGHTS)))
 
     def smooth(self) -> FloatArray:
         """Return what a smooth function of temperature may be (n, 9)."""

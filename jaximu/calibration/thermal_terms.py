@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
+from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import SHAPES
 
@@ -37,11 +39,16 @@ SCALE = "scale_temperature"
 NETWORK = "learned_network"
 
 
-class Net(NamedTuple):
-    """Weights of three axes (48 numbers, SI), and standard deviations a priori over the root of the noise's scale."""
+@dataclass(frozen=True, eq=False)
+class Net:
+    """Weights (3, 16) of each axis, SI, and standard deviations a priori (3, 16) over the root of the noise's scale.
 
-    weights: tuple[float, ...]
-    prior: tuple[float, ...]
+    determined: how many numbers of an axis the data determine.
+    """
+
+    weights: FloatArray
+    prior: FloatArray
+    determined: float
 
 
 class ThermalTerm(NamedTuple):
@@ -49,7 +56,7 @@ class ThermalTerm(NamedTuple):
 
     name: str
     inner: tuple[tuple[str, float], ...] = ()
-    shape: int | None = None  # of the learned curve, or the weight of the network
+    shape: int = 0  # of an axis: of the learned curve, or the weight of the network
     net: Net | None = None  # about which the network is linear
 
 

@@ -9,7 +9,7 @@ pass for temperature and a long soak counts for no more than it determines.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,7 +40,7 @@ from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import PREFIXES
 from jaximu.model.effects import CATALOGUE, Effect
-from jaximu.model.effects.network import UNITS, WEIGHTS
+from jaximu.model.effects.network import UNITS
 from jaximu.model.sensor import Imu
 
 __all__ = ["TriadFit", "fit_triad"]
@@ -83,7 +83,7 @@ class TriadFit:
         }
 
 
-def fit_triad(data: Whitened, identifiability: Identifiability, families: Sequence[str] | None = None) -> TriadFit:
+def fit_triad(data: Whitened, identifiability: Identifiability, wanted: Sequence[str] | None = None) -> TriadFit:
     """Fit every family of models, choose for each axis by what was left out, and return the choice, with uncertainty.
 
     Inner parameters are those of the model that is best for all axes together: each axis then chooses its terms at
@@ -94,7 +94,7 @@ def fit_triad(data: Whitened, identifiability: Identifiability, families: Sequen
     offered = {
         family: effects
         for family, effects in families_of(identifiability.told, beyond).items()
-        if family == "constant" or families is None or family in families
+        if family == "constant" or wanted is None or family in wanted
     }
     models: dict[str, Model] = {}
     for family, (names, fixed) in offered.items():
@@ -115,39 +115,29 @@ def fit_triad(data: Whitened, identifiability: Identifiability, families: Sequen
                 models[family] = stepwise(data, (terms,) * 3, fixed, scale)
                 tried[family] = candidate(family)
     candidates = list(tried.values())
-    if families is None or "network" in families:
+    if wanted is None or "network" in wanted:
         best = tuple(candidates[k].model[axis] for axis, k in enumerate(best_by_axis(candidates)))
-        if families is not None or patterned(data, best, scale):
+        if wanted is not None or patterned(data, best, scale):
             rated = any(name in identifiability.told for name in RATES)
             network, scale = with_network(data, beyond, rated, folds, scale)
             candidates = [*map(candidate, models), network]
-    chosen = [candidates[k] for k in best_by_axis(candidates)]
-    fit = _concluded(data, chosen, candidates)
+    by_axis = [candidates[k] for k in best_by_axis(candidates)]
+    families = tuple(chosen.family for chosen in by_axis)
+    model = completed(tuple(chosen.model[axis] for axis, chosen in enumerate(by_axis)))
+    title = ", ".join(dict.fromkeys(family for family in families if family != "constant")) or "constant"
+    fit = _concluded(data, candidate_of(data, title, model, folds, scale), families, candidates)
     vague = memories(effect for (effect, _), (value, sigma) in fit.inner.items() if sigma > VAGUE * value)
     if not vague:
         return fit
     observable = tuple(name for name in identifiability.told if name not in vague)
-    return fit_triad(data, replace(identifiability, told=observable), families)
+    return fit_triad(data, replace(identifiability, told=observable), wanted)
 
 
-def _joined(chosen: Sequence[Candidate]) -> Candidate:
-    """Return the model that has the terms of one candidate on each axis."""
-
-    def own(values: Callable[[Candidate], FloatArray]) -> FloatArray:
-        return np.diagonal(np.array([values(candidate) for candidate in chosen]))
-
-    parts = tuple(candidate.model[axis] for axis, candidate in enumerate(chosen))
-    model = completed(parts)
-    more = [len(terms) - len(part) for terms, part in zip(model, parts, strict=True)]
-    families = dict.fromkeys(candidate.family for candidate in chosen if candidate.family != "constant")
-    held = Held(own(lambda candidate: candidate.held.rms), own(lambda candidate: candidate.held.by_axis))
-    numbers, costs = own(lambda candidate: candidate.numbers) + more, own(lambda candidate: candidate.costs)
-    return Candidate(", ".join(families) or "constant", model, numbers, costs, held)
-
-
-def _concluded(data: Whitened, by_axis: Sequence[Candidate], candidates: Sequence[Candidate]) -> TriadFit:
-    """Return the core's fit of the candidates chosen axis by axis, and what it leaves of the blocks."""
-    blocks, chosen = data.blocks, _joined(by_axis)
+def _concluded(
+    data: Whitened, chosen: Candidate, families: tuple[str, ...], candidates: Sequence[Candidate]
+) -> TriadFit:
+    """Return the core's fit of the model chosen axis by axis, and what it leaves of the blocks."""
+    blocks = data.blocks
     freedom = len(blocks) - blocks.levels - chosen.numbers
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(chosen.model)])
     fitted = _fitted(data, chosen.model, np.maximum(misfit / freedom, 1.0))
@@ -162,7 +152,6 @@ def _concluded(data: Whitened, by_axis: Sequence[Candidate], candidates: Sequenc
     rest = rest - level.T[blocks.level]
     white = np.einsum("aij,ja->ai", data.root, rest)
     chi = np.sum(white**2, axis=1) / freedom
-    families = tuple(candidate.family for candidate in by_axis)
     return TriadFit(chosen, families, tuple(candidates), fitted, effects, level, rest, added, before, after, chi)
 
 
@@ -182,15 +171,15 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
     used, known = set(), {}
     for axis, terms in enumerate(model):
         for term, value in zip(terms, data.coefficients(axis, terms), strict=True):
-            shape = term.shape or 0
-            unit = signal.nominal_scale[axis] if term.net is None or shape < UNITS else 1.0  # inside tanh there is none
-            index = axis * kinds[term.name].size // 3 + shape
+            inside = term.net is not None and term.shape >= UNITS  # of tanh, where there is no unit
+            unit = 1.0 if inside else signal.nominal_scale[axis]
+            index = axis * kinds[term.name].size // 3 + term.shape
             number = Name(name, "coefficients", (index,), order.index(term.name))
             used.add(number)
             values[term.name][index] = value * unit
             inner[term.name] |= dict(term.inner)
             if term.net is not None:
-                known[number] = np.reshape(term.net.prior, (3, WEIGHTS))[axis, shape] * np.sqrt(scale[axis]) * unit
+                known[number] = term.net.prior[axis, term.shape] * np.sqrt(scale[axis]) * unit
 
     def free(number: Name) -> bool:
         if number.effect is None:

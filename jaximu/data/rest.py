@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -22,7 +23,7 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.sensor import Imu
 
-__all__ = ["RestOverTemperature", "mean_terms", "padded_count"]
+__all__ = ["RestOverTemperature", "mean_terms", "over_blocks", "padded_count"]
 
 _ROWS = 256
 """Blocks are padded to a multiple of so many: few shapes to compile."""
@@ -70,7 +71,7 @@ class RestOverTemperature(OfOneUnit):
         used[:, : self.weights.shape[1]] = 1.0
         factors = tuple((used * axis[:, None]).ravel() for axis in np.eye(3))
         group = np.repeat(np.arange(3), self._length)
-        self.covariance = Covariance(np.ones(3 * self._length), factors, used.ravel(), group)  # pyright: ignore[reportArgumentType]
+        self.covariance = Covariance(np.ones(3 * self._length), factors, used.ravel(), group)
         self.bias = self._white(np.tile(np.eye(3), (len(output), 1, 1)))
 
     def about_one(self, imu: Imu) -> About:
@@ -78,7 +79,7 @@ class RestOverTemperature(OfOneUnit):
         added, slopes = mean_terms(tuple(imu.all_effects().values()), self.paths, len(self.output))
         output = self._white((self.output - added)[:, :, None])[:, 0]
         gyroscope = np.int64(self.triad == "gyroscope")
-        conditions = _WhiteOutputs(output, self.bias, np.float64(0.0), gyroscope)  # pyright: ignore[reportCallIssue]
+        conditions = _WhiteOutputs(output, self.bias, np.float64(0.0), gyroscope)
         return About(conditions, self.covariance, self._white(-slopes))
 
     def _white(self, values: FloatArray) -> FloatArray:
@@ -93,23 +94,37 @@ def mean_terms(effects: Sequence[Effect], tracks: Sequence[Track], count: int) -
 
     In output units; numbers are in the order of `effect_numbers`.
     """
-    added, slopes, rows = np.zeros((count, 3)), [np.zeros((count, 3, 0))], padded_count(count)
+    added, slopes = np.zeros((count, 3)), [np.zeros((count, 3, 0))]
     for effect in effects:
-        kind = CATALOGUE[f"accel.{effect.plain}"]  # its term is the gyroscope's, too: half as many to compile
         numbers = np.concatenate([effect.coefficients, [float(getattr(effect, name)) for name in effect.inner]])
-
-        def means(track, numbers, kind=kind):
-            def of(varied):
-                return track.means(varied.term(track.stimulus), rows)
-
-            inner = dict(zip(kind.inner, numbers[kind.size :], strict=True))
-            return of(kind(numbers[: kind.size], **inner)), derivatives_by_numbers(kind, of, numbers)
-
-        recordings = [stored.call(means, f"rest {kind.name} {rows}", track, numbers) for track in tracks]
-        value, slope = (sum(part[:count] for part in parts) for parts in zip(*recordings, strict=True))
-        added = added + value
-        slopes.append(np.asarray(slope))
+        value, slope = over_blocks(effect.plain, numbers[None], tracks, count, slopes=True)
+        added = added + value[0]
+        slopes.append(slope[0])
     return added, free_columns(dict(enumerate(effects)), np.concatenate(slopes, axis=2))
+
+
+def over_blocks(
+    plain: str, numbers: FloatArray, tracks: Sequence[Track], count: int, slopes: bool = False
+) -> list[FloatArray]:
+    """Return what an effect adds to means over blocks (G, n, 3) at numbers (G, q + i), coefficients and inner ones.
+
+    **Arguments:** `plain`: the effect's name, alike for both triads. `slopes`: the derivatives (G, n, 3, q + i), too.
+    """
+    kind, rows = CATALOGUE[f"accel.{plain}"], padded_count(count)  # its term is the gyroscope's: half as many programs
+
+    def means(track, numbers):
+        def of(varied):
+            return track.means(varied.term(track.stimulus), rows)
+
+        def at(numbers):
+            inner = dict(zip(kind.inner, numbers[kind.size :], strict=True))
+            value = of(kind(numbers[: kind.size], **inner))
+            return (value, derivatives_by_numbers(kind, of, numbers)) if slopes else (value,)
+
+        return jax.lax.map(at, numbers)
+
+    parts = [stored.call(means, f"rest {kind.name} {rows} {slopes}", track, numbers) for track in tracks]
+    return [np.sum(values, axis=0)[:, :count] for values in zip(*parts, strict=True)]
 
 
 def padded_count(count: int) -> int:

@@ -113,7 +113,7 @@ class Resting(OfOneUnit):
         tracks = self.blocks.tracks(force, imu.accelerometer.temperature_reference)
         details = _AtRests([dict.fromkeys(TRIADS, track) for track in tracks])
         output = self._outputs - (self._added(imu, details.tracks) if imu.all_effects() else 0.0)
-        conditions = RestingConditions(output, force, np.float64(0.0))  # pyright: ignore[reportArgumentType]
+        conditions = RestingConditions(output, force, np.float64(0.0))
         return About(conditions, self._covariance, self.own_columns(imu, details, output.size), details)
 
     def reactions(self, details: _AtRests):
@@ -223,7 +223,7 @@ class Resting(OfOneUnit):
         size = 6 * count
         factors = tuple(factor.ravel() for factor in unit)
         group = np.tile(np.repeat([0, 1], 3), count)
-        return Covariance(whole.reshape(size, size), factors, np.ones(size), group)  # pyright: ignore[reportArgumentType]
+        return Covariance(whole.reshape(size, size), factors, np.ones(size), group)
 
     def allowed(self, count: int) -> FloatArray:
         """Return the columns (count, k) of the levels of the rests and of smooth functions, in standard deviations."""

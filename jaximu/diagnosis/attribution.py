@@ -25,7 +25,7 @@ from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
 from jaximu.diagnosis.drift import DRAWS
 from jaximu.diagnosis.evidence import BLIND, FEWEST_DIMENSIONS, Evidence
 from jaximu.diagnosis.improvement import cross_validated
-from jaximu.estimation.leave_out import orthonormal
+from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
@@ -185,7 +185,7 @@ class BoardRecording:
             others += [evidence.off_base(self.rests.columns(triad, curve)) for triad in TRIADS]
         columns = evidence.columns[:, evidence.place(block)]
         basis = orthonormal(np.concatenate(others, axis=1))
-        u, s, v = np.linalg.svd(columns - basis @ (basis.T @ columns), full_matrices=False)
+        u, s, v = np.linalg.svd(off(basis, columns), full_matrices=False)
         kept = s > BLIND * np.max(np.linalg.norm(columns, axis=0), initial=1e-300)
         return u[:, kept].T @ evidence.residual, s[kept, None] * v[kept]
 
@@ -380,7 +380,7 @@ def _as_slow(rates: FloatArray, times: FloatArray, up: FloatArray, random: np.ra
     steps = np.sqrt(np.diff(times, prepend=2 * times[0] - times[1]))[:, None]
     walks = np.cumsum(steps * random.standard_normal(rates[1:].shape), axis=1)
     basis = orthonormal(np.concatenate([np.ones((len(times), 1)), up], axis=1))
-    walks -= basis @ (basis.T @ walks)
+    walks = off(basis, walks)
     scaled, walks = (values / np.maximum(np.std(values, axis=1, keepdims=True), 1e-300) for values in (rates, walks))
     measured, drawn, walking = (
         np.mean(values[:, 1:] * values[:, :-1], axis=1) for values in (scaled[:1], scaled[1:], walks)

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.experiment import LEAST_WARMING, Experiment, State
+from jaximu.estimation.leave_out import off
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, holm, kolmogorov_sf
@@ -78,8 +79,7 @@ def _by_kind(state: State, experiment: Experiment) -> list[Check]:
     root = np.linalg.inv(state.weights)
     evidence = state.evidence
     residual = root @ evidence.residual
-    basis = np.linalg.svd(evidence.jacobian, full_matrices=False)[0]
-    left = root @ (np.eye(len(residual)) - basis @ basis.T) @ root.T
+    left = root @ evidence.off_base(root.T)
     checks = []
     for index, kind in enumerate(experiment.real.kinds):
         plain = kind.name.replace("_", " ")
@@ -185,7 +185,7 @@ def _odd_even(state: State, experiment: Experiment) -> Check:
         basis, values, _ = np.linalg.svd(np.linalg.solve(white, jacobian[rows]), full_matrices=False)
         basis = basis[:, values > 1e-8 * values[0]]
         error = np.linalg.solve(white, state.conditions[rows])
-        error = error - basis @ (basis.T @ error)
+        error = off(basis, error)
         return float(error @ error), len(error) - basis.shape[1]
 
     (whole, whole_freedom), (half, half_freedom) = misfit(alone), misfit(even)

@@ -24,7 +24,7 @@ from jaximu.data.drift import (
 )
 from jaximu.estimation.data import Data, Handling
 from jaximu.estimation.fitting import Linear
-from jaximu.estimation.leave_out import orthonormal
+from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
@@ -104,7 +104,7 @@ class DriftComponents:
 
         drawn = changed(drawn, np.linalg.cholesky(self.uncertainty) @ random.standard_normal((len(sizes), DRAWS)))
         basis = orthonormal(np.concatenate([jacobian, weights @ self.beside[used]], axis=1))
-        pulled = drawn - basis @ (basis.T @ drawn)
+        pulled = off(basis, drawn)
         inside = [np.trace(part) - np.trace(basis.T @ part @ basis) for part in parts]
         gradient = (
             np.stack(

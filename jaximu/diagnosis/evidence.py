@@ -18,6 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.diagnosis.drift import DRAWS
+from jaximu.estimation.leave_out import off
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
 
@@ -125,7 +126,7 @@ class Evidence:
 
     def off_base(self, values: FloatArray) -> FloatArray:
         """Return whitened conditions (n, …) without what the base parameters can imitate."""
-        return values - self._base @ (self._base.T @ values)
+        return off(self._base, values)
 
     def draws(self, random: np.random.Generator, count: int) -> FloatArray:
         """Return whitened conditions (n, count) of noise alone, as uncertain as its covariance is, off the base."""
@@ -206,14 +207,11 @@ class Evidence:
         keep = values > BLIND**2
         return columns @ (vectors[:, keep] / np.sqrt(values[keep]))
 
-    def _off_span(self, values: FloatArray) -> FloatArray:
-        return values - self._spanned @ (self._spanned.T @ values)
-
     def _outside(self, known: Sequence[int]) -> tuple[float, int, float]:
         """The misfit outside the span of all blocks but those at a position, unless given."""
-        rest = self._off_span(self.residual)
+        rest = off(self._spanned, self.residual)
         inside = self.span(k for k in known if self.blocks[k].position)
-        columns = self._off_span(self.columns[:, inside])
+        columns = off(self._spanned, self.columns[:, inside])
         statistic, rank = _quadratic((columns.T @ columns)[None], (columns.T @ rest)[None], self._reach[inside][None])
         left = self.freedom - self._spanned.shape[1] - int(rank[0])
         if left < 1:

@@ -298,9 +298,8 @@ class Experiment(Data):
         """
         if self.data.averaged() is None:
             return False
-        white = state.weights @ self.data.change_by_averaging(state.linear.details)[self.used]
-        basis = np.linalg.svd(state.evidence.jacobian, full_matrices=False)[0]
-        white -= basis @ (basis.T @ white)
+        change = self.data.change_by_averaging(state.linear.details)[self.used]
+        white = state.evidence.off_base(state.weights @ change)
         length = float(white @ white)
         return length > _SURE**2 and abs(float(white @ state.evidence.residual) / length - 1) < 0.5
 

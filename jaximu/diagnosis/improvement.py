@@ -13,7 +13,7 @@ from scipy.linalg import null_space
 from jaximu.diagnosis.evidence import Evidence
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
-from jaximu.estimation.leave_out import LeftOut, leave_out
+from jaximu.estimation.leave_out import LeftOut, leave_out, off
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
@@ -157,7 +157,7 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
             )
             # a turn between two folds is left out twice; its later error is kept
             rest = (root @ np.tensordot(weight, [residual for _, residual in options], 1))[rows]
-            errors[key][rows] = rest - (estimate - determined @ (determined.T @ estimate))
+            errors[key][rows] = rest - off(determined, estimate)
             squared[key] += part_squared
             likelihood[key] += part_likelihood
     predictions = {key: Prediction(real.rms(errors[key]), squared[key], count_out, likelihood[key]) for key in errors}

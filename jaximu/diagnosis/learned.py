@@ -194,17 +194,14 @@ def _left_out(state: State, columns: FloatArray, strength: float, folds) -> tupl
     known = np.eye(columns.shape[1]) / np.sqrt(strength)
     known = np.concatenate([np.zeros((len(known), jacobian.shape[1])), known], axis=1)
     design = np.concatenate([np.concatenate([jacobian, columns], axis=1), known])
-    squared, log_size, count, errors = 0.0, 0.0, 0, np.zeros(len(residual))
-    for part in leave_out(state.weights, design, np.pad(residual, (0, len(known))), folds):
-        if part.blind:  # the rest does not determine the parameters
-            continue
-        errors[part.rows] = part.errors
-        squared += part.chi_squared
-        log_size -= float(np.sum(np.log(part.precisions)))
-        count += len(part.errors)
+    parts = leave_out(state.weights, design, np.pad(residual, (0, len(known))), folds)
+    predicted = [part for part in parts if not part.blind]  # else the rest does not determine the parameters
+    squared, count = sum(part.chi_squared for part in predicted), sum(len(part.errors) for part in predicted)
     # noise that looks too small is widened, or any term that makes predictions uncertain would pay
-    unit = max(1.0, squared / max(count, 1))
-    return -0.5 * (count * np.log(2 * np.pi * unit) + log_size + squared / unit), squared / unit, count, errors
+    unit, errors = max(1.0, squared / max(count, 1)), np.zeros(len(residual))
+    for part in predicted:
+        errors[part.rows] = part.errors
+    return sum(part.log_likelihood(unit) for part in predicted), squared / unit, count, errors
 
 
 def _prediction(experiment: Experiment, left: tuple[float, float, int, FloatArray]) -> Prediction:

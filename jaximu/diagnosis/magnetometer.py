@@ -305,6 +305,6 @@ def _left_out(weights: FloatArray, columns: FloatArray, residual: FloatArray, re
     likelihood, errors = 0.0, np.zeros(len(residual))
     size = 1 / np.linalg.norm(weights, axis=0)  # rows are in µT and sines: what is blind is told in units of their own
     for part in leave_out(weights * size, columns, residual, parts):
-        likelihood += 0.5 * float(np.sum(np.log(part.precisions)) - part.chi_squared)
+        likelihood += part.log_likelihood()
         errors[part.rows] = size[part.rows] * part.errors
     return likelihood, float(np.sqrt(np.mean(errors[real.of_kind("field_strength")] ** 2)))

@@ -346,10 +346,7 @@ def _joined(known: AxisNoise, more: AxisNoise) -> AxisNoise:
 
 def _parted(evidence: Evidence, added: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the sizes (k,) of a whitened covariance (n, n) off the base, and the residual's squares (k,) along it."""
-    u, s, _ = np.linalg.svd(evidence.jacobian, full_matrices=False)
-    base = u[:, s > 1e-10 * s[0]]
-    off = np.eye(len(base)) - base @ base.T
-    sizes, vectors = np.linalg.eigh(off @ added @ off)
+    sizes, vectors = np.linalg.eigh(evidence.off_base(evidence.off_base(added).T))
     keep = sizes > 1e-12 * sizes[-1]
     return sizes[keep], (vectors[:, keep].T @ evidence.residual) ** 2
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaximu.diagnosis.evidence import FAMILY_LEVEL, EffectBlock, Evidence, Scores
 
-__all__ = ["BESIDE", "LEVEL", "SelectedCause", "Selection", "causes_of", "one_curve", "select", "shape_of"]
+__all__ = ["BESIDE", "LEVEL", "SelectedCause", "Selection", "causes_of", "criterion", "one_curve", "select", "shape_of"]
 
 LEVEL = FAMILY_LEVEL
 """Rate of false alarms over all tests together."""

@@ -1,8 +1,8 @@
 """Poses and turns by hand while the temperature changes: bias, scale and misalignment over it, both triads at once.
 
 The conditions are those of any hand-held recording: the norm of gravity in each pose, its direction carried over each
-turn by the gyroscope, and the gyroscope at rest. Terms are taken in by the score test's statistic less the information
-criterion's penalty, and stay where they predict parts of the recording left out.
+turn by the gyroscope, and the gyroscope at rest. Terms are taken in by the criterion of every selection of causes, and
+stay where they predict parts of the recording left out.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from jaximu.diagnosis.diagnosis import extended, recorded_by_hand
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import left_out_likelihood
 from jaximu.diagnosis.noise import usual_noise
+from jaximu.diagnosis.selection import criterion
 from jaximu.ground.document import Document
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -124,24 +125,8 @@ def calibrate_thermal_by_hand(
     experiment = Experiment(recorded_by_hand(calibration), calibration.imu.with_effects(), candidates=ASKED)
     noise = usual_noise(experiment) if noise is None else noise
     experiment = replace(experiment, data=experiment.data.with_noise(noise))
-    base = state = experiment.fit()
-    steps: list[tuple[str, float, float]] = []
-    refused: set[str] = set()
-    while (name := _next(state, refused)) is not None:
-        evidence = state.evidence
-        index = [block.name for block in evidence.blocks].index(name)
-        statistic = float(evidence.scores().statistic[index])
-        try:
-            tried = experiment.fit((*state.effects, CATALOGUE[name].dormant()), state.imu)
-        except NotPossibleError:  # beside the others it comes to nothing
-            refused.add(name)
-            continue
-        gain = left_out_likelihood(experiment, tried) - left_out_likelihood(experiment, state)
-        if gain > 0:
-            state = tried
-            steps.append((name, statistic, gain))
-        else:
-            refused.add(name)
+    base = experiment.fit()
+    state, steps = _extended(experiment, base)
     result = extended(calibration, experiment, state, noise)
     assert result.fit is not None
     require_solved(result.fit, logs[0].name)
@@ -160,16 +145,34 @@ def calibrate_thermal_by_hand(
     )
 
 
-def _next(state: State, refused: set[str]) -> str | None:
-    """Return the effect whose statistic exceeds its penalty by most, if any does."""
-    evidence, inside = state.evidence, {(effect.owner, effect.plain) for effect in state.effects}
-    gains = {}
-    for block, statistic in zip(evidence.blocks, evidence.scores().statistic, strict=True):
-        if block.kind != "effect" or block.name in refused:
+def _extended(experiment: Experiment, state: State) -> tuple[State, list[tuple[str, float, float]]]:
+    """Take effects into a fit, one after another, while each predicts parts left out better; say what each gained."""
+    steps: list[tuple[str, float, float]] = []
+    refused: set[str] = set()
+    while (best := _next(state, refused)) is not None:
+        name, statistic = state.evidence.blocks[best].name, float(state.evidence.scores().statistic[best])
+        try:
+            extension = experiment.fit((*state.effects, CATALOGUE[name].dormant()), state.imu)
+        except NotPossibleError:  # beside the others it comes to nothing
+            refused.add(name)
             continue
-        kind = CATALOGUE[block.name]
-        before = _FIRST.get(kind.plain)
-        if before is None or (kind.owner, before) in inside:
-            gains[block.name] = float(statistic - len(block.sizes) * np.log(len(state.conditions)))
-    best = max(gains, key=lambda name: gains[name], default="")
-    return best if gains.get(best, 0.0) > 0 else None
+        gain = left_out_likelihood(experiment, extension) - left_out_likelihood(experiment, state)
+        if gain > 0:
+            state = extension
+            steps.append((name, statistic, gain))
+        else:
+            refused.add(name)
+    return state, steps
+
+
+def _next(state: State, refused: set[str]) -> int | None:
+    """Return the place of the effect that gains most by the criterion of every selection, if any does."""
+    evidence, inside = state.evidence, {(effect.owner, effect.plain) for effect in state.effects}
+    scores, gains = evidence.scores(), {}
+    for k, block in enumerate(evidence.blocks):
+        if block.kind == "effect" and block.name not in refused:
+            kind = CATALOGUE[block.name]
+            if kind.plain not in _FIRST or (kind.owner, _FIRST[kind.plain]) in inside:
+                gains[k] = criterion(evidence, scores, k)
+    best = max(gains, key=lambda k: gains[k], default=None)
+    return None if best is None or gains[best] <= 0 else best

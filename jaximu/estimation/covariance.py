@@ -33,6 +33,7 @@ __all__ = [
     "inverse_cholesky",
     "mean_root",
     "parts_of",
+    "scored",
     "update_excess",
 ]
 
@@ -438,10 +439,12 @@ def update_excess(
         scoring = scoring.at[numbers, numbers].add(second)
         within += inner
     products = jnp.stack(within)
-    return _scored(excess, jnp.stack(gradient), scoring + jnp.einsum("ipq,jqp->ij", products, products))
+    return scored(excess, jnp.stack(gradient), scoring + jnp.einsum("ipq,jqp->ij", products, products))
 
 
-def _scored(excess: Float[Array, " k"], gradient: Float[Array, " k"], scoring: Float[Array, "k k"]):
+def scored(
+    excess: Float[Array, " k"], gradient: Float[Array, " k"], scoring: Float[Array, "k k"]
+) -> Float[Array, " k"]:
     """Take a step of scoring; a component without rows (no turns, say) has no information, and stays.
 
     One at zero that would go below it has no part in the step: it would hold the others off their maximum.

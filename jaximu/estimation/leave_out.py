@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["LeftOut", "leave_out", "orthonormal"]
+__all__ = ["LeftOut", "leave_out", "off", "orthonormal"]
 
 _RANK = 1e-9
 """Share of the largest singular value below which a combination of columns is none."""
@@ -46,6 +46,11 @@ class LeftOut(NamedTuple):
         """Of the errors against their covariance."""
         return float(np.sum(self.precisions * (self.directions.T @ self.errors) ** 2))
 
+    def log_likelihood(self, scale: float = 1.0) -> float:
+        """Return that of the errors (nats), their variance and that of their prediction `scale` times as large."""
+        sizes = self.precisions / (2 * np.pi * scale)
+        return 0.5 * (float(np.sum(np.log(sizes))) - self.chi_squared / scale)
+
     @property
     def blind(self) -> bool:
         """Whether there is a direction in which the others predict nothing."""
@@ -68,7 +73,7 @@ def leave_out(
     kept = s > _RANK * s[:1].max(initial=0.0)
     basis, count = u[:, kept], len(weights)
     back = weights.T @ basis[:count]
-    pull = weights.T @ (target - basis @ (basis.T @ target))[:count]
+    pull = weights.T @ off(basis, target)[:count]
     for rows in parts:
         weighted = weights[:, rows]
         values, vectors = np.linalg.eigh(weighted.T @ weighted - back[rows] @ back[rows].T)
@@ -85,3 +90,8 @@ def orthonormal(columns: FloatArray) -> FloatArray:
         return columns
     u, s, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
     return u[:, s > _RANK * s[0]]
+
+
+def off(basis: FloatArray, values: FloatArray) -> FloatArray:
+    """Return values (n, …) without what orthonormal columns (n, k) span."""
+    return values - basis @ (basis.T @ values)

@@ -60,6 +60,7 @@ from scipy.linalg import block_diag
 from jaximu.calibration.turntable import fit_turntable, free_on_table
 from jaximu.data.station_error import turntable_error
 from jaximu.data.stations import station_excess, station_weights, turntable
+from jaximu.estimation.covariance import scored
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, Problem, flatten, names_of
 from jaximu.estimation.solver import solve
 from jaximu.estimation.uncertainty import UNDETERMINED, weak_directions
@@ -356,7 +357,7 @@ def _expected_excess(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the excess (3,) that the estimator finds on average, and the Jacobian (6 S, p) whitened by noise alone.
 
-    The restricted likelihood's scoring (`jaximu.estimation.covariance.update_excess`) with the residuals' expected
+    The restricted likelihood's scoring (`jaximu.estimation.covariance.scored`) with the residuals' expected
     squares: errors scatter the mean outputs by `scattered` @ standard normal draws.
     """
     measured = np.asarray(block_diag(*stations.accelerometer_covariance, *stations.gyroscope_covariance))
@@ -371,10 +372,7 @@ def _expected_excess(
         inverse = weights.T @ weights - basis.T @ basis
         gradient = units @ (np.sum((inverse @ scattered) ** 2, axis=1) - np.diagonal(inverse))
         information = units @ inverse**2 @ units.T
-        there = np.diagonal(information) > 1e-20
-        step = np.zeros(len(units))
-        step[there] = np.linalg.lstsq(information[np.ix_(there, there)], gradient[there], rcond=1e-9)[0]
-        before, excess = excess, np.maximum(excess + step, 0.0)
+        before, excess = excess, np.asarray(scored(excess, gradient, information))
         if np.all(np.abs(excess - before) <= 1e-4 * (1 + before)):
             break
     return excess, whitening(np.zeros(len(units))) @ design

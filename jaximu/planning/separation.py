@@ -22,6 +22,7 @@ from jaximu.data.recorded_stations import RecordedStations
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, Option
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment
+from jaximu.estimation.leave_out import off
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, noncentral_chi2_sf
 from jaximu.mistakes.titles import effect_title
@@ -182,9 +183,6 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
     def columns(kind: type[Effect], inner: Sequence[dict[str, float]]) -> FloatArray:
         matrices = experiment.dormant_columns(imu, linear.details, {kind: inner})[kind]
         return np.stack([np.linalg.solve(root, matrix[used]) for matrix in matrices])
-
-    def off(basis: FloatArray, values: FloatArray) -> FloatArray:
-        return values - basis @ (basis.T @ values)
 
     signals = []
     for effect in effects:
