@@ -15,6 +15,7 @@ from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS, Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
+from jaximu.mistakes import prepared
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.columns.names import COUNTS_ADVICE
@@ -289,7 +290,14 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     or stamps that are not in their stated unit, `NotPossibleError` where there is no temperature, it does not change,
     or the unit did not rest.
     """
-    logs = [_with_finite_temperature(recording) for recording in recordings_of(recordings)]
+    with prepared(recordings_of(recordings), gyroscope=False, gravity=False) as ready:
+        blocks = _of_ready([_with_finite_temperature(one.recording) for one in ready], block)
+    findings = [note for one in ready for note in one.notes]
+    return replace(blocks, notes=tuple(dict.fromkeys((*blocks.notes, *findings))))
+
+
+def _of_ready(logs: Sequence[Recording], block: float | None) -> RestBlocks:
+    """The blocks of recordings that were looked over."""
     same_outputs(logs)
     for recording in logs:
         _require_temperature(recording)

@@ -7,6 +7,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.mistakes.base import Samples, Sensor, leave_out_both, spans_of
 from jaximu.mistakes.lost_samples import steps
+from jaximu.recordings.alignment import carried, turning
 from jaximu.recordings.finding import Finding
 
 __all__ = ["TITLES", "find"]
@@ -15,6 +16,11 @@ TITLES = {"data.mixed_devices": "sensors of different devices", "data.units": "c
 
 _RELATED = 0.4
 """Share of the turning of gravity that some gyroscope of this motion, however mounted, must explain."""
+_FEWEST_TURNS, _CARRIED = 4, np.radians(25)
+"""Turns from rest to rest that must be whole, and the error, of three in four, below which the gyroscope carries
+gravity over them."""
+_ANOTHER_SCALE = 3.0
+"""Factor between angles from which on the scale of a gyroscope is another one."""
 _SHIFT = 12.0
 """Standard deviations of the means at rest by which another device's bias must differ."""
 
@@ -25,25 +31,44 @@ def find(samples: Samples) -> list[Finding]:
 
 
 def _unrelated(samples: Samples) -> list[Finding]:
-    blocks = samples.turning
-    if blocks is None:
+    blocks, both = samples.turning, samples.both
+    if blocks is None or both is None or not samples.posed:
         return []
-    change, force, turned, time = blocks.change, blocks.force, blocks.turned(), blocks.centre[:-1]
-    moving = np.linalg.norm(change, axis=1) > 0.5
-    turning_gyroscope = np.linalg.norm(turned, axis=1) > 0.05
-    rests = samples.rests
-    if moving.sum() < 20 or turning_gyroscope.sum() < 20 or len(change) < 100 or not samples.posed:
+    force, rate = both
+    clocks = samples.clocks
+    explained = turning(force.time, force.values, rate.time, rate.values).explained
+    if max(explained, 0.0 if clocks is None else clocks.explained) > _RELATED:
+        return []
+    # accelerations on the way hide how gravity turns, and do not matter from rest to rest
+    whole = carried(force.time, force.values, rate.time, rate.values, samples.rests)
+    if whole.turns < _FEWEST_TURNS:
+        return []
+    if whole.error < _CARRIED:
+        factor = abs(whole.factor)
+        if 1 / _ANOTHER_SCALE < factor < _ANOTHER_SCALE:
+            return []
+        return [
+            Finding(
+                "data.range",
+                (),
+                f"The gyroscope reads {1 / factor:.2g} times the angles by which gravity turns in the accelerometer "
+                f"from rest to rest, in {whole.turns} turns: its scale or unit is wrong. Check --gyro-scale, or the "
+                "unit in the column name.",
+                spoils=True,
+                refuses="gyroscope",
+            )
+        ]
+    moving = np.linalg.norm(blocks.change, axis=1) > 0.5
+    turning_gyroscope = np.linalg.norm(blocks.turned(), axis=1) > 0.05
+    if clocks is None or moving.sum() < 20 or turning_gyroscope.sum() < 20 or len(blocks.change) < 100:
         return []
     # a vehicle's specific force does not turn with it: only turns from pose to pose count, and slow ones, in which
     # the norm stays that of gravity
-    norm = np.linalg.norm(force, axis=1)
+    rests, time, norm = samples.rests, blocks.centre[:-1], np.linalg.norm(blocks.force, axis=1)
     later = np.clip(np.searchsorted(rests[:, 0], time), 1, len(rests) - 1)
     between = (rests[later, 0] - rests[later - 1, 1] < 10.0) & (time > rests[0, 0]) & (time < rests[-1, 1])
     usable = (np.abs(norm / np.median(norm) - 1) < 0.08) & between
     if (moving & usable).sum() < 20:
-        return []
-    clocks = samples.clocks
-    if clocks is None or clocks.explained > _RELATED:
         return []
     return [
         Finding(
