@@ -85,7 +85,7 @@ __getattr__ = lazily(
         "jaximu.calibration.means": "calibrate_means",
         "jaximu.calibration.nominal": "nominal_imu",
         "jaximu.calibration.recipe": "calibrate",
-        "jaximu.calibration.refusals": "require_carried require_spanning",
+        "jaximu.calibration.refusals": "require_carried, require_spanning",
         "jaximu.calibration.scheme": "Scheme, describe_scheme",
         "jaximu.calibration.systematic": "History, calibrate_by_filter",
         "jaximu.calibration.thermal": "ThermalCalibration, calibrate_thermal",

@@ -290,17 +290,18 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     or stamps that are not in their stated unit, `NotPossibleError` where there is no temperature, it does not change,
     or the unit did not rest.
     """
-    with prepared(recordings_of(recordings), gyroscope=False, gravity=False) as ready:
-        blocks = _of_ready([_with_finite_temperature(one.recording) for one in ready], block)
+    logs = [_with_finite_temperature(recording) for recording in recordings_of(recordings)]
+    same_outputs(logs)
+    for recording in logs:
+        _require_temperature(recording)
+    with prepared(logs, gyroscope=False, gravity=False) as ready:
+        blocks = _of_ready([one.recording for one in ready], block)
     findings = [note for one in ready for note in one.notes]
     return replace(blocks, notes=tuple(dict.fromkeys((*blocks.notes, *findings))))
 
 
 def _of_ready(logs: Sequence[Recording], block: float | None) -> RestBlocks:
     """The blocks of recordings that were looked over."""
-    same_outputs(logs)
-    for recording in logs:
-        _require_temperature(recording)
     used = [without_startup(recording) for recording in logs]
     span = sum(float(part.accelerometer.time[-1] - part.accelerometer.time[0]) for part in used)
     rate = min(part.accelerometer.rate for part in used)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
@@ -27,16 +28,18 @@ _ABOUT = ("meta", "__macosx")
 """Folders of what is about a recording."""
 _NO_LOG = set(".json .jsonc .xml .plist .yaml .yml .toml .html .md .pdf .png .jpg .svg .py .ipynb".split())
 """Suffixes of files that are logs only where there is no other."""
+_GZIP = b"\x1f\x8b"
 _PACKED = set(".zip .gz .bz2 .xz .7z .rar .tar .tgz".split())
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a path is a folder that is no ROS 2 bag, or a ZIP archive that is no NPZ file."""
+    """Whether a path is a folder that is no ROS 2 bag, a ZIP archive that is no NPZ file, or a file packed by gzip."""
     if path.is_dir():
         return not (path / "metadata.yaml").is_file()
     with path.open("rb") as file:
-        if file.read(2) != b"PK":
-            return False
+        start = file.read(2)
+    if start != b"PK":
+        return start == _GZIP
     try:
         with zipfile.ZipFile(path) as archive:
             return not any(name.endswith(".npy") for name in archive.namelist())
@@ -56,6 +59,14 @@ def opened(path: Path, name: str) -> Iterator[dict[str, tuple[str, Path]]]:
         files = {file.name: file for file in sorted(path.iterdir()) if file.is_file()}
         chosen = _chosen(files, path, name)
         yield {sensor: (f"{name}/{inside}", files[inside]) for sensor, inside in chosen.items()}
+        return
+    data = path.read_bytes()
+    if data.startswith(_GZIP):
+        unpacked = Unpacking(Source(name, "", 0), len(data)).unpack(zlib.decompressobj(31), data)
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / path.stem
+            file.write_bytes(unpacked)
+            yield {"": (name, file)}
         return
     with zipfile.ZipFile(path) as archive, tempfile.TemporaryDirectory() as folder:
         members = _members(archive, name)
