@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["Use", "allowed", "describe", "read_openly", "run"]
 
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
+_BIAS = 0.5  # rad/s: largest bias of a gyroscope that is taken for rest
 _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
 _BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
 _CUT = 600.0  # s at rest that are worth cutting out of a log
@@ -145,6 +146,7 @@ def describe(
     else:
         findings.append("no accelerometer: poses cannot be found")
         uses = [
+            *(_noise_uses(*_at_rest(recording, ready.recording, findings)) if not guessed else ()),
             Use("turntable", "with a schedule of rests and turns (--reference)", _WITH_SCHEDULE, alone=False),
             replace(_COMPENSATE, why="with a calibration of this gyroscope"),
         ]
@@ -174,7 +176,6 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
     import numpy as np
 
     from jaximu.recordings.recording import plausibility
-    from jaximu.report.recording import signal_facts
 
     signals, poses = recording.signals, 0
     force = np.linalg.norm(recording.accelerometer.si(), axis=1)
@@ -187,13 +188,7 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
     except JaximuError as error:
         if not means:
             findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
-    rest, longest, begin = _rest(repaired) if physical else (0.0, 0.0, 0.0)
-    length = signal_facts(recording.accelerometer, repaired.accelerometer)["duration"]
-    if rest:
-        findings.append(
-            f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
-            f"{_STILL_FORCE:g} m/s²{f' and {_STILL_RATE:g} rad/s' if 'gyroscope' in signals else ''} rms)"
-        )
+    at_rest = _at_rest(recording, repaired, findings) if physical else (0.0,) * 4
     if means:
         yield Use("calibrate --means", f"if each of the {len(force)} rows is the mean of a pose at rest", alone=False)
     if poses >= 9:
@@ -211,13 +206,29 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
         yield Use(
             "magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round"
         )
-    yield from _noise_uses(length, rest, longest, begin)
+    yield from _noise_uses(*at_rest)
     heat = recording.temperature
     if heat is not None and (span := np.ptp(heat.values)) >= 5.0:
         yield Use("thermal", f"the temperature spans {span:.0f} K")
     yield _COMPENSATE
     if poses > 1 and "gyroscope" in signals:
         yield Use("check", "whether a calibration of this unit is still valid", "", _OLD, alone=False)
+
+
+def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> tuple[float, float, float, float]:
+    """Seconds of a recording, those at rest in all and at a stretch, and when that begins; said among `findings`."""
+    from jaximu.report.recording import signal_facts
+
+    names = [name for name in ("accelerometer", "gyroscope") if name in recording.signals]
+    rest, longest, begin = _rest(repaired)
+    length = signal_facts(recording.signals[names[0]], repaired.signals[names[0]])["duration"]
+    if rest:
+        limits = {"accelerometer": f"{_STILL_FORCE:g} m/s²", "gyroscope": f"{_STILL_RATE:g} rad/s"}
+        findings.append(
+            f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
+            f"{' and '.join(limits[name] for name in names)} rms)"
+        )
+    return length, rest, longest, begin
 
 
 def _noise_uses(length: float, rest: float, longest: float, begin: float) -> Iterator[Use]:
@@ -283,6 +294,8 @@ def _rest(recording: Recording) -> tuple[float, float, float]:
         still &= (scatter < limit) & (count > 1)
         if signal is recording.accelerometer and seconds > 1:
             still[1:] &= np.linalg.norm(np.diff(mean, axis=0), axis=1) < _MIDDLE
+        if len(sensors) == 1 and signal is recording.gyroscope:  # a table's steady turn scatters as little
+            still &= np.linalg.norm(mean + np.median(signal.si(), axis=0), axis=1) < _BIAS
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
     runs = edges[1::2] - edges[::2]
     at = int(np.argmax(runs)) if len(runs) else 0
