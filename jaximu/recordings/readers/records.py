@@ -220,10 +220,11 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
     return _unnamed_device(table, device or usual)
 
 
-_ROWS, _PARTS, _MOST_IN_TURN = 20000, 20, 6
-"""Rows that are looked at, parts of them that must agree, and number of units that write in turn at the most."""
-_DISTINCT, _PLAIN = 5.0, 0.25
-"""Times its scatter from part to part, and of a sample's about its neighbours, that rows in turn must differ by."""
+_ROWS, _PARTS, _FEWEST_A_PART, _MOST_IN_TURN = 20000, 20, 12, 6
+"""Rows that are looked at, parts of them that must agree, a unit's rows in each, and units in turn at the most."""
+_DISTINCT, _PLAIN, _AGREE = 5.0, 0.5, 2
+"""Times its scatter from part to part, and of a sample's about its neighbours, that rows in turn must differ by;
+columns that must agree."""
 
 
 def _unnamed_device(table: LogTable, device: str | None) -> LogTable:
@@ -249,7 +250,7 @@ _ORDINALS = ("", "", "second", "third", "fourth", "fifth", "sixth")
 
 
 def _units_in_turn(table: LogTable) -> int:
-    """How many units write in turn: the least period with which rows differ from their neighbours, in three columns.
+    """How many units write in turn: the least period with which rows differ from their neighbours.
 
     Biases of two units differ all along; whatever else swings as quickly drifts against the rows.
     """
@@ -261,10 +262,11 @@ def _units_in_turn(table: LogTable) -> int:
             values = np.asarray(table.numbers(at)[:_ROWS], np.float64)
         except InputError:
             continue
-        if len(values) > _PARTS * 2 * _MOST_IN_TURN and np.isfinite(values).all() and not rises(values):
+        if np.isfinite(values).all() and not rises(values):
             columns.append(values)
-    for count in range(2, _MOST_IN_TURN + 1):
-        if sum(_differ_in_turn(values, count) for values in columns) >= len(GROUPS["accel"].columns):
+    rows = min(map(len, columns), default=0)
+    for count in range(2, min(_MOST_IN_TURN, rows // (_PARTS * _FEWEST_A_PART)) + 1):
+        if sum(_differ_in_turn(values, count) for values in columns) >= _AGREE:
             return count
     return 1
 
@@ -275,11 +277,13 @@ def _differ_in_turn(values: np.ndarray, count: int) -> bool:
     off = values - np.convolve(values, around / around.sum(), "same")
     size = len(off) // (_PARTS * count) * count
     parts = off[count : count + (_PARTS - 1) * size].reshape(_PARTS - 1, -1, count)
-    pattern = np.median(parts, axis=1)
+    fourth = parts.shape[1] // 4
+    pattern = np.sort(parts, axis=1)[:, fourth : parts.shape[1] - fourth].mean(axis=1)
     middle = np.median(pattern, axis=0)
     scatter = 1.4826 * np.median(np.abs(pattern - middle), axis=0).max()
     usual = 1.4826 * np.median(np.abs(parts - pattern[:, None]))
-    return bool(np.ptp(middle) > max(_DISTINCT * scatter, _PLAIN * usual, 1e-9 * np.ptp(values)))
+    apart = np.ptp(middle)  # rows that repeat themselves to the last digit were made
+    return bool(apart > max(_DISTINCT * scatter, _PLAIN * usual) and scatter > 1e-9 * apart)
 
 
 def _alike(table: LogTable, groups: Sequence[np.ndarray]) -> bool:
