@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from jaximu.cli import options
 from jaximu.ground.errors import InputError, JaximuError
 from jaximu.ground.gravity import STANDARD
+from jaximu.ground.quantities import sentence
 
 if TYPE_CHECKING:
     from jaximu.ground.array_types import FloatArray
@@ -85,7 +86,11 @@ def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice 
 
     options.require_files(path)
     try:
-        return log.read(path, check=False, alone=True), None, []
+        recording = log.read(path, check=False, alone=True)
+        if contradicted := in_other_units(log, path):
+            other, advice, note = contradicted
+            return other.read(path, check=False, alone=True), advice, [note]
+        return recording, None, []
     except JaximuError:
         from jaximu.recordings.readers import advise_reading
 
@@ -115,6 +120,31 @@ def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice 
             "from gravity, given poses all around)"
         )
     return recording, advice, notes
+
+
+def in_other_units(log: options.LogOptions, path: Path) -> tuple[options.LogOptions, Advice, str] | None:
+    """The options that read a log in the units of its values where these contradict the ones it states, how its columns
+    are understood then, and a sentence; None where they do not, or no other units are offered.
+    """
+    from jaximu.recordings.readers import advise_reading
+
+    if log.columns is not None or log.gyro_log is not None:
+        return None
+    try:
+        log.read(path, alone=True)
+    except JaximuError as error:
+        advice = advise_reading(path, log.rate)
+        if advice is None or not advice.readable or "?" in advice.line():
+            return None
+        other = replace(log, columns=advice.columns, accel_scale=advice.accel_scale or log.accel_scale,
+                        gyro_scale=advice.gyro_scale or log.gyro_scale)  # fmt: skip
+        try:
+            other.read(path, alone=True)
+        except JaximuError:
+            return None
+        text = str(error).removeprefix(f"{path}: ").partition("Or, after")[0].strip()
+        return other, advice, f"{sentence(text)} Read as {advice.line()}."
+    return None
 
 
 def _shown(advice: Advice) -> str:
@@ -189,13 +219,17 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
         if not means:
             findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
     at_rest = _at_rest(recording, repaired, findings) if physical else (0.0,) * 4
+    if 1 < poses < _STATIONS:
+        findings.append(
+            f"{poses} poses are too few for a calibration: record nine or more, all around, two seconds or more each"
+        )
     if means:
         yield Use("calibrate --means", f"if each of the {len(force)} rows is the mean of a pose at rest", alone=False)
     if poses >= 9:
         yield Use("calibrate", f"{poses} poses" + (" and the turns between them" if "gyroscope" in signals else ""))
         if "gyroscope" in signals:
             yield Use("diagnose", "the same, and what the model gets wrong")
-    elif poses > 1:
+    elif poses >= _STATIONS:
         yield Use("calibrate", f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one")
     table = [name for name in ("table_angle", "table_rate") if getattr(recording, name) is not None]
     if table or (recording.attitude is not None and poses >= _STATIONS):
@@ -212,7 +246,7 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
         yield Use("thermal", f"the temperature spans {span:.0f} K")
     yield _COMPENSATE
     if poses > 1 and "gyroscope" in signals:
-        yield Use("check", "whether a calibration of this unit is still valid", "", _OLD, alone=False)
+        yield Use("check", "whether an older calibration of this unit is still valid", "", " CALIBRATION", alone=False)
 
 
 def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> tuple[float, float, float, float]:

@@ -229,8 +229,9 @@ def _parts(tables: Sequence[LogTable], options: ReadOptions) -> "list[_FilePart]
     """Return the signals of one file's tables."""
     first = whole_stamps(tables[0])
     named = {column.name for column in header_columns(first) or ()}
-    sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
-    sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
+    alone = options.alone and GROUPS["accel"].columns[0] not in named and GROUPS["gyro"].columns[0] in named
+    # an accelerometer under a name that says too little is asked about, and not left out
+    sensor = "gyro" if alone and (options.columns is not None or not advise(first).accelerometer) else "accel"
     parts = [extract(first, choose_columns(first, options.columns, sensor), options, set(GROUPS))]
     return parts + [extract(table, header_columns(table) or (), options, set(GROUPS)) for table in tables[1:]]
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -209,8 +210,7 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
         if device is None:
             raise InputError(
                 f"{table.path}: its rows are of {len(units)} units, which write in turn, by column {table.label(at)}: "
-                f"choose one of them, {', '.join(units[:8])}, with --device; for jaximu array take all: --device "
-                f"{','.join(units[:8])}{',…' if len(units) > 8 else ''}."
+                f"choose one of them, {', '.join(units[:8])}, with --device. {_all_of(table, units)}"
             )
         if device not in units:
             raise InputError(f"{table.path}: --device {device}: column {table.label(at)} holds {', '.join(units[:8])}.")
@@ -218,6 +218,12 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
         note = f"the rows are those of {device}, by column {table.label(at)}."
         return replace(taken, device=device, notes=(*taken.notes, note))
     return _unnamed_device(table, device or usual)
+
+
+def _all_of(table: LogTable, units: Sequence[str]) -> str:
+    """Say which verb takes all units of a table."""
+    names = f"{','.join(units[:8])}{',…' if len(units) > 8 else ''}"
+    return f"`jaximu array {shlex.quote(table.path)} --device {shlex.quote(names)}` takes all, on one rigid body."
 
 
 _ROWS, _PARTS, _FEWEST_A_PART, _MOST_IN_TURN = 20000, 20, 12, 6
@@ -239,7 +245,7 @@ def _unnamed_device(table: LogTable, device: str | None) -> LogTable:
         raise InputError(
             f"{table.path}: its rows are of {count} units, which write in turn, though no column says so: every "
             f"{_ORDINALS[count]} row is alike and its neighbours differ, all along. Choose one of them with --device "
-            f"1 … --device {count} (as the first rows come); for jaximu array take all: --device {','.join(units)}."
+            f"1 … --device {count} (as the first rows come). {_all_of(table, units)}"
         )
     taken = table.take(np.arange(int(device) - 1, len(table.columns[0]), count))
     note = f"the rows are those of unit {device} of {count} that write in turn."
