@@ -67,11 +67,10 @@ def _run(command: str) -> every_verb.Outcome:
     return every_verb.run(shlex.split(command)[1:], None, False)
 
 
-def followed(command: str, folder: Path, options: str = "") -> Iterator[Advice]:
+def followed(command: str, folder: Path) -> Iterator[Advice]:
     """Run a command in a folder that is the working one, then everything that it suggests.
 
-    A calibration that a command asks for is one made of the same log, where there is one. options: behind each
-    command of a verb that computes.
+    Commands that need a calibration which is not there (that of another recording) are left out.
     """
     first = _run(command)
     for advised in commands_in(first.stdout, first.stderr):

@@ -14,11 +14,14 @@ __all__ = ["TITLES", "find"]
 
 TITLES = {"data.mixed_devices": "sensors of different devices", "data.units": "change of unit"}
 
-_RELATED = 0.4
-"""Share of the turning of gravity that some gyroscope of this motion, however mounted, must explain."""
-_FEWEST_TURNS, _CARRIED = 4, np.radians(25)
-"""Turns from rest to rest that must be whole, and the error, of three in four, below which the gyroscope carries
-gravity over them."""
+_RELATED = 0.6
+"""Share of the turning of gravity that some gyroscope of this motion, however mounted, must explain: nine numbers
+suit a few turns of another one to 0.4."""
+_CLEARLY = 0.9
+"""Share from which on there is nothing to ask."""
+_FEWEST_TURNS, _LOST, _SURELY = 5, np.radians(45), np.radians(12)
+"""Turns from rest to rest that must be whole, and the error, of three in four, beyond which gravity is lost over them
+in any arrangement, and below which another scale carries it, among the many that are tried."""
 _ANOTHER_SCALE = 3.0
 """Factor between angles from which on the scale of a gyroscope is another one."""
 _SHIFT = 12.0
@@ -31,22 +34,21 @@ def find(samples: Samples) -> list[Finding]:
 
 
 def _unrelated(samples: Samples) -> list[Finding]:
-    blocks, both = samples.turning, samples.both
-    if blocks is None or both is None or not samples.posed:
+    both = samples.both
+    if both is None or not samples.posed:
         return []
     force, rate = both
     clocks = samples.clocks
     explained = turning(force.time, force.values, rate.time, rate.values).explained
-    if max(explained, 0.0 if clocks is None else clocks.explained) > _RELATED:
+    explained = max(explained, 0.0 if clocks is None else clocks.explained)
+    if explained > _CLEARLY:
         return []
     # accelerations on the way hide how gravity turns, and do not matter from rest to rest
     whole = carried(force.time, force.values, rate.time, rate.values, samples.rests)
     if whole.turns < _FEWEST_TURNS:
         return []
-    if whole.error < _CARRIED:
-        factor = abs(whole.factor)
-        if 1 / _ANOTHER_SCALE < factor < _ANOTHER_SCALE:
-            return []
+    factor = abs(whole.factor)
+    if whole.error < _SURELY and not 1 / _ANOTHER_SCALE < factor < _ANOTHER_SCALE:
         return [
             Finding(
                 "data.range",
@@ -58,23 +60,13 @@ def _unrelated(samples: Samples) -> list[Finding]:
                 refuses="gyroscope",
             )
         ]
-    moving = np.linalg.norm(blocks.change, axis=1) > 0.5
-    turning_gyroscope = np.linalg.norm(blocks.turned(), axis=1) > 0.05
-    if clocks is None or moving.sum() < 20 or turning_gyroscope.sum() < 20 or len(blocks.change) < 100:
-        return []
-    # a vehicle's specific force does not turn with it: only turns from pose to pose count, and slow ones, in which
-    # the norm stays that of gravity
-    rests, time, norm = samples.rests, blocks.centre[:-1], np.linalg.norm(blocks.force, axis=1)
-    later = np.clip(np.searchsorted(rests[:, 0], time), 1, len(rests) - 1)
-    between = (rests[later, 0] - rests[later - 1, 1] < 10.0) & (time > rests[0, 0]) & (time < rests[-1, 1])
-    usable = (np.abs(norm / np.median(norm) - 1) < 0.08) & between
-    if (moving & usable).sum() < 20:
+    if explained > _RELATED or whole.error < _LOST:
         return []
     return [
         Finding(
             "data.mixed_devices",
             (),
-            f"The gyroscope, however it is mounted and delayed, explains {100 * clocks.explained:.0f} % of how "
+            f"The gyroscope, however it is mounted and delayed, explains {100 * explained:.0f} % of how "
             "gravity turns in the accelerometer: the two did not move together. Their columns come from different "
             "recordings or devices.",
             rivals=("data.clocks",),

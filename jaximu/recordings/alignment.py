@@ -220,8 +220,8 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     return bool(np.mean(better > 0) > 0.9 and np.median(better) > np.log(1.5))
 
 
-_TURN_SECONDS, _TURN_STEPS = 10.0, 256
-"""Longest turn from rest to rest, s, and the steps in which its rotation is put together."""
+_TURN_SECONDS, _TURN_STEPS, _MOST = 10.0, 128, 24
+"""Longest turn from rest to rest, s, the steps in which its rotation is put together, and turns that are enough."""
 _TURN_ANGLE = np.radians(20)
 """Angle by which gravity must turn from rest to rest to show anything."""
 _FACTORS = 1.15 ** np.arange(-30, 31)
@@ -267,6 +267,7 @@ def carried(
         for (_, start), (stop, _), a, b in zip(rests, rests[1:], middle, middle[1:], strict=False)
     ]
     used = np.flatnonzero(whole & (np.sum(up[1:] * up[:-1], axis=1) < np.cos(_TURN_ANGLE)))
+    used = used[:: -(-len(used) // _MOST) or 1]
     if not len(used):
         return Carried(1.0, np.pi, 0)
     still = (rests[:, 0] <= rate_time[:, None]) & (rate_time[:, None] <= rests[:, 1])
