@@ -149,6 +149,13 @@ def test_gzip(tmp_path):
         read_recording(path)
 
 
+def test_units_behind_the_values(tmp_path):
+    values = columns(by_hand())
+    rows = [",".join(f"{value:.6f}{unit}" for value, unit in zip(row, ["s"] + ["m/s^2"] * 3 + ["rad/s"] * 3,
+                                                                 strict=True)) for row in values]  # fmt: skip
+    same(read_recording(save(tmp_path / "log.csv", "time,ax,ay,az,gx,gy,gz", *rows)), values)
+
+
 def test_a_rule_between_names_and_rows(tmp_path):
     values = columns(by_hand())
     head = " ".join(f"{name:>14}" for name in f"time[s],{HEAD}".replace(" [", "[").split(","))
@@ -229,6 +236,15 @@ def test_a_check_names_axes_that_are_not_those_of_the_calibration():
     mirrored = replace(other, accelerometer=replace(signal, values=signal.values * [-1, 1, 1]))
     with pytest.raises(InputError, match=r"Against the calibration, .*its x axis has the wrong sign"):
         check(calibration, mirrored)
+
+
+def test_a_page_of_exchanged_axes(tmp_path, capsys):
+    """Their scales start from nothing: no share of it is stated."""
+    values = columns(by_hand(rate=25.0, poses=12))[:, [0, 1, 2, 3, 5, 4, 6]]
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values))
+    assert main(["calibrate", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("its axes are exchanged") == 6 and "its x and y axes are exchanged. --axes" in printed
 
 
 # --- info

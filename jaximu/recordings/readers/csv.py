@@ -191,10 +191,11 @@ def _cells(line: str, delimiter: str) -> list[str]:
 def _is_number(cell: str, decimal: str = ".") -> bool:
     if decimal == "," and "." in cell:
         return False
+    text = cell.replace(decimal, ".")
     try:
-        float(cell.replace(decimal, "."))
+        float(text)
     except ValueError:
-        return False
+        return measured(np.array([text], object)) is not None
     return True
 
 
