@@ -136,8 +136,8 @@ def in_other_units(log: options.LogOptions, path: Path) -> tuple[options.LogOpti
         advice = advise_reading(path, log.rate)
         if advice is None or not advice.readable or "?" in advice.line():
             return None
-        other = replace(log, columns=advice.columns, accel_scale=advice.accel_scale or log.accel_scale,
-                        gyro_scale=advice.gyro_scale or log.gyro_scale)  # fmt: skip
+        scales = {name: getattr(advice, name) or getattr(log, name) for name in ("accel_scale", "gyro_scale")}
+        other = replace(log, columns=advice.columns, **scales)
         try:
             other.read(path, alone=True)
         except JaximuError:

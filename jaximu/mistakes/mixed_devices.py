@@ -12,7 +12,11 @@ from jaximu.recordings.finding import Finding
 
 __all__ = ["TITLES", "find"]
 
-TITLES = {"data.mixed_devices": "sensors of different devices", "data.units": "change of unit"}
+TITLES = {
+    "data.mixed_devices": "sensors of different devices",
+    "data.range": "another range",
+    "data.units": "change of unit",
+}
 
 _RELATED = 0.6
 """Share of the turning of gravity that some gyroscope of this motion, however mounted, must explain: nine numbers
