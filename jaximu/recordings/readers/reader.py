@@ -453,6 +453,8 @@ def _tables_of(path: str | os.PathLike[str], selection: MessageSelection | None)
     except Exception as error:  # the library behind raises nearly anything on damaged archives
         raise _damaged(name, "a ZIP archive", error) from error
     tables = parts.get("") or _of_sensors({sensor: first for sensor, (first, *_) in parts.items()})
+    if "" in parts and file.is_dir():  # of a folder with one log in it
+        tables = [replace(table, notes=(*table.notes, f"read from {files[''][0]}.")) for table in tables]
     return tuple(replace(table, source=replace(source, rows=table.source.rows)) for table in tables)
 
 
