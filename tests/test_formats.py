@@ -389,7 +389,8 @@ def test_directions_that_do_not_tell_the_offset(tmp_path, directions):
 def test_gyroscope_offset_is_that_of_the_quietest_second(tmp_path):
     generator = np.random.default_rng(5)
     gyro = np.round(generator.normal(0.0, np.repeat([200.0, 2.0, 100.0], 200)[:, None], (600, 3)) + [50, -70, 10])
-    values = np.column_stack([np.tile(samples(), (75, 1))[:, :3], gyro])
+    force = np.tile(samples(), (75, 1))[:, :3] + generator.normal(0.0, 0.1, (600, 3))
+    values = np.column_stack([force, gyro])
     header = ",".join([*NAMES[:3], "gx [count]", "gy [count]", "gz [count]"])
     recording = read_recording(
         save(tmp_path / "log.csv", values, header), options=ReadOptions(rate=100.0, gyro_scale="131 count/dps")

@@ -414,7 +414,19 @@ def test_a_damaged_archive_is_refused(phone, tmp_path):
             read_recording(tmp_path / "phone.zip")
 
 
-@pytest.mark.parametrize("count", [0, 2, 1000])
+@pytest.mark.parametrize("verb", [[], ["info"], ["calibrate"], ["allan"]])
+@pytest.mark.parametrize("files", [[], ["a.pdf", "b.png"]])
+def test_a_folder_without_logs_is_not_advised_a_fleet(files, verb, tmp_path, capsys, monkeypatch):
+    """The advice would refuse the same folder."""
+    for name in files:
+        (tmp_path / name).write_text("nothing")
+    monkeypatch.chdir(tmp_path)
+    assert main([*verb, "."]) in (1, 2)
+    printed = capsys.readouterr().err
+    assert "Name a log, or a folder of logs." in printed and "fleet" not in printed
+
+
+@pytest.mark.parametrize("count", [2, 1000])
 def test_a_folder_of_logs_offers_a_fleet(count, tmp_path, capsys, monkeypatch):
     for number in range(count):
         (tmp_path / f"unit{number}.csv").write_text("time [s]\n")

@@ -481,8 +481,13 @@ def test_start_up_rows_are_dropped_and_a_later_knock_is_not(one_way):
 def test_blocks_in_which_the_unit_moved_are_left_out(one_way):
     values = one_way.accelerometer.values.copy()
     values[1000:1050] += np.random.default_rng(0).normal(0, 3.0, (50, 3))
+    knocked = replace(one_way, accelerometer=replace(one_way.accelerometer, values=values))
+    blocks = rest_blocks(knocked)
+    assert any("was knocked, first about 500.0 s in" in note for note in blocks.notes)  # as every verb says it
+    assert np.ptp(blocks.means["accelerometer"], axis=0).max() < 0.1
+    values[1000:1400] += np.random.default_rng(0).normal(0, 3.0, (400, 3))  # too long for a knock
     blocks = rest_blocks(replace(one_way, accelerometer=replace(one_way.accelerometer, values=values)))
-    assert 5 <= blocks.dropped <= 20 and any("moved" in note for note in blocks.notes)
+    assert 50 <= blocks.dropped <= 110 and any("moved" in note for note in blocks.notes)
 
 
 def test_status_flags(tmp_path, one_way):
@@ -497,8 +502,9 @@ def test_status_flags(tmp_path, one_way):
 def test_a_block_too_short(one_way):
     with pytest.raises(InputError, match="less than two samples"):
         rest_blocks(one_way, 0.5)
+    noise = 9.8 + np.random.default_rng(0).normal(0, 0.01, (40000, 3))
     with pytest.raises(InputError, match="more than"):
-        rest_blocks(replace(one_way, accelerometer=Signal(np.arange(40000) / 10.0, np.ones((40000, 3)), "m/s^2"),
+        rest_blocks(replace(one_way, accelerometer=Signal(np.arange(40000) / 10.0, noise, "m/s^2"),
                             gyroscope=None), 1.0)  # fmt: skip
 
 

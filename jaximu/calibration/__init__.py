@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jaximu.calibration.means import calibrate_means
     from jaximu.calibration.nominal import nominal_imu
     from jaximu.calibration.recipe import calibrate
-    from jaximu.calibration.refusals import require_spanning
+    from jaximu.calibration.refusals import require_carried, require_spanning
     from jaximu.calibration.scheme import Scheme, describe_scheme
     from jaximu.calibration.systematic import History, calibrate_by_filter
     from jaximu.calibration.thermal import ThermalCalibration, calibrate_thermal
@@ -62,6 +62,7 @@ __all__ = [
     "linear_least_squares",
     "load_calibration",
     "nominal_imu",
+    "require_carried",
     "require_spanning",
     "six_position",
     "turn_pairs",
@@ -84,7 +85,7 @@ __getattr__ = lazily(
         "jaximu.calibration.means": "calibrate_means",
         "jaximu.calibration.nominal": "nominal_imu",
         "jaximu.calibration.recipe": "calibrate",
-        "jaximu.calibration.refusals": "require_spanning",
+        "jaximu.calibration.refusals": "require_carried, require_spanning",
         "jaximu.calibration.scheme": "Scheme, describe_scheme",
         "jaximu.calibration.systematic": "History, calibrate_by_filter",
         "jaximu.calibration.thermal": "ThermalCalibration, calibrate_thermal",

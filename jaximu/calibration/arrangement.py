@@ -19,8 +19,10 @@ from jaximu.recordings.alignment import angle_of, rotation_of, signed_permutatio
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, apply_axes, spelled_axes
 
-__all__ = ["arrangement", "unusual_gains"]
+__all__ = ["arrangement", "axes_unlike", "unusual_gains"]
 
+_EXPLAINED = 0.5
+"""Share of the turning of gravity that a gyroscope must explain for its axes to be judged by it."""
 _MOUNTED = np.radians(5.0)
 """Rotation of the gyroscope against the accelerometer beyond which it is a mounting and no misalignment."""
 _BETWEEN = np.radians(20.0)
@@ -74,6 +76,17 @@ def unusual_gains(imu: Imu, weak: Sequence[WeakDirection], scales: Mapping[str, 
             )
         )
     return findings + _factors("gyroscope", scale, imu.gyroscope)
+
+
+def axes_unlike(recording: Recording, imu: Imu) -> str:
+    """Say which axes of a recording are not those of a calibrated unit, as gravity turns in it; else nothing."""
+    motion, gyroscope = recording.turning, recording.gyroscope
+    if motion is None or motion.explained < _EXPLAINED or gyroscope is None or imu.gyroscope is None:
+        return ""
+    arranged = signed_permutation(motion.matrix @ (np.asarray(imu.gyroscope.gain) / gyroscope.nominal_scale[:, None]))
+    if np.array_equal(arranged, np.eye(3)):
+        return ""
+    return f" Against the calibration, {_axes(arranged.T).text.partition(';')[0]}."
 
 
 def _axes(arranged: FloatArray) -> Finding:

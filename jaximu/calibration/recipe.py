@@ -14,7 +14,7 @@ from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, 
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.calibration.refusals import require_determined
+from jaximu.calibration.refusals import require_carried, require_determined
 from jaximu.calibration.saturation import saturation
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import means_by_hand
@@ -228,6 +228,15 @@ def calibrate_ready(
     ranges; with `repair` axes are mapped. `losses`: whether lost time is looked for; turns that miss for another
     reason would be taken for it.
     """
+    calibration, findings = _calibrated_in_axes(recordings, choices, repair, losses)
+    if "gravity_direction" in calibration.rms:
+        require_carried(calibration.rms["gravity_direction"][1], ", ".join(one.name for one in recordings))
+    return calibration, findings
+
+
+def _calibrated_in_axes(
+    recordings: Sequence[Recording], choices: Choices, repair: bool, losses: bool
+) -> tuple[Calibration, list[Finding]]:
     calibration = _calibrated(recordings, choices)
     findings = arrangement(recordings[0], calibration)
     wrong = [finding for finding in findings if finding.apply is not None]

@@ -15,7 +15,17 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.quantities import Z95, number, sentence
 
-__all__ = ["refuse_undetermined", "relative_covariance", "require_determined", "require_solved", "require_spanning"]
+__all__ = [
+    "refuse_undetermined",
+    "relative_covariance",
+    "require_carried",
+    "require_determined",
+    "require_solved",
+    "require_spanning",
+]
+
+_LOST = 45.0
+"""Degrees, rms, by which a gyroscope that turned with the accelerometer cannot lose gravity over turns."""
 
 
 def require_determined(
@@ -33,6 +43,16 @@ def require_determined(
             require_excited(fitted, where, shown, record)
     require_solved(fitted, where)
     refuse_undetermined(fitted, prior)
+
+
+def require_carried(error: float, where: str) -> None:
+    """Raise `NotPossibleError` where the fitted gyroscope loses gravity over the turns; `error`: degrees, rms."""
+    if error > _LOST:
+        raise NotPossibleError(
+            f"{where}: no gyroscope explains the turns: gravity carried over them is still off by {error:.0f}° (rms) "
+            "after the fit. Check the gyroscope's scale or unit (--gyro-scale, --columns), its axes (--axes) and "
+            "its clock; or leave its columns out (_ in --columns)."
+        )
 
 
 def require_solved(fitted: Fit, where: str) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from jaximu.cli import options
 from jaximu.ground.errors import InputError, JaximuError
 from jaximu.ground.gravity import STANDARD
+from jaximu.ground.quantities import sentence
 
 if TYPE_CHECKING:
     from jaximu.ground.array_types import FloatArray
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["InfoCommand", "Use", "allowed", "describe", "read_openly"]
 
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
+_BIAS = 0.5  # rad/s: largest bias of a gyroscope that is taken for rest
 _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
 _BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
 _CUT = 600.0  # s at rest that are worth cutting out of a log
@@ -86,7 +88,11 @@ def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice 
 
     options.require_files(path)
     try:
-        return log.read(path, check=False, alone=True), None, []
+        recording = log.read(path, check=False, alone=True)
+        if contradicted := in_other_units(log, path):
+            other, advice, note = contradicted
+            return other.read(path, check=False, alone=True), advice, [note]
+        return recording, None, []
     except JaximuError:
         from jaximu.recordings.readers import advise_reading
 
@@ -118,6 +124,31 @@ def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice 
     return recording, advice, notes
 
 
+def in_other_units(log: options.LogOptions, path: Path) -> tuple[options.LogOptions, Advice, str] | None:
+    """The options that read a log in the units of its values where these contradict the ones it states, how its columns
+    are understood then, and a sentence; None where they do not, or no other units are offered.
+    """
+    from jaximu.recordings.readers import advise_reading
+
+    if log.columns is not None or log.gyro_log is not None:
+        return None
+    try:
+        log.read(path, alone=True)
+    except JaximuError as error:
+        advice = advise_reading(path, log.rate)
+        if advice is None or not advice.readable or "?" in advice.line():
+            return None
+        scales = {name: getattr(advice, name) or getattr(log, name) for name in ("accel_scale", "gyro_scale")}
+        other = replace(log, columns=advice.columns, **scales)
+        try:
+            other.read(path, alone=True)
+        except JaximuError:
+            return None
+        text = str(error).removeprefix(f"{path}: ").partition("Or, after")[0].strip()
+        return other, advice, f"{sentence(text)} Read as {advice.line()}."
+    return None
+
+
 def _shown(advice: Advice) -> str:
     """The first rows of the columns that are used, under what they are taken for; as lines of text."""
     if not advice.rows:
@@ -147,6 +178,7 @@ def describe(
     else:
         findings.append("no accelerometer: poses cannot be found")
         uses = [
+            *(_noise_uses(*_at_rest(recording, ready.recording, findings)) if not guessed else ()),
             Use("turntable", "with a schedule of rests and turns (--reference)", _WITH_SCHEDULE, alone=False),
             replace(_COMPENSATE, why="with a calibration of this gyroscope"),
         ]
@@ -176,7 +208,6 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
     import numpy as np
 
     from jaximu.recordings.recording import plausibility
-    from jaximu.report.recording import signal_facts
 
     signals, poses = recording.signals, 0
     force = np.linalg.norm(recording.accelerometer.si(), axis=1)
@@ -189,12 +220,10 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
     except JaximuError as error:
         if not means:
             findings.append(str(error).removeprefix(f"{recording.name}: ").partition(" (intervals")[0])
-    rest, longest, begin = _rest(repaired) if physical else (0.0, 0.0, 0.0)
-    length = signal_facts(recording.accelerometer, repaired.accelerometer)["duration"]
-    if rest:
+    at_rest = _at_rest(recording, repaired, findings) if physical else (0.0,) * 4
+    if 1 < poses < _STATIONS:
         findings.append(
-            f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
-            f"{_STILL_FORCE:g} m/s²{f' and {_STILL_RATE:g} rad/s' if 'gyroscope' in signals else ''} rms)"
+            f"{poses} poses are too few for a calibration: record nine or more, all around, two seconds or more each"
         )
     if means:
         yield Use("calibrate --means", f"if each of the {len(force)} rows is the mean of a pose at rest", alone=False)
@@ -202,7 +231,7 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
         yield Use("calibrate", f"{poses} poses" + (" and the turns between them" if "gyroscope" in signals else ""))
         if "gyroscope" in signals:
             yield Use("diagnose", "the same, and what the model gets wrong")
-    elif poses > 1:
+    elif poses >= _STATIONS:
         yield Use("calibrate", f"as far as {poses} poses allow: nine or more, all around, are needed for a whole one")
     table = [name for name in ("table_angle", "table_rate") if getattr(recording, name) is not None]
     if table or (recording.attitude is not None and poses >= _STATIONS):
@@ -213,13 +242,29 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
         yield Use(
             "magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round"
         )
-    yield from _noise_uses(length, rest, longest, begin)
+    yield from _noise_uses(*at_rest)
     heat = recording.temperature
     if heat is not None and (span := np.ptp(heat.values)) >= 5.0:
         yield Use("thermal", f"the temperature spans {span:.0f} K")
     yield _COMPENSATE
     if poses > 1 and "gyroscope" in signals:
-        yield Use("check", "whether a calibration of this unit is still valid", "", _OLD, alone=False)
+        yield Use("check", "whether an older calibration of this unit is still valid", "", " CALIBRATION", alone=False)
+
+
+def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> tuple[float, float, float, float]:
+    """Seconds of a recording, those at rest in all and at a stretch, and when that begins; said among `findings`."""
+    from jaximu.report.recording import signal_facts
+
+    names = [name for name in ("accelerometer", "gyroscope") if name in recording.signals]
+    rest, longest, begin = _rest(repaired)
+    length = signal_facts(recording.signals[names[0]], repaired.signals[names[0]])["duration"]
+    if rest:
+        limits = {"accelerometer": f"{_STILL_FORCE:g} m/s²", "gyroscope": f"{_STILL_RATE:g} rad/s"}
+        findings.append(
+            f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
+            f"{' and '.join(limits[name] for name in names)} rms)"
+        )
+    return length, rest, longest, begin
 
 
 def _noise_uses(length: float, rest: float, longest: float, begin: float) -> Iterator[Use]:
@@ -285,6 +330,8 @@ def _rest(recording: Recording) -> tuple[float, float, float]:
         still &= (scatter < limit) & (count > 1)
         if signal is recording.accelerometer and seconds > 1:
             still[1:] &= np.linalg.norm(np.diff(mean, axis=0), axis=1) < _MIDDLE
+        if len(sensors) == 1 and signal is recording.gyroscope:  # a table's steady turn scatters as little
+            still &= np.linalg.norm(mean + np.median(signal.si(), axis=0), axis=1) < _BIAS
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
     runs = edges[1::2] - edges[::2]
     at = int(np.argmax(runs)) if len(runs) else 0

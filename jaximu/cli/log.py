@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import arg
 
 from jaximu.cli import options
-from jaximu.cli.info import Use, describe, read_openly
+from jaximu.cli.info import Use, describe, in_other_units, read_openly
 from jaximu.cli.messages import progress, say
 from jaximu.cli.usage import command_of
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
@@ -184,6 +184,10 @@ def _settled(path: Path, log: options.LogOptions, asker: _Asker) -> tuple[option
             raise
         stated = {name: value and str(value) for name, value in values.items() if name != "gyro_columns"}
         return settled, advice and replace(advice, **stated)
+    if contradicted := in_other_units(log, path):
+        settled, advice, note = contradicted
+        asker.assumed.append(note)
+        return settled, advice
     return log, None
 
 

@@ -15,6 +15,7 @@ from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS, Track
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
+from jaximu.mistakes import prepared
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.columns.names import COUNTS_ADVICE
@@ -293,6 +294,14 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
     same_outputs(logs)
     for recording in logs:
         _require_temperature(recording)
+    with prepared(logs, gyroscope=False, gravity=False) as ready:
+        blocks = _of_ready([one.recording for one in ready], block)
+    findings = [note for one in ready for note in one.notes]
+    return replace(blocks, notes=tuple(dict.fromkeys((*blocks.notes, *findings))))
+
+
+def _of_ready(logs: Sequence[Recording], block: float | None) -> RestBlocks:
+    """The blocks of recordings that were looked over."""
     used = [without_startup(recording) for recording in logs]
     span = sum(float(part.accelerometer.time[-1] - part.accelerometer.time[0]) for part in used)
     rate = min(part.accelerometer.rate for part in used)

@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.calibration.arrangement import axes_unlike
 from jaximu.calibration.calibration import provenance, require_another, require_calibration
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.recipe import require_gravity
@@ -146,11 +147,12 @@ def _compared(
     old = old.rested(data.rate_at_rest())
     notes += _temperatures(calibration, old, experiment)
     conditions = experiment.predict(old.imu)[0]
-    _same_unit(experiment, conditions, name)
+    unlike = axes_unlike(data.recordings[0], old.imu)
+    _same_unit(experiment, conditions, name, unlike)
 
     scatter = np.ones(len(experiment.real.kinds))
     fresh = Fresh.fit(old, experiment, scatter)
-    _same_gains(old, fresh, name)
+    _same_gains(old, fresh, name, unlike)
     enough = len(conditions) - len(old.names) >= FEWEST_DIMENSIONS and bool(fresh.known(old).all())
     others = candidates(old, experiment) if enough else []
     question = Question.ask(old, Widened(experiment, scatter).predict(old.imu), others)
@@ -405,7 +407,7 @@ def _same_sensors(calibration: Calibration, recordings: Sequence[Recording]) -> 
         )
 
 
-def _same_unit(experiment: Experiment, conditions: FloatArray, name: str) -> None:
+def _same_unit(experiment: Experiment, conditions: FloatArray, name: str, unlike: str) -> None:
     real = experiment.real
     for index, (kind, limit) in enumerate(zip(real.kinds, _FAR_OFF, strict=False)):
         vectors = (conditions * real.to_si)[real.kind == index].reshape(-1, kind.components)
@@ -413,11 +415,11 @@ def _same_unit(experiment: Experiment, conditions: FloatArray, name: str) -> Non
             raise InputError(
                 f"{name}: with this calibration the {kind.name.replace('_', ' ')} is off by "
                 f"{size(kind.factor * median, kind.unit)} in the median: is it the same unit, in the same units and "
-                "axes?"
+                f"axes?{unlike}"
             )
 
 
-def _same_gains(old: Old, fresh: Fresh, name: str) -> None:
+def _same_gains(old: Old, fresh: Fresh, name: str, unlike: str) -> None:
     for index, parameter in enumerate(old.names):
         if parameter.part != "gain":
             continue
@@ -425,7 +427,7 @@ def _same_gains(old: Old, fresh: Fresh, name: str) -> None:
         if shift > _OTHER_UNIT * scale and shift > 5 * np.sqrt(fresh.covariance_of_difference[index, index]):
             raise InputError(
                 f"{name}: the {parameter.owner}'s gain differs from the calibration's by {100 * shift / scale:.2g} % "
-                f"({parameter}): is it the same unit, in the same units and axes?"
+                f"({parameter}): is it the same unit, in the same units and axes?{unlike}"
             )
 
 

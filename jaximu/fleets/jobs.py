@@ -22,6 +22,7 @@ from jaximu.ground.errors import InputError, only, readable
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.magnetic_field import FieldStrength
 from jaximu.recordings.readers import ReadOptions
+from jaximu.recordings.readers.archive import SUFFIXES, is_log, logs_below
 from jaximu.recordings.segmentation import SegmentationOptions
 
 __all__ = ["ONE_THREAD", "Job", "Rows", "Settings", "batches", "find_jobs", "own_effects", "register_all"]
@@ -32,25 +33,6 @@ ONE_THREAD: dict[str, str] = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"), "1"
 )
 
-SUFFIXES = (
-    ".csv",
-    ".tsv",
-    ".txt",
-    ".dat",
-    ".log",
-    ".parquet",
-    ".npz",
-    ".mat",
-    ".h5",
-    ".hdf5",
-    ".bag",
-    ".mcap",
-    ".db3",
-    ".ulg",
-    ".bin",
-)
-"""What a folder is searched for; a file that is named on its own may have any."""
-_NO_LOGS = (".truth.json", ".schedule.csv")
 _COLUMNS = ("device", "file", "date", "lot", "station", "static", "options")
 _ALL = ""  # no device is called so
 _NUMBERS = {"rate": float, "instance": int}
@@ -170,7 +152,7 @@ def find_jobs(
     for argument in arguments:
         path = Path(argument)
         if path.is_dir():
-            inside = wanted(_logs_below(path))
+            inside = wanted(logs_below(path))
             if not inside:
                 raise InputError(f"{argument}: the folder holds no logs (files ending in {', '.join(SUFFIXES)}).")
             loose += inside
@@ -181,7 +163,7 @@ def find_jobs(
             else:
                 named += manifest
         elif any(sign in argument for sign in "*?["):
-            matches = wanted(filter(_is_log, map(Path, sorted(glob.glob(argument, recursive=True)))))
+            matches = wanted(filter(is_log, map(Path, sorted(glob.glob(argument, recursive=True)))))
             if not matches:
                 raise InputError(f"{argument}: no file fits this pattern.")
             loose += matches
@@ -207,7 +189,7 @@ def _recordings_at_rest(static: str | os.PathLike[str] | None) -> dict[str, Path
     if not path.is_dir():
         raise InputError(f"--static {path}: no such file or folder.")
     recordings: dict[str, Path] = {}
-    for log in _logs_below(path):
+    for log in logs_below(path):
         device = log.relative_to(path).with_suffix("").as_posix()
         if device in recordings:
             raise InputError(
@@ -217,22 +199,6 @@ def _recordings_at_rest(static: str | os.PathLike[str] | None) -> dict[str, Path
     if not recordings:
         raise InputError(f"--static {path}: the folder holds no logs (files ending in {', '.join(SUFFIXES)}).")
     return recordings
-
-
-def _logs_below(folder: Path) -> list[Path]:
-    with readable(folder):
-        below = list(folder.rglob("*"))
-    return sorted(
-        inner
-        for inner in below
-        if inner.suffix.lower() in SUFFIXES
-        and not any(part.startswith(".") for part in inner.relative_to(folder).parts)
-        and _is_log(inner)
-    )
-
-
-def _is_log(path: Path) -> bool:
-    return path.is_file() and not path.name.endswith(_NO_LOGS)
 
 
 def _is_own(path: Path, output: Path | None) -> bool:

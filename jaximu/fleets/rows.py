@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from jaximu.calibration import nominal_imu, require_spanning
+from jaximu.calibration import nominal_imu, require_carried, require_spanning
 from jaximu.calibration.arrangement import unusual_gains
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.fitting import Fit
@@ -255,6 +255,7 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
     assert unit is not None
     try:
         _require(fit, row["poses"], row["file"], "accelerometer")
+        require_carried(float(rms[1]), row["file"])
     except NotPossibleError as error:
         return row | _failure(error)
     rank, weak = weak_directions(fit.jacobian, fit.names, fit.sizes, unit.nominal)

@@ -76,6 +76,8 @@ _FACTORS = {
         "ms msec msecs milliseconds": 1e-3,
         "us µs μs usec microseconds": 1e-6,
         "ns nsec nanosec nanoseconds": 1e-9,
+        "min minute minutes": 60.0,
+        "d day days": 86400.0,
     },
     "temperature": {"degC °C C celsius ℃": 1.0, "K kelvin": 1.0, "degF °F F fahrenheit": 5.0 / 9.0},
     "magnetic field": {

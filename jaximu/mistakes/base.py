@@ -32,7 +32,6 @@ TITLES = {
     "data.bumped_pose": "bumped pose",
     "data.moving_pose": "moving pose",
     "data.order": "rows out of order",
-    "data.range": "another range",
     "data.sampling": "turns too quick for the rate",
     "data.swapped_axes": "swapped axes",
     "setup.mounting": "rotated mounting",

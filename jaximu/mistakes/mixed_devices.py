@@ -7,14 +7,27 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.mistakes.base import Samples, Sensor, leave_out_both, spans_of
 from jaximu.mistakes.lost_samples import steps
+from jaximu.recordings.alignment import carried, turning
 from jaximu.recordings.finding import Finding
 
 __all__ = ["TITLES", "find"]
 
-TITLES = {"data.mixed_devices": "sensors of different devices", "data.units": "change of unit"}
+TITLES = {
+    "data.mixed_devices": "sensors of different devices",
+    "data.range": "another range",
+    "data.units": "change of unit",
+}
 
-_RELATED = 0.4
-"""Share of the turning of gravity that some gyroscope of this motion, however mounted, must explain."""
+_RELATED = 0.6
+"""Share of the turning of gravity that some gyroscope of this motion, however mounted, must explain: nine numbers
+suit a few turns of another one to 0.4."""
+_CLEARLY = 0.9
+"""Share from which on there is nothing to ask."""
+_FEWEST_TURNS, _LOST, _SURELY = 5, np.radians(45), np.radians(12)
+"""Turns from rest to rest that must be whole, and the error, of three in four, beyond which gravity is lost over them
+in any arrangement, and below which another scale carries it, among the many that are tried."""
+_ANOTHER_SCALE = 3.0
+"""Factor between angles from which on the scale of a gyroscope is another one."""
 _SHIFT = 12.0
 """Standard deviations of the means at rest by which another device's bias must differ."""
 
@@ -25,31 +38,39 @@ def find(samples: Samples) -> list[Finding]:
 
 
 def _unrelated(samples: Samples) -> list[Finding]:
-    blocks = samples.turning
-    if blocks is None:
+    both = samples.both
+    if both is None or not samples.posed:
         return []
-    change, force, turned, time = blocks.change, blocks.force, blocks.turned(), blocks.centre[:-1]
-    moving = np.linalg.norm(change, axis=1) > 0.5
-    turning_gyroscope = np.linalg.norm(turned, axis=1) > 0.05
-    rests = samples.rests
-    if moving.sum() < 20 or turning_gyroscope.sum() < 20 or len(change) < 100 or not samples.posed:
-        return []
-    # a vehicle's specific force does not turn with it: only turns from pose to pose count, and slow ones, in which
-    # the norm stays that of gravity
-    norm = np.linalg.norm(force, axis=1)
-    later = np.clip(np.searchsorted(rests[:, 0], time), 1, len(rests) - 1)
-    between = (rests[later, 0] - rests[later - 1, 1] < 10.0) & (time > rests[0, 0]) & (time < rests[-1, 1])
-    usable = (np.abs(norm / np.median(norm) - 1) < 0.08) & between
-    if (moving & usable).sum() < 20:
-        return []
+    force, rate = both
     clocks = samples.clocks
-    if clocks is None or clocks.explained > _RELATED:
+    explained = turning(force.time, force.values, rate.time, rate.values).explained
+    explained = max(explained, 0.0 if clocks is None else clocks.explained)
+    if explained > _CLEARLY:
+        return []
+    # accelerations on the way hide how gravity turns, and do not matter from rest to rest
+    whole = carried(force.time, force.values, rate.time, rate.values, samples.rests)
+    if whole.turns < _FEWEST_TURNS:
+        return []
+    factor = abs(whole.factor)
+    if whole.error < _SURELY and not 1 / _ANOTHER_SCALE < factor < _ANOTHER_SCALE:
+        return [
+            Finding(
+                "data.range",
+                (),
+                f"The gyroscope reads {1 / factor:.2g} times the angles by which gravity turns in the accelerometer "
+                f"from rest to rest, in {whole.turns} turns: its scale or unit is wrong. Check --gyro-scale, or the "
+                "unit in the column name.",
+                spoils=True,
+                refuses="gyroscope",
+            )
+        ]
+    if explained > _RELATED or whole.error < _LOST:
         return []
     return [
         Finding(
             "data.mixed_devices",
             (),
-            f"The gyroscope, however it is mounted and delayed, explains {100 * clocks.explained:.0f} % of how "
+            f"The gyroscope, however it is mounted and delayed, explains {100 * explained:.0f} % of how "
             "gravity turns in the accelerometer: the two did not move together. Their columns come from different "
             "recordings or devices.",
             rivals=("data.clocks",),

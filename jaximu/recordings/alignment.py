@@ -7,7 +7,7 @@ in M, which is the identity for right axes, signs and scales.
 
 from __future__ import annotations
 
-from itertools import pairwise, permutations
+from itertools import pairwise, permutations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +17,11 @@ from jaximu.ground.array_types import FloatArray
 __all__ = [
     "CORRELATED",
     "BlockMeans",
+    "Carried",
     "Clocks",
     "Turning",
     "angle_of",
+    "carried",
     "clocks",
     "gravity_turning",
     "rotation_of",
@@ -216,6 +218,80 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
         scatter.append(np.sum(np.var(carried, axis=1), axis=1))
     better = np.log(scatter[0] / np.maximum(scatter[1], 1e-300))
     return bool(np.mean(better > 0) > 0.9 and np.median(better) > np.log(1.5))
+
+
+_TURN_SECONDS, _TURN_STEPS, _MOST = 10.0, 128, 24
+"""Longest turn from rest to rest, s, the steps in which its rotation is put together, and turns that are enough."""
+_TURN_ANGLE = np.radians(20)
+"""Angle by which gravity must turn from rest to rest to show anything."""
+_FACTORS = 1.15 ** np.arange(-30, 31)
+"""Factors by which rates as read may have to be multiplied."""
+_SIGNS = [np.array(signs)[:, None] for signs in product((1.0, -1.0), repeat=3)]
+_MOST_TURNS, _ROUGH_ANGLE = 0.75, np.radians(3)
+"""Share of the turns whose error counts; difference of such errors that distinguishes nothing."""
+
+
+class Carried(NamedTuple):
+    """How gravity is carried from rest to rest by the gyroscope in its likeliest arrangement and scale.
+
+    factor: by which its rates must be multiplied, negative where its sense is the opposite one. error: what three of
+    four turns stay below, rad. turns: how many there are.
+    """
+
+    factor: float
+    error: float
+    turns: int
+
+
+def carried(
+    force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray, rests: FloatArray
+) -> Carried:
+    """Carry the specific force (n, 3) of each rest, of `rests` (k, 2) s, to the next one by the rates (m, 3) between.
+
+    What accelerates the unit on the way does not matter, nor how fast it turned. Turns that the gyroscope lacks samples
+    of, that take long or in which gravity hardly turns are left out.
+    """
+    from scipy.spatial.transform import Rotation
+
+    edges = np.searchsorted(force_time, rests)
+    up = np.stack([force[a : max(b, a + 1)].mean(axis=0) for a, b in edges])
+    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-300)
+    interval = np.diff(rate_time)
+    gap = 2.5 * np.median(interval)
+    middle = rests.mean(axis=1)
+    whole = [
+        stop - start < _TURN_SECONDS
+        and rate_time[0] <= a
+        and b <= rate_time[-1]
+        and interval[slice(*np.searchsorted(rate_time, (start, stop)))].max(initial=0.0) < gap
+        for (_, start), (stop, _), a, b in zip(rests, rests[1:], middle, middle[1:], strict=False)
+    ]
+    used = np.flatnonzero(whole & (np.sum(up[1:] * up[:-1], axis=1) < np.cos(_TURN_ANGLE)))
+    used = used[:: -(-len(used) // _MOST) or 1]
+    if not len(used):
+        return Carried(1.0, np.pi, 0)
+    still = (rests[:, 0] <= rate_time[:, None]) & (rate_time[:, None] <= rests[:, 1])
+    rate = rate - np.median(rate[still.any(axis=1)], axis=0) if still.any() else rate
+    angle = np.concatenate([np.zeros((1, 3)), np.cumsum((rate[1:] + rate[:-1]) / 2 * interval[:, None], axis=0)])
+    stamps = np.linspace(middle[used], middle[used + 1], _TURN_STEPS + 1)
+    steps = np.diff(np.stack([np.interp(stamps, rate_time, axis) for axis in angle.T], axis=2), axis=0)
+    factors = np.concatenate([_FACTORS, -_FACTORS])
+    turns = Rotation.from_rotvec((factors[:, None, None, None] * steps).reshape(-1, 3))
+    for _ in range(_TURN_STEPS.bit_length() - 1):
+        order = np.arange(len(turns)).reshape(len(factors), -1, len(used))
+        turns = turns[order[:, ::2].ravel()] * turns[order[:, 1::2].ravel()]
+    back = turns.as_matrix().reshape(len(factors), len(used), 3, 3)
+    arranged = np.stack([signs * np.eye(3)[list(order)] for order in permutations(range(3)) for signs in _SIGNS])
+    arranged = arranged[np.linalg.det(arranged) > 0]
+    # f' = Q Rᵀ Qᵀ f, with Q from the gyroscope's axes to the accelerometer's
+    before, after = (np.einsum("qji,tj->qti", arranged, part) for part in (up[used], up[used + 1]))
+    cosine = np.einsum("qti,stji,qtj->sqt", after, back, before)
+    error = np.quantile(np.arccos(np.clip(cosine, -1.0, 1.0)), _MOST_TURNS, axis=2)
+    # of factors that do as well the one nearest to none
+    best = error.min(axis=1)
+    alike = np.flatnonzero(best < best.min() + _ROUGH_ANGLE)
+    factor = factors[alike[np.argmin(np.abs(np.log(np.abs(factors[alike]))) + 1e-9 * best[alike])]]
+    return Carried(float(factor), float(best.min()), len(used))
 
 
 def _levers(blocks: BlockMeans) -> FloatArray:

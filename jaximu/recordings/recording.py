@@ -369,7 +369,7 @@ def recordings_of(recordings: "Recording | Sequence[Any]") -> list[Recording]:
 
 
 def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[str, ...]:
-    """Raise `InputError` where recordings of one unit have not the same sensors and units.
+    """Raise `InputError` where recordings of one unit have not the same sensors and units, or one is there twice.
 
     Return notes of those that were read in other axes than the first, whose reading a calibration keeps.
 
@@ -391,6 +391,13 @@ def same_outputs(recordings: Sequence[Recording], alone: bool = False) -> tuple[
                 )
             if a is not None and (a.unit != b.unit or not np.allclose(a.nominal_scale, b.nominal_scale, rtol=0.2)):
                 raise InputError(f"{first.name} and {other.name} give the {name} in different units or scales.")
+    for at, other in enumerate(recordings):
+        for before in recordings[:at]:
+            signals = before.signals
+            if signals.keys() == other.signals.keys() and all(
+                np.array_equal(signals[name].values, signal.values) for name, signal in other.signals.items()
+            ):
+                raise InputError(f"{other.name} is the same recording as {before.name}: name it once.")
     axes = [None if recording.reading is None else str(recording.reading.maps) for recording in recordings]
     return tuple(
         f"{recording.name} was read in other axes than {first.name}, whose reading the calibration keeps."

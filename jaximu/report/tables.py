@@ -86,6 +86,10 @@ def _scaled(values: FloatArray, digits: int = 7) -> tuple[str, list[list[str]]]:
     return f"10{raised(power)} ·" if power else "", cells
 
 
+_EXCHANGED = "its axes are exchanged"
+"""In place of what the scale and the misalignments of an output would be that is another axis'."""
+
+
 def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, str, str, str]]:
     """Return a triad's scales, misalignments and biases: symbol, words, value ± 95 % in output units, in other words.
 
@@ -99,11 +103,14 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     per = f"{unit} per {si}" if counts else ""
     weak = {parameter for direction in calibration.weak for parameter, _ in direction.parameters}
     scale = np.diagonal(gain)
+    exchanged = np.argmax(np.abs(gain), axis=1) != range(3)
 
     def scale_words(i: int) -> str:
         if nominal is None and counts:
             return ""
         start = 1.0 if nominal is None else np.asarray(nominal.gain)[i, i]
+        if exchanged[i]:
+            return _EXCHANGED
         change = with_interval(100 * (scale[i] / start - 1), 100 * gain_sigma[i, i] / abs(start), "%", sign=True)
         origin = "nominal" if _started_nominal(calibration, name) else "where the fit started,"
         return f"{change} from {origin}" + (f" {plain(start)}" if counts else "")
@@ -111,6 +118,8 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     def misalignment_words(i: int, j: int) -> str:
         if not (gain[i, j] or gain_sigma[i, j]):
             return "by convention: fixes the body frame"
+        if exchanged[i]:
+            return _EXCHANGED
         tilt, sigma = gain[i, j] / scale[i], _ratio_sigma(calibration, name, gain, i, j)
         in_mrad = with_interval(1e3 * tilt, 1e3 * sigma, "mrad", sign=True)
         return f"{in_mrad} = {with_interval(tilt, sigma, 'rad', sign=True)}"

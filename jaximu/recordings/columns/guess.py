@@ -22,7 +22,7 @@ from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.alignment import CORRELATED, Turning, turning
-from jaximu.recordings.columns.habits import Field, fields_of, measures, sensor_of, words_of
+from jaximu.recordings.columns.habits import Field, fields_of, last_of, measures, sensor_of, words_of
 from jaximu.recordings.columns.known import EPOCH
 from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
@@ -38,6 +38,8 @@ _PLAUSIBLE = 0.5, 8000.0
 _LIKELY = 5.0, 4000.0
 """Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
 _MIDDLE_RATE = 50.0  # Hz; of two rates that stamps may mean, the nearer one on a log scale is likelier
+_DAY, _SPREADSHEET = 86400.0, (3e4, 8e4)
+"""Seconds, and the days since 1900 of the years 1982 to 2119, as spreadsheets store dates."""
 _STEADY = 0.12
 """Scatter of the norm over poses, of its mean, below which a triad holds something constant."""
 _PER_G = (16384, 8192, 4096, 2048, 1024, 512, 256)
@@ -301,7 +303,8 @@ class _Guess:
         for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
             if values is None or field.sensor or not rises(values):
                 continue
-            if not (_plain(field) or find_unit(field.unit or "", "time") or "time" in field.stem):
+            named = find_unit(field.unit or "", "time") or {"time", "date"} & set(field.stem) or _ends_in_time(field)
+            if not (named or _plain(field)):
                 continue  # a name that says something else: a counter, a tick, an angle
             steps = np.diff(values)
             usual = np.median(steps)
@@ -561,6 +564,8 @@ class _Guess:
             if self.table.rate and abs(rates[name] / self.table.rate - 1) < 0.1:
                 return [(name, factor)]
         first = np.nanmin(np.asarray(self.numbers[self.time or 0]))
+        if _SPREADSHEET[0] < first < _SPREADSHEET[1] and _PLAUSIBLE[0] <= 1 / (self._step() * _DAY) <= _PLAUSIBLE[1]:
+            return [("d", _DAY)]
         for name, factor in names.items():
             if name != "100 us" and EPOCH[0] < first * factor < EPOCH[1] and 0.5 < rates[name] < 2e4:
                 return [(name, factor)]
@@ -926,6 +931,11 @@ def _fitting(unit: str | None, group: str) -> str | None:
     """A stated unit, if it is one of what the group's columns measure; "count" by whatever name."""
     stated = find_unit(unit or "", GROUPS[group].quantities)
     return stated and ("count" if stated.quantity == "raw count" else unit)
+
+
+def _ends_in_time(field: Field) -> bool:
+    """Whether the last of several words of a name is a unit of time."""
+    return len(field.stem) > 1 and len(field.stem[-1]) > 1 and last_of(field.stem[-1])[1] is not None
 
 
 def _plain(field: Field) -> bool:

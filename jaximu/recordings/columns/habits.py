@@ -56,7 +56,7 @@ _ESTIMATED = {("b", "w"), ("b", "a"), ("b", "g")}
 """How the names of an estimated state's biases begin, as in EuRoC's b_w_RS_S_x."""
 _TIME = set(
     "t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec zeit temps "
-    "tiempo unix epoch tow utc".split()
+    "tiempo unix epoch tow sow tod sod utc".split()
 )
 _TIME_ALONE = set("ms us ns sec secs seconds milliseconds microseconds nanoseconds epoch uptime".split())
 """Words that name a column of time where they are its whole name, and no other names one."""
@@ -66,22 +66,22 @@ _TIME_BESIDE = _NEUTRAL | set(
     "startup us ms ns sec nanosec nanoseconds nanos micros microseconds millis milliseconds usec msec nsec "
     "accelerometer "
     "acc gyro gyroscope logging arrival creation gps week whole "
-    "absolute relative and date txt".split()
+    "absolute relative and date txt day midnight mcu cpu board timer runtime".split()
 )
 _UNIT_NAMES = {
     "time": {
-        "s": "s, sec, secs, seconds",
+        "s": "s, sec, secs, seconds, sow, sod",
         "ms": "ms, msec, msecs, millis, milliseconds",
         "us": "us, usec, usecs, micros, microseconds",
         "ns": "ns, nsec, nsecs, nanos, nanosec, nanosecs, nanoseconds",
     },
-    "accel": {"g": "g, gs", "mg": "mg", "m/s^2": "ms2, mps2, mss, m s 2, m s2, m s s, m per s2, m s"},
+    "accel": {"g": "g, gs", "mg": "mg, m g", "m/s^2": "ms2, mps2, mss, m s 2, m s2, m s s, m per s2, m s"},
     "gyro": {
         "deg/s": "dps, degs, deg s, deg sec, deg per s",
         "rad/s": "rads, rad s, radps, rps, rad sec, rad per s",
-        "mdeg/s": "mdps",
+        "mdeg/s": "mdps, mdeg s",
     },
-    "mag": {"uT": "ut", "G": "gauss", "mG": "mgauss", "nT": "nt"},
+    "mag": {"uT": "ut, u t, µ t, µt", "G": "gauss, g", "mG": "mgauss, mg, m g", "nT": "nt, n t"},
     "temperature": {"degC": "c, degc, celsius, deg c", "K": "k", "degF": "f"},
 }
 _UNIT_WORDS = {

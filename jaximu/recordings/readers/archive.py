@@ -5,16 +5,17 @@ from __future__ import annotations
 import shlex
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import InputError, readable
 from jaximu.recordings.columns.habits import sensor_of, words_of
 from jaximu.recordings.columns.table import Unpacking
 from jaximu.recordings.recording import Source
 
-__all__ = ["by_sensor", "is_archive", "opened"]
+__all__ = ["SUFFIXES", "by_sensor", "is_archive", "is_log", "logs_below", "opened"]
 
 _MOST = 1000  # files of a recording
 _LETTERS = 3  # of a word that names a file's sensor
@@ -27,16 +28,56 @@ _ABOUT = ("meta", "__macosx")
 """Folders of what is about a recording."""
 _NO_LOG = set(".json .jsonc .xml .plist .yaml .yml .toml .html .md .pdf .png .jpg .svg .py .ipynb".split())
 """Suffixes of files that are logs only where there is no other."""
+SUFFIXES = (
+    ".csv",
+    ".tsv",
+    ".txt",
+    ".dat",
+    ".log",
+    ".parquet",
+    ".npz",
+    ".mat",
+    ".h5",
+    ".hdf5",
+    ".bag",
+    ".mcap",
+    ".db3",
+    ".ulg",
+    ".bin",
+    ".gz",
+)
+"""What a folder is searched for; a file that is named on its own may have any."""
+_BESIDE = (".truth.json", ".schedule.csv")
+_GZIP = b"\x1f\x8b"
 _PACKED = set(".zip .gz .bz2 .xz .7z .rar .tar .tgz".split())
 
 
+def is_log(path: Path) -> bool:
+    """Whether a file may be a log, which what commands write beside one is not."""
+    return path.is_file() and not path.name.endswith(_BESIDE)
+
+
+def logs_below(folder: Path) -> list[Path]:
+    """The logs in a folder and those below it, by their names."""
+    with readable(folder):
+        below = list(folder.rglob("*"))
+    return sorted(
+        inner
+        for inner in below
+        if inner.suffix.lower() in SUFFIXES
+        and not any(part.startswith(".") for part in inner.relative_to(folder).parts)
+        and is_log(inner)
+    )
+
+
 def is_archive(path: Path) -> bool:
-    """Whether a path is a folder that is no ROS 2 bag, or a ZIP archive that is no NPZ file."""
+    """Whether a path is a folder that is no ROS 2 bag, a ZIP archive that is no NPZ file, or a file packed by gzip."""
     if path.is_dir():
         return not (path / "metadata.yaml").is_file()
     with path.open("rb") as file:
-        if file.read(2) != b"PK":
-            return False
+        start = file.read(2)
+    if start != b"PK":
+        return start == _GZIP
     try:
         with zipfile.ZipFile(path) as archive:
             return not any(name.endswith(".npy") for name in archive.namelist())
@@ -56,6 +97,14 @@ def opened(path: Path, name: str) -> Iterator[dict[str, tuple[str, Path]]]:
         files = {file.name: file for file in sorted(path.iterdir()) if file.is_file()}
         chosen = _chosen(files, path, name)
         yield {sensor: (f"{name}/{inside}", files[inside]) for sensor, inside in chosen.items()}
+        return
+    data = path.read_bytes()
+    if data.startswith(_GZIP):
+        unpacked = Unpacking(Source(name, "", 0), len(data)).unpack(zlib.decompressobj(31), data)
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / path.stem
+            file.write_bytes(unpacked)
+            yield {"": (name, file)}
         return
     with zipfile.ZipFile(path) as archive, tempfile.TemporaryDirectory() as folder:
         members = _members(archive, name)
@@ -127,10 +176,12 @@ def _refusal(files: Sequence[str], path: Path, name: str) -> str:
     """Say what is there in place of one recording, and what to do."""
     held = f"it holds {', '.join(files[:3])}{f' and {len(files) - 3} more' if len(files) > 3 else ''}"
     if path.is_dir():
+        folder = f"{name}: is a folder, not a file, and no ROS 2 bag (it has no metadata.yaml); "
+        if not logs_below(path):
+            return f"{folder}{held if files else 'no file lies in it'}, and no log. Name a log, or a folder of logs."
         return (
-            f"{name}: is a folder, not a file, and no ROS 2 bag (it has no metadata.yaml); "
-            f"{held if files else 'no file lies in it'}. Name one log, or calibrate all: jaximu fleet "
-            f"{shlex.quote(name)} -o fleet.parquet."
+            f"{folder}{held if files else 'its logs lie in folders below'}. Name one log, or calibrate all: jaximu "
+            f"fleet {shlex.quote(name)} -o fleet.parquet."
         )
     return (
         f"{name}: is an archive, and not of one recording: {held}. Unpack it, and name one log, or calibrate all: "

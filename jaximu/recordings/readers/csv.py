@@ -191,15 +191,18 @@ def _cells(line: str, delimiter: str) -> list[str]:
 def _is_number(cell: str, decimal: str = ".") -> bool:
     if decimal == "," and "." in cell:
         return False
+    text = cell.replace(decimal, ".")
     try:
-        float(cell.replace(decimal, "."))
+        float(text)
     except ValueError:
-        return False
+        return measured(np.array([text], object)) is not None
     return True
 
 
 _MARKS = ("#", "//", "%")
 """Signs that a line is a remark, or the header behind such a sign."""
+_RULE = re.compile(r"[-=_+|\s]*")
+"""A line that only separates others, or an empty one."""
 _STYLES = (("\t", "."), (",", "."), (";", "."), (" ", "."), (";", ","), ("\t", ","), (",", ","), (" ", ","))
 """Delimiters and decimal signs, the likelier first."""
 
@@ -208,7 +211,8 @@ def _layout(data: bytes, path: str) -> _Layout:
     """Delimiter, decimal sign, header and first line of data: data is what most of the first lines look like."""
     raw = data[:HEAD].split(b"\n", _LOOKED_AT)
     lines = [_text(line) for line in raw[:_LOOKED_AT]]
-    filled = [(at, line) for at, line in enumerate(lines) if line.strip() and not line.lstrip().startswith(_MARKS)]
+    ruled = [(at, line) for at, line in enumerate(lines) if not _RULE.fullmatch(line)]
+    filled = [(at, line) for at, line in ruled if not line.lstrip().startswith(_MARKS)]
     if not filled:
         raise InputError(f"{path}: holds no data.")
     best: tuple[float, str, str, int] | None = None

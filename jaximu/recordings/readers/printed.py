@@ -26,6 +26,8 @@ _MOST = 0.6  # of the lines that must have the shape
 _FEWEST = 3  # numbers with a label, and numbers in all, of a sample
 _NUMBER = re.compile(r"(?<![\w.^])[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?![\w.])")
 _CLOCK = re.compile(r"(?<![\w:])\d{1,2}:\d{2}:\d{2}[.,]\d+")
+_ADDRESS = re.compile(r"\b(?:[0-9A-Fa-f]{2}[:-]){5}[0-9A-Fa-f]{2}\b")
+_TUPLE = re.compile(r"\s*[\[({]\s*#(?:[,;]?\s*#){2,}\s*[\])}],?")
 _CHECKSUM = re.compile(r"\*[0-9A-Fa-f]{2,8}\s*$")
 _LABELLED = re.compile(r"[A-Za-z_)\]\"]\s*[:=]\s*[\[(]?\s*#|->\s*#|^\[#\]\s*\$")
 _PROTOCOL = re.compile(r"[\w.\-]+(?:,[\w.\-]+=[\w.\-]+)* (?:[\w.\-]+=#i?,?)+ #")
@@ -41,12 +43,12 @@ def _text(data: bytes) -> list[str]:
 
 
 def _shape(line: str) -> str:
-    """The line with a # for each number, and @ for a time of day."""
-    return _NUMBER.sub("#", _CLOCK.sub("@", _CHECKSUM.sub("", line.rstrip())))
+    """The line with a # for each number, @ for a time of day, and without a device's address."""
+    return _NUMBER.sub("#", _CLOCK.sub("@", _ADDRESS.sub("", _CHECKSUM.sub("", line.rstrip()))))
 
 
 def _values(line: str) -> list[str]:
-    line = _CHECKSUM.sub("", line.rstrip())
+    line = _ADDRESS.sub("", _CHECKSUM.sub("", line.rstrip()))
     return [*_CLOCK.findall(line), *_NUMBER.findall(_CLOCK.sub("@", line))]
 
 
@@ -73,7 +75,8 @@ def _of(data: bytes) -> tuple[str, ...] | None:
     if sample is None or sum(line.count("#") for line in sample) < _FEWEST:
         return None
     labels = sum(len(_LABELLED.findall(line)) for line in sample)
-    return sample if labels >= _FEWEST or (len(sample) == 1 and re.search(r"->\s*#|^\[#\]\s*\$", sample[0])) else None
+    alone = len(sample) == 1 and (re.search(r"->\s*#|^\[#\]\s*\$", sample[0]) or _TUPLE.fullmatch(sample[0]))
+    return sample if labels >= _FEWEST or alone else None
 
 
 def prints(head: bytes) -> bool:
@@ -210,6 +213,8 @@ def read(data: bytes, source: Source) -> LogTable:
         note = f"a terminal program's time stands before each {sentence[1]} sentence."
     elif "@" in sample[0] and "->" in sample[0]:
         note = "a serial monitor's time of day and arrow (->) stand before the values."
+    elif _TUPLE.fullmatch(sample[0]):
+        note = "each row stands in brackets, as a program prints a list."
     elif len(sample) > 1:
         note = f"a sample is printed in {len(sample)} lines, with words and labels beside the numbers."
         note = "YAML as `ros2 topic echo` prints it." if "---" in sample else note

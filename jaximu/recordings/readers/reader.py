@@ -231,8 +231,9 @@ def _parts(tables: Sequence[LogTable], options: ReadOptions) -> "list[_FilePart]
     """Return the signals of one file's tables."""
     first = whole_stamps(tables[0])
     named = {column.name for column in header_columns(first) or ()}
-    sensor = "gyro" if options.alone and GROUPS["accel"].columns[0] not in named else "accel"
-    sensor = sensor if GROUPS[sensor].columns[0] in named else "accel"
+    alone = options.alone and GROUPS["accel"].columns[0] not in named and GROUPS["gyro"].columns[0] in named
+    # an accelerometer under a name that says too little is asked about, and not left out
+    sensor = "gyro" if alone and (options.columns is not None or not advise(first).accelerometer) else "accel"
     parts = [extract(first, choose_columns(first, options.columns, sensor), options, set(GROUPS))]
     return parts + [extract(table, header_columns(table) or (), options, set(GROUPS)) for table in tables[1:]]
 
@@ -454,6 +455,8 @@ def _tables_of(path: str | os.PathLike[str], selection: MessageSelection | None)
     except Exception as error:  # the library behind raises nearly anything on damaged archives
         raise _damaged(name, "a ZIP archive", error) from error
     tables = parts.get("") or _of_sensors({sensor: first for sensor, (first, *_) in parts.items()})
+    if "" in parts and file.is_dir():  # of a folder with one log in it
+        tables = [replace(table, notes=(*table.notes, f"read from {files[''][0]}.")) for table in tables]
     return tuple(replace(table, source=replace(source, rows=table.source.rows)) for table in tables)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -209,17 +210,86 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
         if device is None:
             raise InputError(
                 f"{table.path}: its rows are of {len(units)} units, which write in turn, by column {table.label(at)}: "
-                f"choose one of them, {', '.join(units[:8])}, with --device; for jaximu array take all: --device "
-                f"{','.join(units[:8])}{',…' if len(units) > 8 else ''}."
+                f"choose one of them, {', '.join(units[:8])}, with --device. {_all_of(table, units)}"
             )
         if device not in units:
             raise InputError(f"{table.path}: --device {device}: column {table.label(at)} holds {', '.join(units[:8])}.")
         taken = table.take(np.flatnonzero(names == device))
         note = f"the rows are those of {device}, by column {table.label(at)}."
         return replace(taken, device=device, notes=(*taken.notes, note))
-    if device is not None:
-        raise InputError(f"{table.path}: --device {device}: no column says which of several units a row is of.")
-    return table
+    return _unnamed_device(table, device or usual)
+
+
+def _all_of(table: LogTable, units: Sequence[str]) -> str:
+    """Say which verb takes all units of a table."""
+    names = f"{','.join(units[:8])}{',…' if len(units) > 8 else ''}"
+    return f"`jaximu array {shlex.quote(table.path)} --device {shlex.quote(names)}` takes all, on one rigid body."
+
+
+_ROWS, _PARTS, _FEWEST_A_PART, _MOST_IN_TURN = 20000, 20, 12, 6
+"""Rows that are looked at, parts of them that must agree, a unit's rows in each, and units in turn at the most."""
+_DISTINCT, _PLAIN, _AGREE = 5.0, 0.5, 2
+"""Times its scatter from part to part, and of a sample's about its neighbours, that rows in turn must differ by;
+columns that must agree."""
+
+
+def _unnamed_device(table: LogTable, device: str | None) -> LogTable:
+    """A table with the rows of one unit where several write in turn and no column says which; any other as it is."""
+    count = _units_in_turn(table)
+    units = list(map(str, range(1, count + 1)))
+    if count == 1:
+        if device is not None:
+            raise InputError(f"{table.path}: --device {device}: no column says which of several units a row is of.")
+        return table
+    if device not in units:
+        raise InputError(
+            f"{table.path}: its rows are of {count} units, which write in turn, though no column says so: every "
+            f"{_ORDINALS[count]} row is alike and its neighbours differ, all along. Choose one of them with --device "
+            f"1 … --device {count} (as the first rows come). {_all_of(table, units)}"
+        )
+    taken = table.take(np.arange(int(device) - 1, len(table.columns[0]), count))
+    note = f"the rows are those of unit {device} of {count} that write in turn."
+    return replace(taken, device=device, notes=(*taken.notes, note))
+
+
+_ORDINALS = ("", "", "second", "third", "fourth", "fifth", "sixth")
+
+
+def _units_in_turn(table: LogTable) -> int:
+    """How many units write in turn: the least period with which rows differ from their neighbours.
+
+    Biases of two units differ all along; whatever else swings as quickly drifts against the rows.
+    """
+    columns = []
+    for at, field in enumerate(fields_of(table.names) if table.names else [None] * len(table.columns)):
+        if field is not None and field.sensor not in _TRIADS:
+            continue
+        try:
+            values = np.asarray(table.numbers(at)[:_ROWS], np.float64)
+        except InputError:
+            continue
+        if np.isfinite(values).all() and not rises(values):
+            columns.append(values)
+    rows = min(map(len, columns), default=0)
+    for count in range(2, min(_MOST_IN_TURN, rows // (_PARTS * _FEWEST_A_PART)) + 1):
+        if sum(_differ_in_turn(values, count) for values in columns) >= _AGREE:
+            return count
+    return 1
+
+
+def _differ_in_turn(values: np.ndarray, count: int) -> bool:
+    """Whether every `count`th value (n,) is off the mean of those around it by as much, all along."""
+    around = np.ones(count) if count % 2 else np.concatenate([[0.5], np.ones(count - 1), [0.5]])
+    off = values - np.convolve(values, around / around.sum(), "same")
+    size = len(off) // (_PARTS * count) * count
+    parts = off[count : count + (_PARTS - 1) * size].reshape(_PARTS - 1, -1, count)
+    fourth = parts.shape[1] // 4
+    pattern = np.sort(parts, axis=1)[:, fourth : parts.shape[1] - fourth].mean(axis=1)
+    middle = np.median(pattern, axis=0)
+    scatter = 1.4826 * np.median(np.abs(pattern - middle), axis=0).max()
+    usual = 1.4826 * np.median(np.abs(parts - pattern[:, None]))
+    apart = np.ptp(middle)  # rows that repeat themselves to the last digit were made
+    return bool(apart > max(_DISTINCT * scatter, _PLAIN * usual) and scatter > 1e-9 * apart)
 
 
 def _alike(table: LogTable, groups: Sequence[np.ndarray]) -> bool:

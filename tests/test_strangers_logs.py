@@ -1,0 +1,268 @@
+"""Logs as strangers have them: whose rows, clocks, names, layouts, and what only turns from rest to rest show."""
+
+import gzip
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaximu import InputError, NotPossibleError, calibrate, check
+from jaximu.calibration.refusals import require_carried
+from jaximu.cli import main
+from jaximu.mistakes import inspect
+from jaximu.recordings.alignment import carried
+from jaximu.recordings.readers import ReadOptions, advise_reading, read_recording
+from jaximu.recordings.recording import Recording
+from jaximu.simulation import consumer_noise, draw_imu, simulate
+from jaximu.simulation.protocols import HandHeld, Static
+
+HEAD = "ax [m/s^2],ay [m/s^2],az [m/s^2],gx [rad/s],gy [rad/s],gz [rad/s]"
+
+
+def by_hand(seed=3, rate=50.0, poses=14, unit=None) -> Recording:
+    return simulate(draw_imu(unit or seed), HandHeld(poses, 2.0, 1.0), consumer_noise(), rate=rate, seed=seed)[0]
+
+
+def columns(recording) -> np.ndarray:
+    """(n, 7) time, force, rate."""
+    return np.column_stack([recording.accelerometer.time, recording.accelerometer.si(), recording.gyroscope.si()])
+
+
+def lines(values, form="{:.6f}", sep=",") -> list[str]:
+    return [sep.join(form.format(value) for value in row) for row in values]
+
+
+def save(path, *rows: str):
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return path
+
+
+def same(recording, values, atol=1e-4) -> None:
+    """A recording holds the samples (n, 7)."""
+    np.testing.assert_allclose(recording.accelerometer.si(), values[:, 1:4], atol=atol)
+    np.testing.assert_allclose(recording.gyroscope.si(), values[:, 4:], atol=atol)
+    np.testing.assert_allclose(recording.gyroscope.time, values[:, 0] - values[0, 0], atol=1e-3)
+
+
+# --- whose row
+
+
+def in_turn(folder, count=2, late=0.0, rate=50.0):
+    """Rows of some units that moved together, with nothing that says whose a row is."""
+    units = [columns(by_hand(seed=3, rate=rate, unit=number + 1)) for number in range(count)]
+    for number, unit in enumerate(units):
+        unit[:, 0] += number * late
+    return save(folder / "log.csv", f"time [s],{HEAD}", *lines(np.stack(units, axis=1).reshape(-1, 7))), units
+
+
+@pytest.mark.parametrize(("count", "late"), [(2, 0.0), (2, 0.01), (3, 0.005)])
+def test_units_that_write_in_turn_without_an_id(tmp_path, count, late):
+    path, units = in_turn(tmp_path, count, late)
+    with pytest.raises(InputError, match=f"rows are of {count} units, which write in turn"):
+        read_recording(path)
+    for number, unit in enumerate(units, 1):
+        same(read_recording(path, options=ReadOptions(device=str(number))), unit)
+    with pytest.raises(InputError, match="units, which write in turn"):
+        read_recording(path, options=ReadOptions(device=str(count + 1)))
+
+
+@pytest.mark.parametrize("rate", [12.5, 25.0, 100.0, 400.0])
+@pytest.mark.parametrize("coarse", [False, True])
+def test_one_unit_is_not_called_several(tmp_path, rate, coarse):
+    """At any rate, with coarse steps and without, by hand and at rest; held rows are none of another unit."""
+    rest = simulate(draw_imu(2), Static(30.0), consumer_noise(), rate=rate, seed=2)[0]
+    for number, (recording, steps) in enumerate(((by_hand(rate=rate, poses=6), 0.15), (rest, 1e-3))):
+        values, steps = columns(recording), steps * coarse
+        values[:, 1:] = np.round(values[:, 1:] / steps) * steps if steps else values[:, 1:]
+        for held in (1, 2):
+            rows = values[np.arange(len(values)) // held * held] if held > 1 else values
+            rows = np.column_stack([values[:, 0], rows[:, 1:]])
+            path = save(tmp_path / f"{number}{held}.csv", f"time [s],{HEAD}", *lines(rows))
+            assert read_recording(path, options=ReadOptions(check=False)).reading.device is None
+
+
+def test_devices_by_their_address(tmp_path):
+    one, other = columns(by_hand()), columns(by_hand(unit=5))
+    rows = [f"{row},{address}" for pair in zip(lines(one), lines(other), strict=True)
+            for row, address in zip(pair, ("D4:22:CD:00:12:A1", "D4:22:CD:00:12:B7"), strict=True)]  # fmt: skip
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD},mac", *rows)
+    with pytest.raises(InputError, match=r"choose one of them, D4:22:CD:00:12:A1, .* `jaximu array .* takes all"):
+        read_recording(path)
+    same(read_recording(path, options=ReadOptions(device="D4:22:CD:00:12:B7")), other)
+
+
+def test_a_recording_that_is_given_twice():
+    recording = by_hand()
+    with pytest.raises(InputError, match="is the same recording as"):
+        calibrate([recording, replace(recording)])
+
+
+# --- clocks, names, layouts
+
+
+@pytest.mark.parametrize(
+    ("name", "stamps"),
+    [
+        ("Date", lambda time: 45413.5 + time / 86400),
+        ("sec_of_day", lambda time: (86400 - 20 + time) % 86400),
+        ("gps_sow", lambda time: 400000.0 + time),
+        ("esp_timer_us", lambda time: np.round(time * 1e6)),
+        ("time [min]", lambda time: time / 60),
+    ],
+)
+def test_clocks_by_their_names(tmp_path, name, stamps):
+    values = columns(by_hand())
+    rows = [f"{stamp:.10f},{row}" for stamp, row in zip(stamps(values[:, 0]), lines(values[:, 1:]), strict=True)]
+    path = save(tmp_path / "log.csv", f"{name},{HEAD}", *rows)
+    try:
+        recording = read_recording(path)
+    except InputError:
+        advice = advise_reading(path)
+        assert advice.columns and "?" not in advice.line()
+        recording = read_recording(path, options=ReadOptions(columns=advice.columns))
+    same(recording, values)
+
+
+def test_units_that_names_end_in(tmp_path):
+    """mG is thousandths of g of an accelerometer, and of gauss of a magnetometer."""
+    values = columns(by_hand())
+    field = np.random.default_rng(1).normal(0, 300, (len(values), 3))
+    names = ["time_s", *(f"acc{axis}_mG" for axis in "XYZ"), *(f"gyr{axis}_mdps" for axis in "XYZ"),
+             *(f"mag{axis}_mG" for axis in "XYZ")]  # fmt: skip
+    stated = np.column_stack([values[:, :1], values[:, 1:4] / 9.80665e-3, np.degrees(values[:, 4:]) * 1e3, field])
+    recording = read_recording(save(tmp_path / "log.csv", ",".join(names), *lines(stated)))
+    same(recording, values)
+    np.testing.assert_allclose(recording.magnetometer.si(), field / 10, atol=1e-4)
+
+
+def test_gzip(tmp_path):
+    values = columns(by_hand())
+    text = "\n".join([f"time [s],{HEAD}", *lines(values)])
+    path = tmp_path / "log.csv.gz"
+    path.write_bytes(gzip.compress(text.encode()))
+    same(read_recording(path), values)
+    path.write_bytes(gzip.compress(text.encode())[:-200])
+    with pytest.raises(InputError, match="cut off or damaged"):
+        read_recording(path)
+    path.write_bytes(gzip.compress(bytes(300_000_000)))
+    with pytest.raises(InputError, match="as no recording does"):
+        read_recording(path)
+
+
+def test_units_behind_the_values(tmp_path):
+    values = columns(by_hand())
+    rows = [",".join(f"{value:.6f}{unit}" for value, unit in zip(row, ["s"] + ["m/s^2"] * 3 + ["rad/s"] * 3,
+                                                                 strict=True)) for row in values]  # fmt: skip
+    same(read_recording(save(tmp_path / "log.csv", "time,ax,ay,az,gx,gy,gz", *rows)), values)
+
+
+def test_a_rule_between_names_and_rows(tmp_path):
+    values = columns(by_hand())
+    head = " ".join(f"{name:>14}" for name in f"time[s],{HEAD}".replace(" [", "[").split(","))
+    for rule in ("-" * len(head), "=" * 20, "--- | --- | ---"):
+        same(read_recording(save(tmp_path / "log.txt", head, rule, *lines(values, "{:14.6f}", " "))), values)
+
+
+def test_rows_in_brackets(tmp_path):
+    values = columns(by_hand())
+    rows = [f"({row})" for row in lines(values, sep=", ")]
+    path = save(tmp_path / "log.txt", "soft reboot", *rows)
+    advice = advise_reading(path)
+    same(read_recording(path, options=ReadOptions(columns=advice.columns)), values)
+
+
+# --- what turns from rest to rest show
+
+
+def accelerated(recording, size, seed=0) -> Recording:
+    """The recording with a hand's accelerations (m/s²) while it turns, which hide how gravity does."""
+    random = np.random.default_rng(seed)
+    signal, rate = recording.accelerometer, recording.gyroscope.si()
+    moving = np.linalg.norm(rate - np.median(rate, axis=0), axis=1) > 0.2
+    shaken = np.stack([np.convolve(axis, np.hanning(7) / 2, "same") for axis in random.normal(size=(3, len(signal)))])
+    return replace(recording, accelerometer=replace(signal, values=signal.values + size * shaken.T * moving[:, None]))
+
+
+def names_of(recording):
+    return [finding.name for finding in inspect(recording)]
+
+
+@pytest.mark.parametrize("size", [0.0, 2.0, 6.0])
+def test_accelerations_on_the_way_make_no_other_device(size):
+    for seed in range(3):
+        recording = accelerated(by_hand(seed=seed + 1, rate=25.0, poses=16), size, seed)
+        assert "data.mixed_devices" not in names_of(recording) and "data.range" not in names_of(recording)
+
+
+@pytest.mark.parametrize("factor", [1 / 8, 5.0])
+@pytest.mark.parametrize("size", [2.0, 6.0])
+def test_a_wrong_scale_is_named_by_the_angles_from_rest_to_rest(factor, size):
+    recording = accelerated(by_hand(rate=25.0, poses=16), size)
+    gyroscope = recording.gyroscope
+    recording = replace(recording, gyroscope=replace(gyroscope, values=gyroscope.values * factor))
+    with pytest.raises(InputError, match=r"reads [\d.]+ times the (angles|rate)"):
+        calibrate(recording)
+
+
+def test_the_gyroscope_of_another_recording_is_of_another_device():
+    first, other = accelerated(by_hand(poses=16), 1.0), by_hand(seed=9, poses=16)
+    count = min(len(first.gyroscope), len(other.gyroscope))
+    mixed = replace(first, gyroscope=replace(other.gyroscope, values=other.gyroscope.values[:count],
+                                             time=first.gyroscope.time[:count]))  # fmt: skip
+    assert "data.mixed_devices" in names_of(mixed)
+
+
+@pytest.mark.parametrize("arranged", [np.eye(3), np.diag([1.0, -1.0, -1.0]), np.roll(np.eye(3), 1, 0), -np.eye(3)])
+def test_gravity_is_carried_in_any_arrangement(arranged):
+    recording = by_hand(rate=25.0)
+    force, rate = recording.accelerometer, recording.gyroscope
+    quiet = np.linalg.norm(rate.si() - np.median(rate.si(), axis=0), axis=1) < 0.05
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], quiet.astype(int), [0]]))).reshape(-1, 2)
+    rests = np.array([[rate.time[a], rate.time[b - 1]] for a, b in edges if b - a > 25])
+    whole = carried(force.time, force.si(), rate.time, rate.si() @ arranged.T / 2, rests)
+    assert whole.turns > 8 and whole.error < np.radians(10) and abs(whole.factor) == pytest.approx(2.0, rel=0.15)
+
+
+def test_turns_that_no_gyroscope_explains_are_refused():
+    require_carried(3.0, "log.csv")
+    with pytest.raises(NotPossibleError, match=r"off by 99° \(rms\) after the fit.*scale or unit"):
+        require_carried(99.0, "log.csv")
+
+
+def test_a_check_names_axes_that_are_not_those_of_the_calibration():
+    calibration = calibrate(by_hand(seed=4))
+    other = by_hand(seed=6, unit=4)
+    signal = other.accelerometer
+    mirrored = replace(other, accelerometer=replace(signal, values=signal.values * [-1, 1, 1]))
+    with pytest.raises(InputError, match=r"Against the calibration, .*its x axis has the wrong sign"):
+        check(calibration, mirrored)
+
+
+def test_a_page_of_exchanged_axes(tmp_path, capsys):
+    """Their scales start from nothing: no share of it is stated."""
+    values = columns(by_hand(rate=25.0, poses=12))[:, [0, 1, 2, 3, 5, 4, 6]]
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values))
+    assert main(["calibrate", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("its axes are exchanged") == 6 and "its x and y axes are exchanged. --axes" in printed
+
+
+# --- info
+
+
+def test_info_of_a_gyroscope_alone(tmp_path, capsys):
+    """At rest its noise can be identified; a table's steady turn is no rest."""
+    time = np.arange(6000) / 50
+    rate = 0.01 + np.random.default_rng(0).normal(0, 1e-3, (6000, 3))
+    head = "time [s],gyro_x [rad/s],gyro_y [rad/s],gyro_z [rad/s]"
+    rest = save(tmp_path / "rest.csv", head, *lines(np.column_stack([time, rate])))
+    turning = save(tmp_path / "turning.csv", head, *lines(np.column_stack([time, rate + [0, 0, 1.6]])))
+    assert main(["info", str(rest)]) == 0 and "jaximu allan" in capsys.readouterr().out
+    assert main(["info", str(turning)]) == 0 and "jaximu allan" not in capsys.readouterr().out
+
+
+def test_info_offers_no_calibration_from_three_poses(tmp_path, capsys):
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(columns(by_hand(poses=3))))
+    assert main(["info", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert "jaximu calibrate" not in printed and "3 poses are too few" in printed
