@@ -270,18 +270,21 @@ def carried(
     used = used[:: -(-len(used) // _MOST) or 1]
     if not len(used):
         return Carried(1.0, np.pi, 0)
-    still = (rests[:, 0] <= rate_time[:, None]) & (rate_time[:, None] <= rests[:, 1])
-    rate = rate - np.median(rate[still.any(axis=1)], axis=0) if still.any() else rate
+    at_rest = np.concatenate([rate[a:b] for a, b in np.searchsorted(rate_time, rests)])
+    rate = rate - np.median(at_rest, axis=0) if len(at_rest) else rate
     angle = np.concatenate([np.zeros((1, 3)), np.cumsum((rate[1:] + rate[:-1]) / 2 * interval[:, None], axis=0)])
     stamps = np.linspace(middle[used], middle[used + 1], _TURN_STEPS + 1)
-    steps = np.diff(np.stack([np.interp(stamps, rate_time, axis) for axis in angle.T], axis=2), axis=0)
+    passed = np.stack([np.interp(stamps, rate_time, axis) for axis in angle.T], axis=2)
+    steps = passed[1:] - passed[:-1]
     factors = np.concatenate([_FACTORS, -_FACTORS])
-    turns = Rotation.from_rotvec((factors[:, None, None, None] * steps).reshape(-1, 3))
-    for _ in range(_TURN_STEPS.bit_length() - 1):
-        order = np.arange(len(turns)).reshape(len(factors), -1, len(used))
-        turns = turns[order[:, ::2].ravel()] * turns[order[:, 1::2].ravel()]
-    back = turns.as_matrix().reshape(len(factors), len(used), 3, 3)
-    arranged = np.stack([signs * np.eye(3)[list(order)] for order in permutations(range(3)) for signs in _SIGNS])
+    turns = Rotation.from_rotvec((factors[:, None, None, None] * steps).reshape(-1, 3)).as_matrix()
+    turns = turns.reshape(len(factors), -1, len(used), 3, 3)
+    while turns.shape[1] > 1:
+        turns = turns[:, ::2] @ turns[:, 1::2]
+    back = turns[:, 0]
+    arranged = np.stack(
+        [np.array(signs) * np.eye(3)[list(order)] for order in permutations(range(3)) for signs in _SIGNS]
+    )
     arranged = arranged[np.linalg.det(arranged) > 0]
     # f' = Q Rᵀ Qᵀ f, with Q from the gyroscope's axes to the accelerometer's
     before, after = (np.einsum("qji,tj->qti", arranged, part) for part in (up[used], up[used + 1]))

@@ -210,7 +210,7 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
         if device is None:
             raise InputError(
                 f"{table.path}: its rows are of {len(units)} units, which write in turn, by column {table.label(at)}: "
-                f"choose one of them, {', '.join(units[:8])}, with --device. {_all_of(table, units)}"
+                f"choose one of them, {', '.join(units[:8])}, with --device. {_all_of(table, units.tolist())}"
             )
         if device not in units:
             raise InputError(f"{table.path}: --device {device}: column {table.label(at)} holds {', '.join(units[:8])}.")
