@@ -1,6 +1,8 @@
 """Logs as strangers have them: whose rows, clocks, names, layouts, and what only turns from rest to rest show."""
 
 import gzip
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -266,3 +268,19 @@ def test_info_offers_no_calibration_from_three_poses(tmp_path, capsys):
     assert main(["info", str(path)]) == 0
     printed = capsys.readouterr().out
     assert "jaximu calibrate" not in printed and "3 poses are too few" in printed
+
+
+def test_info_reads_the_gyroscopes_offset_from_any_rest(tmp_path, capsys):
+    """Of a vehicle that stops, level all the time, and turns steadily for longer than it stands."""
+    time, random = np.arange(12000) / 50, np.random.default_rng(0)
+    standing = time % 60 < 20
+    rate = [0.01, -0.02, 0.005] + random.normal(0, 2e-3, (12000, 3))
+    rate[:, 2] += np.where(standing, 0.0, 0.3)
+    force = [0.3, 0, 9.8] + random.normal(0, 0.02, (12000, 3))
+    log = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(np.column_stack([time, force, rate])))
+    assert main(["info", str(log), "--json"]) == 0
+    (said,) = (text for text in json.loads(capsys.readouterr().out)["findings"] if "gyroscope reads" in text)
+    read = re.findall(r"([xyz]) (−?[\d.]+) ± ([\d.]+) °/s", said)
+    for (_, *value), truth in zip(read, np.degrees([0.01, -0.02, 0.005]), strict=True):
+        middle, half = (float(text.replace("−", "-")) for text in value)
+        assert abs(middle - truth) < 2 * half < 0.1

@@ -11,9 +11,12 @@ from typing import TYPE_CHECKING, Any
 from jaximu.cli import options
 from jaximu.ground.errors import InputError, JaximuError
 from jaximu.ground.gravity import STANDARD
-from jaximu.ground.quantities import sentence
+from jaximu.ground.quantities import Z95, listed, sentence, with_interval
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from jaximu.ground.array_types import FloatArray
     from jaximu.recordings.columns.guess import Advice
     from jaximu.recordings.recording import Recording, Signal
@@ -21,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["InfoCommand", "Use", "allowed", "describe", "read_openly"]
 
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
+_PARTS = 8  # of a rest, by which the interval of its mean is told
 _BIAS = 0.5  # rad/s: largest bias of a gyroscope that is taken for rest
 _MIDDLE = 0.1  # m/s²: how far that mean may lie from the second before
 _BUMPS = 0.002  # share of the seconds that may move where noise is to be identified
@@ -253,18 +257,45 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
 
 def _at_rest(recording: Recording, repaired: Recording, findings: list[str]) -> tuple[float, float, float, float]:
     """Seconds of a recording, those at rest in all and at a stretch, and when that begins; said among `findings`."""
+    import numpy as np
+
+    from jaximu.recordings.recording import runs_of
     from jaximu.report.recording import signal_facts
 
     names = [name for name in ("accelerometer", "gyroscope") if name in recording.signals]
-    rest, longest, begin = _rest(repaired)
+    start, still, rates = _still_seconds(repaired)
     length = signal_facts(recording.signals[names[0]], repaired.signals[names[0]])["duration"]
-    if rest:
-        limits = {"accelerometer": f"{_STILL_FORCE:g} m/s²", "gyroscope": f"{_STILL_RATE:g} rad/s"}
-        findings.append(
-            f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
-            f"{' and '.join(limits[name] for name in names)} rms)"
-        )
-    return length, rest, longest, begin
+    if not still.any():
+        return length, 0.0, 0.0, 0.0
+    first, stop = max(runs_of(still), key=lambda run: run[1] - run[0])
+    rest, longest = float(still.sum()), float(stop - first)
+    limits = {"accelerometer": f"{_STILL_FORCE:g} m/s²", "gyroscope": f"{_STILL_RATE:g} rad/s"}
+    findings.append(
+        f"still for {rest:.0f} s of {length:.0f} s, {longest:.0f} s at a stretch (seconds with less than "
+        f"{' and '.join(limits[name] for name in names)} rms)"
+    )
+    rates = rates[still] if recording.gyroscope is not None and recording.gyroscope.unit != "count" else rates[:0]
+    size = np.linalg.norm(rates, axis=1)
+    if len(rates) >= _PARTS and size.min() < _BIAS:  # a table's steady turn looks like a rest: the slowest is one
+        near = np.linalg.norm(rates - rates[np.argmin(size)], axis=1) < _STILL_RATE
+        findings += [_offset(rates[near])] if near.sum() >= _PARTS else []
+    return length, rest, longest, float(start + first)
+
+
+def _offset(rates: FloatArray) -> str:
+    """Say what the gyroscope reads at rest, from its means (n, 3) over seconds, rad/s.
+
+    Its interval is Student's, of the means over parts of the rest: drift is in it as far as the parts differ by it.
+    """
+    import numpy as np
+
+    from jaximu.ground.distributions import student_isf
+
+    parts = np.stack([part.mean(axis=0) for part in np.array_split(rates, _PARTS)])
+    sigma = parts.std(axis=0, ddof=1) / np.sqrt(_PARTS) * student_isf(0.025, _PARTS - 1) / Z95
+    words = [with_interval(*pair, "rad/s") for pair in zip(parts.mean(axis=0), sigma, strict=True)]
+    named = listed([f"{axis} {text}" for axis, text in zip("xyz", words, strict=True)])
+    return f"at rest the gyroscope reads {named}: its offset, and up to 0.0042 °/s of the Earth's rotation"
 
 
 def _noise_uses(length: float, rest: float, longest: float, begin: float) -> Iterator[Use]:
@@ -310,18 +341,21 @@ def _tilt(signal: Signal, intervals: FloatArray) -> float:
     return float(np.degrees(np.arccos(np.clip(up @ middle / max(np.linalg.norm(middle), 1e-9), -1.0, 1.0))).max())
 
 
-def _rest(recording: Recording) -> tuple[float, float, float]:
-    """Seconds at rest in all, at a stretch, and when that begins: from seconds' scatter and how their means move."""
+def _still_seconds(recording: Recording) -> tuple[float, NDArray[np.bool_], FloatArray]:
+    """When the first of all seconds begins; which (n,) are at rest, by their scatter and how their means move; and the
+    means (n, 3) in them of the gyroscope, rad/s, or none.
+    """
     import numpy as np
 
     limits = {"accelerometer": _STILL_FORCE, "gyroscope": _STILL_RATE}
     sensors = [(signal, limits[name]) for name, signal in recording.signals.items() if name in limits]
-    start = max(signal.time[0] for signal, _ in sensors)
+    start, rates = max(signal.time[0] for signal, _ in sensors), np.zeros((0, 3))
     seconds = int(min(signal.time[-1] for signal, _ in sensors) - start)
     still = np.ones(max(seconds, 0), bool)
     for signal, limit in sensors:
         edges = np.searchsorted(signal.time, start + np.arange(seconds + 1))
-        values = signal.si() - np.median(signal.si(), axis=0)
+        middle = np.median(signal.si(), axis=0)
+        values = signal.si() - middle
         sums, squares = (np.vstack([np.zeros(3), np.cumsum(values**power, axis=0)]) for power in (1, 2))
         count = np.diff(edges)
         safe = np.maximum(count, 1)[:, None]
@@ -331,8 +365,6 @@ def _rest(recording: Recording) -> tuple[float, float, float]:
         if signal is recording.accelerometer and seconds > 1:
             still[1:] &= np.linalg.norm(np.diff(mean, axis=0), axis=1) < _MIDDLE
         if len(sensors) == 1 and signal is recording.gyroscope:  # a table's steady turn scatters as little
-            still &= np.linalg.norm(mean + np.median(signal.si(), axis=0), axis=1) < _BIAS
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
-    runs = edges[1::2] - edges[::2]
-    at = int(np.argmax(runs)) if len(runs) else 0
-    return float(still.sum()), float(np.max(runs, initial=0)), float(start + edges[2 * at]) if len(runs) else 0.0
+            still &= np.linalg.norm(mean + middle, axis=1) < _BIAS
+        rates = mean + middle if signal is recording.gyroscope else rates
+    return float(start), still, rates

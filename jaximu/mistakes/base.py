@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turning
 from jaximu.recordings.finding import Rows
-from jaximu.recordings.recording import Recording, Signal
+from jaximu.recordings.recording import Recording, Signal, runs_of
 
 __all__ = [
     "BRIDGED",
@@ -22,7 +22,6 @@ __all__ = [
     "Samples",
     "Sensor",
     "coarse_step",
-    "runs_of",
     "scale_around",
     "spans_of",
     "steps_of",
@@ -304,12 +303,6 @@ class Samples:
             return None
         cosine = np.sum(means[1:] * means[:-1], axis=1) / np.maximum(size[1:] * size[:-1], 1e-300)
         return int(np.sum(cosine < np.cos(_TURN)))
-
-
-def runs_of(flags: NDArray[np.bool_]) -> Rows:
-    """Return first and last + 1 (k, 2) of every run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return edges.reshape(-1, 2)
 
 
 def spans_of(flags: NDArray[np.bool_], time: FloatArray, shortest: float) -> FloatArray:

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
-from jaximu.mistakes.base import HUNG, Samples, Sensor, runs_of
+from jaximu.mistakes.base import HUNG, Samples, Sensor
 from jaximu.recordings.finding import Finding, Rows
+from jaximu.recordings.recording import runs_of
 
 __all__ = ["TITLES", "at_limits", "find", "stops"]
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.quantities import counted
-from jaximu.mistakes.base import Samples, runs_of
+from jaximu.mistakes.base import Samples
 from jaximu.recordings.finding import Finding, Rows
+from jaximu.recordings.recording import runs_of
 
 __all__ = ["TITLES", "find"]
 

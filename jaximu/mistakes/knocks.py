@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaximu.mistakes.base import Samples, Sensor, runs_of
+from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
+from jaximu.recordings.recording import runs_of
 
 __all__ = ["TITLES", "find"]
 

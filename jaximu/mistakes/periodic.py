@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import gamma_mean_sf
 from jaximu.ground.quantities import size
-from jaximu.mistakes.base import Samples, Sensor, runs_of
+from jaximu.mistakes.base import Samples, Sensor
 from jaximu.mistakes.resampled import held_at, interpolated_at
 from jaximu.recordings.finding import Finding
+from jaximu.recordings.recording import runs_of
 
 __all__ = ["TITLES", "find"]
 

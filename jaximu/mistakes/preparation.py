@@ -32,9 +32,9 @@ from jaximu.mistakes import (
     wrap,
     zeros,
 )
-from jaximu.mistakes.base import BRIDGED, Samples, runs_of, steps_of
+from jaximu.mistakes.base import BRIDGED, Samples, steps_of
 from jaximu.recordings.finding import Finding, Rows
-from jaximu.recordings.recording import Defect, Recording, Signal, recordings_of
+from jaximu.recordings.recording import Defect, Recording, Signal, recordings_of, runs_of
 
 __all__ = ["MISTAKES", "Prepared", "inspect", "one_or_several", "prepare", "prepared", "without_rows"]
 

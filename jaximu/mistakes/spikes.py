@@ -6,8 +6,9 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted, size
-from jaximu.mistakes.base import BRIDGED, Samples, Sensor, runs_of
+from jaximu.mistakes.base import BRIDGED, Samples, Sensor
 from jaximu.recordings.finding import Finding, Rows
+from jaximu.recordings.recording import runs_of
 
 __all__ = ["TITLES", "find"]
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.mistakes.base import HUNG, Samples, Sensor, runs_of
+from jaximu.mistakes.base import HUNG, Samples, Sensor
 from jaximu.mistakes.clipping import at_limits, stops
 from jaximu.mistakes.resampled import held_at
 from jaximu.recordings.finding import Finding
+from jaximu.recordings.recording import runs_of
 
 __all__ = ["TITLES", "find"]
 

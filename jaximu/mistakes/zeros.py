@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.quantities import counted
-from jaximu.mistakes.base import Samples, Sensor, runs_of
+from jaximu.mistakes.base import Samples, Sensor
 from jaximu.mistakes.held_at_rest import zeroed_at_rest
 from jaximu.recordings.finding import Finding, Rows
+from jaximu.recordings.recording import runs_of
 
 __all__ = ["TITLES", "find"]
 

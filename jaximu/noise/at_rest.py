@@ -5,11 +5,10 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes import Prepared, prepared
-from jaximu.mistakes.base import runs_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
 from jaximu.noise.analysis import at_rest
 from jaximu.noise.cleaning import BRIDGED, filled, periodic_lines
-from jaximu.recordings.recording import Recording, recordings_of
+from jaximu.recordings.recording import Recording, recordings_of, runs_of
 
 __all__ = ["fit_noise", "noise_of"]
 

@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.mistakes.base import runs_of
+from jaximu.recordings.recording import runs_of
 
 __all__ = ["BRIDGED", "PeriodicLine", "filled", "lowest", "periodic_lines", "without_line", "without_outliers"]
 
