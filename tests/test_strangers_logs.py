@@ -284,3 +284,12 @@ def test_info_reads_the_gyroscopes_offset_from_any_rest(tmp_path, capsys):
     for (_, *value), truth in zip(read, np.degrees([0.01, -0.02, 0.005]), strict=True):
         middle, half = (float(text.replace("−", "-")) for text in value)
         assert abs(middle - truth) < 2 * half < 0.1
+
+
+def test_sections_put_together_are_not_two_devices(tmp_path):
+    """Where the turns were cut out, gravity jumps and the gyroscope rests: it says nothing of the two sensors."""
+    values = columns(by_hand())
+    rests = values[np.linalg.norm(values[:, 4:], axis=1) < 0.1][:, 1:]
+    log = save(tmp_path / "log.csv", HEAD, *lines(rests))
+    names = {finding.name for finding in inspect(read_recording(log, options=ReadOptions(rate=50.0)))}
+    assert not names & {"data.mixed_devices", "data.range"}

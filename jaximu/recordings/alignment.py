@@ -224,6 +224,8 @@ _TURN_SECONDS, _TURN_STEPS, _MOST = 10.0, 128, 24
 """Longest turn from rest to rest, s, the steps in which its rotation is put together, and turns that are enough."""
 _TURN_ANGLE = np.radians(20)
 """Angle by which gravity must turn from rest to rest to show anything."""
+_JUMP = 0.15
+"""Share of the way from one rest's gravity to the next's that may lie before and behind a jump."""
 _FACTORS = 1.15 ** np.arange(-30, 31)
 """Factors by which rates as read may have to be multiplied."""
 _SIGNS = [np.array(signs)[:, None] for signs in product((1.0, -1.0), repeat=3)]
@@ -249,7 +251,7 @@ def carried(
     """Carry the specific force (n, 3) of each rest, of `rests` (k, 2) s, to the next one by the rates (m, 3) between.
 
     What accelerates the unit on the way does not matter, nor how fast it turned. Turns that the gyroscope lacks samples
-    of, that take long or in which gravity hardly turns are left out.
+    of, that take long or in which gravity hardly turns are left out, as are those in which gravity jumps.
     """
     from scipy.spatial.transform import Rotation
 
@@ -266,7 +268,11 @@ def carried(
         and interval[slice(*np.searchsorted(rate_time, (start, stop)))].max(initial=0.0) < gap
         for (_, start), (stop, _), a, b in zip(rests, rests[1:], middle, middle[1:], strict=False)
     ]
-    used = np.flatnonzero(whole & (np.sum(up[1:] * up[:-1], axis=1) < np.cos(_TURN_ANGLE)))
+    turned = np.sum(up[1:] * up[:-1], axis=1) < np.cos(_TURN_ANGLE)
+    kept = [
+        not _jumps(force[stop:start], *up[[at, at + 1]]) for at, ((_, stop), (start, _)) in enumerate(pairwise(edges))
+    ]
+    used = np.flatnonzero(np.array(whole, bool) & turned & np.array(kept, bool))
     used = used[:: -(-len(used) // _MOST) or 1]
     if not len(used):
         return Carried(1.0, np.pi, 0)
@@ -295,6 +301,14 @@ def carried(
     alike = np.flatnonzero(best < best.min() + _ROUGH_ANGLE)
     factor = factors[alike[np.argmin(np.abs(np.log(np.abs(factors[alike]))) + 1e-9 * best[alike])]]
     return Carried(float(factor), float(best.min()), len(used))
+
+
+def _jumps(force: FloatArray, before: FloatArray, after: FloatArray) -> bool:
+    """Whether gravity jumps from one direction (3,) to another within a step of the force (n, 3): rows were cut out."""
+    up = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-300)
+    near = _JUMP * np.linalg.norm(after - before)
+    left, reached = (np.linalg.norm(up - direction, axis=1) < near for direction in (before, after))
+    return bool(np.any(left[:-1] & reached[1:]))
 
 
 def _levers(blocks: BlockMeans) -> FloatArray:
