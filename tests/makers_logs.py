@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 import io
 import json
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +14,7 @@ from dialects import ALL, Dialect, off, simulate
 from makers import habit
 
 from jaximu.cli import main
+from jaximu.cli.usage import command_of
 from jaximu.ground.page import Page
 
 __all__ = ["THIRTY", "Answer", "answer"]
@@ -62,15 +61,16 @@ def _noted(read: list[Any]) -> Iterator[None]:
     """In place of what verbs compute, keep what they read."""
     with pytest.MonkeyPatch.context() as patch:
         for verb in VERBS:
-            module = import_module(f"jaximu.cli.{verb}")
 
-            def run(logs, /, *, results, **arguments):
+            def run(command):
+                logs, *_ = vars(command).values()
                 path = logs[0] if isinstance(logs, tuple) else logs
-                read.append(arguments["log"].with_gyroscope(path).read(path, check=False, alone=True))
-                results.present(lambda: Page("It", ["It is done."]), calibration=_Document(), diagnosis=_Document())
+                read.append(command.log.with_gyroscope(path).read(path, check=False, alone=True))
+                command.results.present(
+                    lambda: Page("It", ["It is done."]), calibration=_Document(), diagnosis=_Document()
+                )
 
-            run.__signature__ = inspect.signature(module.run)  # type: ignore[attr-defined]
-            patch.setattr(module, "run", run)
+            patch.setattr(command_of(verb), "run", run)
         yield
 
 
