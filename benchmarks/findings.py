@@ -158,7 +158,7 @@ def main() -> None:
         listed = Table("Findings in measured recordings", ["recording", "findings"])
         board = Counter()
         for name, findings in by_file.items():
-            names = dict.fromkeys(name for name, _ in findings)
+            names = list(dict.fromkeys(name for name, _ in findings))
             if name.startswith("mimu4444"):
                 board.update(names)
             else:

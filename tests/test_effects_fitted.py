@@ -128,6 +128,8 @@ def test_the_earths_rotation_is_no_finding_where_the_latitude_is_known(on_earth)
 def test_several_recordings_have_headings_of_their_own(on_earth):
     """Their levels share no heading: the vertical part of the Earth's rotation, which needs none, is in the model."""
     recording, _ = on_earth
-    (earth,) = calibrate([recording, recording], wgs84_gravity(48.0)).imu.all_effects().values()
+    force = recording.accelerometer
+    later = replace(recording, accelerometer=replace(force, values=force.values + 1e-9))  # the same twice is refused
+    (earth,) = calibrate([recording, later], wgs84_gravity(48.0)).imu.all_effects().values()
     vertical = EARTH_RATE * np.sin(np.radians(48.0))
     assert np.asarray(earth.coefficients) == pytest.approx([0.0, 0.0, vertical], abs=5e-3 * EARTH_RATE)
