@@ -229,7 +229,7 @@ def calibrate_ready(
     reason would be taken for it.
     """
     calibration, findings = _calibrated_in_axes(recordings, choices, repair, losses)
-    if "gravity_direction" in calibration.rms:
+    if "gravity_direction" in calibration.rms and calibration.gains_determined():
         require_carried(calibration.rms["gravity_direction"][1], ", ".join(one.name for one in recordings))
     return calibration, findings
 

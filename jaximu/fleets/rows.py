@@ -19,7 +19,7 @@ from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.fitting import Fit
 from jaximu.estimation.problem import flatten, names_of, without_equipment
 from jaximu.estimation.solver import Failure
-from jaximu.estimation.uncertainty import weak_directions
+from jaximu.estimation.uncertainty import gains_open, weak_directions
 from jaximu.fleets.field import FieldUnit, field_row, field_unit
 from jaximu.fleets.fit import FleetUnit, fit_units
 from jaximu.fleets.jobs import Job, Settings
@@ -255,10 +255,11 @@ def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> di
     assert unit is not None
     try:
         _require(fit, row["poses"], row["file"], "accelerometer")
-        require_carried(float(rms[1]), row["file"])
+        rank, weak = weak_directions(fit.jacobian, fit.names, fit.sizes, unit.nominal)
+        if not gains_open(weak):
+            require_carried(float(rms[1]), row["file"])
     except NotPossibleError as error:
         return row | _failure(error)
-    rank, weak = weak_directions(fit.jacobian, fit.names, fit.sizes, unit.nominal)
     scales = {
         triad: np.array(row[f"{name}_nominal"][:3]) for name, triad in SENSORS.items() if row.get(f"{name}_nominal")
     }

@@ -103,7 +103,8 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     per = f"{unit} per {si}" if counts else ""
     weak = {parameter for direction in calibration.weak for parameter, _ in direction.parameters}
     scale = np.diagonal(gain)
-    exchanged = np.argmax(np.abs(gain), axis=1) != range(3)
+    largest = range(3), np.argmax(np.abs(gain), axis=1)
+    exchanged = (largest[1] != range(3)) & (np.abs(gain)[largest] > Z95 * gain_sigma[largest])
 
     def scale_words(i: int) -> str:
         if nominal is None and counts:
