@@ -1,8 +1,8 @@
 """Which named findings good recordings have, where they should have none: simulated ones by kind, and measured ones.
 
 Poses by hand come from `tests/hidden_effects.py`, which shares nothing with the library; rests and rate tables from the
-library's own simulation. Coarse steps are of 1/256 g and 1/14 °/s, as of chips of ten bits: there `data.quantisation` is
-true, and not counted. What is found in measured recordings is listed, and may be true.
+library's own simulation. Coarse steps are of 1/256 g and 1/14 °/s, as of chips of ten bits: there `data.quantisation`
+is true, and not counted. What is found in measured recordings is listed, and may be true.
 """
 
 import os
