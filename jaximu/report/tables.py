@@ -8,6 +8,7 @@ from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name
@@ -103,8 +104,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     per = f"{unit} per {si}" if counts else ""
     weak = {parameter for direction in calibration.weak for parameter, _ in direction.parameters}
     scale = np.diagonal(gain)
-    largest = range(3), np.argmax(np.abs(gain), axis=1)
-    exchanged = (largest[1] != range(3)) & (np.abs(gain)[largest] > Z95 * gain_sigma[largest])
+    along, exchanged = _along(gain, gain_sigma)
 
     def scale_words(i: int) -> str:
         if nominal is None and counts:
@@ -128,7 +128,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     def bias_words(i: int) -> str:
         if counts:
             offset = 0.0 if nominal is None else np.asarray(nominal.bias)[i]
-            change = with_interval((bias[i] - offset) / scale[i], bias_sigma[i] / scale[i], si, sign=True)
+            change = with_interval((bias[i] - offset) / along[i], bias_sigma[i] / abs(along[i]), si, sign=True)
             return change + (f" from nominal {plain(offset)}" if nominal is not None else "")
         if name == "magnetometer":
             return "hard iron"
@@ -151,6 +151,13 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
         *(row("gain", axes, misalignment_words(*axes)) for axes in permutations(range(3), 2)),
         *(row("bias", (i,), bias_words(i)) for i in range(3)),
     ]
+
+
+def _along(gain: FloatArray, sigma: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the gain (3,) of each output along the axis that it is of, and whether that is another's for certain."""
+    axis = np.argmax(np.abs(gain), axis=1)
+    along = gain[range(3), axis]
+    return along, (axis != range(3)) & (np.abs(along) > Z95 * sigma[range(3), axis])
 
 
 def _started_nominal(calibration: Calibration, name: str) -> bool:
