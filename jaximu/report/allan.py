@@ -214,7 +214,7 @@ def allan_figure(analysis: NoiseAnalysis) -> Figure:
     ]
     figure.legend(
         handles=handles,
-        loc="lower center",
+        loc="outside lower center",
         ncols=7 if len(panels) > 1 else 4,
         fontsize=8.5,
         frameon=False,

@@ -69,14 +69,8 @@ _MOST_POINTS = 3000  # drawn of one trace: more than there are pixels
 def _shown() -> type[Figure]:
     from matplotlib.figure import Figure
 
-    from jaximu.report.layout import place_panels
-
     class Shown(Figure):
-        """A figure whose panels have room for their words, and that a notebook shows without pyplot."""
-
-        def draw(self, renderer) -> None:
-            place_panels(self)
-            super().draw(renderer)
+        """A figure that a notebook shows without pyplot."""
 
         def _repr_png_(self) -> bytes:
             return png(self)
@@ -85,10 +79,10 @@ def _shown() -> type[Figure]:
 
 
 def new_figure(height: float, width: float = _WIDTH) -> Figure:
-    """Return an empty figure, inches; its panels are placed when it is drawn, so that their words have room."""
+    """Return an empty figure, inches, whose panels have room for their words."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    figure = _shown()(figsize=(width, height), facecolor="white")
+    figure = _shown()(figsize=(width, height), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
@@ -123,7 +117,7 @@ def legend(axes: Axes, columns: int = 1, where: Any = "best") -> None:
 
 def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
     """Draw the key of a panel at the bottom of its figure."""
-    figure.legend(*axes.get_legend_handles_labels(), loc="lower center", ncols=columns, fontsize=9, frameon=False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns, fontsize=9, frameon=False)
 
 
 def band(axes: Axes, x: FloatArray, value: FloatArray, half: FloatArray, color: str, **style: Any) -> None:
@@ -306,11 +300,8 @@ def residual_figure(errors: PoseAndTurnErrors) -> Figure:
         logarithmic(axes, "y")
         lost = f"by {number(_rms(errors.angle_after), 2)}° (rms), before by {number(_rms(errors.angle_before))}°"
         dressed(axes, f"Over a turn the gyroscope loses gravity's direction {lost}", ylabel="angle error (°)")
-    from jaximu.report.layout import BELOW
-
-    for axes in grid[1:]:
-        handles, labels = axes.get_legend_handles_labels()
-        axes.legend(handles[::-1], labels[::-1], loc="upper center", ncols=4, fontsize=8, frameon=False).set_gid(BELOW)
+        legend(grid[1], 2)
+    legend_below(figure, grid[-1], 4)
     grid[-1].set_xlabel("pose" + (" (turns lie between two poses)" if rows == 3 else ""))
     grid[-1].set_xlim(0.4, len(pose) + 0.6)
     grid[-1].xaxis.get_major_locator().set_params(integer=True)
