@@ -117,7 +117,8 @@ def legend(axes: Axes, columns: int = 1, where: Any = "best") -> None:
 
 def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
     """Draw the key of a panel at the bottom of its figure."""
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=columns, fontsize=9, frameon=False)
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns, fontsize=9, frameon=False)
 
 
 def band(axes: Axes, x: FloatArray, value: FloatArray, half: FloatArray, color: str, **style: Any) -> None:
