@@ -148,6 +148,11 @@ class Evidence:
         columns = self.place(block)
         return self._gram[columns, columns]
 
+    def shared(self, block: int, other: int) -> float:
+        """Return the largest share of what one block does to the conditions that another can do as well, 0 to 1."""
+        spaces = [scipy.linalg.orth(self.columns[:, self.place(k)], rcond=BLIND) for k in (block, other)]
+        return float(np.max(np.linalg.svd(spaces[0].T @ spaces[1], compute_uv=False), initial=0.0)) ** 2
+
     def observable(self, block: int) -> bool:
         """Whether the base parameters leave anything of the block that the recording reacts to."""
         columns = self.place(block)

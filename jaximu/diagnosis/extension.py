@@ -11,7 +11,7 @@ import numpy as np
 from jaximu.diagnosis.evidence import EffectBlock, Evidence, strength
 from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.improvement import on_held_out
-from jaximu.diagnosis.selection import BESIDE, SelectedCause, Selection, causes_of, one_curve, select
+from jaximu.diagnosis.selection import BESIDE, SelectedCause, Selection, causes_of, one_curve, select, strength_needed
 from jaximu.ground.errors import NotPossibleError
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
@@ -117,12 +117,23 @@ def extend(
         strongest = max(entries[chosen:], key=lambda entry: entry.statistic)
         entries = [*entries[:chosen], strongest]
         state = experiment.fit(_those_found(state.effects, entries), base.imu)
-    if guessed and len(entries) > 1 and any(entry.weak for entry in entries):
-        # Combinations of weak effects imitate what is outside the catalogue: only what is strong may keep its name.
+    imitating = _imitating(base.evidence, entries[chosen:], chosen_causes) if guessed else []
+    if imitating and len(entries) > 1:
         complete = False
-        entries = [entry for k, entry in enumerate(entries) if k < chosen or not entry.weak]
+        entries = [entry for entry in entries if entry not in imitating]
         state = experiment.fit(_those_found(state.effects, entries), base.imu)
     return Extension(entries, state, experiment, base, complete, poses, beside)
+
+
+def _imitating(evidence: Evidence, entries: Sequence[Found], causes: Sequence[SelectedCause]) -> list[Found]:
+    """Return causes that are too weak beside the others: combinations of such imitate what no catalogue has."""
+    blocks = {evidence.blocks[cause.block].name: cause.block for cause in causes}
+
+    def stands(entry: Found) -> bool:
+        others = [block for name, block in blocks.items() if name != entry.name]
+        return entry.name in blocks and entry.times > strength_needed(evidence, blocks[entry.name], others)
+
+    return [entry for entry in entries if not stands(entry)]
 
 
 def _those_found(effects: Iterable[Effect], entries: Sequence[Found]) -> list[Effect]:

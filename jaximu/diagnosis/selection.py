@@ -9,7 +9,18 @@ import numpy as np
 
 from jaximu.diagnosis.evidence import FAMILY_LEVEL, EffectBlock, Evidence, Scores
 
-__all__ = ["BESIDE", "LEVEL", "SelectedCause", "Selection", "causes_of", "criterion", "one_curve", "select", "shape_of"]
+__all__ = [
+    "BESIDE",
+    "LEVEL",
+    "SelectedCause",
+    "Selection",
+    "causes_of",
+    "criterion",
+    "one_curve",
+    "select",
+    "shape_of",
+    "strength_needed",
+]
 
 LEVEL = FAMILY_LEVEL
 """Rate of false alarms over all tests together."""
@@ -20,11 +31,12 @@ BESIDE = 0.1
 _DEFECT = 10.0
 """What a defect of the recording must lead by, which would be cut out, against an effect that explains as much."""
 _STRONG, _SEPARATE = 2.0, 1.0
-"""Detection limits that each of a pair must have beside the other: weak ones imitate what is outside the catalogue.
-Fewer will do for effects of two sensors that take nothing of each other's statistic: nothing imitates both at once."""
+"""Detection limits that each of several must have beside the others: weak ones imitate what is outside the catalogue.
+Fewer will do for the only one of its sensor, whose conditions hardly share any with the others': nothing imitates both
+at once."""
 _SHARED, _ALIKE = 0.1, 0.5
-"""Share of its statistic that one effect may take of another's to be separate from it; and beyond which two curves of
-one input are one curve that the catalogue lacks: each mends what the other is wrong by."""
+"""Share of one effect's conditions that another may make to be separate from it; and share of its statistic beyond
+which two curves of one input are one curve that the catalogue lacks: each mends what the other is wrong by."""
 _SECOND_ORDER = 0.02
 """Share of a strong effect's own χ² that it may leave and still be taken alone: columns are those about a fit without
 the effect, so that a slope of 10 % against the gain leaves 1 % of χ² in the shape of a higher power."""
@@ -187,6 +199,16 @@ def one_curve(evidence: Evidence, one: int, other: int) -> bool:
     return max(_taken(evidence, one, other), _taken(evidence, other, one)) > _ALIKE
 
 
+def strength_needed(evidence: Evidence, block: int, others: Sequence[int]) -> float:
+    """Return the detection limits that a cause must have beside others for them not to imitate what has no name."""
+    triad = evidence.blocks[block].name.partition(".")[0]
+    separate = all(
+        evidence.blocks[other].name.partition(".")[0] != triad and evidence.shared(block, other) < _SHARED
+        for other in others
+    )
+    return _SEPARATE if separate else _STRONG
+
+
 def _taken(evidence: Evidence, one: int, other: int) -> float:
     """Share of its statistic that an effect loses when another is in the model."""
     alone, beside = evidence.scores(), evidence.scores([one])
@@ -205,9 +227,7 @@ def _pairs(evidence: Evidence, first: Sequence[int], explain: Callable[..., bool
                 ranked[pair] = criterion(evidence, alone, one) + criterion(evidence, beside[one], other)
 
     def stands(one: int, other: int) -> bool:
-        names = [evidence.blocks[k].name for k in (one, other)]
-        separate = len({name.partition(".")[0] for name in names}) == 2 and abs(_taken(evidence, one, other)) < _SHARED
-        return evidence.scores([one]).times(other) > (_SEPARATE if separate else _STRONG)
+        return evidence.scores([one]).times(other) > strength_needed(evidence, other, [one])
 
     pairs: dict[tuple[int, int], float] = {}
     for pair in sorted(ranked, key=lambda pair: -ranked[pair])[:_TRIED]:

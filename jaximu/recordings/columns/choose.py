@@ -83,7 +83,11 @@ def _unnamed(table: LogTable, sensor: str, option: str) -> InputError:
         )
     else:
         text = f"{table.path}: has no column names ({len(table.columns)} columns). Name them all"
-    guess = advise(table, "gyro" if sensor == "gyro" else None).sentence(option)
+    advice = advise(table, "gyro" if sensor == "gyro" else None)
+    if advice.columns is None:  # the header names all that it has
+        file = f"; a file of its own is given with --{sensor}-log" if sensor != "accel" else ""
+        return InputError(f"{text} in order with {option}{file}.")
+    guess = advice.sentence(option)
     return InputError(f"{text} in order with {option}, after checking order and units of this guess: {guess}")
 
 
