@@ -26,9 +26,9 @@ def find(samples: Samples) -> list[Finding]:
     if clocks is None or gyroscope is None or clocks.explained < _EXPLAINED:
         return []
     ends = clocks.late(gyroscope.time[[0, -1]])
-    drifts = abs(clocks.drift) > _SURE * clocks.drift_sigma and abs(float(np.diff(ends)[0])) > _LEAST
-    delay = max(abs(clocks.offset), *np.abs(ends)) if drifts else abs(clocks.offset)
-    if not drifts and (delay < _LEAST or delay < _SURE * clocks.sigma):
+    drifts = abs(clocks.drift) > _SURE * clocks.drift_sigma
+    delay = float(np.max(np.abs(ends))) if drifts else abs(clocks.offset)
+    if delay < _LEAST or (not drifts and delay < _SURE * clocks.sigma):
         return []
 
     right = clocks if drifts else clocks._replace(drift=0.0, drift_sigma=0.0)  # sensors of one clock

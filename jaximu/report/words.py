@@ -49,17 +49,17 @@ _SCATTER = {
     "accelerometer": (
         "Accelerometer at rest",
         "the poses' averages",
-        "such as a nonlinear axis, temperature, a unit that was still warming up, or a drifting bias",
+        "such as a nonlinear axis, temperature, a unit that was still warming up, a drifting bias, or steps coarser than the noise",
     ),
     "turns": (
         "Turns",
         "the turns",
-        "such as timing, a nonlinear or acceleration-sensitive gyroscope, or a filter's lag",
+        "such as timing, a nonlinear or acceleration-sensitive gyroscope, a filter's lag, or a bias that drifts",
     ),
     "gyroscope": (
         "Gyroscope at rest",
         "the gyroscope's averages at rest",
-        "such as a bias that wanders with time or temperature, or that depends on orientation",
+        "such as a bias that wanders with time or temperature, or depends on orientation, or steps coarser than the noise",
     ),
 }
 
