@@ -49,7 +49,8 @@ _SCATTER = {
     "accelerometer": (
         "Accelerometer at rest",
         "the poses' averages",
-        "such as a nonlinear axis, temperature, a unit that was still warming up, a drifting bias, or steps coarser than the noise",
+        "such as a nonlinear axis, temperature, a unit that was still warming up, a drifting bias, or steps coarser "
+        "than the noise",
     ),
     "turns": (
         "Turns",
@@ -59,7 +60,8 @@ _SCATTER = {
     "gyroscope": (
         "Gyroscope at rest",
         "the gyroscope's averages at rest",
-        "such as a bias that wanders with time or temperature, or depends on orientation, or steps coarser than the noise",
+        "such as a bias that wanders with time or temperature, or depends on orientation, or steps coarser than the "
+        "noise",
     ),
 }
 
