@@ -46,8 +46,8 @@ def find(samples: Samples) -> list[Finding]:
         Finding(
             "data.zeros",
             first.rows(rows),
-            f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(int(rows[0]))}: the "
-            "logger wrote rows without a measurement. They are left out.",
+            f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(int(rows[0]))}: a "
+            "transfer failed, or the logger filled them in. They are left out.",
             without=without,
         )
     ]
