@@ -153,7 +153,8 @@ def contradictions(drawn: Drawn) -> list[str]:
         wrong += [f"calibrate lacks: {text}" for text in texts - set(calibration.notes)]
         wrong += of_words(sentences(calibration.summary()))
     if checked is not None:
-        wrong += [f"check lacks: {text}" for text in texts - set(checked.notes)]
+        fitted = {finding.text for finding in (calibrated or (None, ()))[1]}
+        wrong += [f"check lacks: {text}" for text in (texts | fitted) - set(checked.notes)]
         wrong += of_words(sentences(checked.summary()))
     if diagnosed is not None:
         wrong += [f"diagnose lacks: {text}" for text in texts - {finding.text for finding in diagnosed.preflight}]
