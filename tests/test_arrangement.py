@@ -16,7 +16,7 @@ from jaximu.mistakes import prepare
 from jaximu.recordings.alignment import Clocks, angle_of, clocks, rotation_of, signed_permutation, turning
 from jaximu.recordings.readers import read_recording
 from jaximu.simulation import consumer_noise, draw_imu, simulate
-from jaximu.simulation.protocols import HandHeld
+from jaximu.simulation.protocols import HandHeld, RateTable
 
 ONE = np.eye(3)
 AXES = [np.diag(signs) @ ONE[list(order)] for order in permutations(range(3)) for signs in product((1, -1), repeat=3)]
@@ -164,6 +164,16 @@ def test_clocks_that_agree_are_not_mentioned(unit_logs):
     for unit in range(8):
         recording = read_recording(unit_logs / f"unit{unit:03d}.parquet")
         assert prepare(recording).findings == ()
+
+
+@pytest.mark.parametrize("seed", [5, 8, 13])
+@pytest.mark.parametrize("late", [0.0, 0.15])
+def test_errors_of_an_accelerometer_on_a_rate_table_are_no_lag(seed, late):
+    """Gravity lies along the axis of the table: the rate changes, and nothing turns but by the sensors' errors."""
+    recording, _ = simulate(draw_imu(seed), RateTable(rates=(45.0, 90.0)), consumer_noise(), rate=100.0, seed=seed)
+    measured = clocks(*arguments(recording, late))
+    assert measured.offset == pytest.approx(late, abs=0.005)
+    assert abs(measured.drift) < 3 * measured.drift_sigma
 
 
 def test_a_negated_gyroscope_is_adequate_and_said(recording):

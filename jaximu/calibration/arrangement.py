@@ -146,6 +146,7 @@ def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
     option = "--accel-scale" if name == "accelerometer" else "--gyro-scale"
     findings = []
     whole = np.zeros(3)
+    like = "another full-scale range" + (", or a sample rate that is as far off" if name == "gyroscope" else "")
     for factor in _FACTORS:
         whole[np.abs(np.log(sizes / factor)) < _NEAR] = factor
     if whole.all() and len(set(whole)) == 1:
@@ -154,7 +155,7 @@ def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
                 "data.range",
                 (),
                 f"{name}: its gain is {np.exp(np.mean(np.log(sizes))):.3g} times the nominal on all axes, as with "
-                f"another full-scale range. State the range that was set ({option}); the calibration includes it.",
+                f"{like}. State the range that was set ({option}); the calibration includes it.",
             )
         ]
     usual = float(np.exp(np.mean(np.log(sizes))))

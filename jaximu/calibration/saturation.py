@@ -57,7 +57,8 @@ def saturation(calibration: Calibration) -> list[Finding]:
             (),
             f"gyroscope: its output bends towards a limit of about {np.degrees(limits[best]):.3g} °/s: straightened, "
             f"it carries gravity over the turns {np.sqrt(variance / bent[best]):.2g} times better. Quick turns read "
-            "too little, and the gain is wrong. Choose a larger range, or turn more slowly, and record again.",
+            "too little, and the gain is wrong. A gyroscope that is as nonlinear itself (gyro.cubic) looks alike. "
+            "Choose a larger range, or turn more slowly, and record again.",
             rivals=("gyro.cubic",),
             spoils=True,
         )

@@ -13,7 +13,7 @@ from jaximu.calibration import Calibration
 from jaximu.calibration.arrangement import axes_unlike
 from jaximu.calibration.calibration import provenance, require_another, require_calibration
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
-from jaximu.calibration.recipe import require_gravity
+from jaximu.calibration.recipe import Choices, calibrate_ready, require_gravity
 from jaximu.calibration.systematic import History, noise_at_rest
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.diagnosis.comparison import FollowedUnit, Fresh, Old, Question, Widened, candidates, scatter_about_a_fit
@@ -27,7 +27,7 @@ from jaximu.estimation.rows import TEMPERATURE
 from jaximu.estimation.uncertainty import describe, label
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, holm, normal_sf
-from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed, size
@@ -36,6 +36,7 @@ from jaximu.mistakes import prepared
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
 from jaximu.noise.at_rest import noise_of
+from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import POWER_ON
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import SegmentationOptions, observed_poses, segment
@@ -121,6 +122,7 @@ def _checked(
 ) -> Validity:
     """Compare with recordings that were looked over: by their poses, or by a filter where there are too few."""
     old = Old.of(calibration, gravity)
+    recordings, findings = _without_losses(recordings, Choices(gravity, noise, segmentation))
     try:
         parts = tuple(segment(recording, segmentation) for recording in recordings)
         if len(recordings) == 1 and len(parts[0].intervals) < _FEWEST_POSES:
@@ -130,8 +132,22 @@ def _checked(
     except NotPossibleError as error:
         return _followed(calibration, old, recordings, gravity, noise, level, error)
     data = RecordedByHand(parts, observed_poses(parts, gravity.value, noise=noise))
-    notes = [note for source in (*recordings, *parts) for note in source.notes]
-    return _compared(calibration, old, data, noise, level, notes)
+    notes = [finding.text for finding in findings]
+    notes += [note for source in (*recordings, *parts) for note in source.notes]
+    validity = _compared(calibration, old, data, noise, level, notes)
+    spoiling = [finding.text for finding in findings if finding.spoils]
+    if validity.verdict != "valid" and spoiling:
+        raise NotPossibleError(f"this recording cannot show whether the calibration is still valid. {spoiling[0]}")
+    return validity
+
+
+def _without_losses(recordings: Sequence[Recording], choices: Choices) -> tuple[Sequence[Recording], Sequence[Finding]]:
+    """Return recordings without the turns that lost time, as a fresh fit shows them, and what else only it shows."""
+    try:
+        fresh, findings = calibrate_ready(recordings, choices)
+    except JaximuError:  # too few poses for a calibration, which may do for a check
+        return recordings, ()
+    return [part.recording for part in fresh.segmentations], findings
 
 
 def _compared(

@@ -700,11 +700,17 @@ class _Course:
         # where no error is smaller, the likelihood must say it beyond the nat that each number may gain by chance
         least = 0.0 if full or gain.smaller(state.effects) else _GUESSED + sum(effect.size for effect in state.effects)
         if gain.log_likelihood <= least and not self.chosen:
-            errors = gain.errors(gain.best_kind(state.effects[0]))
-            self.notes.append(
-                f"{self._names()} would explain part of this recording but does not improve data that was not fitted "
-                f"({gain.data}: {errors}, log-likelihood {gain.log_likelihood:+.1f}), and was not kept."
-            )
+            errors = f"{gain.errors(gain.best_kind(*state.effects))}, log-likelihood {gain.log_likelihood:+.1f}"
+            if gain.log_likelihood > 0:
+                gained = f"gains no more than chance may on data that was not fitted ({gain.data}: {errors})"
+            elif gain.smaller(state.effects):
+                gained = (
+                    "makes errors smaller on data that was not fitted, but that data less probable "
+                    f"({gain.data}: {errors})"
+                )
+            else:
+                gained = f"does not improve data that was not fitted ({gain.data}: {errors})"
+            self.notes.append(f"{self._names()} would explain part of this recording but {gained}, and was not kept.")
             self._settle(found=[], state=base, complete=False)
         elif full:
             self._settle(complete=False)

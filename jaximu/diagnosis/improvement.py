@@ -58,17 +58,18 @@ class Gain:
 
     def smaller(self, effects: Sequence[Effect]) -> bool:
         """Return whether some error of what was left out is smaller with the extension."""
-        kinds = {self.best_kind(effect) for effect in effects}
-        return any(self.after.rms[kind][0] < self.before.rms[kind][0] for kind in kinds)
+        kind = self.best_kind(*effects)
+        return self.after.rms[kind][0] < self.before.rms[kind][0]
 
     def errors(self, kind: str) -> str:
         """Return the rms errors of a kind of residual without and with the extension, as a person reads them."""
         return change(self.before.rms[kind][0], *self.after.rms[kind])
 
-    def best_kind(self, effect: Effect) -> str:
-        """Return the kind of residual that an effect improves most."""
+    def best_kind(self, *effects: Effect) -> str:
+        """Return the kind of residual that effects improve most, among those of their sensors."""
         first, *others = self.before.rms  # the accelerometer's comes first
-        kinds = {"accelerometer": [first], "gyroscope": others}.get(effect.owner) or [first, *others]
+        by_owner = {"accelerometer": [first], "gyroscope": others}
+        kinds = [kind for effect in effects for kind in by_owner.get(effect.owner) or [first, *others]]
         return max(kinds, key=lambda kind: self.before.rms[kind][0] / max(self.after.rms[kind][0], 1e-300))
 
 

@@ -96,7 +96,9 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
     **Arguments:** `state`: a fit that leaves something unexplained; `held`: another recording of the unit, on which
     the gain is measured (and must be one) where the curve belongs to the unit.
     """
-    folds = _folds(experiment)
+    folds = _predicted_folds(experiment, state)
+    if not folds:
+        return None
     base = _left_out(state, np.zeros((len(state.conditions), 0)), 1.0, folds)
     best: tuple[float, Curve, float, Any] | None = None
     for effect, columns, root in curves(experiment, state):
@@ -132,9 +134,7 @@ def left_out(experiment: Experiment, before: State, after: State) -> Gain:
     Only the numbers are fitted without a part; the effects, and their inner parameters, were chosen with all of it.
     """
     nothing = np.zeros((len(after.conditions), 0))
-    folds = _folds(experiment)
-    # a part that one of the two cannot predict at all is no comparison
-    folds = [fold for fold in folds if all(_left_out(state, nothing, 1.0, [fold])[2] for state in (before, after))]
+    folds = _predicted_folds(experiment, before, after)
     predictions = [_prediction(experiment, _left_out(state, nothing, 1.0, folds)) for state in (before, after)]
     return Gain(predictions[0], predictions[1], f"{len(folds)} parts left out in turn")
 
@@ -186,6 +186,12 @@ def _folds(experiment: Experiment) -> list[NDArray[np.bool_]]:
     """Conditions (n,) that touch each of the parts, in the order of time, which are left out in turn."""
     parts = [experiment.real.touching(part) for part in experiment.parts()]
     return [rows for rows in parts if rows.any()]
+
+
+def _predicted_folds(experiment: Experiment, *states: State) -> list[NDArray[np.bool_]]:
+    """Conditions (n,) of the parts that all fits predict from the others: the rest are no comparison."""
+    nothing = np.zeros((len(states[0].conditions), 0))
+    return [fold for fold in _folds(experiment) if all(_left_out(state, nothing, 1.0, [fold])[2] for state in states)]
 
 
 def _left_out(state: State, columns: FloatArray, strength: float, folds) -> tuple[float, float, int, FloatArray]:

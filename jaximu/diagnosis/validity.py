@@ -208,6 +208,8 @@ class Validity(Result, Document, page="validity"):
     def headline(self) -> str:
         """Return the one sentence a person wants first."""
         ratio = f"χ² per condition {self.chi_squared / self.freedom:.2f}, p {probability(self.p_value)}"
+        if self.verdict != "valid" and self.chi_squared <= self.freedom:
+            ratio = f"p {probability(self.p_value)} in one direction, though noise is expected to scatter more in all"
         if self.verdict == "valid":
             return f"The calibration is still valid: it predicts this recording to within its uncertainty ({ratio})."
         if self.verdict == "unexplained" and self.history is not None:

@@ -26,9 +26,9 @@ def find(samples: Samples) -> list[Finding]:
     if clocks is None or gyroscope is None or clocks.explained < _EXPLAINED:
         return []
     ends = clocks.late(gyroscope.time[[0, -1]])
-    drifts = abs(clocks.drift) > _SURE * clocks.drift_sigma and abs(float(np.diff(ends)[0])) > _LEAST
-    delay = max(abs(clocks.offset), *np.abs(ends)) if drifts else abs(clocks.offset)
-    if not drifts and (delay < _LEAST or delay < _SURE * clocks.sigma):
+    drifts = abs(clocks.drift) > _SURE * clocks.drift_sigma
+    delay = float(np.max(np.abs(ends))) if drifts else abs(clocks.offset)
+    if delay < _LEAST or (not drifts and delay < _SURE * clocks.sigma):
         return []
 
     right = clocks if drifts else clocks._replace(drift=0.0, drift_sigma=0.0)  # sensors of one clock
@@ -41,11 +41,14 @@ def find(samples: Samples) -> list[Finding]:
         text = (
             f"gyroscope: its clock runs {1e3 * abs(clocks.drift):.3g} ms a second "
             f"{'slow' if clocks.drift < 0 else 'fast'} against the accelerometer's: its stamps are {ends[0]:.3f} s "
-            f"late at the start and {ends[1]:.3f} s at the end. --repair puts them on the accelerometer's clock."
+            f"late at the start and {ends[1]:.3f} s at the end, as if its clock were another, or one of the two lost "
+            "samples here and there. --repair puts them on the accelerometer's clock."
         )
-        return [Finding("data.clocks", (), text, "--repair", spoils=delay > _HARMFUL, apply=apply)]
+        rivals = ("data.lost_samples",)
+        return [Finding("data.clocks", (), text, "--repair", rivals, spoils=delay > _HARMFUL, apply=apply)]
     text = (
         f"gyroscope: its stamps are {1e3 * abs(clocks.offset):.3g} ± {1.96e3 * clocks.sigma:.2g} ms "
-        f"{'late' if clocks.offset > 0 else 'early'} against the accelerometer's. --repair shifts them."
+        f"{'late' if clocks.offset > 0 else 'early'} against the accelerometer's, or a filter delays "
+        "it by as much (gyro.lag). --repair shifts them."
     )
-    return [Finding("setup.time_offset", (), text, "--repair", spoils=delay > _HARMFUL, apply=apply)]
+    return [Finding("setup.time_offset", (), text, "--repair", ("gyro.lag",), spoils=delay > _HARMFUL, apply=apply)]

@@ -73,7 +73,7 @@ def _unrelated(samples: Samples) -> list[Finding]:
             (),
             f"The gyroscope, however it is mounted and delayed, explains {100 * explained:.0f} % of how "
             "gravity turns in the accelerometer: the two did not move together. Their columns come from different "
-            "recordings or devices.",
+            "recordings or devices, or the gyroscope failed.",
             rivals=("data.clocks",),
             spoils=True,
             refuses="gyroscope",
@@ -126,7 +126,7 @@ def _changed(samples: Samples) -> list[Finding]:
                 "data.units",
                 accelerometer.rows([int(np.searchsorted(accelerometer.time, rests[rest - 1, 1]))]),
                 f"From about {rests[rest, 0]:.1f} s on, the accelerometer's norm at rest is {factor:.3g} times what it "
-                "was before: the unit changes within the file. Cut it there.",
+                "was before: the unit changes within the file, or the range does. Cut it there.",
                 spoils=True,
                 refuses="accelerometer",
             )
@@ -151,8 +151,8 @@ def _changed(samples: Samples) -> list[Finding]:
             accelerometer.rows([row]),
             f"From about {accelerometer.time[row]:.1f} s on, the gyroscope's bias and "
             + ("the noise of both sensors" if noisier > 5.0 else "the accelerometer's output")
-            + " are others: the rows before and after come from different devices, or settings. Cut the recording "
-            "there.",
+            + " are others: the rows before and after come from different devices or settings, or it was switched "
+            "off in between. Cut the recording there.",
             spoils=True,
         )
     ]

@@ -34,7 +34,7 @@ def find(samples: Samples) -> list[Finding]:
                 "data.gravity_free",
                 (),
                 f"accelerometer: the median of its norm is {middle:.2g} m/s², far from gravity: gravity was taken out "
-                "(a linear acceleration). Log the raw accelerometer.",
+                "(a linear acceleration), or the unit is not m/s². Log the raw accelerometer, with its unit.",
                 spoils=True,
                 refuses="gravity",
             )

@@ -16,6 +16,10 @@ TITLES = {"data.zeros": "rows of zeros"}
 
 _MOST = 0.3
 """Share of rows beyond which a sensor is not interrupted but silent."""
+_BESIDE = 2
+"""Rows on either side, that a smooth motion has near what it reads between them."""
+_BEYOND = 6.0
+"""Noise and steps by which the rows beside must lie off zero on an axis, all to one side."""
 
 
 def find(samples: Samples) -> list[Finding]:
@@ -26,12 +30,11 @@ def find(samples: Samples) -> list[Finding]:
         zero = nothing[name]
         if not zero.any() or zero.mean() > _MOST or not len(sensor):
             continue
-        if name == "gyroscope":
-            if zeroed_at_rest(samples) is not None:
-                continue
-            zero = _interrupted(sensor, zero)
-            if samples.shared and "accelerometer" in without:
-                zero[without["accelerometer"]] |= nothing[name][without["accelerometer"]]
+        if name == "gyroscope" and zeroed_at_rest(samples) is not None:
+            continue
+        zero = _interrupted(sensor, zero)
+        if name == "gyroscope" and samples.shared and "accelerometer" in without:
+            zero[without["accelerometer"]] |= nothing[name][without["accelerometer"]]
         if zero.any():
             without[name] = np.flatnonzero(zero)
     if not without:
@@ -43,24 +46,27 @@ def find(samples: Samples) -> list[Finding]:
         Finding(
             "data.zeros",
             first.rows(rows),
-            f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(int(rows[0]))}: the "
-            "logger wrote rows without a measurement. They are left out.",
+            f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(int(rows[0]))}: a "
+            "transfer failed, or the logger filled them in. They are left out.",
             without=without,
         )
     ]
 
 
 def _interrupted(sensor: Sensor, zero: np.ndarray) -> np.ndarray:
-    """Keep the runs of zeros whose neighbours differ from zero: a gyroscope at rest may read zero by rounding."""
+    """Keep the runs of zeros that the rows beside them rule out.
+
+    A gyroscope at rest, a turn that is reversed and a fall may read zero by rounding. Then zero lies between the rows
+    before and after, on every axis, or within 6 σ of noise and a step of one of them: one in 10⁹ rows does not.
+    """
     kept = np.zeros_like(zero)
     scale = sensor.noise + sensor.step
     for start, stop in runs_of(zero):
-        before, after = np.arange(max(0, start - 5), start), np.arange(stop, min(len(zero), stop + 5))
-        sides = [np.median(sensor.values[part[~zero[part]]], axis=0) for part in (before, after) if (~zero[part]).any()]
-        if not sides:
+        near = np.r_[max(0, start - _BESIDE) : start, stop : min(len(zero), stop + _BESIDE)]
+        near = sensor.values[near[~zero[near]]]
+        if not len(near):
             continue
-        # a rate that goes through zero has other signs on either side
-        least = np.where(np.sign(sides[0]) == np.sign(sides[-1]), np.minimum(np.abs(sides[0]), np.abs(sides[-1])), 0.0)
-        if np.max(least / np.maximum(scale, 1e-300)) > 6:
+        least = np.where(np.ptp(np.sign(near), axis=0) == 0, np.min(np.abs(near), axis=0), 0.0)
+        if np.max(least / np.maximum(scale, 1e-300)) > _BEYOND:
             kept[start:stop] = True
     return kept

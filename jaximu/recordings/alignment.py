@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import student_isf
 
 __all__ = [
     "CORRELATED",
@@ -39,12 +40,19 @@ _FAR = 0.3
 """rad between blocks beyond which they count for less: the equation is one of small angles."""
 _FEWEST = 20
 _LAGS = np.arange(-8.0, 8.05, 0.1)  # s
+_STEPS = (0.06, 0.03, 0.03, 0.02, 0.02)
+"""Seconds to either side over which the turning is differentiated by the lag, pass by pass."""
 _PARTS = 12
 """Parts of a recording from whose scatter the uncertainty of a time offset is taken."""
 CORRELATED = 0.6
 """Correlation from which on the gyroscope turns as gravity does in the accelerometer."""
 _WELL = 0.8
 """Share of the turning that the gyroscope must explain for its stamps to be sought close to where they are."""
+
+
+_SHEARS = [np.diag([1.0, -1.0, 0.0]), np.diag([0.0, 1.0, -1.0])]
+"""A basis (5, 3, 3) of the symmetric matrices without a common scale."""
+_SHEARS += [np.eye(3)[[a]].T @ np.eye(3)[[b]] + np.eye(3)[[b]].T @ np.eye(3)[[a]] for a, b in ((0, 1), (0, 2), (1, 2))]
 
 
 class Turning(NamedTuple):
@@ -317,6 +325,18 @@ def _levers(blocks: BlockMeans) -> FloatArray:
     return np.cross(weighted[:, None], np.eye(3)).swapaxes(1, 2)
 
 
+def _accelerometer_columns(blocks: BlockMeans, rate: FloatArray) -> FloatArray:
+    """The derivatives (3 n, 8) of the weighted change of force, turned by (n, 3), by the accelerometer's errors.
+
+    For f = K g + b with K = 1 + S and a symmetric S, the change is f × θ + S (f × θ) − (S f) × θ − b × θ to first
+    order. An S of one size on all axes changes nothing, and a turned one is a turned gyroscope.
+    """
+    turned = np.cross(blocks.force, rate)
+    shears = [turned @ shear - np.cross(blocks.force @ shear, rate) for shear in _SHEARS]
+    biases = [np.cross(axis, rate) for axis in np.eye(3)]
+    return (blocks.weight[:, None, None] * np.stack([*shears, *biases], axis=2)).reshape(-1, 8)
+
+
 def _columns(levers: FloatArray, turned: FloatArray) -> FloatArray:
     """The derivatives (3 n, 9) of the weighted f × M Δθ by the entries of M."""
     return (levers[..., None] * turned[:, None, None]).reshape(-1, 9)
@@ -343,8 +363,9 @@ class Clocks(NamedTuple):
 def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rate: FloatArray) -> Clocks | None:
     """Estimate by how much the gyroscope's stamps are late, as a straight line; None where nothing turns.
 
-    Each part of the recording has the lag at which the gyroscope explains its turning best. Deviations are taken from
-    the scatter of the parts about the line.
+    Each part of the recording has the lag at which the gyroscope explains its turning best, beside errors of the
+    accelerometer's gain and bias. Deviations are taken from the scatter of the parts about the line, and are of 95 %
+    intervals by Student over 1.96.
     """
     blocks = gravity_turning(force_time, force, rate_time, rate)
     if blocks is None or len(blocks.change) < 6 * _FEWEST:
@@ -369,11 +390,6 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
         return power - np.einsum("...i,...ij,...j->...", product, inverse, product)
 
-    def missed(lag: FloatArray, matrix: FloatArray) -> FloatArray:
-        """Return the sum of squares (P,) of each part that a matrix (9,) leaves at a lag (n + 1,)."""
-        explained = (_columns(levers, blocks.turned(lag)) @ matrix).reshape(-1, 3)
-        return np.add.reduceat(np.sum((changes - explained) ** 2, axis=1), edges[:-1])
-
     line = np.zeros(2)  # of the lag: at the middle, and by time
     power = np.add.reduceat(np.sum(changes**2, axis=1), edges[:-1])
     whole = float(power.sum())
@@ -389,25 +405,30 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
             trusted = residuals.min(axis=0) < (1 - _WELL) * power
             if trusted.sum() >= 3:
                 line = _robust_line(places[trusted], _LAGS[best[trusted]])
-    for step in (0.06, 0.03, 0.01, 0.01, 0.005):
+    for step in _STEPS:
         lag = line[0] + line[1] * (blocks.centre - middle)
-        columns = _columns(levers, blocks.turned(lag))
+        turned = blocks.turned(lag)
+        columns = _columns(levers, turned)
         matrix = np.asarray(np.linalg.lstsq(columns, changes.ravel(), rcond=1e-6)[0], np.float64)
-        early, there, later = (missed(lag + shift, matrix) for shift in (-step, 0.0, step))
-        bends = np.maximum(early - 2 * there + later, 0.0) / step**2
-        slope = early - later  # of a part: its shift by its curvature, no further than two steps
-        shifts = slope / np.maximum(np.maximum(2 * bends * step, np.abs(slope) / (2 * step)), 1e-300)
-        good = bends > 1e-3 * bends.max()
+        # where the rate hardly changes, errors of the accelerometer would pass for lags
+        columns = np.hstack([columns, _accelerometer_columns(blocks, turned @ matrix.reshape(3, 3).T)])
+        rest = changes.ravel() - columns @ np.linalg.lstsq(columns, changes.ravel(), rcond=1e-6)[0]
+        by_lag = _columns(levers, (blocks.turned(lag + step) - blocks.turned(lag - step)) / (2 * step)) @ matrix
+        information, slope = (np.add.reduceat(by_lag * part, 3 * edges[:-1]) for part in (by_lag, rest))
+        shifts = np.clip(slope / np.maximum(information, 1e-300), -2 * step, 2 * step)
+        good = information > 1e-3 * information.max()
         if good.sum() < 3:
             return None
         design = np.stack([np.ones(int(good.sum())), places[good]], axis=1)
-        # turns that are accelerated much err by more than their curvature says: no part counts for more than twice
-        weight = np.minimum(bends[good], 2 * np.median(bends[good]))
+        # turns that are accelerated much err by more than the noise lets them: no part counts for more than twice
+        weight = np.minimum(information[good], 2 * np.median(information[good]))
         inverse = np.linalg.inv((design * weight[:, None]).T @ design)
         change = inverse @ (design.T @ (weight * shifts[good]))
         line = line + change
-    rest = shifts[good] - design @ change
-    spread = float(np.sum(weight * rest**2)) / max(int(good.sum()) - 2, 1)
+    freedom = int(good.sum()) - 2
+    spread = float(np.sum(weight * (shifts[good] - design @ change) ** 2)) / freedom
+    # parts that agree by chance are no surer than the noise of their samples lets them be
+    spread = max(spread * float(student_isf(0.025, freedom) / 1.96) ** 2, float(np.mean(rest**2)))
     sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))
     columns = _columns(levers, blocks.turned(line[0] + line[1] * (blocks.centre - middle)))
     explained = 1 - float(left(columns.T @ columns, columns.T @ changes.ravel(), whole)) / max(whole, 1e-300)

@@ -176,14 +176,17 @@ def _gained(diagnosis: Diagnosis) -> str:
     gain, learned = diagnosis.gain, diagnosis.learned
     effects = [cause.effect for cause in diagnosis.named]
     if gain is not None:
-        effect, subject = effects[0], "them" if len(effects) > 1 else "it"
+        subject = "them" if len(effects) > 1 else "it"
     elif learned is not None:
-        gain, effect, subject = learned.gain, learned.effect, "this as a smooth curve"
+        gain, effects, subject = learned.gain, [learned.effect], "this as a smooth curve"
     else:
         return ""
-    kind = gain.best_kind(effect)
+    kind = gain.best_kind(*effects)
     (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
     data = f"the error on data not fitted ({gain.data})"
+    if after >= before and gain.log_likelihood > 0:
+        likelier = f"data not fitted ({gain.data}) more probable (log-likelihood {gain.log_likelihood:+.1f})"
+        return f"Modelling {subject} makes {likelier}; their error stays near {size(after, unit)}."
     if after >= before:
         return f"Modelling {subject} does not reduce {data}, {size(after, unit)}."
     little = "only " if after > _LITTLE * before else ""
@@ -196,9 +199,15 @@ def _number(diagnosis: Diagnosis) -> tuple[str, str]:
     if learned is not None:
         gain = learned.gain
     if gain is not None:
-        kind = gain.best_kind(diagnosis.named[0].effect if learned is None else learned.effect)
-        meaning = f"rms of {_kind_words(diagnosis)[kind]} on data not fitted ({gain.data}), without and with the "
-        return gain.errors(kind), meaning + ("extension" if learned is None else "curve")
+        effects = [learned.effect] if learned is not None else [cause.effect for cause in diagnosis.named]
+        kind, subject = gain.best_kind(*effects), "extension" if learned is None else "curve"
+        if gain.smaller(effects) or gain.log_likelihood <= 0:
+            meaning = f"rms of {_kind_words(diagnosis)[kind]} on data not fitted ({gain.data}), without and with the "
+            return gain.errors(kind), meaning + subject
+        return (
+            f"{gain.log_likelihood:+.1f}",
+            f"log-likelihood that the {subject} gains on data not fitted ({gain.data})",
+        )
     index = _shown_kind(diagnosis)
     shown = diagnosis.experiment.real.kinds[index]
     measured = np.sqrt(np.mean(np.square(diagnosis.experiment.errors(diagnosis.base)[index])))
@@ -438,7 +447,7 @@ def _shown_kind(diagnosis: Diagnosis) -> int:
     if diagnosis.learned is not None:
         return kinds.index(diagnosis.learned.gain.best_kind(diagnosis.learned.effect))
     if diagnosis.named and diagnosis.gain is not None:
-        return kinds.index(diagnosis.gain.best_kind(diagnosis.named[0].effect))
+        return kinds.index(diagnosis.gain.best_kind(*(cause.effect for cause in diagnosis.named)))
     present = np.unique(diagnosis.experiment.real.kind)
     first = diagnosis.checks[: len(present)]
     return int(present[first.index(min(first, key=lambda check: check.p_value))])

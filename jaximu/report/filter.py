@@ -18,7 +18,7 @@ from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.report.attitude import mounting_words
 from jaximu.report.calibration import calibration_page
 from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, new_figure, zero_line
-from jaximu.report.words import gravity_statements, limits
+from jaximu.report.words import BEYOND, gravity_statements, limits
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,10 +41,13 @@ def statements(calibration: Calibration, history: History) -> Iterator[Statement
         yield Statement("Diverged", sentence(text), True)
     nis = calibration.filter["nis"]
     measured = int(np.sum(history.freedom > 0))
-    fits = 0.7 < nis < 1.4
+    widened = float(np.sqrt(max(calibration.filter.get("noise", {}).values(), default=1.0)))
+    fits = 0.7 < nis < 1.4 and text is None and widened < BEYOND
+    cause = "noise explains them" if fits else "an unmodelled effect, or the noise stated is not this unit’s"
     text = (
-        f"Over {measured} updates the squared innovations are {number(nis, 2)} times what their uncertainty "
-        f"expects: {'noise explains them' if fits else 'an unmodelled effect, or the noise stated is not this unit’s'}."
+        f"Over {measured} updates the squared innovations are {number(nis, 2)} times what their uncertainty expects"
+        + (f", once their noise is taken as {number(widened, 2)} times the unit's" if widened >= BEYOND else "")
+        + f": {cause}."
     )
     yield Statement("Innovations", text, not fits)
     yield Statement("Convergence", _convergence(history))

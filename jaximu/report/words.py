@@ -9,11 +9,13 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import WeakDirection
+from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.page import Statement
 from jaximu.ground.quantities import Z95, listed, number, sentence, size
 from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
 __all__ = [
+    "BEYOND",
     "counts",
     "direction_words",
     "gravity_statements",
@@ -24,7 +26,9 @@ __all__ = [
     "weak_statements",
 ]
 
-_BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
+BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
+_CHANCE = 0.01
+"""Share of recordings in which noise alone scatters more than a scatter that is called noise."""
 
 
 def counts(calibration: Calibration) -> tuple[int, int]:
@@ -49,17 +53,19 @@ _SCATTER = {
     "accelerometer": (
         "Accelerometer at rest",
         "the poses' averages",
-        "such as a nonlinear axis, temperature, a unit that was still warming up, or a drifting bias",
+        "such as a nonlinear axis, temperature, a unit that was still warming up, a drifting bias, or steps coarser "
+        "than the noise",
     ),
     "turns": (
         "Turns",
         "the turns",
-        "such as timing, a nonlinear or acceleration-sensitive gyroscope, or a filter's lag",
+        "such as timing, a nonlinear or acceleration-sensitive gyroscope, a filter's lag, or a bias that drifts",
     ),
     "gyroscope": (
         "Gyroscope at rest",
         "the gyroscope's averages at rest",
-        "such as a bias that wanders with time or temperature, or that depends on orientation",
+        "such as a bias that wanders with time or temperature, or depends on orientation, or steps coarser than the "
+        "noise",
     ),
 }
 
@@ -93,15 +99,23 @@ def trust(calibration: Calibration) -> Iterator[Statement]:
 
 def scatter_statements(calibration: Calibration) -> list[Statement]:
     """Say of each kind of error how much it scatters, in multiples of the noise."""
-    entries = []
+    entries, (poses, turns) = [], counts(calibration)
+    norms = 1 if "gravity_norm" in calibration.rms else 3
+    conditions = {"accelerometer": norms * poses - 9, "turns": 2 * turns - 9, "gyroscope": 3 * poses - 3}
+    freedom = {name: max(left, 1) for name, left in conditions.items()}
     for name, (about, subject, causes) in _SCATTER.items():
         excess = calibration.excess.get(name)
         if excess is None or (name == "turns" and not counts(calibration)[1]):
             continue
         times = np.sqrt(1 + excess)
-        large = times >= _BEYOND
+        large = times >= BEYOND
         how = "as much as" if times < 1.1 else f"{times:.1f} times as much as"
-        why = f"something beyond noise is there, {causes}." if large else "noise explains what the model leaves."
+        if large:
+            why = f"something beyond noise is there, {causes}."
+        elif chi2_sf(times**2 * freedom[name], freedom[name]) > _CHANCE:
+            why = "noise explains what the model leaves."
+        else:
+            why = "there is a little more than noise, and the intervals include it."
         entries.append(Statement(about, f"{sentence(subject)} scatter {how} their measured noise: {why}", large))
     if any(entry.caution for entry in entries):
         text = (
