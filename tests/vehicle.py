@@ -92,7 +92,7 @@ def drive(
             break
         top = rng.uniform(8.0, 18.0) if number not in backwards else -rng.uniform(1.5, 3.0)
         up, down = (int(abs(top) / rng.uniform(1.0, 2.5) * RATE) for _ in range(2))
-        long = int(rng.uniform(*cruise) * RATE)
+        long = int(rng.uniform(*(cruise if top > 0 else (2.0, 4.0))) * RATE)  # nobody drives backwards for long
         ramp = [0.5 - 0.5 * np.cos(np.pi * (np.arange(part) + 0.5) / part) for part in (up, down)]
         speed.append(top * np.concatenate([ramp[0], np.ones(long), ramp[1][::-1]]))
         bend = np.zeros(up + long + down)  # a turn of up to a right angle, slower where it is quick

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from jaximu.calibration.calibration import Calibration, provenance
@@ -33,11 +34,13 @@ from jaximu.recordings.segmentation import Segmentation, rest_statistics
 
 __all__ = ["calibrate_at_stops"]
 
-_SECONDS, _STRAIGHT = 6.0, np.radians(5.0)
+_SECONDS, _STRAIGHT = 4.0, np.radians(30.0)
 """Seconds after and before a stop whose speeds show where forward is, while the vehicle turns by less than this."""
-_FEWEST_SPEEDS, _WIDEST, _ONE_WAY = 3, np.radians(20.0), 0.5
-"""Speeds that a direction needs, half its 95 % interval up to which it counts as determined, and the least share by
-which speeds one way exceed those the other way for it to be called forward."""
+_FEWEST_STOPS, _WIDEST, _ONE_WAY = 3, np.radians(20.0), 0.5
+"""Stops that a direction needs, half its 95 % interval up to which it counts as determined, and the least by
+which squared speeds one way exceed those the other way, over all, for it to be called forward."""
+_ELSEWHERE = 15.0
+"""Seconds of motion after which the slope of the road counts as another one."""
 _BROAD = 0.5
 """rad/s: one sigma of the gyroscope's bias before the first stop."""
 _SHORTEST = 1e-9
@@ -82,7 +85,8 @@ def calibrate_at_stops(
     force = (rest_statistics(accelerometer, stops.intervals)[1] - accelerometer.nominal_offset) / (
         accelerometer.nominal_scale
     )
-    up = _mean_direction(force)
+    sites = _sites(stops.intervals)
+    up = _mean_direction(_by_site(force, sites))
     earth, spread = _earth(up, gravity.latitude)
     rate, history = _rate(gyroscope, stops.intervals, earth, known)
     scale = gyroscope.nominal_scale
@@ -112,12 +116,12 @@ def calibrate_at_stops(
         reading=recording.reading,
         bias_sigma_recording={"gyroscope": np.sqrt(rate.sigma_recording**2 + steady)},
     )
-    vehicle = _mounted(stops, force, up, (rate.bias - gyroscope.nominal_offset) / scale, gravity)
+    vehicle = _mounted(stops, sites, force, up, (rate.bias - gyroscope.nominal_offset) / scale, gravity)
     vehicle["bias_change"] = _entry(rate.change, rate.change_sigma, "rad/s")
     vehicle["earth_rotation"] = {"vertical_removed": gravity.latitude is not None}
     summary = {
         "states": ["gyroscope drift", *map(str, history.names)],
-        "nis": float(history.innovations.sum() / history.freedom.sum()),
+        "nis": float(history.innovations.sum() / history.freedom.sum()) if len(force) > 1 else None,
         "open": [*_OPEN, *_undetermined(vehicle)],
         "vehicle": vehicle,
     }
@@ -182,6 +186,8 @@ def _rate(
     change, change_sigma = (length * part / scale for part in (moved[3:], np.sqrt(np.diag(moved_covariance)[3:])))
     if count < 3:
         change, change_sigma = np.full((2, 3), np.nan)
+    trend = np.square(scale) * np.maximum(change**2 - np.square(Z95 * change_sigma), 0.0)
+    after = after + np.diag(np.nan_to_num(trend))  # what changed beyond chance may go on changing
     rate = _Rate(bias, after, sigmas["gyroscope"], change, change_sigma, left, excess, noise, notes)
     return rate, _followed(names, start, stop, values.reshape(-1, 3), variance["gyroscope"], noise, scale)
 
@@ -230,12 +236,22 @@ def _followed(
         drifts.append([states @ estimated[:size], np.sqrt(np.diag(states @ covariance[:size, :size] @ states.T))])
         innovations.append(innovation)
     of_rate = np.pad(np.swapaxes(np.array(drifts), 0, 1) / scale, ((0, 0), (0, 0), (0, 3)))
-    resting, freedom = np.ones(count, bool), np.full(count, 3.0)
+    resting, freedom = np.ones(count, bool), 3.0 * (np.arange(count) > 0)
     path = np.array(estimates), np.array(sigmas)
-    return History(stop, resting, names, *path, *of_rate, np.array(innovations), freedom, ())
+    return History(stop, resting, names, *path, *of_rate, freedom.astype(bool) * innovations, freedom, ())
 
 
 # --- the mounting -----------------------------------------------------------------------------------------------------
+
+
+def _sites(intervals: FloatArray) -> NDArray[np.int64]:
+    """Return the site (P,) of each stop: after a few seconds of motion a vehicle stands on the same slope again."""
+    return np.append(0, np.cumsum(intervals[1:, 0] - intervals[:-1, 1] > _ELSEWHERE))
+
+
+def _by_site(values: FloatArray, sites: NDArray[np.int64]) -> FloatArray:
+    """Return the mean (S, k) over each site of values (P, k) at stops."""
+    return np.array([values[sites == site].mean(axis=0) for site in range(sites[-1] + 1)])
 
 
 def _mean_direction(force: FloatArray) -> FloatArray:
@@ -245,18 +261,24 @@ def _mean_direction(force: FloatArray) -> FloatArray:
 
 
 def _mounted(
-    stops: Segmentation, force: FloatArray, up: FloatArray, bias: FloatArray, gravity: LocalGravity
+    stops: Segmentation,
+    sites: NDArray[np.int64],
+    force: FloatArray,
+    up: FloatArray,
+    bias: FloatArray,
+    gravity: LocalGravity,
 ) -> dict[str, Any]:
     """Return how a unit is mounted in the vehicle, by the force (P, 3) at its stops and the speeds beside these.
 
-    **Arguments:** `bias` (3,): of the gyroscope, rad/s.
+    **Arguments:** `sites` (P,): of the stops; `bias` (3,): of the gyroscope, rad/s.
     """
     across = np.linalg.svd(up[None])[2][1:]
+    across[1] = np.cross(up, across[0])
     tilts = force / np.linalg.norm(force, axis=1, keepdims=True) @ across.T
-    count = len(force)
-    covariance = _of_mean(tilts)
-    sides, speeds = _speeds(stops, force, up, bias)
-    forward, sigma, alike = _forward(speeds @ across.T)
+    different = _by_site(tilts, sites)
+    covariance = _of_mean(different)
+    sides, speeds = _speeds(stops, force, across, up, bias)
+    forward, sigma, alike = _forward(sides, speeds)
     determined = sigma is not None and Z95 * sigma < _WIDEST and alike > _ONE_WAY
     ahead = forward @ across
     axes = np.stack([ahead, np.cross(up, ahead), up])
@@ -285,10 +307,10 @@ def _mounted(
         "roll": _entry(angles[0], shown[0], "rad"),
         "pitch": _entry(angles[1], shown[1], "rad"),
         "yaw": _entry(angles[2], shown[2], "rad") if determined else None,
-        "slope": None if count < 2 else float(np.sqrt(np.sum(tilts.var(axis=0, ddof=1)))),
+        "slope": None if covariance is None else float(np.sqrt(np.sum(different.var(axis=0, ddof=1)))),
         "speeds": [
-            {"stop": int(side), "along": float(speed @ axes[0]), "left": float(speed @ axes[1])}
-            for side, speed in zip(sides, speeds, strict=True)
+            {"stop": int(side), "along": float(along), "left": float(left)}
+            for side, (along, left) in zip(sides, speeds @ across @ axes[:2].T, strict=True)
         ],
         "forward_share": (1 + alike) / 2 if determined else None,
         "norm_error": _entry(
@@ -322,49 +344,55 @@ def _of_mean(values: FloatArray) -> FloatArray | None:
     return widened**2 / count * np.atleast_2d(np.cov(values.T))
 
 
-def _speeds(stops: Segmentation, force: FloatArray, up: FloatArray, bias: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the stop that each speed belongs to (n,), and speeds (n, 3), m/s, in the unit's axes, as if forwards.
+def _speeds(
+    stops: Segmentation, force: FloatArray, across: FloatArray, up: FloatArray, bias: FloatArray
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the stop beside each speed (n,), and speeds (n, 2), m/s, along `across` (2, 3), as if driven forwards.
 
-    Speeds are gained after a stop and lost before one, while the vehicle runs straight.
+    Speeds are gained after a stop and lost before one. The gyroscope carries the axes in which they add up, so that
+    turning is no speed to the side.
     """
     recording, intervals = stops.recording, stops.intervals
     accelerometer, gyroscope = recording.accelerometer, recording.signals["gyroscope"]
     time, sensed = accelerometer.time, accelerometer.si()
     heading = np.cumsum((gyroscope.si() - bias) @ up * np.gradient(gyroscope.time))
-    heading = np.interp(time, gyroscope.time, heading)
+    course = np.exp(1j * np.interp(time, gyroscope.time, heading))
     step = np.gradient(time)
     edges = [time[0], *((intervals[1:, 0] + intervals[:-1, 1]) / 2), time[-1]]
     sides, speeds = [], []
     for number, (start, stop) in enumerate(intervals):
-        for sign, first, last in (
-            (-1, max(edges[number], start - _SECONDS), start),
-            (1, stop, min(edges[number + 1], stop + _SECONDS)),
-        ):
+        before = -1, max(edges[number], start - _SECONDS), start
+        after = 1, stop, min(edges[number + 1], stop + _SECONDS)
+        for sign, first, last in (before, after):
             rows = np.flatnonzero((time >= first) & (time < last))[::sign]
-            turned = np.abs(heading[rows] - heading[rows[:1]]) > _STRAIGHT
+            turned = np.abs(np.angle(course[rows] / course[rows[:1]])) > _STRAIGHT
             rows = rows[: int(np.argmax(turned)) if turned.any() else None]
             if last - first > 1.0 and len(rows):
+                gained = (sensed[rows] - force[number]) @ across.T @ np.array([1.0, 1j])
+                speed = sign * np.sum(gained * step[rows] * course[rows]) / course[rows[-1]]
                 sides.append(number)
-                speeds.append(sign * ((sensed[rows] - force[number]) * step[rows, None]).sum(axis=0))
-    return np.array(sides, int), np.array(speeds).reshape(-1, 3)
+                speeds.append([speed.real, speed.imag])
+    return np.array(sides, int), np.array(speeds).reshape(-1, 2)
 
 
-def _forward(speeds: FloatArray) -> tuple[FloatArray, float | None, float]:
+def _forward(sides: NDArray[np.int64], speeds: FloatArray) -> tuple[FloatArray, float | None, float]:
     """Return the direction (2,) along which speeds (n, 2) lie, its sigma (rad) if any, and how one-sided they are.
 
-    The last is the sum of speeds along it over that of their sizes.
+    The last is the sum of squared speeds one way less that of those the other way, over that of all: backwards is
+    slow. Speeds beside one stop share its slope, so the scatter that counts is that of stops.
     """
     if not len(speeds):
         return np.array([1.0, 0.0]), None, 0.0
     direction = np.linalg.svd(speeds, full_matrices=False)[2][0]
     direction = direction * (np.sign(speeds.sum(axis=0) @ direction) or 1.0)
     along, across = speeds @ direction, speeds @ np.array([-direction[1], direction[0]])
-    alike = float(along.sum() / np.abs(along).sum())
-    if len(speeds) < _FEWEST_SPEEDS:
+    alike = float(np.sum(along * np.abs(along)) / np.sum(along**2))
+    pulls = np.bincount(sides, along * across)[np.unique(sides)]
+    count = len(pulls)
+    if count < _FEWEST_STOPS:
         return direction, None, alike
-    freedom = len(speeds) - 1
-    sigma = np.sqrt(np.sum(across**2) / freedom / np.sum(along**2)) * student_isf(0.025, freedom) / Z95
-    return direction, float(sigma), alike
+    scatter = np.sqrt(np.sum(pulls**2) * count / (count - 1)) / np.sum(along**2)
+    return direction, float(scatter * student_isf(0.025, count - 1) / Z95), alike
 
 
 def _entry(value: Any, sigma: Any, unit: str) -> dict[str, Any]:
