@@ -106,7 +106,6 @@ def drive(
     count = len(speed)
     time = np.arange(count) / RATE
     moving = speed != 0
-    along = np.abs(np.cumsum(speed)) / RATE
     metres = int(np.abs(speed).sum() / RATE) + 30
     travelled = np.cumsum(np.abs(speed)) / RATE
     grade, fall = (
@@ -115,7 +114,6 @@ def drive(
         )
         for _ in range(2)
     )
-    del along
     acceleration, lateral = np.gradient(speed, 1 / RATE), speed * turn
     pitch = -grade - 0.02 * acceleration / GRAVITY  # nose up is negative about the left axis; it squats and dives
     roll = fall + 0.06 * lateral / GRAVITY

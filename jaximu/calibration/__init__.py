@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from jaximu.calibration.calibration import Calibration, load_calibration
     from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
     from jaximu.calibration.compensation import compensate
+    from jaximu.calibration.filter_history import History
     from jaximu.calibration.hand_held import Method, fit_hand_held
-    from jaximu.calibration.history import History
     from jaximu.calibration.identifiability import Identifiability
     from jaximu.calibration.in_use import FilterInUse, FilterState, followed_in_use
     from jaximu.calibration.magnetometer import FieldStrength, Heading, MagneticLog, calibrate_magnetometer
@@ -80,7 +80,7 @@ __getattr__ = lazily(
         "jaximu.calibration.closed_form": "ferraris, linear_least_squares, six_position, turn_pairs",
         "jaximu.calibration.compensation": "compensate",
         "jaximu.calibration.hand_held": "Method, fit_hand_held",
-        "jaximu.calibration.history": "History",
+        "jaximu.calibration.filter_history": "History",
         "jaximu.calibration.identifiability": "Identifiability",
         "jaximu.calibration.in_use": "FilterInUse, FilterState, followed_in_use",
         "jaximu.calibration.magnetometer": "FieldStrength, Heading, MagneticLog, calibrate_magnetometer",

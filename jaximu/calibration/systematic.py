@@ -13,7 +13,7 @@ import numpy as np
 from jaximu.calibration.attitude import Mounted, mounted_on, reference_summary
 from jaximu.calibration.calibration import Calibration, concluded, effect_named
 from jaximu.calibration.compensation import compensate
-from jaximu.calibration.history import History
+from jaximu.calibration.filter_history import History
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import refuse_undetermined, require_solved
 from jaximu.calibration.vehicle import calibrate_at_stops
@@ -177,6 +177,10 @@ def calibrate_by_filter(
     heading of every rest. `latitude`: degrees, where known: what the Earth's rotation
     is about the vertical; `effects`: of the catalogue, states beside gain and bias, those included that only motion
     excites; the others as for [`jaximu.calibrate`].
+
+    A recording of a vehicle that stops shows the gyroscope's bias alone, and how the unit is mounted in the vehicle
+    ([`jaximu.calibration.vehicle.calibrate_at_stops`]): the calibration is then of that bias, and `filter` has a part
+    `vehicle`.
 
     **Returns:** the calibration, with `filter` {states, nis, open}, and how the filter came to it. What it leaves open
     of an effect stays at the start and is among `open`.

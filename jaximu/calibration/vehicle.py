@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from jaximu.calibration.calibration import Calibration, provenance
-from jaximu.calibration.history import History
+from jaximu.calibration.filter_history import History
 from jaximu.calibration.nominal import as_stated
 from jaximu.data.drift import about_biases, estimated_drift
 from jaximu.estimation.data import OutputMeans

@@ -12,7 +12,7 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.calibration.arrangement import axes_unlike
 from jaximu.calibration.calibration import provenance, require_another, require_calibration
-from jaximu.calibration.history import History
+from jaximu.calibration.filter_history import History
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.recipe import require_gravity
 from jaximu.calibration.systematic import noise_at_rest

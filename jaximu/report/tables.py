@@ -107,10 +107,10 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     scale = np.diagonal(gain)
     along, exchanged = _along(gain, gain_sigma)
 
-    given = f"{name} gain" in calibration.from_data_sheet
+    undetermined = f"{name} gain" in calibration.from_data_sheet
 
     def scale_words(i: int) -> str:
-        if given:
+        if undetermined:
             return _GIVEN
         if nominal is None and counts:
             return ""
@@ -122,7 +122,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
         return f"{change} from {origin}" + (f" {plain(start)}" if counts else "")
 
     def misalignment_words(i: int, j: int) -> str:
-        if given:
+        if undetermined:
             return _GIVEN
         if not (gain[i, j] or gain_sigma[i, j]):
             return "by convention: fixes the body frame"
