@@ -160,7 +160,7 @@ def test_one_stop_has_a_bias_and_no_interval_of_the_mounting():
     vehicle = summary["vehicle"]
     assert len(history.time) == 1 and summary["nis"] is None and vehicle["bias_change"]["value"] is None
     assert vehicle["roll"]["sigma"] is None and vehicle["slope"] is None
-    assert any("one stop" in text for text in summary["open"])
+    assert any("one site" in text for text in summary["open"])
     assert json.loads(calibration.text())["filter"]["vehicle"]["yaw"] is None
 
 

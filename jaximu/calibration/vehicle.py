@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.filter_history import History
@@ -43,7 +42,10 @@ _ELSEWHERE = 15.0
 """Seconds of motion after which the slope of the road counts as another one."""
 _BROAD = 0.5
 """rad/s: one sigma of the gyroscope's bias before the first stop."""
+_MOST = 200
+"""Stops, the longest, of which the bias is estimated: more take minutes and show little more."""
 _SHORTEST = 1e-9
+"""Share of a drift's size that a step drives it by at the least."""
 _OPEN = (
     "Gyroscope scale and misalignment: a vehicle turns about the vertical, and nothing here measures how far.",
     "Accelerometer scale, misalignment and bias: all stops have one orientation. A bias tilts the mounting, by 0.6° "
@@ -88,7 +90,8 @@ def calibrate_at_stops(
     sites = _sites(stops.intervals)
     up = _mean_direction(_by_site(force, sites))
     earth, spread = _earth(up, gravity.latitude)
-    rate, history = _rate(gyroscope, stops.intervals, earth, known)
+    longest = np.sort(np.argsort(-np.diff(stops.intervals)[:, 0])[:_MOST])
+    rate, history = _rate(gyroscope, stops.intervals[longest], earth, known)
     scale = gyroscope.nominal_scale
     covariance = rate.covariance + scale[:, None] * spread * scale
     nominal = as_stated(recording)
@@ -131,7 +134,9 @@ def calibrate_at_stops(
 def _undetermined(vehicle: dict[str, Any]) -> list[str]:
     texts = []
     if vehicle["roll"]["sigma"] is None:
-        texts.append("Slope of the road: one stop does not show it, so the mounting has no interval. Stop more often.")
+        texts.append(
+            "Slope of the road: stops at one site do not show it, so the mounting has no interval. Stop elsewhere, too."
+        )
     if vehicle["forward"] is None:
         texts.append(
             "Direction of driving: what the unit felt in driving off and braking does not agree on one. Drive off and "
@@ -166,7 +171,7 @@ def _rate(
     variance = {"gyroscope": np.diagonal(measured, axis1=1, axis2=2)}
     means = OutputMeans.of(start, stop, np.zeros(count, int), reaction, {"gyroscope": scale}, variance)
     values = (mean - scale * earth).ravel()
-    white = block_diag(*measured)
+    white = np.einsum("pq,pij->piqj", np.eye(count), measured).reshape(3 * count, -1)
     notes: tuple[str, ...] = ()
     if known is None:
         shown = estimated_drift(values, ones, white, [np.diag(np.diag(white))], means)
@@ -198,7 +203,8 @@ def _least_squares(
     """Return the numbers (p,) that explain values (n,) best, their covariance, and how they react to values (p, n)."""
     weighted = np.linalg.solve(covariance, design).T
     inverse = np.linalg.pinv(weighted @ design)
-    return inverse @ weighted @ values, inverse, inverse @ weighted
+    reactions = inverse @ weighted
+    return reactions @ values, np.asarray(inverse, np.float64), reactions
 
 
 def _followed(
@@ -236,9 +242,11 @@ def _followed(
         drifts.append([states @ estimated[:size], np.sqrt(np.diag(states @ covariance[:size, :size] @ states.T))])
         innovations.append(innovation)
     of_rate = np.pad(np.swapaxes(np.array(drifts), 0, 1) / scale, ((0, 0), (0, 0), (0, 3)))
-    resting, freedom = np.ones(count, bool), 3.0 * (np.arange(count) > 0)
-    path = np.array(estimates), np.array(sigmas)
-    return History(stop, resting, names, *path, *of_rate, freedom.astype(bool) * innovations, freedom, ())
+    resting, freedom = np.ones(count, bool), np.where(np.arange(count) > 0, 3.0, 0.0)
+    innovations = np.where(freedom > 0, innovations, 0.0)
+    return History(
+        stop, resting, names, np.array(estimates), np.array(sigmas), of_rate[0], of_rate[1], innovations, freedom, ()
+    )
 
 
 # --- the mounting -----------------------------------------------------------------------------------------------------

@@ -234,7 +234,10 @@ def find_stops(recording: Recording) -> Segmentation | None:
     force = scan.means[0]
     middle = np.median(force, axis=0)
     turned = np.mean(_angles(force, np.broadcast_to(middle, force.shape)) > _UPRIGHT)
-    if turned > _TURNED or np.mean(np.linalg.norm(force - middle, axis=1) > _STEADY) < _TURNED:
+    limits = (_STEADY, SegmentationOptions.rate_limit)  # of force and rate; beyond either the unit moves
+    off = [np.linalg.norm(mean - np.median(mean, axis=0), axis=1) for mean in scan.means]
+    moving = np.mean([values > limit for values, limit in zip(off, limits, strict=False)], axis=1).max()
+    if turned > _TURNED or moving < _TURNED:
         return None
     threshold, parted = _parting(np.log(scan.ratio[np.isfinite(scan.ratio)]))
     quiet = (scan.ratio < np.exp(threshold)) & (parted > _PARTED)
