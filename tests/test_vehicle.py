@@ -13,6 +13,7 @@ from jaximu.calibration.vehicle import calibrate_at_stops
 from jaximu.cli import main
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD
+from jaximu.mistakes import prepare
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import find_stops
@@ -216,3 +217,9 @@ def test_the_simulated_mounting_is_the_one_that_is_asked_for():
     assert run.mounting.T == pytest.approx(
         about(2, np.radians(30.0)) @ about(1, np.radians(-20.0)) @ about(0, np.radians(10.0))
     )
+
+
+@pytest.mark.parametrize("seed", [45, 52])
+def test_vibration_is_no_integer_overflow(seed):
+    run = drive(seed, stops=2 + seed % 7, idle=(1.0, 5.0, 20.0)[seed % 3])
+    assert not prepare(recorded(run)).findings
