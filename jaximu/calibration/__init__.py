@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from jaximu.calibration.calibration import Calibration, load_calibration
     from jaximu.calibration.closed_form import ferraris, linear_least_squares, six_position, turn_pairs
     from jaximu.calibration.compensation import compensate
+    from jaximu.calibration.filter_history import History
     from jaximu.calibration.hand_held import Method, fit_hand_held
     from jaximu.calibration.identifiability import Identifiability
     from jaximu.calibration.in_use import FilterInUse, FilterState, followed_in_use
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from jaximu.calibration.recipe import calibrate
     from jaximu.calibration.refusals import require_carried, require_spanning
     from jaximu.calibration.scheme import Scheme, describe_scheme
-    from jaximu.calibration.systematic import History, calibrate_by_filter
+    from jaximu.calibration.systematic import calibrate_by_filter
     from jaximu.calibration.thermal import ThermalCalibration, calibrate_thermal
     from jaximu.calibration.thermal_triad import TriadFit
     from jaximu.calibration.turntable import calibrate_turntable, fit_turntable
@@ -79,6 +80,7 @@ __getattr__ = lazily(
         "jaximu.calibration.closed_form": "ferraris, linear_least_squares, six_position, turn_pairs",
         "jaximu.calibration.compensation": "compensate",
         "jaximu.calibration.hand_held": "Method, fit_hand_held",
+        "jaximu.calibration.filter_history": "History",
         "jaximu.calibration.identifiability": "Identifiability",
         "jaximu.calibration.in_use": "FilterInUse, FilterState, followed_in_use",
         "jaximu.calibration.magnetometer": "FieldStrength, Heading, MagneticLog, calibrate_magnetometer",
@@ -87,7 +89,7 @@ __getattr__ = lazily(
         "jaximu.calibration.recipe": "calibrate",
         "jaximu.calibration.refusals": "require_carried, require_spanning",
         "jaximu.calibration.scheme": "Scheme, describe_scheme",
-        "jaximu.calibration.systematic": "History, calibrate_by_filter",
+        "jaximu.calibration.systematic": "calibrate_by_filter",
         "jaximu.calibration.thermal": "ThermalCalibration, calibrate_thermal",
         "jaximu.calibration.thermal_triad": "TriadFit",
         "jaximu.calibration.turntable": "calibrate_turntable, fit_turntable",

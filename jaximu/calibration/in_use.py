@@ -12,9 +12,9 @@ import numpy as np
 
 from jaximu.calibration.attitude import Mounted, mounted_on
 from jaximu.calibration.calibration import Calibration, provenance
+from jaximu.calibration.filter_history import History
 from jaximu.calibration.systematic import (
     FIELD,
-    History,
     disturbances,
     field_of,
     known_scale,

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration.attitude import Mounted, mounted_on, reference_summary
 from jaximu.calibration.calibration import Calibration, concluded, effect_named
 from jaximu.calibration.compensation import compensate
+from jaximu.calibration.filter_history import History
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import refuse_undetermined, require_solved
+from jaximu.calibration.vehicle import calibrate_at_stops
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import with_usual_drift
 from jaximu.data.motion import (
@@ -49,12 +50,11 @@ from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, rest_statistics
+from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, find_stops, rest_statistics
 
 __all__ = [
     "FIELD",
     "NEIGHBOURS",
-    "History",
     "calibrate_by_filter",
     "disturbances",
     "field_of",
@@ -85,34 +85,6 @@ _CARRIED = {"specific_force", "angular_rate", "angular_acceleration", "time", "a
 """What the filter knows of a path: an effect that needs more is not its."""
 NEIGHBOURS = 3
 """Samples about an interval that effects see: derivatives, and delays of up to a sample and a half."""
-
-
-@dataclass(frozen=True)
-class History:
-    """What the filter knew when. time (N,): s, at the end of each interval; rest (N,).
-
-    names: of the free numbers; values, sigmas (N, p) of them, in their own units. drift, drift_sigma (N, 6): of rate
-    (rad/s) and force (m/s²), smoothed. innovations (N,): normalised, squared, of `freedom` (N,) degrees. earth: places
-    of the Earth's rotation among the numbers.
-    """
-
-    time: FloatArray
-    rest: NDArray[np.bool_]
-    names: tuple[Name, ...]
-    values: FloatArray
-    sigmas: FloatArray
-    drift: FloatArray
-    drift_sigma: FloatArray
-    innovations: FloatArray
-    freedom: FloatArray
-    earth: tuple[int, ...]
-
-    def converged(self, place: int) -> float | None:
-        """Return after how many seconds a number's uncertainty came within twice its last; None if it never halved."""
-        sigma = self.sigmas[:, place]
-        if sigma[-1] > sigma[0] / 2:
-            return None
-        return float(self.time[np.argmax(sigma <= 2 * sigma[-1])] - self.time[0])
 
 
 def noise_at_rest(segmentation: Segmentation) -> NoiseModel:
@@ -206,6 +178,10 @@ def calibrate_by_filter(
     is about the vertical; `effects`: of the catalogue, states beside gain and bias, those included that only motion
     excites; the others as for [`jaximu.calibrate`].
 
+    A recording of a vehicle that stops shows the gyroscope's bias alone, and how the unit is mounted in the vehicle
+    ([`jaximu.calibration.vehicle.calibrate_at_stops`]): the calibration is then of that bias, and `filter` has a part
+    `vehicle`.
+
     **Returns:** the calibration, with `filter` {states, nis, open}, and how the filter came to it. What it leaves open
     of an effect stays at the start and is among `open`.
 
@@ -219,6 +195,15 @@ def calibrate_by_filter(
     chosen = [state_effect(effect_named(effect)) for effect in effects]
     with prepared([recording], repair) as (ready,):
         known = noise_of(static)
+        stops = find_stops(ready.recording) if attitude is None and segmentation is None else None
+        if stops is not None:
+            if chosen or magnetometer is not None:
+                raise NotPossibleError(
+                    f"{recording.name}: this is a vehicle that stops, which determines neither effects nor more with a "
+                    "magnetometer: leave --effect and --magnetometer out."
+                )
+            calibration, history = calibrate_at_stops(stops, replace(gravity, latitude=latitude), known)
+            return replace(calibration, notes=(*ready.notes, *calibration.notes)), history
         choices = Choices(gravity, known, segmentation)
         start, findings, noise = _start(ready.recording, choices, known, repair, bool(chosen))
         rests = start.segmentations[0]

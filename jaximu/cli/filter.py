@@ -25,11 +25,13 @@ __all__ = ["FilterCommand"]
 class FilterCommand:
     """Calibrate from all of a recording, motion included, by a Kalman filter; or follow a calibrated unit in use.
 
-    For good units and sequences of positions; for a consumer unit turned by hand use `jaximu calibrate`. DIR receives
-    calibration.json, report.html and pictures.
+    For good units and sequences of positions; for a consumer unit turned by hand use `jaximu calibrate`. Of a vehicle
+    that stops it finds the gyroscope's bias, how the unit is mounted against the horizontal, and where forward is. DIR
+    receives calibration.json, report.html and pictures.
 
     Examples:
       jaximu filter log.csv --static rest.csv --latitude 48.1 -o results
+      jaximu filter drive.csv --latitude 48.1 -o results
       jaximu filter log.csv --effect accel.size_effect --effect setup.time_offset
       jaximu filter log.csv --reference tracker.csv
       jaximu filter log.csv --magnetometer results/magnetometer/calibration.json

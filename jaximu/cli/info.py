@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaximu.cli import options
-from jaximu.ground.errors import InputError, JaximuError
+from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.quantities import Z95, listed, sentence, with_interval
 
@@ -242,6 +242,9 @@ def allowed(recording: Recording, repaired: Recording, findings: list[str], phys
         yield Use("turntable", f"it holds a reference: {', '.join(table) or 'attitude'}")
     if recording.attitude is not None and "gyroscope" in signals:
         yield Use("reference", "the attitude beside it calibrates both sensors in any motion that turns about all axes")
+    if physical and not poses and (stops := _stops(repaired)) > 1:
+        why = f"{stops} stops of a vehicle: gyroscope bias, mounting against the horizontal, direction of driving"
+        yield Use("filter", why)
     if "magnetometer" in signals:
         yield Use(
             "magnetometer", "soft and hard iron, and how good a heading becomes, where the unit is turned all round"
@@ -328,6 +331,17 @@ def _poses(recording: Recording, findings: list[str]) -> int:
         )
         return 0
     return poses
+
+
+def _stops(recording: Recording) -> int:
+    """Return how often a vehicle stops; 0 for any other recording."""
+    from jaximu.recordings.segmentation import find_stops
+
+    try:
+        stops = None if recording.gyroscope is None else find_stops(recording)
+    except NotPossibleError:
+        return 0
+    return 0 if stops is None else len(stops.intervals)
 
 
 def _tilt(signal: Signal, intervals: FloatArray) -> float:

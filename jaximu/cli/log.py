@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LogCommand"]
 
-_ORDER = ("calibrate", "diagnose", "turntable", "reference", "magnetometer", "allan", "thermal")
+_ORDER = ("calibrate", "diagnose", "turntable", "reference", "filter", "magnetometer", "allan", "thermal")
 """Verbs that need no more than logs."""
 _HELD = {"calibrate": ("diagnose", "calibration")}
 """A verb whose result another holds, as which document: it is run alone where that one gives none."""

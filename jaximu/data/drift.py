@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.data.poses_covariance import Sensitivities
 from jaximu.data.rest_blocks import RATIO, correlation_times
@@ -28,9 +30,11 @@ from jaximu.recordings.segmentation import Segmentation
 __all__ = [
     "DRIFT_ESTIMATED",
     "USUAL_DRIFT",
+    "EstimatedDrift",
     "about_biases",
     "drift_components",
     "drifting",
+    "estimated_drift",
     "mean_output_reactions",
     "means_by_hand",
     "power_on_text",
@@ -144,19 +148,50 @@ def with_drift(
     by_conditions[:, used] = -total / sizes @ np.linalg.solve(weighted, jacobian[used]).T
     sentences: tuple[str, ...] = ()
     if noise is None:
-        present = [k for k in range(len(excess)) if np.any(whole.group[used] == k)]
-        drifts, components = drift_components(means.noise, means)
-        components = np.stack([*(whole.component(k) for k in present), *components])[:, used][:, :, used]
-        priors = [_USUAL_EXCESS] * len(present) + [USUAL_DRIFT[name.partition(" ")[2]] for name in drifts]
+        present = [whole.component(k)[np.ix_(used, used)] for k in range(len(excess)) if np.any(whole.group[used] == k)]
         bare = whole.measured[np.ix_(used, used)]
-        log_size, _ = restricted_likelihood(residual[used], jacobian[used], bare, components, *_beforehand(priors))
-        changed = bare + np.einsum("k,kij->ij", np.exp(log_size), components) - weighted
-        total = total + by_conditions[:, used] @ changed @ by_conditions[:, used].T
-        drift_sizes = dict(zip(drifts, np.exp(log_size[len(present) :] / 2), strict=True))
-        noise = drifting(means.noise, drifts, drift_sizes)
-        sentences = DRIFT_ESTIMATED, *power_on_text(drifts, drift_sizes)
+        estimated = estimated_drift(residual[used], jacobian[used], bare, present, means, used)
+        total = total + by_conditions[:, used] @ (estimated.covariance - weighted) @ by_conditions[:, used].T
+        noise, sentences = estimated.noise, estimated.notes
     total, sigmas = about_biases(fitted.names, total, by_conditions, means, noise)
     return replace(fitted, covariance=total), sigmas, sentences
+
+
+class EstimatedDrift(NamedTuple):
+    """The noise of a unit, drift included, as conditions of it show it; their covariance (n, n) then; and sentences.
+
+    excess (k,): variances of each component of the excess, in multiples of it.
+    """
+
+    noise: NoiseModel
+    covariance: FloatArray
+    excess: FloatArray
+    notes: tuple[str, ...]
+
+
+def estimated_drift(
+    residual: FloatArray,
+    jacobian: FloatArray,
+    measured: FloatArray,
+    excess: Sequence[FloatArray],
+    means: OutputMeans,
+    used: NDArray[np.bool_] | slice = slice(None),
+) -> EstimatedDrift:
+    """Return the drift of biases that conditions show, estimated together with the excess of their noise.
+
+    **Arguments:** `residual` (n,), `jacobian` (n, p) by what is fitted beside, `measured` (n, n): their covariance by
+    the noise alone; `excess`: components (n, n) of what goes beyond; `used`: which of the conditions of `means` they
+    are.
+    """
+    drifts, components = drift_components(means.noise, means)
+    components = np.stack([*excess, *components[:, used][:, :, used]])
+    priors = [_USUAL_EXCESS] * len(excess) + [USUAL_DRIFT[name.partition(" ")[2]] for name in drifts]
+    log_size, _ = restricted_likelihood(residual, jacobian, measured, components, *_beforehand(priors))
+    drift_sizes = dict(zip(drifts, np.exp(log_size[len(excess) :] / 2), strict=True))
+    covariance = measured + np.einsum("k,kij->ij", np.exp(log_size), components)
+    notes = DRIFT_ESTIMATED, *power_on_text(drifts, drift_sizes)
+    noise = drifting(means.noise, drifts, drift_sizes)
+    return EstimatedDrift(noise, covariance, np.exp(log_size[: len(excess)]), notes)
 
 
 def drifting(noise: NoiseModel, drifts: Mapping[str, AxisNoise], sizes: Mapping[str, float]) -> NoiseModel:

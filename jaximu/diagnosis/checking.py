@@ -12,9 +12,10 @@ import numpy as np
 from jaximu.calibration import Calibration
 from jaximu.calibration.arrangement import axes_unlike
 from jaximu.calibration.calibration import provenance, require_another, require_calibration
+from jaximu.calibration.filter_history import History
 from jaximu.calibration.in_use import INTERVAL, FilterInUse, follow
 from jaximu.calibration.recipe import Choices, calibrate_ready, require_gravity
-from jaximu.calibration.systematic import History, noise_at_rest
+from jaximu.calibration.systematic import noise_at_rest
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.diagnosis.comparison import FollowedUnit, Fresh, Old, Question, Widened, candidates, scatter_about_a_fit
 from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS

@@ -14,6 +14,9 @@ __all__ = ["TITLES", "find"]
 
 TITLES = {"data.wrap": "integer overflow"}
 
+_AT_THE_OTHER_END = 0.8
+"""Share of the samples that overflowed which come back in the half of the range that they did not leave by."""
+
 
 def find(samples: Samples) -> list[Finding]:
     """Return the axes that jump by their whole range and back."""
@@ -85,6 +88,8 @@ def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None
     turns -= np.round(np.median(turns))
     rows = np.flatnonzero(turns)
     if turns[-1] != 0 or turns[0] != 0 or np.max(np.abs(turns)) > 1 or len(rows) > 0.4 * len(values):
+        return None
+    if np.mean((values[rows] - middle) * turns[rows] < 0) < _AT_THE_OTHER_END:  # vibration may jump as far and back
         return None
     # what overflowed lay beyond all that did not, put back: the sensor leaves its range there and nowhere else
     inside = values[turns == 0]

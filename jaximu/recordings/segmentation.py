@@ -24,6 +24,7 @@ from jaximu.recordings.recording import PoseMeans, Recording, Signal, runs_of
 __all__ = [
     "Segmentation",
     "SegmentationOptions",
+    "find_stops",
     "noise_by_model",
     "observe_means",
     "observed_poses",
@@ -41,6 +42,11 @@ _ONSET = np.radians(100.0)  # rad/s³; the rate of a quarter turn in three secon
 _CHANCE = 3.0  # standard deviations
 _BRIDGED = 3e-4  # rad; error that a gap may bring into a turn
 _LONGEST_TURN = 60.0  # s; beyond it, gyroscope drift tells more about itself than about the gain
+_STOP_WINDOW, _LEAST_OF_STOP = 1.0, 1.0  # s; and what a stop must have left beside half a window at either end
+_PARTED = 0.8  # share of the variance of log variances between two classes; evenly spread values have 0.75
+_STEADY = 0.1  # m/s²; how far the mean force over a second of a stop may lie from the stop's
+_UPRIGHT, _TURNED = np.radians(25.0), 0.1
+"""How far the force on an upright unit may lie from its median, and in which share of the windows farther."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +135,49 @@ def _samples(signal: Signal, start: float, stop: float) -> slice:
     return slice(np.searchsorted(signal.time, start), np.searchsorted(signal.time, stop))
 
 
+@dataclass(frozen=True, eq=False)
+class _Scan:
+    """Windows over a recording, a step of an eighth apart.
+
+    width: s; centres (W,): s. means: (W, 3) of each sensor, SI. ratio (W,): variance over the noise floor, of the
+    sensor where it is larger. floor: of the last sensor.
+    """
+
+    width: float
+    centres: FloatArray
+    moments: tuple[_Moments, ...]
+    means: tuple[FloatArray, ...]
+    ratio: FloatArray
+    floor: float
+
+    @classmethod
+    def of(cls, recording: Recording, window: float) -> "_Scan":
+        """Scan a recording by windows of so many seconds or a little more. Raises `NotPossibleError` if it is short."""
+        signals = [recording.accelerometer, *([] if recording.gyroscope is None else [recording.gyroscope])]
+        # A slow logger needs a longer window to hold enough samples for a variance.
+        width = max(window, 10 / min(signal.rate for signal in signals))
+        start = max(signal.time[0] for signal in signals) + width / 2
+        end = min(signal.time[-1] for signal in signals) - width / 2
+        if end - start < width:
+            raise NotPossibleError(
+                f"{recording.name}: the recording lasts {end - start + width:.2f} s, too short to find poses: record "
+                "at least nine orientations at rest for two seconds or more each, with turns between them."
+            )
+        step = width / 8
+        centres = np.arange(start, end + step / 2, step)
+        moments = tuple(_Moments(signal) for signal in signals)
+        means, variances = zip(*(_windows(running, centres, width) for running in moments), strict=True)
+        for signal, variance, name in zip(signals, variances, INERTIAL_QUANTITIES, strict=False):
+            if not np.isfinite(variance).any():
+                raise NotPossibleError(
+                    f"{recording.name}: the {name} has too many gaps: nowhere does it keep its rate of "
+                    f"{signal.rate:.4g} Hz for long enough to separate rest from motion."
+                )
+        floors = [_floor(variance, running) for variance, running in zip(variances, moments, strict=True)]
+        ratio = np.stack([variance / floor for variance, floor in zip(variances, floors, strict=True)]).max(axis=0)
+        return cls(width, centres, moments, means, ratio, floors[-1])
+
+
 def segment(recording: Recording, options: SegmentationOptions | None = None) -> Segmentation:
     """Find the static poses of a recording.
 
@@ -136,30 +185,8 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     what is missing.
     """
     options = options or SegmentationOptions()
-    accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
-    signals = [accelerometer] if gyroscope is None else [accelerometer, gyroscope]
-    # A slow logger needs a longer window to hold enough samples for a variance.
-    width = max(options.window, 10 / min(signal.rate for signal in signals))
-    start = max(signal.time[0] for signal in signals) + width / 2
-    end = min(signal.time[-1] for signal in signals) - width / 2
-    if end - start < width:
-        raise NotPossibleError(
-            f"{recording.name}: the recording lasts {end - start + width:.2f} s, too short to find poses: record at "
-            "least nine orientations at rest for two seconds or more each, with turns between them."
-        )
-    step = width / 8
-    centres = np.arange(start, end + step / 2, step)
-
-    moments = [_Moments(signal) for signal in signals]
-    means, variances = zip(*(_windows(running, centres, width) for running in moments), strict=True)
-    for signal, variance, name in zip(signals, variances, INERTIAL_QUANTITIES, strict=False):
-        if not np.isfinite(variance).any():
-            raise NotPossibleError(
-                f"{recording.name}: the {name} has too many gaps: nowhere does it keep its rate of {signal.rate:.4g} "
-                "Hz for long enough to separate rest from motion."
-            )
-    floors = [_floor(variance, running) for variance, running in zip(variances, moments, strict=True)]
-    ratio = np.stack([variance / floor for variance, floor in zip(variances, floors, strict=True)]).max(axis=0)
+    gyroscope, scan = recording.gyroscope, _Scan.of(recording, options.window)
+    width, centres, moments, means, ratio = scan.width, scan.centres, scan.moments, scan.means, scan.ratio
     turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
     sums = np.vstack([np.zeros(3), np.cumsum(means[0], axis=0)])
 
@@ -170,7 +197,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
         # gently, grows with the variance that passes: so does what is cut off there, from 1/8 to 3/4 of a window.
         cut = width * min(np.log2(factor) / 8, 0.75)
         if gyroscope is not None:  # a rate of c t² over a part x of a window adds c² x⁵ / 5 w to its variance
-            cut = max(cut, min((5 * width * factor * floors[-1] / _ONSET**2) ** 0.2, width))
+            cut = max(cut, min((5 * width * factor * scan.floor / _ONSET**2) ** 0.2, width))
         margin = width / 2 - cut
         intervals = np.stack([centres[first] - margin, centres[last - 1] + margin], axis=1)
         long = np.diff(intervals)[:, 0] >= options.minimum_duration
@@ -190,8 +217,54 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     chosen = int(np.flatnonzero(score >= best - 0.05 * abs(best))[0])
     intervals, notes = _drop_rotating(moments, results[chosen][0])
     if len(intervals) < options.fewest:
-        raise NotPossibleError(f"{recording.name}: {_why_no_poses(results[chosen][0], end - start, means[0], notes)}")
+        raise NotPossibleError(
+            f"{recording.name}: {_why_no_poses(results[chosen][0], centres[-1] - centres[0], means[0], notes)}"
+        )
     return Segmentation(recording, intervals, tried[chosen][0], tried, tuple(notes))
+
+
+def find_stops(recording: Recording) -> Segmentation | None:
+    """Find where a unit rests that stays upright in motion, as in a vehicle that stops; None for any other recording.
+
+    Orientations cannot choose the threshold here, so it is where quiet and moving windows part best (Otsu 1979).
+
+    Raises `NotPossibleError` for a vehicle that never stops for two seconds.
+    """
+    scan = _Scan.of(recording, _STOP_WINDOW)
+    force = scan.means[0]
+    middle = np.median(force, axis=0)
+    turned = np.mean(_angles(force, np.broadcast_to(middle, force.shape)) > _UPRIGHT)
+    limits = (_STEADY, SegmentationOptions.rate_limit)  # of force and rate; beyond either the unit moves
+    off = [np.linalg.norm(mean - np.median(mean, axis=0), axis=1) for mean in scan.means]
+    moving = np.mean([values > limit for values, limit in zip(off, limits, strict=False)], axis=1).max()
+    if turned > _TURNED or moving < _TURNED:
+        return None
+    threshold, parted = _parting(np.log(scan.ratio[np.isfinite(scan.ratio)]))
+    quiet = (scan.ratio < np.exp(threshold)) & (parted > _PARTED)
+    steady = np.zeros(len(quiet), bool)
+    for first, last in runs_of(quiet):  # what vibrates at rest hides how gently motion sets in
+        off = np.linalg.norm(force[first:last] - np.median(force[first:last], axis=0), axis=1)
+        steady[first:last] = off < max(_STEADY, _CHANCE * np.median(off))
+    first, last = runs_of(steady).T
+    intervals = np.stack([scan.centres[first] + scan.width / 2, scan.centres[last - 1] - scan.width / 2], axis=1)
+    intervals, notes = _drop_rotating(scan.moments, intervals[np.diff(intervals)[:, 0] > _LEAST_OF_STOP])
+    if not len(intervals):
+        raise NotPossibleError(
+            f"{recording.name}: no stop was found, at which a vehicle stands still for two seconds or more with less "
+            "vibration than in motion. Record a drive with stops of ten seconds or more."
+        )
+    tried = (float(np.exp(threshold)), len(intervals), 1, float(np.sum(np.diff(intervals))))
+    return Segmentation(recording, intervals, tried[0], (tried,), tuple(notes))
+
+
+def _parting(values: FloatArray) -> tuple[float, float]:
+    """Return where values part best into two classes, and the share of their variance that lies between these."""
+    values = np.sort(values)
+    sums, share = np.cumsum(values), np.arange(1, len(values)) / len(values)
+    mean = sums[-1] / len(values)
+    between = (share * mean - sums[:-1] / len(values)) ** 2 / (share * (1 - share))
+    best = int(np.argmax(between))
+    return float(values[best : best + 2].mean()), float(between[best] / max(np.var(values), 1e-300))
 
 
 def _why_no_poses(intervals: FloatArray, duration: float, force: FloatArray, notes: Sequence[str]) -> str:

@@ -94,7 +94,7 @@ def calibration_page(
     limits: Callable[[], Iterable[Part]],
     verdict: Sequence[str] = (),
     number: tuple[str, str] | None = None,
-    findings: Iterable[Statement] = (),
+    findings: Iterable[Part] = (),
 ) -> Page:
     """Return the page of any calibration.
 

@@ -18,6 +18,7 @@ from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.report.attitude import mounting_words
 from jaximu.report.calibration import calibration_page
 from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, new_figure, zero_line
+from jaximu.report.vehicle import vehicle_page
 from jaximu.report.words import BEYOND, gravity_statements, limits
 
 if TYPE_CHECKING:
@@ -115,6 +116,8 @@ def _earth(history: History) -> Statement | None:
 def page_of(calibration: Calibration, history: History) -> Page:
     """Return the page of a calibration by the filter."""
     assert calibration.filter is not None
+    if "vehicle" in calibration.filter:
+        return vehicle_page(calibration, history)
     bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
     scale = np.mean(np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1))
     worst = np.degrees(Z95 * max(bias) / scale)

@@ -87,6 +87,7 @@ def _scaled(values: FloatArray, digits: int = 7) -> tuple[str, list[list[str]]]:
     return f"10{raised(power)} ·" if power else "", cells
 
 
+_GIVEN = "not determined: as the data sheet states it"
 _EXCHANGED = "its axes are exchanged"
 """In place of what the scale and the misalignments of an output would be that is another axis'."""
 
@@ -106,7 +107,11 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     scale = np.diagonal(gain)
     along, exchanged = _along(gain, gain_sigma)
 
+    undetermined = f"{name} gain" in calibration.from_data_sheet
+
     def scale_words(i: int) -> str:
+        if undetermined:
+            return _GIVEN
         if nominal is None and counts:
             return ""
         start = 1.0 if nominal is None else np.asarray(nominal.gain)[i, i]
@@ -117,6 +122,8 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
         return f"{change} from {origin}" + (f" {plain(start)}" if counts else "")
 
     def misalignment_words(i: int, j: int) -> str:
+        if undetermined:
+            return _GIVEN
         if not (gain[i, j] or gain_sigma[i, j]):
             return "by convention: fixes the body frame"
         if exchanged[i]:

@@ -1,0 +1,413 @@
+"""A vehicle that stops: the gyroscope's bias, how the unit is mounted against the horizontal, and where forward is.
+
+At a stop the gyroscope's mean is its bias and the Earth's rotation, and the mean force points up but for the slope of
+the road. Slopes differ from stop to stop, and their scatter is the uncertainty of the mean. In the seconds after a stop
+and before one the force less that at the stop adds up to a speed along the vehicle, forward after most stops: the
+direction in the horizontal plane along which these speeds lie best, in the sense of least squares, is the vehicle's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaximu.calibration.calibration import Calibration, provenance
+from jaximu.calibration.filter_history import History
+from jaximu.calibration.nominal import as_stated
+from jaximu.data.drift import about_biases, estimated_drift
+from jaximu.estimation.data import OutputMeans
+from jaximu.estimation.information_filter import Knowledge, WhiteRows, advance, estimate
+from jaximu.estimation.problem import Name
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import student_isf
+from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.quantities import Z95
+from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
+from jaximu.model.noise_model import NoiseModel
+from jaximu.recordings.recording import Signal
+from jaximu.recordings.segmentation import Segmentation, rest_statistics
+
+__all__ = ["calibrate_at_stops"]
+
+_SECONDS, _STRAIGHT = 4.0, np.radians(30.0)
+"""Seconds after and before a stop whose speeds show where forward is, while the vehicle turns by less than this."""
+_FEWEST_STOPS, _WIDEST, _ONE_WAY = 3, np.radians(20.0), 0.5
+"""Stops that a direction needs, half its 95 % interval up to which it counts as determined, and the least by
+which squared speeds one way exceed those the other way, over all, for it to be called forward."""
+_ELSEWHERE = 15.0
+"""Seconds of motion after which the slope of the road counts as another one."""
+_BROAD = 0.5
+"""rad/s: one sigma of the gyroscope's bias before the first stop."""
+_MOST = 200
+"""Stops, the longest, of which the bias is estimated: more take minutes and show little more."""
+_SHORTEST = 1e-9
+"""Share of a drift's size that a step drives it by at the least."""
+_OPEN = (
+    "Gyroscope scale and misalignment: a vehicle turns about the vertical, and nothing here measures how far.",
+    "Accelerometer scale, misalignment and bias: all stops have one orientation. A bias tilts the mounting, by 0.6° "
+    "for 0.1 m/s², which its interval does not contain.",
+)
+
+
+@dataclass(frozen=True)
+class _Rate:
+    """The gyroscope's bias (3,) and its covariance after the recording, in output units; and what goes with it.
+
+    change, change_sigma (3,): of the bias over the recording, rad/s. left (P, 3): of each stop's mean, rad/s.
+    """
+
+    bias: FloatArray
+    covariance: FloatArray
+    sigma_recording: FloatArray
+    change: FloatArray
+    change_sigma: FloatArray
+    left: FloatArray
+    excess: FloatArray
+    noise: NoiseModel
+    notes: tuple[str, ...]
+
+
+def calibrate_at_stops(
+    stops: Segmentation, gravity: LocalGravity, known: NoiseModel | None = None
+) -> tuple[Calibration, History]:
+    """Calibrate a gyroscope by the stops of a vehicle, and find how the unit is mounted in it.
+
+    **Arguments:** `gravity`: with its latitude where that is known, which takes the vertical part of the Earth's
+    rotation off the bias. `known`: the unit's noise; else noise and drift are estimated from the stops.
+
+    **Returns:** a calibration of the gyroscope's bias alone, with `filter` {states, nis, open, vehicle}, and how a
+    filter comes to know the bias from stop to stop.
+    """
+    recording, signals = stops.recording, stops.recording.signals
+    accelerometer, gyroscope = recording.accelerometer, signals["gyroscope"]
+    force = (rest_statistics(accelerometer, stops.intervals)[1] - accelerometer.nominal_offset) / (
+        accelerometer.nominal_scale
+    )
+    sites = _sites(stops.intervals)
+    up = _mean_direction(_by_site(force, sites))
+    earth, spread = _earth(up, gravity.latitude)
+    longest = np.sort(np.argsort(-np.diff(stops.intervals)[:, 0])[:_MOST])
+    rate, history = _rate(gyroscope, stops.intervals[longest], earth, known)
+    scale = gyroscope.nominal_scale
+    covariance = rate.covariance + scale[:, None] * spread * scale
+    nominal = as_stated(recording)
+    assert nominal.gyroscope is not None
+    unit = replace(nominal, gyroscope=replace(nominal.gyroscope, bias=rate.bias))
+    still = np.sqrt(np.mean(np.square(rate.left + (rate.bias - gyroscope.nominal_offset) / scale)))
+    steady = np.diag(scale[:, None] * spread * scale)
+    calibration = Calibration(
+        imu=jax.tree.map(np.asarray, unit),
+        names=history.names,
+        covariance=covariance,
+        gravity=gravity,
+        method="filter",
+        loss="linear",
+        rms={"static_gyroscope": (float(still), float(np.sqrt(np.mean(rate.left**2))), "rad/s")},
+        rank=3,
+        weak=(),
+        excess={"gyroscope": float(rate.excess[0])},
+        solver="",
+        data=provenance([recording]) | {"stops": len(force)},
+        notes=tuple(dict.fromkeys((*recording.notes, *stops.notes, *rate.notes))),
+        segmentations=(stops,),
+        nominal=nominal,
+        absent=("accelerometer",),
+        reading=recording.reading,
+        bias_sigma_recording={"gyroscope": np.sqrt(rate.sigma_recording**2 + steady)},
+    )
+    vehicle = _mounted(stops, sites, force, up, (rate.bias - gyroscope.nominal_offset) / scale, gravity)
+    vehicle["bias_change"] = _entry(rate.change, rate.change_sigma, "rad/s")
+    vehicle["earth_rotation"] = {"vertical_removed": gravity.latitude is not None}
+    summary = {
+        "states": ["gyroscope drift", *map(str, history.names)],
+        "nis": float(history.innovations.sum() / history.freedom.sum()) if len(force) > 1 else None,
+        "open": [*_OPEN, *_undetermined(vehicle)],
+        "vehicle": vehicle,
+    }
+    return replace(calibration, filter=summary), history
+
+
+def _undetermined(vehicle: dict[str, Any]) -> list[str]:
+    texts = []
+    if vehicle["roll"]["sigma"] is None:
+        texts.append(
+            "Slope of the road: stops at one site do not show it, so the mounting has no interval. Stop elsewhere, too."
+        )
+    if vehicle["forward"] is None:
+        texts.append(
+            "Direction of driving: what the unit felt in driving off and braking does not agree on one. Drive off and "
+            "brake briskly on straight, level road, forwards, five times or more."
+        )
+    return texts
+
+
+# --- the gyroscope ----------------------------------------------------------------------------------------------------
+
+
+def _earth(up: FloatArray, latitude: float | None) -> tuple[FloatArray, FloatArray]:
+    """Return the Earth's rotation (3,) that a unit of unknown heading feels, and its covariance (3, 3), rad/s."""
+    if latitude is None:
+        return np.zeros(3), EARTH_RATE**2 / 3 * np.eye(3)
+    effect, spread = GyroEarthRotation.at(latitude)
+    along = np.outer(up, up)
+    covariance = spread[0] ** 2 * (np.eye(3) - along) + spread[2] ** 2 * along
+    return float(effect.coefficients[2]) * up, covariance
+
+
+def _rate(
+    gyroscope: Signal, intervals: FloatArray, earth: FloatArray, known: NoiseModel | None
+) -> tuple[_Rate, History]:
+    """Return the bias by generalised least squares over the stops (P, 2), and a filter's way to it."""
+    start, stop = intervals.T
+    count, scale = len(start), gyroscope.nominal_scale
+    _, mean, measured = rest_statistics(gyroscope, intervals)
+    names = tuple(Name("gyroscope", "bias", (axis,)) for axis in range(3))
+    ones = np.tile(np.eye(3), (count, 1))
+    reaction = {"gyroscope": np.eye(3 * count).reshape(3 * count, count, 3)}
+    variance = {"gyroscope": np.diagonal(measured, axis1=1, axis2=2)}
+    means = OutputMeans.of(start, stop, np.zeros(count, int), reaction, {"gyroscope": scale}, variance)
+    values = (mean - scale * earth).ravel()
+    white = np.einsum("pq,pij->piqj", np.eye(count), measured).reshape(3 * count, -1)
+    notes: tuple[str, ...] = ()
+    if known is None:
+        shown = estimated_drift(values, ones, white, [np.diag(np.diag(white))], means)
+        covariance, noise, excess, notes = shown.covariance, shown.noise, shown.excess, shown.notes
+    else:
+        assert known.gyroscope is not None
+        slow = known.gyroscope.covariance(start, stop) * np.square(scale)[:, None, None]
+        covariance, noise, excess = np.zeros((count, 3, count, 3)), known, np.zeros(1)
+        covariance[:, range(3), :, range(3)] = slow
+        covariance, notes = covariance.reshape(3 * count, -1), known.notes
+    bias, inverse, reactions = _least_squares(values, ones, covariance)
+    after, sigmas = about_biases(names, inverse, reactions, means, noise)
+    left = (values - ones @ bias).reshape(-1, 3) / scale
+    middle = np.repeat((start + stop) / 2, 3)[:, None]
+    moved, moved_covariance, _ = _least_squares(values, np.hstack([ones, ones * (middle - middle.mean())]), covariance)
+    length = float(stop[-1] - start[0])
+    change, change_sigma = (length * part / scale for part in (moved[3:], np.sqrt(np.diag(moved_covariance)[3:])))
+    if count < 3:
+        change, change_sigma = np.full((2, 3), np.nan)
+    trend = np.square(scale) * np.maximum(change**2 - np.square(Z95 * change_sigma), 0.0)
+    after = after + np.diag(np.nan_to_num(trend))  # what changed beyond chance may go on changing
+    rate = _Rate(bias, after, sigmas["gyroscope"], change, change_sigma, left, excess, noise, notes)
+    return rate, _followed(names, start, stop, values.reshape(-1, 3), variance["gyroscope"], noise, scale)
+
+
+def _least_squares(
+    values: FloatArray, design: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the numbers (p,) that explain values (n,) best, their covariance, and how they react to values (p, n)."""
+    weighted = np.linalg.solve(covariance, design).T
+    inverse = np.linalg.pinv(weighted @ design)
+    reactions = inverse @ weighted
+    return reactions @ values, np.asarray(inverse, np.float64), reactions
+
+
+def _followed(
+    names: tuple[Name, ...],
+    start: FloatArray,
+    stop: FloatArray,
+    values: FloatArray,
+    variance: FloatArray,
+    noise: NoiseModel,
+    scale: FloatArray,
+) -> History:
+    """Return how a filter follows the bias with its drift from stop to stop, by their means `values` (P, 3)."""
+    assert noise.gyroscope is not None
+    drift, count = noise.gyroscope.drift(), len(start)
+    size = 3 * len(drift.correlation_time)
+    spread = np.maximum(np.sqrt(drift.variance.T) * scale, _SHORTEST * scale).ravel()
+    states = np.tile(np.eye(3), size // 3)
+    known = Knowledge(np.diag([*1 / spread, *1 / (_BROAD * scale)]), np.zeros(size + 3))  # pyright: ignore
+    estimates, sigmas, drifts, innovations = [], [], [], []
+    gaps = np.diff((start + stop) / 2, prepend=-np.inf)
+    for gap, value, sigma in zip(gaps, values, np.sqrt(variance), strict=True):
+        kept = np.repeat(np.exp(-gap / drift.correlation_time), 3)
+        driven = 1 / (spread * np.sqrt(np.maximum(1 - kept**2, _SHORTEST)))
+        rows = WhiteRows(
+            np.concatenate([np.diag(-driven * kept), np.zeros((3, size))]),
+            np.concatenate([np.diag(driven), states / sigma[:, None]]),
+            np.concatenate([np.zeros((size, 3)), np.diag(1 / sigma)]),
+            np.concatenate([np.zeros(size), value / sigma]),
+        )  # pyright: ignore[reportArgumentType]
+        known, _, innovation = advance(known, rows)
+        estimated, covariance = estimate(known)
+        whole = np.hstack([states, np.eye(3)])
+        estimates.append(whole @ estimated)
+        sigmas.append(np.sqrt(np.diag(whole @ covariance @ whole.T)))
+        drifts.append([states @ estimated[:size], np.sqrt(np.diag(states @ covariance[:size, :size] @ states.T))])
+        innovations.append(innovation)
+    of_rate = np.pad(np.swapaxes(np.array(drifts), 0, 1) / scale, ((0, 0), (0, 0), (0, 3)))
+    resting, freedom = np.ones(count, bool), np.where(np.arange(count) > 0, 3.0, 0.0)
+    innovations = np.where(freedom > 0, innovations, 0.0)
+    return History(
+        stop, resting, names, np.array(estimates), np.array(sigmas), of_rate[0], of_rate[1], innovations, freedom, ()
+    )
+
+
+# --- the mounting -----------------------------------------------------------------------------------------------------
+
+
+def _sites(intervals: FloatArray) -> NDArray[np.int64]:
+    """Return the site (P,) of each stop: after a few seconds of motion a vehicle stands on the same slope again."""
+    return np.append(0, np.cumsum(intervals[1:, 0] - intervals[:-1, 1] > _ELSEWHERE))
+
+
+def _by_site(values: FloatArray, sites: NDArray[np.int64]) -> FloatArray:
+    """Return the mean (S, k) over each site of values (P, k) at stops."""
+    return np.array([values[sites == site].mean(axis=0) for site in range(sites[-1] + 1)])
+
+
+def _mean_direction(force: FloatArray) -> FloatArray:
+    """Return the direction (3,) in which forces (P, 3) point on average."""
+    mean = np.mean(force / np.linalg.norm(force, axis=1, keepdims=True), axis=0)
+    return mean / np.linalg.norm(mean)
+
+
+def _mounted(
+    stops: Segmentation,
+    sites: NDArray[np.int64],
+    force: FloatArray,
+    up: FloatArray,
+    bias: FloatArray,
+    gravity: LocalGravity,
+) -> dict[str, Any]:
+    """Return how a unit is mounted in the vehicle, by the force (P, 3) at its stops and the speeds beside these.
+
+    **Arguments:** `sites` (P,): of the stops; `bias` (3,): of the gyroscope, rad/s.
+    """
+    across = np.linalg.svd(up[None])[2][1:]
+    across[1] = np.cross(up, across[0])
+    tilts = force / np.linalg.norm(force, axis=1, keepdims=True) @ across.T
+    different = _by_site(tilts, sites)
+    covariance = _of_mean(different)
+    sides, speeds = _speeds(stops, force, across, up, bias)
+    forward, sigma, alike = _forward(sides, speeds)
+    determined = sigma is not None and Z95 * sigma < _WIDEST and alike > _ONE_WAY
+    ahead = forward @ across
+    axes = np.stack([ahead, np.cross(up, ahead), up])
+    angles = _angles(axes)
+    turns = np.vstack([across, up])
+    slopes = np.stack([_angles(axes @ _turned(turn)) - _angles(axes @ _turned(-turn)) for turn in turns], 1) / (
+        2 * _STEP
+    )
+    whole = np.zeros((3, 3))
+    if covariance is not None:
+        quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a turn about one direction moves up along the other
+        whole[:2, :2] = quarter @ covariance @ quarter.T
+    whole[2, 2] = 0.0 if sigma is None else sigma**2
+    sigmas = np.sqrt(np.diag(slopes @ whole @ slopes.T))
+    shown = [None if covariance is None else float(value) for value in sigmas]
+    norm = np.linalg.norm(force, axis=1)
+    scatter = _of_mean(norm[:, None])
+    return {
+        "stops": [
+            {"start": float(begin), "stop": float(end), "tilt": tilt.tolist()}
+            for (begin, end), tilt in zip(stops.intervals, tilts @ (axes[:2] @ across.T).T, strict=True)
+        ],
+        "seconds": float(np.sum(np.diff(stops.intervals))),
+        "up": up.tolist(),
+        "forward": ahead.tolist() if determined else None,
+        "roll": _entry(angles[0], shown[0], "rad"),
+        "pitch": _entry(angles[1], shown[1], "rad"),
+        "yaw": _entry(angles[2], shown[2], "rad") if determined else None,
+        "slope": None if covariance is None else float(np.sqrt(np.sum(different.var(axis=0, ddof=1)))),
+        "speeds": [
+            {"stop": int(side), "along": float(along), "left": float(left)}
+            for side, (along, left) in zip(sides, speeds @ across @ axes[:2].T, strict=True)
+        ],
+        "forward_share": (1 + alike) / 2 if determined else None,
+        "norm_error": _entry(
+            float(norm.mean() - gravity.value),
+            None if scatter is None else float(np.hypot(np.sqrt(scatter[0, 0]), gravity.sigma)),
+            "m/s^2",
+        ),
+    }
+
+
+_STEP = 1e-5
+
+
+def _turned(turn: FloatArray) -> FloatArray:
+    """Return the matrix that turns by a small step about a direction."""
+    return np.eye(3) + _STEP * np.cross(np.eye(3), -turn)
+
+
+def _angles(axes: FloatArray) -> FloatArray:
+    """Return roll, pitch and yaw (rad) of a unit from the vehicle's axes in it, as rows: Rz(yaw) Ry(pitch) Rx(roll)."""
+    (x, y, z) = axes
+    return np.array([np.arctan2(z[1], z[2]), -np.arcsin(np.clip(z[0], -1, 1)), np.arctan2(y[0], x[0])])
+
+
+def _of_mean(values: FloatArray) -> FloatArray | None:
+    """Return the covariance of the mean of values (n, k), widened so that 1.96 of its sigmas hold 95 %; None of one."""
+    count = len(values)
+    if count < 2:
+        return None
+    widened = student_isf(0.025, count - 1) / Z95
+    return widened**2 / count * np.atleast_2d(np.cov(values.T))
+
+
+def _speeds(
+    stops: Segmentation, force: FloatArray, across: FloatArray, up: FloatArray, bias: FloatArray
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return the stop beside each speed (n,), and speeds (n, 2), m/s, along `across` (2, 3), as if driven forwards.
+
+    Speeds are gained after a stop and lost before one. The gyroscope carries the axes in which they add up, so that
+    turning is no speed to the side.
+    """
+    recording, intervals = stops.recording, stops.intervals
+    accelerometer, gyroscope = recording.accelerometer, recording.signals["gyroscope"]
+    time, sensed = accelerometer.time, accelerometer.si()
+    heading = np.cumsum((gyroscope.si() - bias) @ up * np.gradient(gyroscope.time))
+    course = np.exp(1j * np.interp(time, gyroscope.time, heading))
+    step = np.gradient(time)
+    edges = [time[0], *((intervals[1:, 0] + intervals[:-1, 1]) / 2), time[-1]]
+    sides, speeds = [], []
+    for number, (start, stop) in enumerate(intervals):
+        before = -1, max(edges[number], start - _SECONDS), start
+        after = 1, stop, min(edges[number + 1], stop + _SECONDS)
+        for sign, first, last in (before, after):
+            rows = np.flatnonzero((time >= first) & (time < last))[::sign]
+            turned = np.abs(np.angle(course[rows] / course[rows[:1]])) > _STRAIGHT
+            rows = rows[: int(np.argmax(turned)) if turned.any() else None]
+            if last - first > 1.0 and len(rows):
+                gained = (sensed[rows] - force[number]) @ across.T @ np.array([1.0, 1j])
+                speed = sign * np.sum(gained * step[rows] * course[rows]) / course[rows[-1]]
+                sides.append(number)
+                speeds.append([speed.real, speed.imag])
+    return np.array(sides, int), np.array(speeds).reshape(-1, 2)
+
+
+def _forward(sides: NDArray[np.int64], speeds: FloatArray) -> tuple[FloatArray, float | None, float]:
+    """Return the direction (2,) along which speeds (n, 2) lie, its sigma (rad) if any, and how one-sided they are.
+
+    The last is the sum of squared speeds one way less that of those the other way, over that of all: backwards is
+    slow. Speeds beside one stop share its slope, so the scatter that counts is that of stops.
+    """
+    if not len(speeds):
+        return np.array([1.0, 0.0]), None, 0.0
+    direction = np.linalg.svd(speeds, full_matrices=False)[2][0]
+    direction = direction * (np.sign(speeds.sum(axis=0) @ direction) or 1.0)
+    along, across = speeds @ direction, speeds @ np.array([-direction[1], direction[0]])
+    alike = float(np.sum(along * np.abs(along)) / np.sum(along**2))
+    pulls = np.bincount(sides, along * across)[np.unique(sides)]
+    count = len(pulls)
+    if count < _FEWEST_STOPS:
+        return direction, None, alike
+    scatter = np.sqrt(np.sum(pulls**2) * count / (count - 1)) / np.sum(along**2)
+    return direction, float(scatter * student_isf(0.025, count - 1) / Z95), alike
+
+
+def _entry(value: Any, sigma: Any, unit: str) -> dict[str, Any]:
+    """Return a number, or several, with what it is known to, as the JSON document has it; not finite ones are null."""
+
+    def plain(number: Any) -> Any:
+        listed = np.asarray(number, float) if number is not None else None
+        return None if listed is None or not np.isfinite(listed).all() else listed.tolist()
+
+    return {"value": plain(value), "sigma": plain(sigma), "unit": unit}

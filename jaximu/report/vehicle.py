@@ -1,0 +1,143 @@
+"""The page of a vehicle that stops: the gyroscope's bias, how the unit is mounted, and what stays open."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaximu.calibration import Calibration, History
+from jaximu.ground.page import Items, Page, Part, Picture, Section, Statement
+from jaximu.ground.quantities import Z95, counted, listed, size, with_interval, with_intervals
+from jaximu.model.effects.earth_rotation import EARTH_RATE
+from jaximu.report.calibration import calibration_page
+from jaximu.report.figures import AXES, band, dressed, legend, new_figure, zero_line
+from jaximu.report.words import limits
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["vehicle_page"]
+
+_SURE = 4.0
+"""Standard deviations from which on a change of the bias is a caution."""
+
+
+def vehicle_page(calibration: Calibration, history: History) -> Page:
+    """Return the page of a gyroscope that was calibrated by the stops of a vehicle."""
+    assert calibration.filter is not None
+    vehicle = calibration.filter["vehicle"]
+    scale = np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)
+    worst = float(np.max(Z95 * calibration.bias_sigma_recording["gyroscope"] / scale))
+    picture = Picture(
+        "vehicle",
+        partial(_figure, calibration, history),
+        "Gyroscope bias and tilt at each stop, and the speeds gained and lost beside stops",
+        "Top: the bias as a filter knew it after each stop, with 95 % bands. Middle: how much more than on average the "
+        "vehicle tilts at each stop, which is the slope of the road. Bottom: speeds gained in the seconds after a stop "
+        "and lost in those before one, along the vehicle and to its left; backwards they are negative.",
+    )
+    page = calibration_page(
+        calibration,
+        [picture],
+        [],
+        partial(limits, calibration),
+        (f"The vehicle stood still at {counted(len(vehicle['stops']), 'stop')}, {vehicle['seconds']:.0f} s in all.",),
+        (f"±{size(worst, 'rad/s', 2)}", "how well the gyroscope's bias over the drive is known (95 %, the worst axis)"),
+        [*_statements(calibration, vehicle), Section("What stays open", [Items(calibration.filter["open"])], 3)],
+    )
+    files = calibration.data.get("files", ())
+    log = shlex.quote(str(files[0]["file"])) if files else "LOG"
+    return replace(page, next=f"`jaximu compensate CALIBRATION {log} -o CORRECTED.csv` takes the gyroscope's bias off.")
+
+
+def _statements(calibration: Calibration, vehicle: Mapping[str, Any]) -> Iterator[Part]:
+    """Say how the unit is mounted, what gravity and the Earth's rotation show, and how the bias changed."""
+    yield Statement("Mounting", _mounting(vehicle))
+    if (yaw := vehicle["yaw"]) is not None:
+        share = f"{100 * vehicle['forward_share']:.0f} %"
+        yield Statement(
+            "Forward",
+            f"Yaw {_interval(yaw)}, by the speeds gained and lost beside the stops. {share} of their squares are one "
+            "way, which is taken for forwards.",
+        )
+    yield Statement(
+        "Gravity",
+        f"The accelerometer reads {_interval(vehicle['norm_error'], sign=True)} more than gravity at the stops: its "
+        "scale and bias along the vertical.",
+    )
+    change = vehicle["bias_change"]
+    if change["value"] is not None:
+        texts = with_intervals(change["value"], change["sigma"], "rad/s")
+        moved = np.max(np.abs(change["value"]) / np.array(change["sigma"])) > _SURE
+        advice = " Use it for this drive, and let the unit warm up before the next." * bool(moved)
+        axes = [f"{axis} {text}" for axis, text in zip("xyz", texts, strict=True)]
+        yield Statement(
+            "Bias over the drive", f"From the first stop to the last it changed by {listed(axes)}.{advice}", bool(moved)
+        )
+    yield Statement("Earth's rotation", _earth(calibration))
+
+
+def _interval(entry: Mapping[str, Any], sign: bool = False) -> str:
+    """Return a number with its interval, or without one where it has none."""
+    if entry["sigma"] is None:
+        return f"{size(entry['value'], entry['unit'])} (without an interval)"
+    return with_interval(entry["value"], entry["sigma"], entry["unit"], sign)
+
+
+def _mounting(vehicle: Mapping[str, Any]) -> str:
+    slope = vehicle["slope"]
+    known = "" if slope is None else f" The road at the stops sloped by {size(slope, 'rad', 2)} (rms), which is in it."
+    return (
+        f"Roll {_interval(vehicle['roll'])} and pitch {_interval(vehicle['pitch'])} against the horizontal: the unit's "
+        f"axes are those of the vehicle (forward, left, up) turned by yaw, pitch and roll.{known} A slope that all "
+        "stops share, such as a road's fall to its side, and the accelerometer's bias (0.6° for 0.1 m/s²) are not."
+    )
+
+
+def _earth(calibration: Calibration) -> str:
+    latitude = calibration.gravity.latitude
+    if latitude is None:
+        return (
+            f"Up to {size(EARTH_RATE, 'rad/s', 2)} of it are in the bias, and its interval allows for that. With "
+            "--latitude its vertical part is taken off."
+        )
+    level = EARTH_RATE * np.cos(np.radians(latitude))
+    return (
+        f"Its vertical part was taken off. Of the horizontal part up to {size(level, 'rad/s', 2)} are in the bias, as "
+        "the heading is unknown, and its interval allows for that."
+    )
+
+
+def _figure(calibration: Calibration, history: History) -> Figure:
+    assert calibration.filter is not None
+    vehicle = calibration.filter["vehicle"]
+    scale = np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)
+    figure = new_figure(7.5)
+    bias, tilt, speed = figure.subplots(3, 1)
+    for row, (axis, color) in enumerate(AXES.items()):
+        values, sigmas = (
+            np.degrees(history.values[:, row] / scale[row]),
+            np.degrees(history.sigmas[:, row] / scale[row]),
+        )
+        band(bias, history.time, values - values[-1], Z95 * sigmas, color, label=axis)
+    limit = 3 * np.degrees(Z95 * np.max(history.sigmas[len(history.time) // 2 :] / scale))
+    bias.set_ylim(-limit, limit)
+    dressed(bias, "Gyroscope bias less its last value [°/s]")
+    tilts = np.degrees([stop["tilt"] for stop in vehicle["stops"]])
+    middle = [(stop["start"] + stop["stop"]) / 2 for stop in vehicle["stops"]]
+    for column, name in enumerate(("forward", "to the left")):
+        tilt.plot(middle, tilts[:, column], "o", label=name, markersize=4)
+    dressed(tilt, "Tilt at each stop less the mean: lean of the vertical [°]", xlabel="time [s]")
+    speeds = np.array([[entry["along"], entry["left"]] for entry in vehicle["speeds"]]).reshape(-1, 2)
+    speed.plot(*speeds.T, "o", markersize=4)
+    dressed(speed, "Speeds beside stops", xlabel="along the vehicle [m/s]", ylabel="to its left [m/s]")
+    legend(bias, 3, "upper right")
+    legend(tilt, 2, "upper right")
+    for panel in (bias, tilt, speed):
+        zero_line(panel)
+    return figure
