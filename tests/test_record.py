@@ -180,14 +180,14 @@ def test_what_cannot_be_recorded_is_refused(log, tmp_path, capsys):
 
 def test_the_terminal_says_the_same_beside_a_page(log, browser, tmp_path, capsys):
     few = tmp_path / "few.csv"
-    few.write_text("".join(log.read_text().splitlines(keepends=True)[:2500]))
+    few.write_text("".join(log.read_text().splitlines(keepends=True)[:1500]))
     printed = []
     for name, more in (("plain", []), ("paged", ["--page"])):
         assert main(["record", "--from", str(few), *more, "-o", str(tmp_path / name)]) == 1
         printed.append(capsys.readouterr().err.replace(name, "…"))
     first, _, rest = printed[1].partition("\n")
     assert first.startswith("The page is http://127.0.0.1:")
-    assert rest == printed[0] and "Pose 2 counts. Next: " in rest
+    assert rest == printed[0] and "Pose 1 counts. Next: " in rest
     assert "<h1" in browser[0]["page"] and "Waiting for the first samples" in browser[0]["page"]
     news = [parts["news"] for parts in browser if parts.get("news")]
     assert news and all(str(text) in rest for text in news)
