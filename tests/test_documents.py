@@ -95,7 +95,7 @@ def test_the_conda_recipe_asks_for_what_the_package_does():
     whole = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     project, text = whole["project"], (ROOT / ".ci" / "conda" / "recipe.yaml").read_text(encoding="utf-8")
     assert re.search(r'(?m)^  version: "(.+)"$', text)[1] == __version__
-    assert f">={re.search(r'(?m)^  python_min: "(.+)"$', text)[1]}" == project["requires-python"]
+    assert ">=" + re.search(r'(?m)^  python_min: "(.+)"$', text)[1] == project["requires-python"]
     assert f'summary: "{project["description"]}"' in text and f"license: {project['license']}" in text
     (command,) = re.findall(r"- (\w+ = [\w.:]+)", text)
     assert dict([command.split(" = ")]) == project["scripts"]
