@@ -88,3 +88,21 @@ def test_the_citation_names_this_version():
         "name": project["authors"][0]["name"],
     }
     assert re.findall(r"(?m)^  - (\w[\w ]*)$", text) == project["keywords"]
+
+
+def test_the_conda_recipe_asks_for_what_the_package_does():
+    """Under conda's name for matplotlib without its windows."""
+    whole = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    project, text = whole["project"], (ROOT / ".ci" / "conda" / "recipe.yaml").read_text(encoding="utf-8")
+    assert re.search(r'(?m)^  version: "(.+)"$', text)[1] == __version__
+    assert ">=" + re.search(r'(?m)^  python_min: "(.+)"$', text)[1] == project["requires-python"]
+    assert f'summary: "{project["description"]}"' in text and f"license: {project['license']}" in text
+    (command,) = re.findall(r"- (\w+ = [\w.:]+)", text)
+    assert dict([command.split(" = ")]) == project["scripts"]
+    host, run = (
+        re.findall(r"(?m)^    - (.+)$", part)
+        for part in re.search(r"(?s)\n  host:\n(.+?)\n  run:\n(.+?)\n\n", text).groups()
+    )
+    stated = {line.replace(" >=", ">=").replace("matplotlib-base", "matplotlib") for line in run}
+    assert stated == {*project["dependencies"], "python>=${{ python_min }}"}
+    assert {line.replace(" >=", ">=") for line in host} >= set(whole["build-system"]["requires"])

@@ -2,25 +2,34 @@
 
 import json
 import os
+import re
+import socket
 import sys
 import threading
+import time
+from dataclasses import replace
 from itertools import pairwise
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from markupsafe import escape
 from simulated_person import GRAVITY, Person
 
 from jaximu.calibration import calibrate, load_calibration
+from jaximu.cli import server
 from jaximu.cli.app import main
 from jaximu.estimation.problem import flatten, names_of
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.planning.goals import per_si
 from jaximu.planning.guide import Guide
-from jaximu.planning.poses import box_words
+from jaximu.planning.poses import box_words, turned_to, up_of
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.readers.stream import Lines
+from jaximu.report.guide import Capture, LivePage
+from jaximu.simulation.protocols.course import attitude_of
 
 KNOWN = LocalGravity(GRAVITY, 0.0)
 
@@ -106,11 +115,31 @@ def log(session, tmp_path_factory):
     return path
 
 
-def test_a_log_played_again_stops_at_the_goal_and_calibrates_as_calibrate_does(log, session, tmp_path, capsys):
+@pytest.fixture
+def browser(monkeypatch):
+    """A browser that follows the page of every recording: all that it is sent, event by event."""
+    shown = []
+
+    def read(address):
+        with urlopen(f"{address}events", timeout=30) as stream:
+            shown.extend(json.loads(line[6:]) for line in stream if line.startswith(b"data: {"))
+
+    def opened(address):
+        shown.append({"page": urlopen(address, timeout=30).read().decode()})
+        threading.Thread(target=read, args=(address,), daemon=True).start()
+
+    monkeypatch.setattr(server, "open_in_browser", opened)
+    return shown
+
+
+def test_a_log_played_again_stops_at_the_goal_and_calibrates_as_calibrate_does(log, session, browser, tmp_path, capsys):
     out = tmp_path / "out"
     given_ = ["record", "--from", str(log), "--gravity", f"{GRAVITY}", "--serial", "A-7", "-o", str(out)]
-    assert main([*given_, "--goal", "accelerometer.bias 0.5 mg", "--json"]) == 0
+    assert main([*given_, "--goal", "accelerometer.bias 0.5 mg", "--json", "--page"]) == 0
     printed = capsys.readouterr()
+    last = {name: text for parts in browser for name, text in parts.items()}
+    assert last["headline"] == f"Calibrated: the report is {out / 'report.html'}"
+    assert last["words"] == "nothing" and "accelerometer.bias 0.5 mg: reached" in last["poses"]
     assert json.loads(printed.out)["trace"]["serial"] == "A-7"
     assert "Next: " in printed.err and "accelerometer.bias 0.5 mg: reached" in printed.err
     recorded = read_recording(out / "log.csv")
@@ -144,6 +173,103 @@ def test_what_cannot_be_recorded_is_refused(log, tmp_path, capsys):
     assert main(["record", "--from", str(few), "-o", str(tmp_path / "c")]) == 1
     told = capsys.readouterr().err
     assert "ended before the goal" in told and "static pose" in told and (tmp_path / "c" / "log.csv").is_file()
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_terminal_says_the_same_beside_a_page(log, browser, tmp_path, capsys):
+    few = tmp_path / "few.csv"
+    few.write_text("".join(log.read_text().splitlines(keepends=True)[:1500]))
+    printed = []
+    for name, more in (("plain", []), ("paged", ["--page"])):
+        assert main(["record", "--from", str(few), *more, "-o", str(tmp_path / name)]) == 1
+        printed.append(capsys.readouterr().err.replace(name, "…"))
+    first, _, rest = printed[1].partition("\n")
+    assert first.startswith("The page is http://127.0.0.1:")
+    assert rest == printed[0] and "Pose 1 counts. Next: " in rest
+    assert "<h1" in browser[0]["page"] and "Waiting for the first samples" in browser[0]["page"]
+    news = [parts["news"] for parts in browser if parts.get("news")]
+    assert news and all(str(text) in rest for text in news)
+    assert browser[-1]["headline"].startswith("The recording has ended: ")
+
+
+def test_a_page_that_cannot_be_served_stops_before_anything_is_recorded(log, tmp_path, capsys):
+    out = tmp_path / "out"
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = str(other.getsockname()[1])
+        assert main(["record", "--from", str(log), "--page", "--page-port", taken, "-o", str(out)]) == 2
+    assert f"--page-port {taken} cannot be used" in capsys.readouterr().err
+    assert main(["record", "--from", str(log), "--page", "--page-port", "70000", "-o", str(out)]) == 2
+    assert "numbers from 1 to 65535" in capsys.readouterr().err
+    assert main(["record", "--from", str(log), "--page-port", "8000", "-o", str(out)]) == 2
+    assert "--page-port goes with --page" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_recording_that_fails_says_so_on_the_page(browser, tmp_path, capsys):
+    words = tmp_path / "words.txt"
+    words.write_text("time,accel\n" + "nothing,<here>\n" * 2000)
+    assert main(["record", "--from", str(words), "--page", "-o", str(tmp_path / "b")]) == 2
+    error = capsys.readouterr().err.splitlines()[-1].removeprefix("jaximu: ")
+    assert browser[-1]["headline"] == str(escape(f"The recording has ended: {error}"))
+
+
+def test_the_page_draws_the_unit_and_what_is_still_uncertain(session):
+    """The drawn unit has the next pose's direction up, and a map with a calibration fades on one scale."""
+    _, moments, _ = session
+    live, maps = LivePage(4.0), []
+    assert live.parts() == {"headline": "Waiting for the first samples", "news": "", "stage": ""}
+    for moment in moments:
+        live.capture = Capture(4.0, moment, "a < b")
+        parts = live.parts()
+        assert parts["news"] == "a &lt; b" and "<svg" in parts["now"] + parts["next"]
+        assert ("at most" in parts["map"]) == (moment.calibration is not None)
+        maps += re.findall("at most. The first map had ±([^:]+):", parts["map"])
+        again = live.parts()
+        assert again == parts  # nothing has changed: nothing is drawn again
+    assert len(maps) > 1 and len(set(maps)) == 1
+    assert live.parts()["headline"] == f"Done: {len(moments[-1].taken)} poses count"
+    assert len(re.findall("pose [0-9]+&", parts["map"])) == len(moments[-1].taken)
+
+
+def test_headlines():
+    person, guide = Person(1, careless=0.0), Guide(rest=3.0)
+    live = LivePage(3.0)
+
+    def headline():
+        live.capture = Capture(3.0, guide.update(person.recording()))
+        return live.parts()["headline"]
+
+    person.hold(2.0, 0.0)
+    assert headline() == "Hold still"
+    person.turn_to([1.0, 0.0, 0.0])
+    assert headline() == "Hold the unit still in any orientation"
+    person.hold(3.5, 0.0)
+    words = live.capture.moment.words
+    assert words == "" and headline() == f"Pose 1 counts. Turn to {live.capture.moment.words}"
+    person.turn_to(live.capture.moment.up)
+    assert headline() == f"Turn to {live.capture.moment.words}"
+    degrees = int(re.match("([0-9]+)° from the next pose", live.parts()["held"])[1])
+    assert degrees < 25  # a person misses by some degrees
+    live.capture = replace(live.capture, stage="Computing …", since=time.monotonic())
+    assert live.parts()["stage"] == ""  # most take less than a second
+    live.capture = replace(live.capture, since=time.monotonic() - 2)
+    assert live.parts()["stage"] == "Computing …"
+
+
+def test_the_shortest_turn_brings_a_direction_upwards():
+    rng = np.random.default_rng(3)
+    for before, after in [
+        *rng.standard_normal((20, 2, 3)),
+        *np.array([[[0, 0, 1], [0, 0, 1]], [[0, 0, 1], [0, 0, -1.0]]]),
+    ]:
+        before, after = before / np.linalg.norm(before), after / np.linalg.norm(after)
+        first = attitude_of(before, 0.7).as_quat(scalar_first=True)
+        turned = turned_to(first, after)
+        np.testing.assert_allclose(up_of(turned), after, atol=1e-12)
+        angle = 2 * np.arccos(np.clip(first @ turned, -1, 1))
+        assert angle == pytest.approx(np.arccos(np.clip(before @ after, -1, 1)), abs=1e-6)
 
 
 # --- sources ----------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import os
 import pickle
 import subprocess
 import sys
+import time
 import zlib
 
 import jax
@@ -51,6 +52,46 @@ def test_a_program_is_compiled_once(folder):
     assert len(written) == 2
     np.testing.assert_allclose(again(MATRIX, np.zeros(3)), ROOT)
     assert times(folder, "program") | times(folder, "name") == written
+
+
+_WORKER = """
+import sys, time
+from pathlib import Path
+import numpy as np
+from jaximu.ground import stored
+
+folder, name = Path(sys.argv[1]), sys.argv[2]
+compiled = stored._compiled
+
+def counted(lowered):
+    (folder / f"compiled by {name}").touch()
+    time.sleep(1.0)
+    return compiled(lowered)
+
+stored._compiled = counted
+stored.prepare_process(folder)
+(folder / f"ready {name}").touch()
+while len(list(folder.glob("ready *"))) < 2:
+    time.sleep(0.01)
+print(stored.call(abs, "absolute", np.array([-2.0, 3.0])))
+"""
+
+
+def test_two_processes_never_compile_the_same_program(folder):
+    workers = [subprocess.Popen([sys.executable, "-c", _WORKER, str(folder), name], stdout=subprocess.PIPE, text=True)
+               for name in "ab"]  # fmt: skip
+    most = 0
+    while any(worker.poll() is None for worker in workers):
+        most = max(most, stored.compiling())
+        time.sleep(0.05)
+    assert [worker.communicate()[0].split() for worker in workers] == [["[2.", "3.]"]] * 2
+    assert len(list(folder.glob("compiled by *"))) == 1 and most == 1
+    assert stored.compiling() == 0 and not list(folder.glob("*.lock"))
+
+
+def test_the_lock_of_a_process_that_died_holds_nobody_up(folder):
+    (folder / "left.lock").touch()
+    assert stored.compiling() == 0 and not list(folder.glob("*.lock"))
 
 
 def test_an_edit_elsewhere_compiles_nothing(folder):

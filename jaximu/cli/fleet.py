@@ -16,6 +16,7 @@ from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
+from jaximu.ground.stored import compiling
 
 if TYPE_CHECKING:
     from jaximu.acceptance.limits import Limits
@@ -169,15 +170,23 @@ def _write(fleet: Fleet, page: Page, table: Path) -> tuple[Path, ...]:
 
 @contextmanager
 def _progress(total: int) -> Iterator[Callable[[int, int, Counter], None]]:
-    """Show how far the run is, its rate and the time that is left, on stderr."""
-    began = time.monotonic()
+    """Show how far the run is, its rate and the time that is left, on stderr.
+
+    The time in which programs are compiled, once on a machine, does not count: nothing is computed meanwhile.
+    """
+    last, working = time.monotonic(), 0.0
     with progress("calibrating", _EVERY) as report:
 
         def show(done: int, kept: int, statuses: Counter) -> None:
-            rate = (done - kept) / max(time.monotonic() - began, 1e-9)
+            nonlocal last, working
+            now, programs = time.monotonic(), compiling()
+            working += 0.0 if programs else now - last
+            last = now
+            rate = (done - kept) / max(working, 1e-9)
             failed = sum(count for status, count in statuses.items() if status != "ok")
             text = f"{done} of {total} recordings" + (f" ({kept} kept from before)" if kept else "")
             text += f", {rate:.3g} a second, {(total - done) / rate:.0f} s left" if rate > 0 else ""
+            text += f", compiling {programs} program{'s' * (programs > 1)} once for this machine" if programs else ""
             (report if done < total else say)(text + (f", {failed} failed" if failed else ""))
 
         yield show

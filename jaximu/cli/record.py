@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import UseAppendAction
+from tyro.conf import UseAppendAction, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import InputError, JaximuError
 
 if TYPE_CHECKING:
-    from jaximu.planning.guide import GoalProgress, Guide, Moment
+    from jaximu.planning.guide import Guide, Moment
     from jaximu.recordings.readers.stream import Lines
     from jaximu.recordings.recording import Recording
 
@@ -32,12 +35,14 @@ class RecordCommand:
     """Record with guidance: which way to hold the unit next, which poses count, and when it is enough.
 
     Lines are CSV with a header, or described by --columns. DIR receives log.csv line by line, then calibration.json and
-    report.html, as of `jaximu calibrate`. Ctrl-C ends the recording and calibrates what there is.
+    report.html, as of `jaximu calibrate`. Ctrl-C ends the recording and calibrates what there is. --page also draws the
+    next pose, what counts and what is still uncertain in the browser; nothing leaves this machine.
 
     Examples:
       jaximu record --from /dev/ttyUSB0 --columns "time [us],accel [g],gyro [deg/s]" -o results
       jaximu record --from "nc -l 5555" --goal "accelerometer.bias 0.5 mg" -o results
       jaximu record --from old/log.csv -o again
+      jaximu record --from /dev/ttyUSB0 --page -o results
 
     """
 
@@ -60,6 +65,10 @@ class RecordCommand:
         ),
     ] = ()
     rest: Annotated[float, option("S", "How long a pose must rest to count, in seconds.")] = 4.0
+    page: Annotated[bool, arg(help="Also show the pose to take next, and what counts, on a page in the browser.")] = (
+        False
+    )
+    page_port: Annotated[int, option("N", "Port of the page, on this machine alone (default: one that is free).")] = 0
     log: options.Reading = options.READING
     local: options.Local = options.LOCAL
     traced: options.Traced = options.TRACED
@@ -77,11 +86,11 @@ class RecordCommand:
         from jaximu.recordings.readers.stream import Lines
 
         guide = Guide(self.goal, gravity, self.rest)
-        with Lines(self.source, self.baud) as lines:
+        with self._page() as show, Lines(self.source, self.baud) as lines:
             self.results.prepare(*options.INERTIAL)
             say(f"Hold the unit still for {self.rest:g} s in each pose, then turn it to the next.")
             try:
-                done = _record(lines, path, self.log, guide)
+                done = _record(lines, path, self.log, guide, show)
             except KeyboardInterrupt:
                 say("Stopped.")
                 done = False
@@ -92,21 +101,52 @@ class RecordCommand:
                     else ""
                 )
                 raise InputError(f"{error.args[0]}{kept}") from None
-        for text in (lines.stopped, f"{lines.garbled} garbled lines were left out." if lines.garbled else ""):
-            if text:
-                say(text)
-        if not done:
-            say("The recording ended before the goal was reached; what there is is calibrated.")
-        with progress("calibrating"):
-            from jaximu.calibration import calibrate
+            for text in (lines.stopped, f"{lines.garbled} garbled lines were left out." if lines.garbled else ""):
+                if text:
+                    say(text)
+            if not done:
+                say("The recording ended before the goal was reached; what there is is calibrated.")
+            show(end="The recording has ended. Calibrating …")
+            with progress("calibrating"):
+                from jaximu.calibration import calibrate
 
-            calibration = calibrate(self.log.read(path, gravity), gravity)
-        calibration = replace(calibration, trace=self.traced.value((path,)))
-        self.results.present(calibration.summary, calibration=calibration)
+                calibration = calibrate(self.log.read(path, gravity), gravity)
+            calibration = replace(calibration, trace=self.traced.value((path,)))
+            self.results.present(calibration.summary, calibration=calibration)
+            show(end=f"Calibrated: the report is {self.results.output / 'report.html'}")
+
+    @contextmanager
+    def _page(self) -> Iterator[Callable[..., None]]:
+        """Give what shows changes of a `Capture` on the page; a page that ends with an error says so."""
+        if not self.page:
+            if self.page_port:
+                raise InputError("--page-port goes with --page.")
+            yield lambda **_: None
+            return
+        from jaximu.cli.server import PageServer, open_in_browser
+        from jaximu.report.guide import LivePage
+
+        live = LivePage(self.rest)
+
+        def show(**changes: Any) -> None:
+            live.capture = replace(live.capture, **changes, since=time.monotonic())
+            server.changed()
+
+        with PageServer(live, self.page_port) as server:
+            say(f"The page is {server.address}")
+            open_in_browser(server.address)
+            try:
+                yield show
+            except JaximuError as error:
+                show(end=f"The recording has ended: {error.args[0]}")
+                raise
 
 
-def _record(lines: Lines, path: Path, log: options.LogOptions, guide: Guide) -> bool:
-    """Write lines to the log and follow it; return whether the goal was reached before they ended."""
+def _record(lines: Lines, path: Path, log: options.LogOptions, guide: Guide, show: Callable[..., None]) -> bool:
+    """Write lines to the log and follow it; return whether the goal was reached before they ended.
+
+    `show`: takes what a `Capture` is to hold by now, by name.
+    """
     count, wanted, last = 0, _FIRST, None
     with path.open("wb") as file:
         while some := lines.take(wanted):
@@ -117,8 +157,13 @@ def _record(lines: Lines, path: Path, log: options.LogOptions, guide: Guide) -> 
             if recording is None:
                 continue
             wanted = max(1, round(_EVERY * recording.accelerometer.rate))
+            show(stage="Computing …")
             moment = guide.update(recording)
-            _tell(moment, last, guide.rest)
+            news = _news(moment, last, guide.rest)
+            if news:
+                counts = len(moment.taken) > (0 if last is None else len(last.taken))
+                say("\a" * (counts and sys.stderr.isatty()) + news)
+            show(moment=moment, stage="Waiting for lines …", **({"news": news} if news else {}))
             last = moment
             if moment.done:
                 return all(goal.reached for goal in moment.goals)
@@ -135,22 +180,14 @@ def _so_far(path: Path, log: options.LogOptions, count: int) -> Recording | None
         return None
 
 
-def _tell(moment: Moment, last: Moment | None, rest: float) -> None:
-    """Say what has changed since the last look."""
-    before = 0 if last is None else len(last.taken)
-    if len(moment.taken) > before:
-        bell = "\a" if sys.stderr.isatty() else ""
-        goals = "".join(f" {_goal_words(goal)}." for goal in moment.goals)
-        say(f"{bell}Pose {len(moment.taken)} counts.{goals}" + ("" if moment.done else f" Next: {moment.words}."))
-    elif len(moment.taken) < before:
-        say(f"The unit moved in a pose: {len(moment.taken)} count. Next: {moment.words or 'hold it still'}.")
-    elif moment.short and (last is None or last.still):
-        say(f"Not long enough: {moment.short:.1f} s at rest, {rest:g} s are needed.")
-
-
-def _goal_words(goal: GoalProgress) -> str:
-    import math
-
-    if goal.now == math.inf:
-        return f"{goal.text}: open"
-    return f"{goal.text}: {'reached' if goal.reached else f'{goal.now / goal.size:.2g} times that'}"
+def _news(moment: Moment, last: Moment | None, rest: float) -> str:
+    """Return what has changed since the last look, in words."""
+    before, count = 0 if last is None else len(last.taken), len(moment.taken)
+    if count > before:
+        goals = "".join(f" {goal.text}: {goal.words}." for goal in moment.goals)
+        return f"Pose {count} counts.{goals}" + ("" if moment.done else f" Next: {moment.words}.")
+    if count < before:
+        return f"The unit moved in a pose: {count} count. Next: {moment.words or 'hold it still'}."
+    if moment.short and (last is None or last.still):
+        return f"Not long enough: {moment.short:.1f} s at rest, {rest:g} s are needed."
+    return ""

@@ -1,6 +1,7 @@
 """Engines: they compute the rows of jobs, here or on a cluster. The job is the same; only who works on it differs.
 
-An engine takes all jobs and the places of those that are wanted, and gives batches of (places, rows) in any order.
+An engine takes all jobs and the places of those that are wanted, and gives batches of (places, rows) in any order,
+and empty ones while it waits.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ __all__ = ["ENGINES", "local"]
 Engine = Callable[[Sequence[Job], Sequence[int], Settings, int], Iterator[Rows]]
 _TRIES = 2
 """Times that a batch may bring its process down before its jobs are tried one by one."""
+_PATIENCE = 1.0  # s without a row after which an empty batch is given
 _DIED = "the process that computed this row died twice: the file may need more memory than there is"
 
 
@@ -64,7 +66,10 @@ def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: 
                 running[future] = part, strikes
             if not running:
                 return
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            finished = wait(running, _PATIENCE, FIRST_COMPLETED).done
+            if not finished:
+                yield (), []
+            for future in finished:
                 part, strikes = running.pop(future)
                 try:
                     yield part, future.result()

@@ -39,7 +39,7 @@ def run_fleet(
     - `engine`: "local", or "ray" for a Ray cluster.
     - `workers`: processes; as many as there are cores if None.
     - `progress`: called with the rows that are there, how many of them were kept from an earlier run, and how often
-      each status occurs among those computed now.
+      each status occurs among those computed now; with each batch, and every second or so without one.
 
     **Returns:** how often each status occurs. Raises `InputError` where the output is in use or cannot be written.
     """
@@ -59,7 +59,8 @@ def run_fleet(
         if pending:
             with closing(ENGINES[engine](jobs, pending, settings, workers or available_cores())) as results:  # pyright: ignore[reportArgumentType]
                 for places, rows in results:
-                    store.add(places, rows)
+                    if rows:
+                        store.add(places, rows)
                     statuses.update(row["status"] for row in rows)
                     done += len(places)
                     progress(done, kept, statuses)

@@ -14,8 +14,8 @@ import os
 import pickle
 import sys
 import zlib
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from functools import wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -24,7 +24,7 @@ from typing import Any, TypeVar, cast
 from jaximu.ground.errors import InputError
 from jaximu.ground.tracing import is_traced
 
-__all__ = ["cache", "call", "compiled", "folder", "forget", "prepare_process", "tell_apart"]
+__all__ = ["cache", "call", "compiled", "compiling", "folder", "forget", "prepare_process", "tell_apart"]
 
 _folder: Path | None = None
 _at_first: Callable[[], None] | None = None
@@ -180,13 +180,26 @@ def _first_run(key: str, function: Callable, leaves: list, quick: bool) -> tuple
     name = _folder / f"{_code()[:_DIGEST]}-{key}.name"
     with suppress(Exception):  # missing, damaged, of another version, or one that does not run here
         return kept(_folder / name.read_text(encoding="utf-8"))
+    with _alone(name.with_suffix(".lock")) as waited:
+        if waited:
+            with suppress(Exception):  # another process has compiled it meanwhile
+                return kept(_folder / name.read_text(encoding="utf-8"))
+        return _keep_first_run(name, kept, function, leaves, quick)
+
+
+def _keep_first_run(
+    name: Path, kept: Callable[[Path], tuple[Callable, Any]], function: Callable, leaves: list, quick: bool
+) -> tuple[Callable, Any]:
+    """Trace a function and compile it, where no kept program has its text; keep it under its name in the folder."""
+    import jax
+
     _tell()
     options = _options(quick)
     shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
     lowered = jax.jit(function, compiler_options=options).lower(*shapes)
     # The text leaves out arguments that are not used, and the structure of the results.
     about = repr((_machine(), options, shapes, str(lowered.out_tree), lowered.as_text()))
-    path = _folder / f"{hashlib.sha256(about.encode()).hexdigest()[:40]}.program"  # whatever the source was
+    path = name.with_name(f"{hashlib.sha256(about.encode()).hexdigest()[:40]}.program")  # whatever the source was
     try:
         program, results = kept(path)
     except Exception:
@@ -196,6 +209,46 @@ def _first_run(key: str, function: Callable, leaves: list, quick: bool) -> tuple
             _keep(path, _dump(program))
     _keep(name, path.name.encode())
     return program, results
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[bool]:
+    """Let one process at a time work on what a file locks, and give whether another one did until now.
+
+    A process that dies lets go of it. Where files cannot be locked (a read-only folder, Windows) nobody waits.
+    """
+    with ExitStack() as stack:
+        waited = False
+        with suppress(ImportError, OSError):
+            import fcntl
+
+            file = stack.enter_context(path.open("wb"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                waited = True
+                fcntl.flock(file, fcntl.LOCK_EX)
+            stack.callback(path.unlink, missing_ok=True)
+        yield waited
+
+
+def compiling() -> int:
+    """Return how many programs processes that share the folder are compiling now."""
+    count = 0
+    with suppress(ImportError):
+        import fcntl
+
+        for path in _folder.glob("*.lock") if _folder else ():
+            try:
+                with path.open("rb") as file:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                count += 1
+            except OSError:  # it is done
+                pass
+            else:
+                path.unlink(missing_ok=True)  # left by a process that died
+    return count
 
 
 def _compiled(lowered: Any) -> Any:

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import jax
 import numpy as np
-from scipy.spatial.transform import Rotation
+from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration, calibrate
 from jaximu.calibration.nominal import as_stated
@@ -29,8 +29,8 @@ from jaximu.planning.goals import goal_of, goal_sigmas, parse_goal
 from jaximu.planning.information import Design, hand_held_information
 from jaximu.planning.optimisation import DesignQuestion
 from jaximu.planning.plan import EQUIPMENT, Known, question_of
-from jaximu.planning.poses import box_words
-from jaximu.recordings.recording import Recording
+from jaximu.planning.poses import box_words, turned_to
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import SegmentationOptions, segment
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.positions import directions
@@ -41,6 +41,7 @@ _BOX = np.array([up for up, _ in directions(26)])
 _FEWEST, _MOST = 9, 60  # poses that a calibration needs; poses after which a goal is given up
 _USUAL = 12  # poses where no goal is stated
 _REACHED = 0.5  # s since the last pose's end after which the unit is said to move
+_HELD = 0.25  # s at the end of the recording whose mean shows how the unit is held now
 _NEXT = np.radians(30.0)
 """The next pose is this far from the present one at least."""
 
@@ -58,6 +59,13 @@ class GoalProgress:
         """Whether it is as small as wanted."""
         return self.now <= self.size
 
+    @property
+    def words(self) -> str:
+        """How far it is."""
+        if self.now == np.inf:
+            return "open"
+        return "reached" if self.reached else f"{self.now / self.size:.2g} times that"
+
 
 @dataclass(frozen=True)
 class Moment:
@@ -66,7 +74,8 @@ class Moment:
     still: s for which the unit has been at rest by now, 0 while it moves. taken (P, 2): start and stop of the poses
     that count, s. short: s of the last rest, where it was too short to count, else 0. up, words: the orientation to go
     to next, which body direction points up. goals: how far each is. done: whether to stop; calibration: of what was
-    recorded, None before it is possible.
+    recorded, None before it is possible. held (3,), ups (P, 3): which body direction points up now, and in the poses
+    that count. wanted: number of poses to record, 0 where there are goals.
     """
 
     still: float
@@ -77,6 +86,9 @@ class Moment:
     goals: tuple[GoalProgress, ...]
     done: bool
     calibration: Calibration | None
+    held: FloatArray
+    ups: FloatArray
+    wanted: int
 
 
 class Guide:
@@ -102,6 +114,7 @@ class Guide:
         self._seen: FloatArray = np.zeros((0, 2))
         self._calibration: Calibration | None = None
         self._next: FloatArray | None = None
+        self._ups: FloatArray = np.zeros((0, 3))
 
     def update(self, recording: Recording) -> Moment:
         """Return where the capture stands. Raises `InputError` where a goal names no parameter of this unit."""
@@ -111,7 +124,8 @@ class Guide:
             rests = np.zeros((0, 2))
         length = rests[:, 1] - rests[:, 0]
         long = length >= self.rest
-        now = recording.accelerometer.time[-1]
+        signal = recording.accelerometer
+        now = signal.time[-1]
         still = float(length[-1]) if len(rests) and now - rests[-1, 1] < _REACHED else 0.0
         taken = rests[long]
         if len(taken) != len(self._seen) or np.any(np.abs(taken[:, 0] - self._seen[:, 0]) > _REACHED):
@@ -122,7 +136,14 @@ class Guide:
         done = all(goal.reached for goal in goals) if goals else len(taken) >= _USUAL
         done = (done and self._calibration is not None) or len(taken) >= _MOST
         words = "" if self._next is None else box_words(self._next)
-        return Moment(still, taken, short, self._next, words, tuple(goals), done, self._calibration)
+        count = len(signal)
+        held = _upward(self._unit(recording), signal, np.array([[count - max(1, round(_HELD * signal.rate)), count]]))[
+            0
+        ]
+        wanted = 0 if goals else _USUAL
+        return Moment(
+            still, taken, short, self._next, words, tuple(goals), done, self._calibration, held, self._ups, wanted
+        )
 
     def _renew(self, recording: Recording) -> None:
         """Calibrate what there is, and choose the next orientation."""
@@ -131,40 +152,36 @@ class Guide:
                 self._calibration = calibrate(recording, self.gravity)
             except NotPossibleError:
                 self._calibration = None
+        imu = self._unit(recording)
+        self._ups = _upward(imu, recording.accelerometer, np.searchsorted(recording.accelerometer.time, self._seen))
         if not len(self._seen):
             return
         if self._calibration is None:
-            imu = as_stated(recording)
             known = Known(
                 imu if recording.gyroscope is not None else replace(imu, gyroscope=None), gravity=self.gravity
             )
         else:
             known = Known.from_calibration(self._calibration)
         question, _ = question_of(known, replace(EQUIPMENT["hands"], rest=self.rest), "D", None)
-        ups = self._ups(recording, known)
         information = np.asarray(question.prior)
         if self._calibration is None:
-            for before, after in pairwise(ups):
+            for before, after in pairwise(self._ups):
                 information = information + _information(question, before, after[None])[0]
-        added = _information(question, ups[-1], _BOX)
+        added = _information(question, self._ups[-1], _BOX)
         self._next = _BOX[
             int(
                 np.argmin(
                     [
-                        self._left(question, information + more, up @ ups[-1])
+                        self._left(question, information + more, up @ self._ups[-1])
                         for more, up in zip(added, _BOX, strict=True)
                     ]
                 )
             )
         ]
 
-    def _ups(self, recording: Recording, known: Known) -> FloatArray:
-        """Return the body's upward directions (P, 3) in the poses that count."""
-        signal, accelerometer = recording.accelerometer, known.imu.accelerometer
-        edges = np.searchsorted(signal.time, self._seen)
-        means = np.array([signal.values[first:last].mean(axis=0) for first, last in edges])
-        force = np.linalg.solve(np.asarray(accelerometer.gain), (means - np.asarray(accelerometer.bias)).T).T
-        return force / np.linalg.norm(force, axis=1, keepdims=True)
+    def _unit(self, recording: Recording) -> Imu:
+        """Return the unit as it is known by now."""
+        return as_stated(recording) if self._calibration is None else self._calibration.imu
 
     def _left(self, question: DesignQuestion, information: FloatArray, cosine: float) -> float:
         """Return how much is left to know with this information, as a logarithm; inf for a turn that cannot be made."""
@@ -192,9 +209,18 @@ class Guide:
         return progress
 
 
+def _upward(imu: Imu, signal: Signal, rows: NDArray[np.int64]) -> FloatArray:
+    """Return the body's mean upward directions (n, 3) over spans of rows (n, 2)."""
+    means = np.array([signal.values[first:last].mean(axis=0) for first, last in rows]).reshape(-1, 3)
+    gain, bias = np.asarray(imu.accelerometer.gain), np.asarray(imu.accelerometer.bias)
+    force = np.linalg.solve(gain, (means - bias).T).T
+    return force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-12)
+
+
 def _information(question: DesignQuestion, before: FloatArray, after: FloatArray) -> FloatArray:
     """Return the information (n, p, p) of a rest in each direction `after` (n, 3) and of the turn to it."""
-    pairs = np.array([_turned(before, direction) for direction in after])
+    first = attitude_of(before).as_quat(scalar_first=True)
+    pairs = np.array([[first, turned_to(first, direction)] for direction in after])
 
     def one(question, attitude):
         design = Design(attitude, attitude[:0], attitude[:0, 0])
@@ -202,15 +228,3 @@ def _information(question: DesignQuestion, before: FloatArray, after: FloatArray
 
     every = jax.vmap(one, (None, 0))
     return in_chunks(lambda pairs: stored.call(every, f"{question.key} guide", question, pairs), len(_BOX), pairs)
-
-
-def _turned(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return attitudes (2, 4) in which two body directions point up, the second reached from the first directly."""
-    first = attitude_of(before, 0.0)
-    cross, cosine = np.cross(before, after), float(before @ after)
-    size = float(np.linalg.norm(cross))
-    axis = cross / size if size > 1e-9 else np.roll(before, 1)
-    # the body turns by −angle about this axis for the level frame's up to come from `before` to `after`
-    step = Rotation.from_rotvec(-np.arctan2(size, cosine) * axis)
-    pair = np.array([rotation.as_quat(scalar_first=True) for rotation in (first, first * step)])
-    return pair * [[1.0], [1.0 if pair[0] @ pair[1] >= 0 else -1.0]]

@@ -18,6 +18,7 @@ __all__ = [
     "round_attitude",
     "round_direction",
     "short_order",
+    "turned_to",
     "up_of",
 ]
 
@@ -25,6 +26,18 @@ __all__ = [
 def up_of(attitude: FloatArray) -> FloatArray:
     """Return the body's upward direction (..., 3) of quaternions (..., 4), scalar first, body to level frame."""
     return Rotation.from_quat(attitude, scalar_first=True).as_matrix()[..., 2, :]
+
+
+def turned_to(attitude: FloatArray, up: FloatArray) -> FloatArray:
+    """Return the attitude (4,) that is reached from another (4,) by the shortest turn that brings `up` (3,) upwards."""
+    before = up_of(attitude)
+    cross, cosine = np.cross(before, up), float(before @ up)
+    size = float(np.linalg.norm(cross))
+    axis = cross / size if size > 1e-9 else np.roll(before, 1)
+    # the body turns by −angle about this axis for the level frame's up to come from `before` to `up`
+    step = Rotation.from_rotvec(-np.arctan2(size, cosine) * axis)
+    turned = (Rotation.from_quat(attitude, scalar_first=True) * step).as_quat(scalar_first=True)
+    return turned * (1.0 if attitude @ turned >= 0 else -1.0)
 
 
 def _polar(up: FloatArray) -> tuple[int, float, float, float]:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from jaximu.report.vector import Drawing
 
-__all__ = ["encoded", "fragment", "write_failure", "write_report"]
+__all__ = ["encoded", "environment", "failure", "fragment", "packaged", "write_failure", "write_report"]
 
 _LONG_WORD = 40  # letters from which on a cell's word is broken
 
@@ -52,8 +52,8 @@ def encoded(page: Page) -> tuple[bytes, dict[str, bytes]]:
         try:
             drawings[picture.name], pictures[f"{picture.name}.png"] = _drawn(picture.draw(), picture.name)
         except Exception as error:
-            drawings[picture.name] = _failure(f"The figure “{picture.name}”", error)
-    template = _environment().get_template("page.html.jinja")
+            drawings[picture.name] = failure(f"The figure “{picture.name}”", error)
+    template = environment().get_template("page.html.jinja")
     text = _FOLDERS.sub("", template.render(page=page, first=first, rest=rest, drawings=drawings))
     return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
 
@@ -77,7 +77,7 @@ def _pictures(parts: Iterable[Part]) -> Iterator[Picture]:
 
 def fragment(content: Page | Part) -> str:
     """Return a page's first screen, or a part of one, as HTML for a notebook, without pictures."""
-    macros: Any = _environment().get_template("page_parts.html.jinja").module
+    macros: Any = environment().get_template("page_parts.html.jinja").module
     return worded(str(macros.all([content.section() if isinstance(content, Page) else content], {})))
 
 
@@ -99,12 +99,12 @@ def _kind_of_cell(text: str) -> Markup:
 
 def write_failure(path: Path, error: Exception) -> tuple[Path, ...]:
     """Write a page that says why a report could not be drawn, in place of the report; return its path."""
-    text = escape(_failure("The report", error))
+    text = escape(failure("The report", error))
     page = f"<!DOCTYPE html>\n<meta charset=utf-8>\n<title>Report</title>\n<p>{text}</p>\n"
     return write_files({path: page.encode("utf-8", "backslashreplace")})
 
 
-def _failure(part: str, error: Exception) -> str:
+def failure(part: str, error: Exception) -> str:
     """Warn of a part that could not be drawn, a defect of ours; return what the page says in its place."""
     if os.environ.get("JAXIMU_DEBUG"):
         raise error
@@ -116,23 +116,25 @@ def _failure(part: str, error: Exception) -> str:
     return text
 
 
-def _file(name: str) -> str:
+def packaged(name: str) -> str:
+    """Return a text file of this folder."""
     return files("jaximu.report").joinpath(name).read_text(encoding="utf-8")
 
 
 @cache
-def _environment() -> jinja2.Environment:
+def environment() -> jinja2.Environment:
+    """Return what renders the templates of this folder."""
     import jinja2
 
     made = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_file),
+        loader=jinja2.FunctionLoader(packaged),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    script = _file("figure.js")
+    script = packaged("figure.js")
     made.globals |= {
         "script": script,
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,23 +14,21 @@ from scipy.spatial.transform import Rotation
 from jaximu.estimation.problem import Name
 from jaximu.estimation.projection import output_uncertainty
 from jaximu.estimation.uncertainty import describe, spoken_amount
-from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Page, Picture, Section, Statement, Table
 from jaximu.ground.quantities import Z95, number, plain, sentence
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.planning import Proposal
 from jaximu.report import figures
-from jaximu.report.uncertainty import sphere_figure, steady
+from jaximu.report.box import AXES_WORDS, draw_floor, draw_unit
+from jaximu.report.uncertainty import Known, Rest, over_sphere, sphere_figure, steady
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["page_of"]
 
 _COLUMNS = 3
 _ABOVE = 0.08  # inches between the figure's edge and its title, for which the layout keeps a line
-_ELEVATION, _SIDE = np.radians(20.0), np.radians(-15.0)  # the person looks down a little, and a little from the right
 _CRITERIA = {
     "D": "the geometric mean of the standard deviations (in typical sizes)",
     "A": "the root mean square of the standard deviations (in typical sizes)",
@@ -193,14 +191,13 @@ def _open(proposal: Proposal) -> Iterator[Section]:
 def _picture(proposal: Proposal) -> Picture:
     """Return the unit drawn in each pose."""
     equipment = proposal.equipment
-    caption = "Arrows are its axes, coloured faces their positive ends; dashed arrows point away from you."
     if equipment.by_hand:
         view = "The unit as the person who holds it sees it, a little from above."
-        caption = f"{view} {caption} A minus marks the negative ends."
     elif equipment.chained:
-        caption = f"Seen a little from above; headings are counted from an arbitrary zero. {caption}"
+        view = "Seen a little from above; headings are counted from an arbitrary zero."
     else:
-        caption = f"Seen a little from above; the heading on the table does not matter. {caption}"
+        view = "Seen a little from above; the heading on the table does not matter."
+    caption = f"{view} {AXES_WORDS}"
     return Picture("poses", partial(_poses_figure, proposal), "The unit drawn in each pose", caption)
 
 
@@ -215,12 +212,16 @@ def _map(proposal: Proposal) -> Iterator[Picture]:
             names = [f"pose {index}: {pose.words}" for index, pose in enumerate(proposal.poses, 1)]
             yield Picture(
                 "orientations",
-                partial(sphere_figure, known, rest, up, names, f"{when} these poses, least certain"),
+                partial(_map_figure, known, rest, up, names, f"{when} these poses, least certain"),
                 "The next poses on a map of the uncertainty of the corrected specific force at rest over orientation",
                 "Colours: 95 % of the corrected specific force at rest over the direction that points up in the body, "
                 "without gravity's own error. Numbers: the poses to record.",
             )
             return
+
+
+def _map_figure(known: Known, rest: Rest, *poses: Any) -> Figure:
+    return sphere_figure(over_sphere(known, rest), *poses)
 
 
 def _poses_figure(proposal: Proposal) -> Figure:
@@ -232,9 +233,10 @@ def _poses_figure(proposal: Proposal) -> Figure:
         axes.set_axis_off()
         axes.set_aspect("equal")
     for index, (axes, pose) in enumerate(zip(grid, proposal.poses, strict=False), 1):
-        _draw_floor(axes, proposal.equipment.by_hand)
-        _draw_unit(axes, Rotation.from_quat(pose.attitude, scalar_first=True).as_matrix())
+        draw_floor(axes, proposal.equipment.by_hand)
+        draw_unit(axes, Rotation.from_quat(pose.attitude, scalar_first=True).as_matrix())
         axes.set_title(f"{index}", loc="left", fontsize=12, fontweight="bold")
+        axes.set_ylim(-2.6, 1.35)  # the words stand below
         axes.text(0.0, -1.75, _folded(pose.words), ha="center", va="top", fontsize=9.5)
     figure.suptitle(
         f"{count} poses {proposal.equipment.words}: {proposal.equipment.rest:g} s at rest in each",
@@ -247,69 +249,3 @@ def _poses_figure(proposal: Proposal) -> Figure:
 
 def _folded(words: str, width: int = 36) -> str:
     return "\n".join(line for part in words.split("; ") for line in textwrap.wrap(part, width))
-
-
-def _view(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Project level-frame points (..., 3) onto the picture (..., 2); and how far they are (...)."""
-    cosine, sine = np.cos(_SIDE), np.sin(_SIDE)
-    right = cosine * points[..., 0] + sine * points[..., 1]
-    away = -sine * points[..., 0] + cosine * points[..., 1]
-    up = points[..., 2]
-    cosine, sine = np.cos(_ELEVATION), np.sin(_ELEVATION)
-    return np.stack([right, cosine * up + sine * away], axis=-1), cosine * away - sine * up
-
-
-def _draw_floor(axes: Axes, by_hand: bool) -> None:
-    """Draw the table top below the unit, and where the person who holds it stands."""
-    from matplotlib.patches import Polygon
-
-    flat, _ = _view(1.15 * np.array([[-1, -1, -0.9], [1, -1, -0.9], [1, 1, -0.9], [-1, 1, -0.9]]))
-    axes.add_patch(Polygon(flat, facecolor="#EDEDED", edgecolor="#BBBBBB", linewidth=0.8, zorder=0))
-    if by_hand:
-        x, y = _view(np.array([0.0, -1.4, -1.035]))[0]
-        axes.text(x, y, "you", ha="center", va="center", fontsize=9)
-
-
-def _draw_unit(axes: Axes, rotation: FloatArray) -> None:
-    """Draw a flat box and its axes, which are the columns of `rotation`."""
-    from matplotlib.patches import Polygon
-
-    half = np.array([0.62, 0.45, 0.2])
-    colors = figures.AXES
-    for axis, (name, color) in enumerate(colors.items()):
-        other, third = (axis + 1) % 3, (axis + 2) % 3
-        for sign in (1.0, -1.0):
-            corners = np.zeros((4, 3))
-            corners[:, axis] = sign * half[axis]
-            corners[:, other] = half[other] * np.array([1, -1, -1, 1])
-            corners[:, third] = half[third] * np.array([1, 1, -1, -1])
-            _, depth = _view(rotation[:, axis] * sign)
-            if depth < 0:  # towards the viewer
-                flat, _ = _view(corners @ rotation.T)
-                face = {"facecolor": "#F6F6F6", "alpha": 0.9} if sign < 0 else {"facecolor": color, "alpha": 0.45}
-                axes.add_patch(Polygon(flat, edgecolor="#444444", linewidth=0.9, zorder=2, **face))
-                if sign < 0 and depth < -0.2:  # an arrow names the positive ends
-                    x, y = flat.mean(axis=0)
-                    axes.text(x, y, f"−{name}", color=color, ha="center", va="center", fontsize=10, zorder=3)
-        start, _ = _view(rotation[:, axis] * half[axis])
-        stop, depth = _view(rotation[:, axis] * 1.15)
-        behind = depth > 0
-        axes.annotate(
-            "",
-            xy=tuple(stop),
-            xytext=tuple(start),
-            zorder=1 if behind else 4,
-            arrowprops={
-                "arrowstyle": "-|>",
-                "color": color,
-                "linewidth": 1.8,
-                "linestyle": "--" if behind else "-",
-                "shrinkA": 0,
-                "shrinkB": 0,
-            },
-        )
-        axes.text(
-            1.12 * stop[0], 1.12 * stop[1], name, color=color, ha="center", va="center", fontsize=10, fontweight="bold"
-        )
-    axes.set_xlim(-1.45, 1.45)
-    axes.set_ylim(-2.6, 1.35)  # the words stand below

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.estimation.projection import OutputUncertainty
@@ -21,14 +22,18 @@ from jaximu.report.export import Range
 from jaximu.report.words import direction_words
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.gridspec import GridSpec
 
-__all__ = ["sphere_figure", "steady", "uncertainty_parts"]
+__all__ = ["Known", "Rest", "at_rest", "over_sphere", "poses_on_sphere", "sphere_figure", "steady", "uncertainty_parts"]
 
 Known = Callable[[Stimulus], dict[str, OutputUncertainty]]
+Rest = Callable[[FloatArray], Stimulus]
 
 _APART = 1e6  # s between samples: whatever lags has settled
-_TICKS, _STEPS = 81, 41
+_STEPS = 41
+_GRID = np.linspace(-1.0, 1.0, 81)
 _LEAST_RANGE = 0.8
 """Share of the worst value at which the colours begin at the latest: a map that is alike everywhere looks alike."""
 _FACES = np.concatenate([np.eye(3), -np.eye(3)])
@@ -59,23 +64,17 @@ def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
 
     Gravity's error is stated beside: it is alike in every orientation, and no pose makes it smaller.
     """
-    triads, shift = calibration.triads(), calibration.gravity_shift()
-    recorded = replace(calibration, covariance=calibration.covariance - np.outer(shift, shift))
-    extent = Range.of(calibration)
-    temperature = float(np.mean(extent.temperature))
+    triads, recorded, extent = calibration.triads(), _recorded(calibration), Range.of(calibration)
     if "accelerometer" in triads:
-        rest = partial(steady, gravity=calibration.gravity.value, temperature=temperature)
         errors = evidence(calibration)
         poses, after = (np.zeros((0, 3)), []) if errors is None else (errors.directions, errors.norm_after)
         names = [f"pose {index}: error {size(error, 'm/s^2', 2)}" for index, error in enumerate(after, 1)]
-        x, y, points = _map_points()
-        directions = points[:, x**2 + y**2 <= 1].reshape(-1, 3)
-        half = Z95 * recorded.uncertainty_of(rest(directions))["accelerometer"].largest
-        yield Statement("At rest", " ".join(_at_rest(calibration, directions, half, bool(shift.any()))))
+        half = at_rest(calibration)
+        yield Statement("At rest", " ".join(_at_rest(calibration, half)))
         if np.isfinite(half).any():
             yield Picture(
                 "orientations",
-                partial(sphere_figure, recorded.uncertainty_of, rest, poses, names),
+                partial(sphere_figure, half, poses, names),
                 "Map of the uncertainty of the corrected specific force at rest over orientation, with the poses",
                 "The two halves of the sphere of directions that point up in the body, seen along z, areas true. "
                 "Colours: 95 % of the corrected specific force at rest, along the direction in which it is least "
@@ -96,9 +95,34 @@ def uncertainty_parts(calibration: Calibration) -> Iterator[Part]:
         )
 
 
-def _at_rest(calibration: Calibration, directions: FloatArray, half: FloatArray, by_gravity: bool) -> Iterator[str]:
-    """Say where the corrected force is least certain, and what that means, half an interval (n,) by direction."""
-    gravity, worst = calibration.gravity, int(np.argmax(half))
+def _recorded(calibration: Calibration) -> Calibration:
+    """Return a calibration without the part of its covariance that is gravity's."""
+    shift = calibration.gravity_shift()
+    return replace(calibration, covariance=calibration.covariance - np.outer(shift, shift))
+
+
+def at_rest(calibration: Calibration) -> FloatArray:
+    """Return `over_sphere` of a calibration, without gravity's own error."""
+    temperature = float(np.mean(Range.of(calibration).temperature))
+    rest = partial(steady, gravity=calibration.gravity.value, temperature=temperature)
+    return over_sphere(_recorded(calibration).uncertainty_of, rest)
+
+
+def over_sphere(known: Known, rest: Rest) -> FloatArray:
+    """Return half the 95 % interval of the corrected specific force at rest at the points of the map (2, n, n), m/s².
+
+    **Arguments:** `known`: the uncertainty of the output at an input; `rest`: what the unit goes through with some
+    directions (n, 3) up.
+    """
+    _, points = _map_points()
+    return Z95 * known(rest(points.reshape(-1, 3)))["accelerometer"].largest.reshape(points.shape[:-1])
+
+
+def _at_rest(calibration: Calibration, half: FloatArray) -> Iterator[str]:
+    """Say where the corrected force is least certain, and what that means; `half`: over the sphere."""
+    (inside, points), gravity = _map_points(), calibration.gravity
+    directions, half = points[:, inside].reshape(-1, 3), half[:, inside].reshape(-1)
+    worst = int(np.argmax(half))
     where = f"the direction {direction_words(directions[worst])}"
     if not np.isfinite(half).all():
         sheet = [name for name in calibration.from_data_sheet if name.startswith("accelerometer")]
@@ -111,7 +135,7 @@ def _at_rest(calibration: Calibration, directions: FloatArray, half: FloatArray,
         f"its worst direction), {number(tilt, 2)}° if it is used as a level; in the best orientation it is "
         f"±{size(half.min(), 'm/s^2', 2)}. `jaximu plan CALIBRATION` chooses the poses that make it smaller."
     )
-    if by_gravity:
+    if calibration.gravity_shift().any():
         yield (
             f"Gravity's own uncertainty adds ±{size(Z95 * gravity.sigma, 'm/s^2', 2)} along the vertical in every "
             "orientation, which no pose makes smaller: state the local gravity."
@@ -158,11 +182,10 @@ def _panels(calibration: Calibration, extent: Range) -> Iterator[tuple[str, str,
             yield title, "temperature (°C)", f"± 95 % ({unit})", {"": temperatures}, half[None]
 
 
-def _map_points() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the map's grid, x and y (n, n), and its directions (2, n, n, 3) on both halves of the sphere."""
-    ticks = np.linspace(-1, 1, _TICKS)
-    x, y = np.meshgrid(ticks, ticks)
-    return x, y, np.stack([figures.raised_to_sphere(x, y, sign) for sign in (1, -1)])
+def _map_points() -> tuple[NDArray[np.bool_], FloatArray]:
+    """Return which points (n, n) of the map's grid are on it, and the directions (2, n, n, 3) of both halves."""
+    x, y = np.meshgrid(_GRID, _GRID)
+    return x**2 + y**2 <= 1, np.stack([figures.raised_to_sphere(x, y, sign) for sign in (1, -1)])
 
 
 def _curves_figure(panels: list) -> Figure:
@@ -184,17 +207,38 @@ def _curves_figure(panels: list) -> Figure:
     return figure
 
 
+def poses_on_sphere(
+    poses: FloatArray, names: Sequence[str], colors: Sequence[str] = ()
+) -> tuple[Figure, list[Axes], GridSpec]:
+    """Draw directions (P, 3) with their numbers on both halves of the sphere, hatched where nothing is known.
+
+    **Arguments:** `names`: of the directions; `colors`: theirs, white if there are none.
+    """
+    from matplotlib.patches import Circle
+
+    figure = figures.new_figure(4.6, 6.8)
+    filled = np.array(colors or ["white"] * len(poses), dtype=object)
+    panels, grid = figures.hemispheres(figure, 2, poses, names, filled, s=60, edgecolors="black", linewidths=0.9)
+    for axes, sign, here, spot in panels:
+        axes.add_patch(Circle((0, 0), 1, facecolor="white", edgecolor="#777777", hatch="///", linewidth=0, zorder=0))
+        figures.number_dots(axes, spot, np.flatnonzero(here) + 1)
+        middle, way = ("+z", "up") if sign > 0 else ("−z", "down")
+        axes.set_title(f"z {way} ({middle} in the middle)", fontsize=10)
+    return figure, [axes for axes, *_ in panels], grid
+
+
 def sphere_figure(
-    known: Known,
-    rest: Callable[[FloatArray], Stimulus],
+    half: FloatArray,
     poses: FloatArray,
-    names: list[str],
+    names: Sequence[str],
     called: str = "Least certain",
+    colors: Sequence[str] = (),
+    most: float | None = None,
 ) -> Figure:
     """Draw how uncertain the corrected specific force is at rest over orientation, and where poses were or will be.
 
-    **Arguments:** `known`: the uncertainty of the output at an input; `rest`: what the unit goes through with some
-    directions (n, 3) up; `poses` (P, 3): directions, with their `names`.
+    **Arguments:** `half`: as `over_sphere` returns it; `poses` (P, 3): directions, with their `names` and `colors`;
+    `most`: m/s² at the end of a scale that begins at zero, for maps that are compared; None: of this map alone.
     """
     import matplotlib
     from matplotlib.cm import ScalarMappable
@@ -202,33 +246,31 @@ def sphere_figure(
     from matplotlib.patches import Circle
     from matplotlib.ticker import MaxNLocator
 
-    figure = figures.new_figure(4.6, 6.8)
-    panels, grid = figures.hemispheres(figure, 2, poses, names, s=60, color="white", edgecolors="black", linewidths=0.9)
-    x, y, points = _map_points()
-    half = Z95 * known(rest(points.reshape(-1, 3)))["accelerometer"].largest.reshape(points.shape[:-1])
-    factor, unit = readable("m/s^2", float(np.max(half[np.isfinite(half)])))
+    figure, panels, grid = poses_on_sphere(poses, names, colors)
+    inside, points = _map_points()
+    finite = half[np.isfinite(half)]
+    factor, unit = readable("m/s^2", float(finite.max()))
+    best, worst = factor * float(finite.min()), factor * float(finite.max())
+    span = (min(best, _LEAST_RANGE * worst), worst) if most is None else (0.0, factor * max(most, float(finite.max())))
     half = factor * half
-    best, worst = (float(end(half[np.isfinite(half)])) for end in (np.min, np.max))
-    levels = MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]).tick_values(min(best, _LEAST_RANGE * worst), worst)
-    colors = LinearSegmentedColormap.from_list("", matplotlib.colormaps["YlGnBu"](np.linspace(0.0, 0.6, 64)))
-    norm = BoundaryNorm(levels, colors.N)
-    inside = np.where(x**2 + y**2 <= 1, half, -1.0)
-    at = np.unravel_index(int(np.argmax(inside)), half.shape)
-    for panel, (axes, sign, here, spot) in enumerate(panels):
+    levels = MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]).tick_values(*span)
+    colormap = LinearSegmentedColormap.from_list("", matplotlib.colormaps["YlGnBu"](np.linspace(0.0, 0.6, 64)))
+    norm = BoundaryNorm(levels, colormap.N)
+    at = np.unravel_index(int(np.argmax(np.where(inside, half, -1.0))), half.shape)
+    for panel, axes in enumerate(panels):
         edge = Circle((0, 0), 1, transform=axes.transData)
-        axes.add_patch(Circle((0, 0), 1, facecolor="white", edgecolor="#777777", hatch="///", linewidth=0, zorder=0))
-        shades = axes.contourf(x, y, np.ma.masked_invalid(half[panel]), levels=levels, norm=norm, cmap=colors, zorder=1)
+        heights = np.ma.masked_invalid(half[panel])
+        shades = axes.contourf(_GRID, _GRID, heights, levels=levels, norm=norm, cmap=colormap, zorder=1)
         shades.set_clip_path(edge)
-        figures.number_dots(axes, spot, np.flatnonzero(here) + 1)
         if at[0] == panel:
             text = f"±{number(half[at], 2)} {unit}" if np.isfinite(half[at]) else "not determined"
-            axes.plot(x[at[1:]], y[at[1:]], "x", color="#CC0033", markersize=11, markeredgewidth=2.4, zorder=4)
+            x, y = _GRID[at[2]], _GRID[at[1]]
+            axes.plot(x, y, "x", color="#CC0033", markersize=11, markeredgewidth=2.4, zorder=4)
             style = {"fontsize": 10, "color": "#CC0033", "fontweight": "bold", "zorder": 6, "ha": "center"}
             box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0}
-            axes.annotate(text, (0.75 * x[at[1:]], y[at[1:]]), (0, -17), textcoords="offset points", bbox=box, **style)
-        middle, way = ("+z", "up") if sign > 0 else ("−z", "down")
-        axes.set_title(f"z {way} ({middle} in the middle)", fontsize=10)
-    bar = figure.colorbar(ScalarMappable(norm, colors), cax=figure.add_subplot(grid[1, :2]), orientation="horizontal")
+            axes.annotate(text, (0.75 * x, y), (0, -17), textcoords="offset points", bbox=box, **style)
+    cell = figure.add_subplot(grid[1, :2])
+    bar = figure.colorbar(ScalarMappable(norm, colormap), cax=cell, orientation="horizontal")
     bar.set_label(f"specific force at rest, ± 95 % ({unit})", fontsize=10)
     what = called if np.isfinite(half[at]) else "Not determined"
     figure.suptitle(

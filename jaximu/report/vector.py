@@ -6,6 +6,7 @@ import html
 import io
 import json
 import re
+import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,6 +23,10 @@ __all__ = ["Drawing", "drawing", "named"]
 _MOST_MARKS, _MOST_OF_ALL, _MOST_VERTICES = 1500, 4000, 6000
 """Marks of one artist, marks of a figure, vertices of a line: what has more is an image, or the page would be large."""
 _LONGEST_UNIT = 12
+
+
+_ONE_AT_A_TIME = threading.Lock()
+"""Settings of matplotlib are those of the whole process."""
 
 
 class Drawing(NamedTuple):
@@ -44,7 +49,7 @@ def drawing(figure: Figure, name: str) -> Drawing:
     width, height = map(float, 72.0 * figure.get_size_inches())
     attributes = _mark(figure)
     written = io.StringIO()
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+    with _ONE_AT_A_TIME, mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(written, format="svg", dpi=150, metadata={"Date": None})
     text = written.getvalue().partition("</metadata>")[2].rpartition("</svg>")[0]
     attributes |= {
