@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from jaximu.cli.app import main
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.errors import InputError, command_line
 from jaximu.recordings import write_recording
@@ -181,6 +182,13 @@ def test_missing_accelerometer(tmp_path):
     header = re.sub(r"accel_(.)", r"foo_\1", HEADER)
     message = refusal(write(tmp_path / "log.csv", rows(), header))
     assert re.search(r"columns accel_x, accel_y, accel_z are missing; it has .*'foo_x \[m/s\^2\]'.*--columns", message)
+
+
+def test_a_log_whose_header_names_all_that_it_has_gets_no_empty_guess(tmp_path, capsys):
+    path = write(tmp_path / "log.csv", rows())
+    assert main(["magnetometer", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert said.rstrip().endswith("with --columns; a file of its own is given with --mag-log.")
 
 
 def test_missing_gyroscope_only_where_needed(tmp_path):

@@ -4,11 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.stats
 
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, EffectBlock, Evidence, detection_limit, limit_noncentrality
 from jaximu.diagnosis.improvement import cross_validated
-from jaximu.diagnosis.selection import select
+from jaximu.diagnosis.selection import select, strength_needed
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
 
 SIZES = (1, 3, 3, 2, 1, 3)
@@ -259,6 +260,34 @@ def test_a_weak_second_effect_does_not_make_a_pair():
             pairs[times] += len(found.causes) == 2
     assert pairs[1.2] <= 4  # noise makes it a strong one in few
     assert pairs[4.0] >= 18
+
+
+def test_the_only_cause_of_another_sensor_needs_less_beside_a_strong_one():
+    """Two of one sensor imitate what is outside the catalogue; so do two whose conditions are alike."""
+    random = np.random.default_rng(23)
+    first, second, alike = (random.standard_normal((90, 3)) for _ in range(3))
+    second -= first @ np.linalg.lstsq(first, second, rcond=None)[0]  # nothing that the first does
+    alike = first + 0.5 * alike
+    named = {"accel.one": first, "gyro.apart": second, "accel.apart": second, "gyro.alike": alike}
+    blocks = [EffectBlock(name, columns, np.ones(3)) for name, columns in named.items()]
+    evidence = Evidence(random.standard_normal(90), np.zeros((90, 1)) + 1e-12, blocks)
+    apart, same, alike = (strength_needed(evidence, k, [0]) for k in (1, 2, 3))
+    assert apart < same == alike
+    assert strength_needed(evidence, 1, [0, 3]) == same  # the other gyroscope's effect stands beside it
+    cosines = scipy.linalg.subspace_angles(evidence.columns[:, :3], evidence.columns[:, 9:12])
+    assert evidence.shared(0, 3) == pytest.approx(np.cos(cosines.min()) ** 2)
+    assert evidence.shared(0, 0) == pytest.approx(1)
+    named = {"accel": 0, "gyro": 0}
+    for seed in range(20):
+        random = np.random.default_rng([24, seed])
+        noise = random.standard_normal(90)
+        clean = Evidence(noise, evidence.jacobian, [blocks[0], blocks[1 if seed % 2 else 2]])
+        residual = noise + planted(clean, 0, 6, random) + planted(clean, 1, 1.5, random)
+        found = select(Evidence(residual, clean.jacobian, clean.blocks))
+        assert found.causes[0].block == 0
+        named[clean.blocks[1].name.partition(".")[0]] += len(found.causes) == 2
+    assert named["gyro"] >= 7
+    assert named["accel"] <= 3  # noise makes it a strong one in few
 
 
 def test_a_tie_inside_a_pair_is_returned():
