@@ -424,9 +424,10 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         weight = np.minimum(information[good], 2 * np.median(information[good]))
         inverse = np.linalg.inv((design * weight[:, None]).T @ design)
         change = inverse @ (design.T @ (weight * shifts[good]))
+        missed = shifts[good] - design @ change
         line = line + change
     freedom = int(good.sum()) - 2
-    spread = float(np.sum(weight * (shifts[good] - design @ change) ** 2)) / freedom
+    spread = float(np.sum(weight * missed**2)) / freedom
     # parts that agree by chance are no surer than the noise of their samples lets them be
     spread = max(spread * float(student_isf(0.025, freedom) / 1.96) ** 2, float(np.mean(rest**2)))
     sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))
