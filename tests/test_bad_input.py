@@ -188,7 +188,7 @@ def test_a_log_whose_header_names_all_that_it_has_gets_no_empty_guess(tmp_path, 
     path = write(tmp_path / "log.csv", rows())
     assert main(["magnetometer", str(path)]) == 2
     said = capsys.readouterr().err
-    assert said.rstrip().endswith("with --columns; a file of its own is given with --mag-log.")
+    assert said.rstrip().endswith("with --columns; a separate file is given with --mag-log.")
 
 
 def test_missing_gyroscope_only_where_needed(tmp_path):
