@@ -8,7 +8,8 @@ off, is k times that which a test of as many degrees of freedom finds with 90 % 
 hour at rest unless said. A recording that is refused counts as neither detected nor named, and is listed. `--small`
 runs a tenth; `--limit` runs the suites at the limit alone, with a table of their own: at k = 1, and at the size that a
 diagnosis prints as its detection limit, which is that of all questions together and anywhere on an effect's grid.
-`--outside` runs those outside the catalogue alone, likewise.
+`--outside` runs those outside the catalogue alone, `--several` three at once and a strong one beside a weak one,
+likewise.
 """
 
 import os
@@ -47,6 +48,7 @@ jax.config.update("jax_enable_x64", True)
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 OUTSIDE_FREEDOM = 3
+SEVERAL = ("three, k = 4", "strong and weak, k = 8 and 1.5")
 LIMIT, AT_PRINTED = "one, k = 1", "one, at the printed limit"
 TIE, SETTLED = "tie, k = 4", "tie with another recording, k = 4"
 PRINTED = ("printed",)
@@ -190,6 +192,14 @@ def judge(suite, results):
                 len(sets) == 2 and all(any(name in each_set for each_set in sets) for name in truth)
             )
             claims["at least one right"].append(bool(truth & set(named)))
+        elif suite in SEVERAL:
+            claims["first, one of them"].append(bool(sets) and bool(truth & sets[0]))
+            claims["all named, and nothing else"].append(set(named) == truth)
+            claims["all within the sets"].append(
+                len(sets) == len(truth) and all(any(name in each_set for each_set in sets) for name in truth)
+            )
+            claims["a wrong name, none of whose rivals is right"].append(any(not truth & each_set for each_set in sets))
+            claims["unexplained"].append(each["verdict"] == "unexplained")
         elif suite.startswith("outside"):
             claims["unexplained"].append(each["verdict"] == "unexplained")
             claims["a wrong single name"].append(each["verdict"] == "effects" and len(named) == 1)
@@ -205,9 +215,11 @@ def judge(suite, results):
 
 def main():
     """Run all suites in two processes and keep the table."""
-    options = arguments(__doc__, limit="the suites at the detection limit alone", outside="those outside the catalogue")
-    alone = "_at_limit" if options.limit else "_outside" if options.outside else ""
-    suites = {"": "", "_at_limit": (LIMIT, AT_PRINTED), "_outside": "outside"}[alone]
+    options = arguments(__doc__, limit="the suites at the detection limit alone", outside="those outside the catalogue",
+                        several="those of several effects, weak ones among them")  # fmt: skip
+    chosen = {"_at_limit": options.limit, "_outside": options.outside, "_several": options.several}
+    alone = next((name for name, wanted in chosen.items() if wanted), "")
+    suites = {"": "", "_at_limit": (LIMIT, AT_PRINTED), "_outside": "outside", "_several": SEVERAL}[alone]
     todo = [each for each in tasks(options.small) if each[0].startswith(suites)]
     with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
         done = [each for each in pool.map(trial, todo, chunksize=4) if each is not None]
