@@ -276,7 +276,7 @@ def test_a_figure_that_fails_takes_nothing_else_with_it(folder, tmp_path, monkey
 @pytest.mark.parametrize("verb", ["calibrate", "allan"])
 def test_a_page_that_fails_takes_no_result_with_it(verb, folder, tmp_path, monkeypatch):
     log = folder / ("log.csv" if verb == "calibrate" else "rest.csv")
-    monkeypatch.setattr("jaximu.report.html._environment", fails)
+    monkeypatch.setattr("jaximu.report.html.environment", fails)
     status, printed, said = drawn(verb, log, *(WORK[2:] if verb == "calibrate" else ()), "-o", tmp_path)
     assert status == 0 and printed and "note: The report could not be drawn (IndexError: list" in said
     assert "could not be drawn" in (tmp_path / "report.html").read_text()
