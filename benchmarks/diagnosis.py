@@ -167,6 +167,9 @@ def tasks(small):
     # at the size that is printed, which nine of ten should pass
     add(AT_PRINTED, 100, lambda rng: (str(rng.choice(everything)),), PRINTED, temperature=True)
     add(SETTLED, 20, lambda rng: ties[int(rng.integers(len(ties)))].hidden, (4.0,), temperature="linear")
+    for suite, multiples in zip(SEVERAL, ((4.0,) * 3, (8.0, 1.5)), strict=True):
+        add(suite, 40, lambda rng, each=multiples: tuple(map(str, rng.choice(everything, len(each), replace=False))),
+            multiples, temperature=True)  # fmt: skip
     return found
 
 
