@@ -8,7 +8,7 @@ import scipy.linalg
 import scipy.stats
 
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, EffectBlock, Evidence, detection_limit, limit_noncentrality
-from jaximu.diagnosis.improvement import cross_validated
+from jaximu.diagnosis.improvement import _beside_open, _likelihood, cross_validated
 from jaximu.diagnosis.selection import select, strength_needed
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
 
@@ -560,3 +560,16 @@ def test_an_axis_that_hardly_anything_reaches_adds_nothing_to_a_limit():
             limits.append(evidence.limit(range(len(own))))
         np.testing.assert_allclose(limits, limits[0], rtol=0.05)  # of two thousand draws
         assert limits[0] > 0.1
+
+
+def test_a_prediction_stands_where_the_fit_leaves_a_number_open():
+    random = np.random.default_rng(31)
+    root, columns, conditions = (random.standard_normal(shape) for shape in ((30, 30), (30, 4), (30,)))
+    covariance, spread = root @ root.T + np.eye(30), np.diag([0.1, 1.0, 2.0, 3.0])
+    expected = _likelihood(conditions, covariance + columns @ spread @ columns.T)
+    assert _beside_open(conditions, covariance, columns, spread) == pytest.approx(expected, rel=1e-9)
+    spread[3, 3], spread[2, 2] = 1e24, -1e-9  # open, and rounding
+    open_ = _beside_open(conditions, covariance, columns, spread)
+    spread[3, 3], spread[2, 2] = 1e6, 0.0
+    assert open_[0] == pytest.approx(_beside_open(conditions, covariance, columns, spread)[0], rel=1e-5)
+    assert np.isfinite(open_[1])

@@ -92,8 +92,7 @@ def _predict(held: Experiment, state: State) -> Prediction:
     for name, size in POWER_ON.items():
         if bias := _biases(names, name):
             spread[bias, bias] += (size * np.linalg.norm(np.asarray(imu.triads()[name].gain), axis=1)) ** 2
-    whole = covariance + columns @ spread @ columns.T
-    chi_squared, likelihood = _likelihood(conditions, whole)
+    chi_squared, likelihood = _beside_open(conditions, covariance, columns, spread)
     return Prediction(held.real.rms(conditions), chi_squared, len(conditions), likelihood)
 
 
@@ -111,6 +110,26 @@ def _rested(held: Experiment, imu: Imu) -> Imu:
     assert gyroscope is not None
     bias = np.asarray(gyroscope.bias) - np.linalg.lstsq(slope, conditions[rest], rcond=None)[0]
     return replace(imu, gyroscope=replace(gyroscope, bias=bias))
+
+
+def _beside_open(
+    conditions: FloatArray, covariance: FloatArray, columns: FloatArray, spread: FloatArray
+) -> tuple[float, float]:
+    """Return χ² and the log-likelihood where numbers of covariance `spread` (p, p) move the conditions by `columns`.
+
+    What a fit leaves open is so large that the noise would be lost in the sum of both.
+    """
+    values, vectors = np.linalg.eigh(spread)
+    root = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(root, conditions)
+    moved, sizes, _ = np.linalg.svd(
+        np.linalg.solve(root, columns @ (vectors * np.sqrt(np.maximum(values, 0.0)))), full_matrices=False
+    )
+    along = moved.T @ white
+    chi_squared = float(np.sum((white - moved @ along) ** 2) + np.sum(along**2 / (1 + sizes**2)))
+    volume = float(np.sum(np.log(np.diag(root))) + 0.5 * np.sum(np.log1p(sizes**2)))
+    likelihood = -0.5 * (chi_squared + len(white) * np.log(2 * np.pi)) - volume
+    return chi_squared, likelihood
 
 
 def _likelihood(conditions: FloatArray, covariance: FloatArray) -> tuple[float, float]:
