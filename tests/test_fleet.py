@@ -2,12 +2,14 @@
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +20,7 @@ import pytest
 
 from jaximu.calibration import fit_hand_held, nominal_imu
 from jaximu.calibration.recipe import Choices, calibrate_ready
+from jaximu.cli import fleet as cli_fleet
 from jaximu.cli import main
 from jaximu.data import residual_rms
 from jaximu.data.poses import PosesAndTurns
@@ -388,3 +391,23 @@ def test_two_processes_give_the_same_table(folder, table, tmp_path, capsys):
     assert main(arguments) == 0
     assert json.loads(capsys.readouterr().out)["statuses"] == {"bad input": 1, "ok": UNITS}
     same(pq.read_table(output), table)
+
+
+@pytest.mark.parametrize(("start", "compiled"), [(20.0, 0.0), (5.0, 20.0)])
+def test_the_time_that_is_left_is_right_within_a_factor_of_two(start, compiled, monkeypatch, capsys):
+    """Two processes that start together give batches of 16 rows in 8 s, after programs were compiled."""
+    clock = [0.0]
+    monkeypatch.setattr(cli_fleet.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(cli_fleet, "compiling", lambda: 3 * (start < clock[0] < start + compiled))
+    finished = sorted(start + compiled + 8.0 * k + shift for k in range(1, 13) for shift in (0.0, 0.3))
+    total, done = 16 * len(finished), 0
+    with cli_fleet._progress(total) as show:
+        for moment in np.arange(0.0, finished[-1], 0.5):
+            clock[0] = float(moment)
+            done = 16 * sum(time <= moment for time in finished)
+            show(done, 0, Counter(ok=done))
+    lines = re.findall(r"(\d+) s left, (\d+) s", capsys.readouterr().err)
+    assert len(lines) > 5
+    for left, now in lines[1:]:
+        true = finished[-1] - float(now)
+        assert true < 16.0 or true / 2 < float(left) < 2 * true, (left, now, true)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -28,6 +28,8 @@ __all__ = ["FleetCommand"]
 
 _EVERY = 10.0
 """Seconds between two lines of progress where stderr is no terminal."""
+_TOGETHER = 1.0
+"""Seconds within which processes that start together give their first rows."""
 
 
 @dataclass(frozen=True)
@@ -172,9 +174,10 @@ def _write(fleet: Fleet, page: Page, table: Path) -> tuple[Path, ...]:
 def _progress(total: int) -> Iterator[Callable[[int, int, Counter], None]]:
     """Show how far the run is, its rate and the time that is left, on stderr.
 
-    The time in which programs are compiled, once on a machine, does not count: nothing is computed meanwhile.
+    The time of compiling, once on a machine, does not count: nothing is computed meanwhile.
     """
     last, working = time.monotonic(), 0.0
+    arrivals: list[tuple[int, float]] = []
     with progress("calibrating", _EVERY) as report:
 
         def show(done: int, kept: int, statuses: Counter) -> None:
@@ -182,11 +185,29 @@ def _progress(total: int) -> Iterator[Callable[[int, int, Counter], None]]:
             now, programs = time.monotonic(), compiling()
             working += 0.0 if programs else now - last
             last = now
-            rate = (done - kept) / max(working, 1e-9)
+            if done > (arrivals[-1][0] if arrivals else kept):
+                together = bool(arrivals) and working - arrivals[-1][1] < _TOGETHER
+                arrivals.append((done, arrivals.pop()[1] if together else working))
+            rate = _recent_rate(arrivals)
             failed = sum(count for status, count in statuses.items() if status != "ok")
             text = f"{done} of {total} recordings" + (f" ({kept} kept from before)" if kept else "")
-            text += f", {rate:.3g} a second, {(total - done) / rate:.0f} s left" if rate > 0 else ""
+            if rate > 0.0:
+                left = (total - done) / rate - (working - arrivals[-1][1])
+                text += f", {rate:.3g} a second, {max(left, 0.0):.0f} s left"
             text += f", compiling {programs} program{'s' * (programs > 1)} once for this machine" if programs else ""
             (report if done < total else say)(text + (f", {failed} failed" if failed else ""))
 
         yield show
+
+
+def _recent_rate(arrivals: Sequence[tuple[int, float]]) -> float:
+    """Return rows a second over the later half of the rows, 0 where it is not known yet.
+
+    The first rows wait for processes to start, and early ones for programs to be loaded. `arrivals`: how many rows
+    there were, and when [s].
+    """
+    if len(arrivals) < 2:
+        return 0.0
+    middle = (arrivals[0][0] + arrivals[-1][0]) / 2.0
+    rows, moment = next(arrival for arrival in reversed(arrivals[:-1]) if arrival[0] <= middle)
+    return (arrivals[-1][0] - rows) / (arrivals[-1][1] - moment)

@@ -16,7 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 
-from jaximu.fleets.jobs import ONE_THREAD, Job, Rows, Settings, batches, own_effects, register_all
+from jaximu.fleets.jobs import ONE_THREAD, PATIENCE, Job, Rows, Settings, batches, own_effects, register_all
 from jaximu.fleets.rows import row_begun, rows_of
 from jaximu.ground.errors import InputError
 
@@ -25,7 +25,6 @@ __all__ = ["ENGINES", "local"]
 Engine = Callable[[Sequence[Job], Sequence[int], Settings, int], Iterator[Rows]]
 _TRIES = 2
 """Times that a batch may bring its process down before its jobs are tried one by one."""
-_PATIENCE = 1.0  # s without a row after which an empty batch is given
 _DIED = "the process that computed this row died twice: the file may need more memory than there is"
 
 
@@ -66,7 +65,7 @@ def _one_pool(jobs: Sequence[Job], waiting: deque, settings: Settings, workers: 
                 running[future] = part, strikes
             if not running:
                 return
-            finished = wait(running, _PATIENCE, FIRST_COMPLETED).done
+            finished = wait(running, PATIENCE, FIRST_COMPLETED).done
             if not finished:
                 yield (), []
             for future in finished:

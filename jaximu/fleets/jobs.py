@@ -25,13 +25,15 @@ from jaximu.recordings.readers import ReadOptions
 from jaximu.recordings.readers.archive import SUFFIXES, is_log, logs_below
 from jaximu.recordings.segmentation import SegmentationOptions
 
-__all__ = ["ONE_THREAD", "Job", "Rows", "Settings", "batches", "find_jobs", "own_effects", "register_all"]
+__all__ = ["ONE_THREAD", "PATIENCE", "Job", "Rows", "Settings", "batches", "find_jobs", "own_effects", "register_all"]
 
 Rows = tuple[Sequence[int], list[dict[str, Any]]]
 # XLA's pool reads NPROC; a flag of XLA's would make it compile everything anew
 ONE_THREAD: dict[str, str] = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"), "1"
 )
+PATIENCE = 1.0
+"""Seconds without a row after which an engine gives an empty batch, so that its caller can say what it waits for."""
 
 _COLUMNS = ("device", "file", "date", "lot", "station", "static", "options")
 _ALL = ""  # no device is called so
