@@ -53,6 +53,8 @@ _OF_RESULTS = ("accept", "verify")  # they take no logs, and no options of readi
 _FILES = {"compensate": "out.csv", "fleet": "table.parquet", "simulate": "log.parquet", "export": "exported"}
 _VERDICTS = {"accept": (3, 4), "verify": (3, 4)}
 """Exit statuses of verbs that answer a question by them."""
+_SHORT = ("", "effects", "export", "help", "record", "verify", "version")
+"""Verbs that compute nothing, or say what they are at in lines of another form."""
 _NEVER = ("should not happen", "Traceback", "Warning:", "could not be drawn")
 
 
@@ -87,6 +89,8 @@ class Outcome:
             faults.append("failed without a word")
         if self.refused and self.written:
             faults.append(f"failed and left {', '.join(self.written)}")
+        if not self.refused and self.verb not in _SHORT and "…" not in self.stderr:
+            faults.append("no stage was said while it worked")
         if not self.refused and sentences:
             faults.append(f"exit status {self.status} with an error: {sentences[0]}")
         return faults

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaximu.cli import options
+from jaximu.cli.messages import progress
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.quantities import Z95, listed, sentence, with_interval
@@ -72,7 +73,9 @@ class InfoCommand:
     def run(self) -> None:
         """Do what the command line says."""
         stated = [self.log.with_gyroscope(path) for path in self.logs]
-        described = [describe(*read_openly(*pair)) for pair in zip(stated, self.logs, strict=True)]
+        options.require_files(*self.logs)
+        with progress("looking at what is in it"):
+            described = [describe(*read_openly(*pair)) for pair in zip(stated, self.logs, strict=True)]
         if self.as_json:
             documents = [document for document, _ in described]
             options.print_json(documents[0] if len(documents) == 1 else documents)

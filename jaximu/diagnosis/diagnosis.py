@@ -17,6 +17,7 @@ from jaximu.calibration.recipe import Choices, calibrate, calibrate_ready
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.drift import about_biases, with_usual_drift
 from jaximu.diagnosis.checks import Check, checks_of
+from jaximu.diagnosis.choice import with_open_choice
 from jaximu.diagnosis.drift import DriftComponents, drifted, estimate_drift, hands_of
 from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS, LIMIT_POWER
 from jaximu.diagnosis.experiment import Experiment, State
@@ -273,7 +274,10 @@ class Diagnosis(Result, Document, page="diagnosis"):
         return hidden_causes(self.extended)
 
     def extended_calibration(self) -> Calibration:
-        """Return the calibration with the effects that were found: it is used and saved like any other."""
+        """Return the calibration with the effects that were found: it is used and saved like any other.
+
+        Its covariance allows for other effects that the recording does not exclude.
+        """
         diagnosis = {
             "verdict": self.verdict,
             "effects": [effect.name for effect in self.effects],
@@ -282,7 +286,8 @@ class Diagnosis(Result, Document, page="diagnosis"):
             "suggestion": self.suggestion,
         }
         with_effects = extended(self.calibration, self.experiment, self.extended, self.noise)
-        return replace(with_effects, diagnosis=diagnosis)
+        chosen = [effect.name for effect in self.extended.effects]
+        return replace(with_open_choice(with_effects, self.base, chosen), diagnosis=diagnosis)
 
 
 def extended(calibration: Calibration, experiment: Experiment, state: State, noise: NoiseModel) -> Calibration:

@@ -285,15 +285,15 @@ class Evidence:
         root, _ = _roots(self._gram[np.ix_(inside, inside)][None], self._reach[inside][None])
         return root[0] @ (root[0].T @ self._product[inside])
 
-    def start(self, blocks: Sequence[int]) -> FloatArray:
-        """Return coefficients, in units of their sizes, to begin a fit of the blocks' effects with.
+    def most_likely(self, blocks: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Return coefficients (k,) of the blocks' effects, in units of their sizes, and their covariance (k, k).
 
-        They are known beforehand to be no larger than effects are, or a direction that the data hardly show would
-        begin anywhere: a lag that all axes have in common moves nothing to first order.
+        They are known beforehand to be no larger than effects are, or a direction that the data hardly show could be
+        anywhere: a lag that all axes have in common moves nothing to first order.
         """
         inside = self.span(blocks)
-        known = self._gram[np.ix_(inside, inside)] + np.eye(len(inside)) / _LARGE**2
-        return np.asarray(np.linalg.solve(known, self._product[inside]), np.float64)
+        covariance = np.linalg.inv(self._gram[np.ix_(inside, inside)] + np.eye(len(inside)) / _LARGE**2)
+        return np.asarray(covariance @ self._product[inside], np.float64), covariance
 
 
 def _guard(outside: FloatArray, freedom: int) -> FloatArray:

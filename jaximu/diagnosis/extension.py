@@ -85,7 +85,7 @@ def extend(
         if len(entries) - chosen + len(poses) + len(selection.causes) > _MOST:
             break
         effects, blocks = list(state.effects), state.evidence.blocks
-        coefficients = state.evidence.start([cause.block for cause in selection.causes])
+        coefficients, _ = state.evidence.most_likely([cause.block for cause in selection.causes])
         edges = np.cumsum([0, *(len(blocks[cause.block].sizes) for cause in selection.causes)])
         bumped, before = [], len(entries)
         for cause, a, b in zip(selection.causes, edges[:-1], edges[1:], strict=True):
@@ -192,7 +192,7 @@ def _fitted(extension: Extension, state: State, name: str, cause: SelectedCause)
     """Return a fit with a cause in the place of the effect of this name."""
     evidence = extension.base.evidence
     block = evidence.blocks[cause.block]
-    coefficients = evidence.start([cause.block]) * block.sizes
+    coefficients = evidence.most_likely([cause.block])[0] * block.sizes
     others = [effect for effect in state.effects if effect.name != name]
     return extension.experiment.fit([*others, CATALOGUE[block.name].make(coefficients, **block.inner)], state.imu)
 
