@@ -46,8 +46,8 @@ __all__ = ["RecordedByHand"]
 class RecordedByHand(OfOneUnit):
     """Poses and turns of one unit, and the recordings that they were cut from, along which effects act.
 
-    known: the unit whose effects were taken off the observations, the Earth's rotation as a rule. swings: by triad, what
-    lines of hardly any frequency add to the mean outputs (p, 3) of real poses, which is taken off them, and the
+    known: the unit whose effects were taken off the observations, the Earth's rotation as a rule. swings: by triad,
+    what lines of hardly any frequency add to the mean outputs (p, 3) of real poses, which is taken off them, and the
     variance (p, 3) with which that is known; output units.
     """
 

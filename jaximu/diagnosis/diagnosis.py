@@ -439,9 +439,10 @@ def _with_lines(diagnosis: Diagnosis, before: Diagnosis | None, lines: tuple[Mov
     if before is not None:
         old, new = (cross_validated(one.experiment, one.base).before for one in (before, diagnosis))
         rest = "static_gyroscope"
+        errors = change(old.rms[rest][0], *new.rms[rest])
         gain = (
-            f"It was fitted at rest and taken off: rate at rest on parts left out {change(old.rms[rest][0], *new.rms[rest])},"
-            f" χ² per condition {old.chi_squared / old.count:.2f} → {new.chi_squared / new.count:.2f}."
+            f"It was fitted at rest and taken off: on parts left out, rate at rest {errors}, χ² per condition "
+            f"{old.chi_squared / old.count:.2f} → {new.chi_squared / new.count:.2f}."
         )
         gone = {effect.name for effect in before.effects} - {effect.name for effect in diagnosis.effects}
         if gone:

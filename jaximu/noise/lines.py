@@ -3,13 +3,13 @@
 The tapered periodogram of noise is exponential about its spectrum. A line of power ρ times the noise multiplies its
 ordinate's mean by 1 + ρ, and so the likelihood of an ordinate x by exp(x ρ/(1 + ρ))/(1 + ρ). Frequency runs on the
 circle on which samples cannot tell frequencies apart, zero to the rate, as a random walk about a constant drift. The
-forward recursion (L. Rabiner, Proc. IEEE 77, 1989) adds the likelihood ratio up over all courses of frequency, each with
-its probability beforehand. Where there is no line this sum has a mean of one, so that it exceeds 1/α with a probability
-of at most α (Markov's inequality). The likeliest course is Viterbi's.
+forward recursion (L. Rabiner, Proc. IEEE 77, 1989) adds the likelihood ratio up over all courses of frequency, each
+with its probability beforehand. Where there is no line this sum has a mean of one, so that it exceeds 1/α with a
+probability of at most α (Markov's inequality). The likeliest course is Viterbi's.
 
-A line moves if the same sum exceeds the greatest likelihood of a constant frequency 1/α times (L. Wasserman et al.,
-Universal inference, PNAS 117, 2020), and by more than a window's main lobe. A course that passes zero or half the rate
-goes on beyond it: what is then recorded is its alias.
+A line moves if the sum exceeds, 1/α times, what a constant frequency takes of it (L. Wasserman et al., Universal
+inference, PNAS 117, 2020), and by more than a window's main lobe. A course that passes zero or half the rate goes on
+beyond it: what is then recorded is its alias.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Line:
 
     times (k,): middles of the windows, s. frequency (k,): Hz, continued beyond zero and half the rate. visible (k,):
     windows that show it. size: amplitude, unit of the samples. rate: of the samples, Hz. resolution: of a window, Hz.
-    evidence: logarithm of the likelihood ratio against noise; steady: the greatest one at a constant frequency.
+    evidence: logarithm of the likelihood ratio against noise; steady: the most that a constant frequency takes of it.
     """
 
     axis: int
@@ -168,27 +168,27 @@ def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> li
 def _beside(power: FloatArray) -> FloatArray:
     """Return the spectrum (k, f) of the noise beside each ordinate, of the side that has more.
 
-    Its shape is that of all windows together, and its level that of each. Where lines of zero frequency leave no lower
-    side the spectrum rises as a random walk's does, which nothing steeper is.
+    Its shape is that of all windows together, and its level that of each. Low ordinates have no whole side below them:
+    there it is what an ordinate is itself in a quarter of the windows, which a line that moves leaves, but no more than
+    where the others end and a random walk's rise from there, which is as steep as noise gets.
     """
     lobe, side, factor = _LOBE * _OVER, _SIDE * _OVER, -np.log1p(-_QUARTILE)
     level = np.quantile(power[:, lobe:], _QUARTILE, axis=1, keepdims=True) / factor
     scaled = power / np.maximum(level, 1e-300)
 
-    def usual(values: FloatArray) -> FloatArray:
-        """The level of the ordinates beside (k, …, s), windows together."""
-        return np.quantile(np.moveaxis(values, 0, -1).reshape(*values.shape[1:-1], -1), _QUARTILE, axis=-1) / factor
+    def usual(span: int) -> FloatArray:
+        """The level of so many ordinates from each one on, windows together."""
+        spans = np.lib.stride_tricks.sliding_window_view(scaled, span, axis=1).swapaxes(0, 1)
+        return np.quantile(spans.reshape(len(spans), -1), _QUARTILE, axis=1) / factor
 
-    whole = usual(np.lib.stride_tricks.sliding_window_view(scaled, side, axis=1))
-    last, shape = power.shape[1], np.zeros(power.shape[1])
-    first = 2 * lobe + _OVER  # the lowest with an ordinate below it that lies beside
-    for index in range(first, last):
-        low, high = index - lobe, index + lobe + 1
-        sides = [whole[low - side] if low - side >= lobe else usual(scaled[:, None, lobe:low])[0]]
-        if high + side <= last:
-            sides.append(whole[high])
-        shape[index] = max(sides)
-    shape[:first] = shape[first] * (first / np.maximum(np.arange(first), 1)) ** 2
+    beside, last = usual(side), power.shape[1]
+    index, first = np.arange(last), 2 * lobe + side
+    below, above = index - lobe - side, np.minimum(index + lobe + 1, last - 1)
+    after = np.where(above <= last - side, beside[np.minimum(above, last - side)], 0.0)
+    shape = np.maximum(beside[np.maximum(below, 0)], after)
+    rise = shape[first] * (first / np.maximum(index[:first], 1)) ** 2
+    itself = usual(2 * _OVER + 1)[np.maximum(index[:first] - _OVER, 0)]
+    shape[:first] = np.minimum(rise, itself)
     return level * shape
 
 
