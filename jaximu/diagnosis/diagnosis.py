@@ -435,20 +435,24 @@ def diagnose(
 
 def _with_lines(diagnosis: Diagnosis, before: Diagnosis | None, lines: tuple[MovingLine, ...]) -> Diagnosis:
     """Return a diagnosis with lines that move; `before`: with those that pass for drift in the means at rest."""
-    gain, notes = "", diagnosis.notes
+    text, notes = "", diagnosis.notes
     if before is not None:
         old, new = (cross_validated(one.experiment, one.base).before for one in (before, diagnosis))
-        rest = "static_gyroscope"
-        errors = change(old.rms[rest][0], *new.rms[rest])
+        gone = [effect.name for effect in before.effects if effect.name not in {one.name for one in diagnosis.effects}]
+        rest, unit = new.rms["static_gyroscope"]
+        errors = change(old.rms["static_gyroscope"][0], rest, unit)
         gain = (
-            f"It was fitted at rest and taken off: on parts left out, rate at rest {errors}, χ² per condition "
+            f"on parts left out, rate at rest {errors}, χ² per condition "
             f"{old.chi_squared / old.count:.2f} → {new.chi_squared / new.count:.2f}."
         )
-        gone = {effect.name for effect in before.effects} - {effect.name for effect in diagnosis.effects}
+        if new.log_likelihood > old.log_likelihood or rest < old.rms["static_gyroscope"][0] or gone:
+            text = f"What it adds to the means at rest was fitted and taken off: {gain}"
+        else:
+            diagnosis, text = before, f"Taking off what it adds to the means at rest gains nothing: {gain}"
         if gone:
-            names = listed([effect_title(name) for name in sorted(gone)])
-            notes = (*notes, f"without the line that crosses zero frequency taken off, {names} would have been named.")
-    findings = (*diagnosis.preflight, *line_findings(lines, gain))
+            named = listed([effect_title(name) for name in gone])
+            notes = (*notes, f"with the line that looks like bias drift left in, {named} would have been named.")
+    findings = (*diagnosis.preflight, *line_findings(lines, text))
     return replace(diagnosis, preflight=findings, notes=notes, lines=lines)
 
 

@@ -47,6 +47,8 @@ _FEWEST = 8
 """Windows below which no course is followed."""
 _LONGEST = 1024
 """Samples of the longest window."""
+_OFF = 2.0
+"""Ordinates of a rest by which a course may be off, and its drift over the rest."""
 _MOST = 30
 """Lines of an axis that are followed."""
 
@@ -104,6 +106,7 @@ def windows_at_rest(time: FloatArray, rests: FloatArray, rate: float) -> tuple[N
     """
     spans = np.searchsorted(time, rests)
     width = int(min(np.median(np.diff(spans)) // 2, _LONGEST)) if len(spans) else 0
+    width -= width % 16  # transforms of round lengths are quick
     if width < 4 * _SIDE:
         return np.zeros(0, np.int64), width
     counts = np.diff(spans)[:, 0] // width
@@ -153,7 +156,8 @@ def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> li
         if whole < _ENOUGH:
             break
         strength, move = np.unravel_index(np.argmax(evidence), evidence.shape)
-        course = _likeliest(odds[strength][:, fold], gaps, *_MOVES[:, move])
+        beyond = np.where(hidden, 0.0, np.maximum(ordinates - _CAP, 0.0))  # of a strong line its middle counts most
+        course = _likeliest((odds[strength] + np.log1p(beyond))[:, fold], gaps, *_MOVES[:, move])
         at = fold[course % points]
         visible = odds[strength, window, at] > 0
         frequency = course * rate / points
@@ -264,14 +268,18 @@ def _size(
 def swing(values: FloatArray, time: FloatArray, line: Line) -> tuple[float, float]:
     """Return what a line adds to the mean of samples at rest (n,), and the variance beyond that of their noise.
 
-    Its size is known beforehand, its phase is not, and its frequency and drift to an ordinate of the rest: the
-    posterior mean over a grid of both, of a sinusoid beside a free mean in white noise.
+    Its size is known beforehand, its phase is not, and its frequency to what a window resolves: the posterior mean over
+    a grid of frequency and drift, of a sinusoid beside a free mean in white noise.
     """
     centred = time - time.mean()
     length = len(time) * (time[1] - time[0])
     frequency = np.interp(time, line.times, line.frequency)
     drift, middle = np.polyfit(centred, frequency, 1)
-    offsets, bends = np.meshgrid(np.linspace(-1, 1, 9) / length, np.linspace(-1, 1, 5) / length**2)
+    hidden, reach = _LOBE * line.resolution, _OFF / length
+    reach = max(reach, hidden) if np.abs(middle - line.rate * np.round(middle / line.rate)) < hidden else reach
+    offsets, bends = np.meshgrid(
+        np.arange(-reach, reach, 1 / (8 * length)), np.linspace(-_OFF, _OFF, 2 * _LOBE * 4 + 1) / length**2
+    )
     turns = (middle + offsets.ravel()[:, None]) * centred + (drift + bends.ravel()[:, None]) * centred**2 / 2
     rows = np.stack([np.ones_like(turns), np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], axis=1)
     level = values.mean()
