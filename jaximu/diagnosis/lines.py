@@ -12,11 +12,12 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted, size
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.base import Sensor
-from jaximu.noise.lines import Line, follow, swing, windows_at_rest
+from jaximu.noise.lines import Line, follow, spectra, swing, windows_at_rest
 from jaximu.recordings.finding import Finding
+from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation
 
-__all__ = ["MOVING_LINE", "MovingLine", "line_findings", "moving_lines", "swings_of"]
+__all__ = ["MOVING_LINE", "MovingLine", "line_findings", "moving_lines", "spectrum_at_rest", "swings_of"]
 
 MOVING_LINE = "data.moving_line"
 _NAMED = 3
@@ -68,12 +69,23 @@ def _moving(segmentations: Sequence[Segmentation]) -> Iterator[MovingLine]:
             signal = part.recording.signals.get(triad)
             if signal is None:
                 continue
-            first, width = windows_at_rest(signal.time, part.intervals, signal.rate)
-            parts = signal.si()[first[:, None] + np.arange(width)]
             coarse = Sensor(triad, signal, np.arange(len(signal))).coarse
-            for line in follow(parts, signal.time[first] + (width - 1) / 2 / signal.rate, signal.rate):
+            for line in follow(*_windows(signal, part), signal.rate):
                 if line.moves and coarse[line.axis] is None:
                     yield MovingLine(number, triad, line)
+
+
+def _windows(signal: Signal, part: Segmentation) -> tuple[FloatArray, FloatArray]:
+    """Return windows at rest (k, w, 3), SI, and their middles (k,), s."""
+    first, width = windows_at_rest(signal.time, part.intervals, signal.rate)
+    return signal.si()[first[:, None] + np.arange(width)], signal.time[first] + (width - 1) / 2 / signal.rate
+
+
+def spectrum_at_rest(part: Segmentation, triad: str, axis: int) -> tuple[FloatArray, FloatArray]:
+    """Return times (k,), s, and power (k, f) over the noise beside it, from zero to half the rate, of an axis."""
+    windows, times = _windows(part.recording.signals[triad], part)
+    _, power, noise = spectra(windows[:, :, axis])
+    return times, np.maximum(power / noise, 1e-3)
 
 
 def swings_of(

@@ -21,10 +21,9 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import gamma_mean_sf
 from jaximu.noise.cleaning import FALSE_LINE
 
-__all__ = ["Line", "follow", "swing", "windows_at_rest"]
+__all__ = ["Line", "follow", "spectra", "swing", "windows_at_rest"]
 
 _OVER = 2
 """Points of the frequency grid an ordinate: a line between two loses 4 % of its size."""
@@ -129,15 +128,21 @@ def follow(parts: FloatArray, times: FloatArray, rate: float) -> list[Line]:
     return [line for axis in range(parts.shape[2]) for line in _of_axis(parts[:, :, axis], times, rate, axis)]
 
 
+def spectra(parts: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return windows (k, w) of an axis without a straight line, by Hann's window; their power (k, f); the noise's."""
+    width = parts.shape[1]
+    slope = np.linspace(-1.0, 1.0, width)
+    level = parts - parts.mean(axis=1, keepdims=True)
+    tapered = (level - (level @ slope / (slope @ slope))[:, None] * slope) * np.hanning(width + 1)[:-1]
+    power = np.abs(np.fft.rfft(tapered, _OVER * width, axis=1)) ** 2
+    return tapered, power, _beside(power)
+
+
 def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> list[Line]:
     """Follow one line after the other; what a line covers says nothing of the next."""
     (count, width), lobe = parts.shape, _LOBE * _OVER
-    taper = np.hanning(width + 1)[:-1]
-    slope = np.linspace(-1.0, 1.0, width)
-    level = parts - parts.mean(axis=1, keepdims=True)
-    level = level - (level @ slope / (slope @ slope))[:, None] * slope
-    power = np.abs(np.fft.rfft(level * taper, _OVER * width, axis=1)) ** 2
-    noise = _beside(power)
+    tapered, power, noise = spectra(parts)
+    total = np.sum(np.hanning(width + 1))
     if not np.all(noise[:, lobe:] > 1e-20 * np.mean(parts**2)):
         return []
     ordinates, points = power / noise, _OVER * width
@@ -163,7 +168,7 @@ def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> li
         frequency = course * rate / points
         near = np.abs(np.arange(odds.shape[2]) - at[:, None]) <= lobe
         steady = np.where(near, odds, 0.0).sum(axis=1).max()
-        size = _size(level * taper, frequency, times, rate, noise[window, at] / np.sum(taper) ** 2, visible)
+        size = _size(tapered / total, frequency, times, rate, noise[window, at] / total**2, visible)
         lines.append(Line(axis, times, frequency, visible, size, rate, rate / width, whole, float(steady)))
         hidden |= _covered(ordinates, at)
     return sorted(lines, key=lambda line: -line.evidence)
@@ -235,13 +240,18 @@ def _likeliest(odds: FloatArray, gaps: FloatArray, drift: float, walk: float) ->
 
 
 def _covered(ordinates: FloatArray, at: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return the ordinates (k, f) that a line reaches: its main lobe, and as far as their mean is no noise's."""
+    """Return the ordinates (k, f) that a line reaches: its main lobe, and as far as their median is no noise's.
+
+    Of noise half of the windows exceed a value with the tail of a binomial law; other lines cross in fewer.
+    """
     (count, last), ends = ordinates.shape, []
+    half = (count + 1) // 2
     for sign in (-1, 1):
         end = _LOBE * _OVER
         while end < last:
             near = ordinates[np.arange(count), np.clip(at + sign * (end + 1), 0, last - 1)]
-            if gamma_mean_sf(float(np.mean(near)), count) > FALSE_LINE:
+            above = np.exp(-np.sort(near)[-half])
+            if scipy.special.betainc(half, count - half + 1, above) > FALSE_LINE:
                 break
             end += 1
         ends.append(end)
@@ -261,7 +271,7 @@ def _size(
     time = (np.arange(tapered.shape[1]) - (tapered.shape[1] - 1) / 2) / rate
     drift = np.gradient(frequency, times)
     phase = 2 * np.pi * (frequency[:, None] * time + drift[:, None] * time**2 / 2)
-    height = np.abs(np.sum(tapered * np.exp(-1j * phase), axis=1)) / np.sum(np.hanning(tapered.shape[1] + 1))
+    height = np.abs(np.sum(tapered * np.exp(-1j * phase), axis=1))
     return float(2 * np.sqrt(np.maximum(np.mean((height**2 - noise)[visible]), 0.0)))
 
 
