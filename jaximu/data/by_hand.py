@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import jax
@@ -46,12 +46,15 @@ __all__ = ["RecordedByHand"]
 class RecordedByHand(OfOneUnit):
     """Poses and turns of one unit, and the recordings that they were cut from, along which effects act.
 
-    known: the unit whose effects were taken off the observations, the Earth's rotation as a rule.
+    known: the unit whose effects were taken off the observations, the Earth's rotation as a rule. swings: by triad,
+    what lines of hardly any frequency add to the mean outputs (p, 3) of real poses, which is taken off them, and the
+    variance (p, 3) with which that is known; output units.
     """
 
     segmentations: tuple[Segmentation, ...]
     observations: Observations
     known: Imu | None = None
+    swings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
 
     excess_names = EXCESS_NAMES
     coarse = COARSE_EXCESS
@@ -118,11 +121,16 @@ class RecordedByHand(OfOneUnit):
 
     def with_noise(self, noise: NoiseModel) -> RecordedByHand:
         """Return the poses and turns with the covariance that a noise of the samples makes."""
-        data = replace(self, observations=observed_poses(self.segmentations, float(self.gravity), noise=noise))
+        observations = observed_poses(self.segmentations, float(self.gravity), noise=noise)
+        data = replace(self, observations=_steadied(observations, self.swings))
         if self.known is None or not self.known.all_effects():
             return data
         left = data.along(self.known, tuple(self.known.all_effects().values())).observations
         return replace(data, observations=left)
+
+    def without_swings(self, swings: Mapping[str, tuple[FloatArray, FloatArray]]) -> RecordedByHand:
+        """Return the recordings with what lines add to the means at rest, see `swings`, taken off."""
+        return replace(self, swings=swings, observations=_steadied(self.observations, swings))
 
     def rms(self, imu: Imu, details: Along, conditions: FloatArray) -> dict[str, tuple[float, str]]:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
@@ -199,6 +207,21 @@ class RecordedByHand(OfOneUnit):
         )
         parts = tuple(replace(part, recording=twin) for part, twin in zip(self.segmentations, made, strict=True))
         return RecordedByHand(parts, observed_poses(parts, float(self.observations.gravity), noise=noise))
+
+
+def _steadied(observations: Observations, swings: Mapping[str, tuple[FloatArray, FloatArray]]) -> Observations:
+    """Return observations without what lines add to means at rest, and with the variance that this leaves."""
+    poses, slow = observations.poses, observations.slow
+    for triad, (shift, variance) in swings.items():
+        mean, spread = (np.array(getattr(poses, f"{triad}_{name}")) for name in ("mean", "covariance"))
+        mean[: len(shift)] -= shift
+        spread[: len(shift)] += variance[:, :, None] * np.eye(3)
+        poses = replace(poses, **{f"{triad}_mean": mean, f"{triad}_covariance": spread})
+        if slow is not None:
+            tied, rest = np.array(getattr(slow, triad)), np.arange(len(shift))
+            tied[:, rest, rest] += variance.T
+            slow = replace(slow, **{triad: tied})
+    return replace(observations, poses=poses, slow=slow)
 
 
 def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:

@@ -25,6 +25,7 @@ from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.hidden import Hidden, hidden_causes
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
 from jaximu.diagnosis.learned import LearnedTerm, learn, left_out_likelihood
+from jaximu.diagnosis.lines import MovingLine, line_findings, moving_lines, swings_of
 from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_noise, slow_noise, usual_noise
 from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.estimation.data import Data
@@ -34,7 +35,7 @@ from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.page import Result
-from jaximu.ground.quantities import Z95, listed, probability, sentence, size, with_interval, with_intervals
+from jaximu.ground.quantities import Z95, change, listed, probability, sentence, size, with_interval, with_intervals
 from jaximu.mistakes import prepare, prepared
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect, register
@@ -233,6 +234,7 @@ class Diagnosis(Result, Document, page="diagnosis"):
     learned: LearnedTerm | None = None
     options: tuple[Option, ...] = ()
     shape: str | None = None
+    lines: tuple[MovingLine, ...] = ()
 
     @property
     def named(self) -> tuple[Named, ...]:
@@ -409,22 +411,54 @@ def diagnose(
             other, _ = calibrate_ready([prepare(heldout, repair).recording], choices, repair)
             notes += same_device(calibration, other)
             held = recorded_by_hand(other)
-        diagnosis = examine(
-            Examination.of(
-                calibration,
-                recorded_by_hand(calibration),
-                noise_of(static),
-                held,
-                names,
-                findings=(*findings, *unusual),
-                notes=tuple(notes),
-                level=level,
-                naming=not spoiling,
+        data = recorded_by_hand(calibration)
+        lines = moving_lines(data.segmentations)
+        swings, diagnosis = swings_of(data.segmentations, lines), None
+        for off in (False, True) if swings else (False,):
+            before, diagnosis = (
+                diagnosis,
+                examine(
+                    Examination.of(
+                        calibration,
+                        data.without_swings(swings) if off else data,
+                        noise_of(static),
+                        held,
+                        names,
+                        findings=(*findings, *unusual),
+                        notes=tuple(notes),
+                        level=level,
+                        naming=not spoiling,
+                    )
+                ),
             )
-        )
+        assert diagnosis is not None
+        diagnosis = _with_lines(diagnosis, before, lines)
     if diagnosis.verdict != "adequate" and not spoiling:  # what a repair could not find may look like an effect
         spoiling = [finding for finding in findings if finding.partial]
     return without_effects(diagnosis, spoiling) if spoiling else diagnosis
+
+
+def _with_lines(diagnosis: Diagnosis, before: Diagnosis | None, lines: tuple[MovingLine, ...]) -> Diagnosis:
+    """Return a diagnosis with lines that move; `before`: with those that pass for drift in the means at rest."""
+    text, notes = "", diagnosis.notes
+    if before is not None:
+        old, new = (cross_validated(one.experiment, one.base).before for one in (before, diagnosis))
+        gone = [effect.name for effect in before.effects if effect.name not in {one.name for one in diagnosis.effects}]
+        rest, unit = new.rms["static_gyroscope"]
+        errors = change(old.rms["static_gyroscope"][0], rest, unit)
+        gain = (
+            f"on parts left out, rate at rest {errors}, χ² per condition "
+            f"{old.chi_squared / old.count:.2f} → {new.chi_squared / new.count:.2f}."
+        )
+        if new.log_likelihood > old.log_likelihood or rest < old.rms["static_gyroscope"][0] or gone:
+            text = f"What it adds to the means at rest was fitted and taken off: {gain}"
+        else:
+            diagnosis, text = before, f"Taking off what it adds to the means at rest gains nothing: {gain}"
+        if gone:
+            named = listed([effect_title(name) for name in gone])
+            notes = (*notes, f"with the line that looks like bias drift left in, {named} would have been named.")
+    findings = (*diagnosis.preflight, *line_findings(lines, text))
+    return replace(diagnosis, preflight=findings, notes=notes, lines=lines)
 
 
 def _only(candidates: Sequence[str] | None) -> list[str]:

@@ -29,6 +29,7 @@ __all__ = [
 
 TITLES = {
     "data.bumped_pose": "bumped pose",
+    "data.moving_line": "line that moves",
     "data.moving_pose": "moving pose",
     "data.order": "rows out of order",
     "data.sampling": "turns too quick for the rate",

@@ -14,13 +14,22 @@ from numpy.typing import NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.recordings.recording import runs_of
 
-__all__ = ["BRIDGED", "PeriodicLine", "filled", "lowest", "periodic_lines", "without_line", "without_outliers"]
+__all__ = [
+    "BRIDGED",
+    "FALSE_LINE",
+    "PeriodicLine",
+    "filled",
+    "lowest",
+    "periodic_lines",
+    "without_line",
+    "without_outliers",
+]
 
 BRIDGED = 5
 """Samples missing in a row that are filled in: a few in a thousand change no term, but would break long averages."""
 _SPIKE = 8.0
 """Standard deviations off its neighbours from which a sample is an outlier: Gaussian noise has none in 10¹⁴."""
-_FALSE_LINE = 1e-6
+FALSE_LINE = 1e-6
 """Probability that noise alone shows a line somewhere on an axis."""
 _MOST_LINES = 20
 
@@ -152,7 +161,7 @@ def _peaks(values: FloatArray, last: int | None) -> list[tuple[int, int, int]]:
     median = np.array([np.median(power[a:b]) for a, b in pairwise(edges)])
     if not (median > 0).all():
         return []
-    factor = np.log(len(power) / _FALSE_LINE) / np.log(2)
+    factor = np.log(len(power) / FALSE_LINE) / np.log(2)
     first = int(np.sqrt((edges[0] + 1.0) * (edges[1] + 1.0)))
     crude = np.repeat(median, np.diff(edges)) * (0.4 * factor)
     high = edges[0] + np.flatnonzero(power[edges[0] : edges[-1]] > crude)

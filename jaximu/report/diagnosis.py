@@ -15,6 +15,7 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.hidden import Hidden
 from jaximu.diagnosis.improvement import Gain
 from jaximu.diagnosis.learned import LearnedTerm
+from jaximu.diagnosis.lines import spectrum_at_rest
 from jaximu.diagnosis.noise import NoiseFinding
 from jaximu.estimation.rows import TIME
 from jaximu.estimation.uncertainty import describe
@@ -41,6 +42,7 @@ __all__ = ["page_of"]
 
 _MEASURED, _TWIN, _EXTENDED = figures.FLAGGED, figures.BEFORE, figures.AFTER
 _SHOWN = 12
+_PANELS = 3  # of axes with lines that move: more would fill pages
 _AN_ERROR = 1e-3  # m/s², rad/s: sizes that errors have, whose unit the axes take
 _DOUBT = 0.01
 """Probability below which chance is no longer offered as an explanation."""
@@ -90,6 +92,7 @@ def _first(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
         yield Section("The recording itself", mistakes)
     if diagnosis.effects:
         yield Section("What is missing in the model", [_effects_table(diagnosis)])
+    yield from _lines_part(diagnosis)
     yield from _learned_part(diagnosis)
     yield from _gains(diagnosis)
     if diagnosis.verdict == "adequate":
@@ -262,6 +265,39 @@ def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
         return f"{effect_title(effect.name)}\n{about}", "", numbers, evidence
     about = f"{effect.effect.formula}; belongs to the {_SCOPES[effect.scope]}"
     return f"{effect.effect.title}\n{about}", f"{effect.size()}\n({effect.triad})", numbers, evidence
+
+
+def _lines_part(diagnosis: Diagnosis) -> Iterator[Section]:
+    """Return the spectral lines that move, over the spectrum that they were followed in."""
+    if not diagnosis.lines:
+        return
+    picture = Picture(
+        "lines",
+        partial(_lines_figure, diagnosis),
+        "Frequency over time, at rest",
+        "Dark: power over the noise beside it, in windows at rest. Coloured: the lines that move, as followed; a line "
+        "that reaches zero frequency or half the sample rate (the edges) goes on as its mirror image.",
+    )
+    yield Section("Lines that move", [picture])
+
+
+def _lines_figure(diagnosis: Diagnosis) -> Figure:
+    """Draw the spectrum over time of the axes with lines that move, those that cross zero frequency first."""
+    parts = diagnosis.calibration.segmentations
+    axes_of = list(dict.fromkeys((one.recording, one.triad, one.line.axis) for one in diagnosis.lines))[:_PANELS]
+    figure = figures.new_figure(0.6 + 2.4 * len(axes_of))
+    grid = figure.subplots(len(axes_of), 1, squeeze=False)[:, 0]
+    for axes, key in zip(grid, axes_of, strict=True):
+        mine = [one for one in diagnosis.lines if (one.recording, one.triad, one.line.axis) == key]
+        times, power = spectrum_at_rest(parts[key[0]], key[1], key[2])
+        edges = np.linspace(0, mine[0].line.rate / 2, power.shape[1])
+        axes.pcolormesh(times, edges, np.log10(power.T), cmap="Greys", vmin=0.0, vmax=2.0, rasterized=True)
+        for index, one in enumerate(mine):
+            color = figures.PALETTE[index % len(figures.PALETTE)]
+            axes.plot(one.line.times, one.line.recorded, color=color, linewidth=1.2, alpha=0.8)
+        dressed(axes, mine[0].axis, ylabel="frequency (Hz)")
+    grid[-1].set_xlabel("time (s)")
+    return figure
 
 
 def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:

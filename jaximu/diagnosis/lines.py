@@ -1,0 +1,121 @@
+"""Spectral lines that move, of all rests of recordings: in words, and what they add to the means at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaximu.estimation.track import TRIADS
+from jaximu.ground.array_types import FloatArray
+from jaximu.ground.quantities import counted, size
+from jaximu.ground.units import SENSOR_UNITS
+from jaximu.mistakes.base import Sensor
+from jaximu.noise.lines import Line, follow, spectra, swing, windows_at_rest
+from jaximu.recordings.finding import Finding
+from jaximu.recordings.recording import Signal
+from jaximu.recordings.segmentation import Segmentation
+
+__all__ = ["MOVING_LINE", "MovingLine", "line_findings", "moving_lines", "spectrum_at_rest", "swings_of"]
+
+MOVING_LINE = "data.moving_line"
+_NAMED = 3
+"""Lines of an axis that are described; the others are counted."""
+
+
+@dataclass(frozen=True)
+class MovingLine:
+    """A spectral line that moves: of which recording, by number, and of which triad; size in SI."""
+
+    recording: int
+    triad: str
+    line: Line
+
+    @property
+    def axis(self) -> str:
+        """The triad's axis."""
+        return f"{self.triad} {'xyz'[self.line.axis]}"
+
+    @property
+    def words(self) -> str:
+        """From where to where it moves, and where it folds."""
+        line = self.line
+        shown = line.recorded[line.visible]
+        text = (
+            f"a line of {size(line.size, SENSOR_UNITS[self.triad], 2)} moves from {shown[0]:.3g} to {shown[-1]:.3g} Hz"
+        )
+        if len(zero := line.folds(0.0)):
+            text += f", crosses zero frequency at t = {zero[0]:.0f} s, where it looks like bias drift and is none"
+        if len(half := line.folds(0.5)):
+            text += (
+                f", and passes half the sample rate ({line.rate / 2:.4g} Hz) at t = {half[0]:.0f} s: on one side of it "
+                "its alias is recorded"
+            )
+        return text
+
+
+def moving_lines(segmentations: Sequence[Segmentation]) -> tuple[MovingLine, ...]:
+    """Return the lines at rest that move, recording by recording, those that cross zero frequency first.
+
+    Axes whose noise is finer than their steps are left out: rounding makes lines.
+    """
+    return tuple(sorted(_moving(segmentations), key=lambda one: (one.recording, not one.line.slow)))
+
+
+def _moving(segmentations: Sequence[Segmentation]) -> Iterator[MovingLine]:
+    for number, part in enumerate(segmentations):
+        for triad in TRIADS:
+            signal = part.recording.signals.get(triad)
+            if signal is None:
+                continue
+            coarse = Sensor(triad, signal, np.arange(len(signal))).coarse
+            for line in follow(*_windows(signal, part), signal.rate):
+                if line.moves and coarse[line.axis] is None:
+                    yield MovingLine(number, triad, line)
+
+
+def _windows(signal: Signal, part: Segmentation) -> tuple[FloatArray, FloatArray]:
+    """Return windows at rest (k, w, 3), SI, and their middles (k,), s."""
+    first, width = windows_at_rest(signal.time, part.intervals, signal.rate)
+    return signal.si()[first[:, None] + np.arange(width)], signal.time[first] + (width - 1) / 2 / signal.rate
+
+
+def spectrum_at_rest(part: Segmentation, triad: str, axis: int) -> tuple[FloatArray, FloatArray]:
+    """Return times (k,), s, and power (k, f) over the noise beside it, from zero to half the rate, of an axis."""
+    windows, times = _windows(part.recording.signals[triad], part)
+    _, power, noise = spectra(windows[:, :, axis])
+    return times, np.maximum(power / noise, 1e-3)
+
+
+def swings_of(
+    segmentations: Sequence[Segmentation], lines: Sequence[MovingLine]
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return what lines that come close to zero frequency add to the means at rest, see `RecordedByHand.swings`."""
+    poses = np.cumsum([0, *(len(part.intervals) for part in segmentations)])
+    swings: dict[str, tuple[FloatArray, FloatArray]] = {}
+    for one in lines:
+        if not one.line.slow:
+            continue
+        part, axis = segmentations[one.recording], one.line.axis
+        signal = part.recording.signals[one.triad]
+        values, scale = signal.si()[:, axis], signal.nominal_scale[axis]
+        shift, variance = swings.setdefault(one.triad, (np.zeros((poses[-1], 3)), np.zeros((poses[-1], 3))))
+        for pose, (start, stop) in enumerate(np.searchsorted(signal.time, part.intervals), poses[one.recording]):
+            mean, spread = swing(values[start:stop], signal.time[start:stop], one.line)
+            shift[pose, axis] += scale * mean
+            variance[pose, axis] += scale**2 * spread
+    return swings
+
+
+def line_findings(lines: Sequence[MovingLine], gain: str = "") -> list[Finding]:
+    """Return a finding for each axis with lines that move; `gain`: what taking off those near zero frequency gained."""
+    findings = []
+    for recording, axis in dict.fromkeys((one.recording, one.axis) for one in lines):
+        mine = [one for one in lines if (one.recording, one.axis) == (recording, axis)]
+        texts = [one.words for one in mine[:_NAMED]]
+        more = f"; and {counted(len(mine) - _NAMED, 'more line')}" if len(mine) > _NAMED else ""
+        slow = any(one.line.slow for one in mine)
+        text = f"{axis}: {'; '.join(texts)}{more}. {gain if slow else ''}".rstrip()
+        findings.append(Finding(MOVING_LINE, (), text[0].upper() + text[1:]))
+    return findings

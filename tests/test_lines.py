@@ -1,0 +1,155 @@
+"""Spectral lines that are followed through time: simulated chirps of known course, noise, and a measured board."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy
+from simulated_board import board
+
+from jaximu import ReadOptions, diagnose, read_recording
+from jaximu.calibration.recipe import calibrate
+from jaximu.diagnosis.lines import MOVING_LINE, line_findings, moving_lines
+from jaximu.noise.lines import follow, swing, windows_at_rest
+from jaximu.report.html import write_report
+
+RATE, DURATION = 50.0, 200.0
+TIME = np.arange(int(RATE * DURATION)) / RATE
+RESTS = np.stack([np.arange(0, 190.0, 10), np.arange(8.4, 198.4, 10)], axis=1)
+FIRST, WIDTH = windows_at_rest(TIME, RESTS, RATE)
+CENTRES = TIME[FIRST] + (WIDTH - 1) / 2 / RATE
+
+
+def noise(seed, flicker=0.0):
+    """White noise of variance one, and flicker noise."""
+    random = np.random.default_rng([seed, 77])
+    frequency = np.maximum(np.fft.rfftfreq(2 * len(TIME), 1 / RATE), 1 / (2 * DURATION))
+    shaped = np.fft.rfft(random.standard_normal(2 * len(TIME))) * flicker / np.sqrt(frequency)
+    return random.standard_normal(len(TIME)) + np.fft.irfft(shaped)[: len(TIME)]
+
+
+def course(start, stop):
+    return start + (stop - start) / DURATION * TIME
+
+
+def chirp(frequency, power):
+    """A line of so many times the power of white noise in an ordinate."""
+    size = np.sqrt(power * 4 * 0.375 / (WIDTH * 0.25))
+    return size, size * np.cos(2 * np.pi * np.cumsum(frequency) / RATE)
+
+
+def followed(values):
+    return follow(values[FIRST[:, None] + np.arange(WIDTH)][:, :, None], CENTRES, RATE)
+
+
+def recorded(frequency):
+    return np.abs((frequency + RATE / 2) % RATE - RATE / 2)
+
+
+@pytest.mark.parametrize("power", [8.0, 40.0, 1000.0])
+@pytest.mark.parametrize(("start", "stop"), [(5.0, 7.0), (-3.0, 4.0), (22.0, 28.0), (14.0, 9.0)])
+def test_a_chirp_is_followed_where_it_folds_as_well(start, stop, power):
+    frequency = course(start, stop)
+    size, wave = chirp(frequency, power)
+    (line,) = [line for line in followed(noise(3, 0.3) + wave) if line.moves]
+    truth = recorded(np.interp(line.times, TIME, frequency))
+    assert np.mean(line.visible) > 0.7
+    assert np.max(np.abs(line.recorded - truth)[line.visible]) < 2 * line.resolution
+    assert 0.8 < line.size / size < 1.2
+    for share, at in ((0.0, 0.0), (0.5, RATE / 2)):
+        expected = [np.interp(at, frequency, TIME)] if start < at < stop else []
+        assert line.folds(share) == pytest.approx(expected, abs=10)
+    assert line.slow == (start < 0)
+
+
+@pytest.mark.parametrize("power", [8.0, 1000.0])
+def test_a_constant_line_does_not_move(power):
+    lines = followed(noise(4, 0.3) + chirp(course(9.3, 9.3), power)[1])
+    assert len(lines) == 1 and not lines[0].moves
+    assert np.all(np.abs(lines[0].frequency - 9.3) < 2 * lines[0].resolution)
+
+
+def test_two_lines_that_cross_are_two():
+    first, second = course(4.0, 9.0), course(16.0, 14.0)
+    lines = followed(noise(5) + chirp(first, 60)[1] + chirp(second, 30)[1] + chirp(course(6.5, 6.5), 30)[1])
+    moving = sorted((line for line in lines if line.moves), key=lambda line: np.median(line.frequency))
+    assert len(moving) == 2 and len(lines) == 3
+    for line, truth in zip(moving, (first, second), strict=True):
+        off = np.abs(line.frequency - np.interp(line.times, TIME, truth))[line.visible]
+        assert np.max(off) < 2 * line.resolution
+
+
+@pytest.mark.parametrize("flicker", [0.0, 0.5, 3.0])
+def test_noise_has_no_line_that_moves(flicker):
+    """A line in noise has a probability of 1e-6 an axis; with none in so many, below 1e-3 an axis at odds of 1 in 7."""
+    axes = 24
+    moving = sum(any(line.moves for line in followed(noise(seed, flicker))) for seed in range(axes))
+    assert moving == 0  # of 24 axes with probability 1e-6 each one may be: 2.4e-5
+    assert scipy.stats.beta.ppf(0.95, moving + 1, axes - moving) < 0.12
+
+
+def test_rounding_and_dead_axes_have_no_line():
+    assert not followed(np.zeros(len(TIME)))
+    assert not follow(np.zeros((3, 64, 3)), np.arange(3.0), RATE)
+    assert len(windows_at_rest(TIME, np.zeros((0, 2)), RATE)[0]) == 0
+    gap = np.where(TIME > 100.5, TIME + 1.0, TIME)
+    assert len(windows_at_rest(gap, RESTS, RATE)[0]) < len(FIRST)
+
+
+def test_what_a_line_adds_to_means_at_rest_is_taken_off_as_far_as_it_is_known():
+    frequency = course(-1.5, 1.5)
+    size, wave = chirp(frequency, 300)
+    values = noise(6) + wave
+    (line,) = [line for line in followed(values) if line.moves]
+    truth, estimate, sigma = [], [], []
+    for start, stop in np.searchsorted(TIME, RESTS):
+        mean, variance = swing(values[start:stop], TIME[start:stop], line)
+        truth.append(wave[start:stop].mean())
+        estimate.append(mean)
+        sigma.append(np.sqrt(variance + 1 / (stop - start)))
+    truth, estimate = np.array(truth), np.array(estimate)
+    assert np.std(truth - estimate) < 0.5 * np.std(truth)
+    assert max(sigma) < size and np.argmax(sigma) in (8, 9, 10)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    """Twenty rests of 20 s, and a line of the gyroscope that crosses zero frequency."""
+    silent = board(1, 1, 1, {}, [], poses=20, rest=20.0, walk=2e-6)[0]
+    signal = silent.gyroscope
+    values, drift = signal.values.copy(), 2.0 / signal.time[-1]
+    values[:, 1] += 3e-3 * signal.nominal_scale[1] * np.cos(2 * np.pi * (drift * signal.time**2 / 2 - signal.time))
+    return replace(silent, gyroscope=replace(signal, values=values))
+
+
+def test_a_line_through_zero_is_named_and_no_drift(recording, tmp_path):
+    diagnosis = diagnose(recording)
+    (line,) = diagnosis.lines
+    assert line.axis == "gyroscope y" and line.line.size == pytest.approx(3e-3, rel=0.2)
+    assert not any(effect.name.startswith("gyro.") for effect in diagnosis.effects)
+    (finding,) = [entry for entry in diagnosis.document()["preflight"] if entry["name"] == MOVING_LINE]
+    assert "crosses zero frequency at t = 2" in finding["text"] and "taken off" in finding["text"]
+    assert json.loads(diagnosis.text())["preflight"]
+    text = write_report(diagnosis, tmp_path).read_text(encoding="utf-8")
+    assert "Lines that move" in text and (tmp_path / "lines.png").is_file()
+
+
+def measured(folder, name):
+    options = ReadOptions(accel_scale="2048 count/g", gyro_scale="16.4 count/(deg/s)")
+    return moving_lines(calibrate(read_recording(folder / f"mimu4444/{name}.parquet", options=options)).segmentations)
+
+
+def test_lines_of_a_measured_board(data_folder):
+    """Read off spectrograms: y drifts from 4 Hz to zero towards the end, z from 13 to 14.5 Hz."""
+    lines = {line.axis: line for line in measured(data_folder, "unit1_session1")}
+    assert set(lines) == {"gyroscope y", "gyroscope z"}
+    (zero,) = lines["gyroscope y"].line.folds(0.0)
+    assert 330 < zero < 420
+    shown = lines["gyroscope z"].line.recorded
+    assert shown[0] == pytest.approx(12.9, abs=0.3) and shown[-1] == pytest.approx(14.5, abs=0.3)
+    assert "crosses zero frequency" in line_findings([lines["gyroscope y"]])[0].text
+
+
+def test_a_quiet_unit_of_the_board_has_no_line_that_moves(data_folder):
+    assert not measured(data_folder, "unit6_session1")
