@@ -105,8 +105,8 @@ class LogTable:
     def numbers(self, index: int) -> np.ndarray:
         """The column as int64 or float64 (NaN where empty).
 
-        Of readings that are infinite, or larger than any is, a few count as empty. Raises InputError for more of them,
-        and for a cell that is no number.
+        Of readings that are infinite or larger than any is, and of cells that are no number, a few count as empty.
+        Raises InputError for more of them.
         """
         column = self.columns[index]
         if column.dtype == object:
@@ -120,15 +120,16 @@ class LogTable:
         return column
 
     def _parse(self, index: int) -> FloatArray:
-        values = np.empty(len(self.columns[index]))
+        values, texts = np.full(len(self.columns[index]), np.nan), []
         for at, cell in enumerate(self.columns[index]):
             try:
                 values[at] = np.nan if cell is None else float(cell)
             except (TypeError, ValueError):
-                text = repr((cell.decode(errors="replace") if isinstance(cell, bytes) else str(cell))[:40])
-                raise InputError(
-                    f"{self.where(at)}: column {self.label(index)} holds {text}, which is not a number."
-                ) from None
+                texts.append(at)
+        if len(texts) > FEW * len(values):
+            cell = self.columns[index][texts[0]]
+            text = repr((cell.decode(errors="replace") if isinstance(cell, bytes) else str(cell))[:40])
+            raise InputError(f"{self.where(texts[0])}: column {self.label(index)} holds {text}, which is not a number.")
         return values
 
 
