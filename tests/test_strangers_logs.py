@@ -338,7 +338,6 @@ def test_angles_are_no_rates(tmp_path):
         (300, "% marker set by user", 0),
         (300, "// marker", 0),
         (300, "; marker", 0),
-        (None, "Mean,0.1,0.2,9.8,0,0,0", 1),
         (None, ",0.1,0.2,9.8,0,0,0", 1),
         (300, "1.23,ERR,0.2,9.8,0,0,0", 1),
         (300, "1.23,0.1,0.2,9.8,--,--,--", 1),
@@ -391,3 +390,36 @@ def test_temperatures_that_are_errors_of_transfer():
     np.testing.assert_allclose(temperature.values[:, 0], celsius[~wrong])
     clean = prepare(replace(recording, temperature=Signal(time, celsius[:, None], "degC")))
     assert not any("far from those" in note for note in clean.notes)
+
+
+@pytest.mark.parametrize("spoil", ["free", "copied"])
+def test_info_offers_nothing_that_a_finding_refuses(tmp_path, capsys, spoil):
+    """Gravity taken out, or an axis that repeats another: what needs the sensor is not offered."""
+    values = columns(by_hand(poses=12))
+    if spoil == "copied":
+        values[:, 2] = values[:, 1]
+    else:
+        values[:, 1:4] = 0.3 * np.sin(7 * values[:, :1] + [0, 1, 2]) * np.random.default_rng(0).random((len(values), 1))
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values))
+    assert main(["info", str(path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert {use["verb"] for use in document["uses"]} <= {"allan", "thermal", "magnetometer", "compensate"}
+    (reason, *_) = document["refused"]
+    assert main(["calibrate", str(path)]) != 0
+    capsys.readouterr()
+    assert main([str(path), "--yes"]) == 1
+    assert reason.rstrip(".") in " ".join(capsys.readouterr().err.split()).replace("Accelerometer:", "accelerometer:")
+
+
+def test_compensate_says_what_is_wrong_with_the_log(tmp_path, capsys):
+    values = columns(by_hand(poses=14))
+    save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values))
+    assert main(["calibrate", str(tmp_path / "log.csv"), "-o", str(tmp_path / "r")]) == 0
+    values[:, 1:4] = np.clip(values[:, 1:4], -9.6, 9.6)
+    save(tmp_path / "clipped.csv", f"time [s],{HEAD}", *lines(values))
+    calibration = str(tmp_path / "r/calibration.json")
+    for name in ("clipped", "log"):
+        capsys.readouterr()
+        command = ["compensate", calibration, str(tmp_path / f"{name}.csv"), "-o", str(tmp_path / "out.csv")]
+        assert main(command) == 0
+        assert ("its range is too small" in capsys.readouterr().err) is (name == "clipped")

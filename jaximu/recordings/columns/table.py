@@ -19,6 +19,8 @@ AXES = b"jaximu.axes"
 """Key of Arrow's metadata: the map by which a writer has put a log in body axes."""
 FEW = 0.01
 """Share of the rows up to which one that holds no whole sample costs itself, and not the recording."""
+_MISSING = {"-", "--", "---", "*", "?", "none", "err", "error", "missing", "overflow", "ovf", "inv", "invalid"}
+"""Words that programs write for a reading that is not there, beside those that Arrow knows."""
 _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
 
 
@@ -105,8 +107,8 @@ class LogTable:
     def numbers(self, index: int) -> np.ndarray:
         """The column as int64 or float64 (NaN where empty).
 
-        Of readings that are infinite or larger than any is, and of cells that are no number, a few count as empty.
-        Raises InputError for more of them.
+        Of readings that are infinite, or larger than any is, a few count as empty. Raises InputError for more of them,
+        and for a cell that is neither a number nor a word for a missing one.
         """
         column = self.columns[index]
         if column.dtype == object:
@@ -120,16 +122,15 @@ class LogTable:
         return column
 
     def _parse(self, index: int) -> FloatArray:
-        values, texts = np.full(len(self.columns[index]), np.nan), []
+        values = np.empty(len(self.columns[index]))
         for at, cell in enumerate(self.columns[index]):
             try:
-                values[at] = np.nan if cell is None else float(cell)
+                values[at] = np.nan if cell is None or str(cell).strip().lower() in _MISSING else float(cell)
             except (TypeError, ValueError):
-                texts.append(at)
-        if len(texts) > FEW * len(values):
-            cell = self.columns[index][texts[0]]
-            text = repr((cell.decode(errors="replace") if isinstance(cell, bytes) else str(cell))[:40])
-            raise InputError(f"{self.where(texts[0])}: column {self.label(index)} holds {text}, which is not a number.")
+                text = repr((cell.decode(errors="replace") if isinstance(cell, bytes) else str(cell))[:40])
+                raise InputError(
+                    f"{self.where(at)}: column {self.label(index)} holds {text}, which is not a number."
+                ) from None
         return values
 
 

@@ -327,9 +327,9 @@ def _parse(file: pa.NativeFile, layout: _Layout, block: int) -> pa.Table:
 def _without_remarks(
     body: bytes, layout: _Layout, rows: np.ndarray, path: str
 ) -> tuple[bytes, np.ndarray, tuple[str, ...]]:
-    """The lines that have as many cells as the rest and their numbers, without remarks and a last row that is cut off.
+    """The lines that have as many cells as the rest and their numbers, without remarks.
 
-    Raises InputError for a row with another number of cells: a row of numbers that is not the last.
+    Raises InputError for a row of numbers with another number of cells.
     """
     lines = body.rstrip(b"\n").split(b"\n")
     kept, notes = [], []
@@ -339,8 +339,9 @@ def _without_remarks(
             kept.append(at)
         elif not any(_is_number(cell, layout.decimal) for cell in cells):
             notes.append(f"row {rows[at]} is a remark and left out: {_text(line)[:_QUOTED]!r}.")
-        elif at == len(lines) - 1 and len(cells) < layout.width:
-            notes.append(f"the file is cut off within its last row ({rows[at]}), which is left out.")
         else:
-            raise InputError(f"{path}, row {rows[at]}: holds {len(cells)} cells where the others hold {layout.width}.")
+            last = "; it is the last one: the file is cut off, delete that row" if at == len(lines) - 1 else ""
+            raise InputError(
+                f"{path}, row {rows[at]}: holds {len(cells)} cells where the others hold {layout.width}{last}."
+            )
     return b"\n".join(lines[at] for at in kept), rows[kept], tuple(notes[:_FEW_NOTES])
