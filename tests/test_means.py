@@ -8,6 +8,7 @@ from jaximu import InputError, LocalGravity, NotPossibleError, load_calibration
 from jaximu.calibration import calibrate_means
 from jaximu.cli.app import main
 from jaximu.recordings.readers import ReadOptions, read_means
+from jaximu.recordings.recording import PoseMeans, Recording, Signal
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 NOISE = 2e-3  # m/s², of a mean
@@ -177,3 +178,21 @@ def test_five_faces_are_refused(tmp_path):
     rows = np.vstack([np.eye(3), -np.eye(3)])[:5] + 0.01
     with pytest.raises(NotPossibleError, match="add 1 pose"):
         calibrate_means(read_means(written(tmp_path / "five.csv", HEADER[:3], rows, 4)), GRAVITY)
+
+
+@pytest.mark.parametrize("repeats", [2, 4])
+@pytest.mark.parametrize("stated", [False, True])
+def test_repeated_faces_do_not_determine_misalignments(repeats, stated):
+    """Six faces twice are twelve poses and no new direction: scale and bias are known, misalignments are not."""
+    random = np.random.default_rng(repeats)
+    gain = np.array([[1.03, 0, 0], [0.004, 0.98, 0], [-0.003, 0.005, 1.01]])
+    faces = np.concatenate([np.eye(3), -np.eye(3)] * repeats)
+    values = 9.80665 * faces @ gain.T + [0.2, -0.1, 0.3] + 0.002 * random.standard_normal(faces.shape)
+    signal = Signal(np.arange(len(faces), dtype=float), values, "m/s^2")
+    sigma = np.full(values.shape, 0.002) if stated else None
+    calibration = calibrate_means(PoseMeans(Recording(signal), sigma), LocalGravity(9.80665, 0.0))
+    triad = calibration.imu.accelerometer
+    np.testing.assert_allclose(np.diag(triad.gain), np.diag(gain), atol=4e-4)
+    np.testing.assert_allclose(triad.bias, [0.2, -0.1, 0.3], atol=5e-3)
+    assert any("leave misalignments open" in note for note in calibration.notes)
+    assert any("intervals are from their misfit" in note for note in calibration.notes) is not stated

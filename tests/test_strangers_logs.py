@@ -11,10 +11,10 @@ import pytest
 from jaximu import InputError, NotPossibleError, calibrate, check
 from jaximu.calibration.refusals import require_carried
 from jaximu.cli import main
-from jaximu.mistakes import inspect
+from jaximu.mistakes import inspect, prepare
 from jaximu.recordings.alignment import carried
 from jaximu.recordings.readers import ReadOptions, advise_reading, read_recording
-from jaximu.recordings.recording import Recording
+from jaximu.recordings.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld, Static
 
@@ -294,3 +294,132 @@ def test_sections_put_together_are_not_two_devices(tmp_path):
     log = save(tmp_path / "log.csv", HEAD, *lines(rests))
     names = {finding.name for finding in inspect(read_recording(log, options=ReadOptions(rate=50.0)))}
     assert not names & {"data.mixed_devices", "data.range"}
+
+
+# --- other languages, and what stands between the rows
+
+
+@pytest.mark.parametrize(
+    ("names", "encoding"),
+    [
+        ("Tempo (s)|Accelerazione {} (m/s²)|Velocità angolare {} (rad/s)", "utf-8"),
+        ("Время, с|Ускорение {}, м/с²|Угловая скорость {}, рад/с", "utf-8"),
+        ("Время, с|Ускорение {}, м/с2|Угловая скорость {}, рад/с", "cp1251"),
+        ("時間（s）|加速度{}（m/s2）|角速度{}（rad/s）", "shift_jis"),
+        ("时间(s)|加速度{}(m/s^2)|角速度{}(rad/s)", "gb18030"),
+        ("Tijd [s]|Versnelling {} [meter/second^2]|Hoeksnelheid {} [radians per second]", "utf-8"),
+        ("time [s]|{}acc [m/s^2]|{}speed [rad/s]", "utf-8"),
+    ],
+)
+def test_names_in_other_languages(tmp_path, names, encoding):
+    """Names and units in brackets, wide brackets or behind a comma: nothing is asked."""
+    values = columns(by_hand())
+    time, force, rate = names.split("|")
+    axes = ["roll", "pitch", "yaw"] if rate.startswith("{}s") else "XYZ"
+    head = [time, *(force.format(axis) for axis in "XYZ"), *(rate.format(axis) for axis in axes)]
+    text = "\n".join([";".join(head), *lines(values, sep=";")]) + "\n"
+    (tmp_path / "log.csv").write_bytes(text.encode(encoding))
+    same(read_recording(tmp_path / "log.csv"), values)
+
+
+def test_angles_are_no_rates(tmp_path):
+    """A sensor's own angles have the shape of a gyroscope's output, and its sign changes."""
+    values = columns(by_hand())
+    head = "time [s],accX [m/s^2],accY [m/s^2],accZ [m/s^2],{0}X,{0}Y,{0}Z"
+    for name in ("Angle", "gyroAngle", "Euler"):
+        path = save(tmp_path / f"{name}.csv", head.format(name), *lines(values))
+        assert read_recording(path).gyroscope is None, name
+
+
+@pytest.mark.parametrize(
+    ("where", "line", "gone"),
+    [
+        (None, "Recording stopped by user", 0),
+        (300, "% marker set by user", 0),
+        (300, "// marker", 0),
+        (300, "; marker", 0),
+        (None, ",0.1,0.2,9.8,0,0,0", 1),
+        (300, "1.23,ERR,0.2,9.8,0,0,0", 1),
+        (300, "1.23,0.1,0.2,9.8,--,--,--", 1),
+    ],
+)
+def test_what_is_no_row_costs_itself(tmp_path, where, line, gone):
+    values = columns(by_hand())
+    rows = lines(values)
+    rows.insert(len(rows) if where is None else where, line.replace("1.23", f"{values[299, 0] + 0.003:.3f}"))
+    recording = read_recording(save(tmp_path / "log.csv", f"time [s],{HEAD}", *rows))
+    assert len(values) <= max(len(recording.accelerometer), len(recording.gyroscope)) <= len(values) + 1
+    assert min(len(recording.accelerometer), len(recording.gyroscope)) == len(values)
+    if not line.startswith(("%", "//")):
+        assert any("left out" in note or "no whole sample" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize("late", [0.1, 0.3, 0.5, 0.6, 0.9])
+def test_two_runs_are_not_sorted_into_each_other(tmp_path, late):
+    """Whatever part of a step the second run is late by."""
+    values = columns(by_hand(poses=16))
+    half = len(values) // 2
+    values[half:, 0] += late * 0.02 - values[half, 0] + values[0, 0]
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values))
+    with pytest.raises(InputError, match=f"row {half + 2}: the clock goes back .* two recordings in one file"):
+        read_recording(path)
+
+
+def test_a_dead_magnetometer_among_rows_of_one_sensor_each(tmp_path):
+    values = columns(by_hand())
+    rows = []
+    for number, (time, *six) in enumerate(values):
+        rows += [f"{time:.4f},ACC,{six[0]},{six[1]},{six[2]}", f"{time + 0.001:.4f},GYR,{six[3]},{six[4]},{six[5]}"]
+        rows += [f"{time + 0.002:.4f},MAG,20,-5,43"] * (number % 5 == 0)
+    path = save(tmp_path / "log.csv", "time [s],sensor,x,y,z", *rows)
+    options = ReadOptions(columns="time [s],accel [m/s^2],gyro [rad/s],mag [uT]")
+    assert read_recording(path, options=options).magnetometer is None
+
+
+def test_temperatures_that_are_errors_of_transfer():
+    """One reading is held for some rows, as of a thermometer that is read once a second; the rest is what it was."""
+    recording = by_hand(rate=50.0, poses=16)
+    time = recording.accelerometer.time
+    celsius = 20.0 + 0.0625 * np.round((np.floor(time) / 4.0) / 0.0625)
+    wrong = np.isin(np.floor(time), (7.0, 21.0, 40.0))
+    values = np.where(wrong, np.where(time > 30.0, 85.0, -127.0), celsius)
+    logged = replace(recording, temperature=Signal(time, values[:, None], "degC"))
+    ready = prepare(logged)
+    assert any("temperature: 150 readings far from those before and after" in note for note in ready.notes)
+    temperature = ready.recording.temperature
+    np.testing.assert_allclose(temperature.values[:, 0], celsius[~wrong])
+    clean = prepare(replace(recording, temperature=Signal(time, celsius[:, None], "degC")))
+    assert not any("far from those" in note for note in clean.notes)
+
+
+@pytest.mark.parametrize("spoil", ["free", "copied"])
+def test_info_offers_nothing_that_a_finding_refuses(tmp_path, capsys, spoil):
+    """Gravity taken out, or an axis that repeats another: what needs the sensor is not offered."""
+    values = columns(by_hand(poses=12))
+    if spoil == "copied":
+        values[:, 2] = values[:, 1]
+    else:
+        values[:, 1:4] = 0.3 * np.sin(7 * values[:, :1] + [0, 1, 2]) * np.random.default_rng(0).random((len(values), 1))
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values))
+    assert main(["info", str(path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert {use["verb"] for use in document["uses"]} <= {"allan", "thermal", "magnetometer", "compensate"}
+    (reason, *_) = document["refused"]
+    assert main(["calibrate", str(path)]) != 0
+    capsys.readouterr()
+    assert main([str(path), "--yes"]) == 1
+    assert reason.rstrip(".") in " ".join(capsys.readouterr().err.split()).replace("Accelerometer:", "accelerometer:")
+
+
+def test_compensate_says_what_is_wrong_with_the_log(tmp_path, capsys):
+    values = columns(by_hand(poses=14))
+    save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values))
+    assert main(["calibrate", str(tmp_path / "log.csv"), "-o", str(tmp_path / "r")]) == 0
+    values[:, 1:4] = np.clip(values[:, 1:4], -9.6, 9.6)
+    save(tmp_path / "clipped.csv", f"time [s],{HEAD}", *lines(values))
+    calibration = str(tmp_path / "r/calibration.json")
+    for name in ("clipped", "log"):
+        capsys.readouterr()
+        command = ["compensate", calibration, str(tmp_path / f"{name}.csv"), "-o", str(tmp_path / "out.csv")]
+        assert main(command) == 0
+        assert ("its range is too small" in capsys.readouterr().err) is (name == "clipped")

@@ -57,7 +57,9 @@ def test_temperatures_have_an_offset(text, value):
 @pytest.mark.parametrize(
     ("text", "plain"),
     [("m s^-2", "m/s^2"), ("m*s^-2", "m/s^2"), ("m·s⁻²", "m/s^2"), ("rad s-1", "rad/s"), ("rad·s⁻¹", "rad/s"),
-     ("rad*s**-1", "rad/s"), ("deg h^-1", "deg/h"), ("mm s^-2", "mm/s^2"), ("° s−1", "deg/s")],
+     ("rad*s**-1", "rad/s"), ("deg h^-1", "deg/h"), ("mm s^-2", "mm/s^2"), ("° s−1", "deg/s"),
+     ("meters/second^2", "m/s^2"), ("metres per second squared", "m/s^2"), ("м/с²", "m/s^2"), ("º/sec", "deg/s"),
+     ("degrees per second", "deg/s"), ("Grad/s", "deg/s"), ("рад/с", "rad/s")],
 )  # fmt: skip
 def test_a_quotient_written_as_a_product(text, plain):
     assert unit(text) == unit(plain)

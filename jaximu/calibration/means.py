@@ -27,6 +27,8 @@ __all__ = ["calibrate_means"]
 
 _SPARE = 3
 """Poses beyond the parameters, from whose misfit an unknown noise is taken."""
+_FACES, _UPRIGHT = 6, 0.1
+"""Faces of a box, and the sine of the tilt below which all poses are on one."""
 _ACROSS = 0.01
 """Standard deviation of a misalignment, rad: data sheets of MEMS sensors state a cross-axis sensitivity of ±2 %
 (InvenSense, MPU-6000 and MPU-6050 Product Specification, rev. 3.4, 2013, sec. 6.2)."""
@@ -41,8 +43,8 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     - `gravity`: local gravity, m/s²; its uncertainty goes into the accelerometer's scales.
     - `loss`: `"linear"`, `"huber"` or `"cauchy"`.
 
-    Where there are too few poses to tell their own noise, misalignments are held near zero, which six positions
-    allow. Raises `NotPossibleError` where the poses do not span enough orientations or are fewer, or the fit does not
+    Where there are too few poses to tell their own noise, or all are a box's faces, misalignments are held near zero.
+    Raises `NotPossibleError` where the poses do not span enough orientations or are fewer, or the fit does not
     converge.
     """
     require_float64()
@@ -54,18 +56,21 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     method = "accelerometer" if recording.gyroscope is None else "joint"
     free = [name for name in names_of(nominal) if name.owner == "accelerometer" and without_equipment_or_effects(name)]
     prior = None
-    if means.accelerometer_sigma is None and poses < len(free) + _SPARE:
+    few = means.accelerometer_sigma is None and poses < len(free) + _SPARE
+    if few or (poses >= _FACES and _open(means)):
         fitted, prior = _with_few_poses(means, nominal, free, gravity.value, method, loss)
         notes += (
             f"{poses} poses leave misalignments open: they were taken to be zero within ±{200 * _ACROSS:g} % (95 %), "
-            "as data sheets state the cross-axis sensitivity. The means are taken to be as good as their digits.",
+            "as data sheets state the cross-axis sensitivity."
+            + few
+            * " The means are taken to be as good as their digits.",
         )
     else:
         fitted = fit_hand_held(nominal, observations, method, loss)
     require_determined(fitted, where, poses=poses)
     if method == "accelerometer":
         fitted = replace(fitted, imu=Imu(fitted.imu.accelerometer, None))
-    stated = {"accelerometer": means.accelerometer_sigma is not None or prior is not None}
+    stated = {"accelerometer": means.accelerometer_sigma is not None or few}
     if method == "joint":
         stated["gyroscope"] = means.gyroscope_sigma is not None
         notes += ("a table of means has no turns: the gyroscope's gain stays at the data sheet's.",)
@@ -89,6 +94,16 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     )
     known = {name: size for name, size in calibration.excess.items() if stated.get(name)}
     return replace(calibration, excess=known)
+
+
+def _open(means: PoseMeans) -> bool:
+    """Whether every pose has one axis upright, as six faces have however often they are repeated.
+
+    Such poses differ in the products of two axes, from which misalignments are known, by the misalignments alone.
+    """
+    values = means.recording.accelerometer.si()
+    upright = (values - (values.max(axis=0) + values.min(axis=0)) / 2) / STANDARD_GRAVITY
+    return bool(np.sort(np.abs(upright), axis=1)[:, 1].max() < _UPRIGHT)
 
 
 def _step(values: FloatArray) -> float:
@@ -117,8 +132,10 @@ def _with_few_poses(
     scale = np.linalg.norm(nominal.accelerometer.gain, axis=1)
     sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
     prior = Prior(tuple(across), np.zeros(len(across)), np.diag(1 / sigma))
-    spread = np.full((len(signal), 3), _step(signal.values) / np.sqrt(12))  # of rounding
-    observations = observe_means(replace(means, accelerometer_sigma=spread), gravity)
+    if means.accelerometer_sigma is None:
+        spread = np.full((len(signal), 3), _step(signal.values) / np.sqrt(12))  # of rounding
+        means = replace(means, accelerometer_sigma=spread)
+    observations = observe_means(means, gravity)
     data = PosesAndTurns.of(observations, "norm" if method == "accelerometer" else "all")
     excess = None if spare >= _SPARE else np.zeros(len(EXCESS_NAMES))
     return fit(nominal, data, prior=prior, loss=loss, excess=excess, estimate_excess=excess is None), prior

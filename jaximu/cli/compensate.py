@@ -42,6 +42,8 @@ class CompensateCommand:
         options.require_files(self.calibration, self.recording)
         options.require_apart(self.output, self.calibration, self.recording, self.log.gyro_log)
         from jaximu.calibration import compensate, load_calibration
+        from jaximu.ground.quantities import sentence
+        from jaximu.mistakes import prepare
         from jaximu.recordings import write_recording
         from jaximu.report.export import is_messages, write_messages
 
@@ -49,11 +51,13 @@ class CompensateCommand:
         with progress("compensating"):
             raw = self.log.alike(model).read(self.recording, model.gravity, alone="accelerometer" not in model.triads())
             written = compensate(model, raw)
+            noticed = prepare(raw).notes
             if is_messages(self.output):
                 write_messages(model, raw, written, self.output)
             else:
                 write_recording(written, self.output)
-        for note in written.notes:
-            if note.startswith("extrapolated"):
-                say(f"note: {note}.")
+        for note in (*noticed, *(note for note in written.notes if note.startswith("extrapolated"))):
+            say(f"note: {sentence(note)}")
+        if noticed:
+            say("note: that is what a fit makes of the log. Here every row is corrected and written.")
         say(f"Written: {self.output}")

@@ -191,6 +191,9 @@ def describe(
         ]
         advice = None
     document = {"file": recording.name, "signals": signals, "findings": list(dict.fromkeys(findings))}
+    if refused := [finding.text for finding in ready.findings if finding.refuses]:
+        document["refused"] = refused
+        uses = [use for use in uses if use.verb in _WHATEVER]
     document["uses"] = [{"verb": use.verb, "why": use.why} for use in uses]
     if advice is not None:
         document["guess"] = {
@@ -202,6 +205,8 @@ def describe(
     return document, uses
 
 
+_WHATEVER = ("allan", "thermal", "magnetometer", "compensate")
+"""Verbs that a sensor which cannot be calibrated does not stop."""
 _OLD = " results/calibration.json"
 _WITH_SCHEDULE = " --reference REF -o results"
 _COMPENSATE = Use("compensate", "to correct it with a calibration of this unit", " -o corrected.csv", _OLD, alone=False)

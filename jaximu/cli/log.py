@@ -368,7 +368,9 @@ def _reasons(contents: Sequence[_Content], refused: Mapping[str, str]) -> list[s
     """Say why nothing could be run."""
     if refused:
         return [sentence(f"{verb}: {text}") for verb, text in refused.items()]
-    poses = [text for content in contents for text in content.document["findings"] if " pose" in text]
+    documents = [content.document for content in contents]
+    poses = [text for document in documents for text in document["findings"] if " pose" in text]
+    poses = [text for document in documents for text in document.get("refused", ())] or poses
     return ["Nothing can be determined from it as it is.", *(f"{sentence(text).rstrip('.')}." for text in poses)]
 
 

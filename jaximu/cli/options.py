@@ -124,7 +124,7 @@ class LogOptions:
         option(
             "NAMES",
             'Names of all columns in order, with units: "time [s],accel [m/s^2],gyro [rad/s]"; "_" skips a column. '
-            "Of several logs that differ, the names of each, with semicolons between them.",
+            "Of several logs that differ, the names of each, with semicolons between them; none where its header does.",
         ),
     ] = None
     gyro_columns: Annotated[str | None, option("NAMES", "The same for the gyroscope's file.")] = None
@@ -233,7 +233,17 @@ class LogOptions:
                 raise InputError(
                     "--device and --columns choose one unit here; several in one log are for jaximu array."
                 )
-            recordings = [log.read(path, gravity, alone=alone) for path, log in logs]
+            recordings: list[Recording] = []
+            for path, log in logs:
+                try:
+                    recordings.append(log.read(path, gravity, alone=alone))
+                except InputError as error:
+                    if self.columns is not None or not recordings:
+                        raise
+                    # the logs before this one keep what their headers say
+                    before, after = ";" * len(recordings), ";" * (len(logs) - 1 - len(recordings))
+                    text = re.sub(r'--columns "([^"]*)"', rf'--columns "{before}\1{after}"', str(error.args[0]))
+                    raise InputError(text) from error
             return recordings, noise.value(replace(logs[0][1], gyro_log=None), gravity)  # --gyro-log is LOG's
 
     def spread(self, paths: tuple[Path, ...]) -> list[tuple[Path, LogOptions]]:
@@ -250,7 +260,7 @@ class LogOptions:
         return [
             (
                 paths[at % len(paths)],
-                replace(self, columns=layouts[at % len(layouts)], device=devices[at % len(devices)]),
+                replace(self, columns=layouts[at % len(layouts)] or None, device=devices[at % len(devices)]),
             )
             for at in range(count)
         ]

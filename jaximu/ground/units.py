@@ -54,7 +54,7 @@ DEGREE = math.pi / 180.0
 _FACTORS = {
     # names, the first of which is canonical
     "acceleration": {
-        "m/s^2 m/s² m/s2 m/s/s m/s**2 m/(s^2) m/(sec^2) m/sec^2 m/sec2 ms^-2 ms-2 meters/s^2": 1.0,
+        "m/s^2 m/s² m/s2 m/s/s m/s**2 m/(s^2) ms^-2 ms-2": 1.0,
         "mm/s^2 mm/s² mm/s2": 1e-3,
         "cm/s^2 cm/s² cm/s2 Gal": 1e-2,
         "ft/s^2 ft/s² ft/s2": 0.3048,
@@ -63,9 +63,9 @@ _FACTORS = {
         "ug µg μg": STANDARD_GRAVITY * 1e-6,
     },
     "angular rate": {
-        "rad/s rads rad/sec radian/s radians/s radians/sec": 1.0,
+        "rad/s rads 1/s": 1.0,
         "mrad/s": 1e-3,
-        "deg/s dps °/s d/s deg/sec degrees/s degree/s degrees/sec degree/sec": DEGREE,
+        "deg/s dps °/s d/s": DEGREE,
         "mdeg/s mdps": DEGREE * 1e-3,
         "deg/h dph °/h": DEGREE / 3600.0,
         "rad/h": 1.0 / 3600.0,
@@ -77,6 +77,7 @@ _FACTORS = {
         "us µs μs usec microseconds": 1e-6,
         "ns nsec nanosec nanoseconds": 1e-9,
         "min minute minutes": 60.0,
+        "h hour hours": 3600.0,
         "d day days": 86400.0,
     },
     "temperature": {"degC °C C celsius ℃": 1.0, "K kelvin": 1.0, "degF °F F fahrenheit": 5.0 / 9.0},
@@ -107,8 +108,26 @@ _FACTOR = re.compile(r"(\S+?)\s*[\s*·.]\s*([a-zA-Z]+)(?:\^|\*\*)?(?:[-−]([12]
 """A unit divided by another, written as a product: "m s^-2", "rad*s**-1", "deg·h⁻¹"."""
 
 
-_SCALED = re.compile(r"(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*([a-zA-Zµμ°].*)")
+_SCALED = re.compile(
+    r"(\d+\.?\d*(?:[eE][+-]?\d+)?)\s*([a-zA-Zµμ°].*?)(?:\s*/\s*(?:lsb|count|digit|bit)s?)?", re.IGNORECASE
+)
 
+
+_SPELT = {
+    word: unit
+    for unit, words in {
+        "m": "meter meters metre metres м",
+        "s": "sec secs second seconds с",
+        "deg": "degree degrees grad град",
+        "rad": "radian radians рад",
+        "h": "hour hours hr",
+        "ms": "мс",
+        "/": "per",
+        "^2": "squared",
+    }.items()
+    for word in words.split()
+}
+"""Words of a compound unit, as "degrees per second" or "м/с²" has them."""
 
 _OF_COUNTS = re.compile(r"(?:counts?|lsb)\s*/\s*(\d+\.?\d*)\s*([-−+]\s*\d+\.?\d*)?", re.IGNORECASE)
 """A chip's temperature as its data sheet has it, in °C: "count/340 + 36.53"."""
@@ -140,7 +159,11 @@ def find_unit(text: str, quantity: str | tuple[str, ...] | None = None) -> Unit 
     if text in fitting:
         return fitting[text]
     alike = {unit for alias, unit in fitting.items() if alias.lower() == text.lower()}
-    return alike.pop() if len(alike) == 1 else None
+    if alike:
+        return alike.pop() if len(alike) == 1 else None
+    plain = re.sub(r"[^\W\d_²]+", lambda word: _SPELT.get(word[0].lower(), word[0]), text)
+    plain = re.sub(r"\s*([/^])\s*", r"\1", plain)
+    return find_unit(plain, quantity) if plain != text else None
 
 
 def unit(text: str, quantity: str | tuple[str, ...] | None = None, *, file: str = "", column: str = "") -> Unit:
@@ -167,19 +190,25 @@ def unit(text: str, quantity: str | tuple[str, ...] | None = None, *, file: str 
 
 
 _AXIS = re.compile(r"[xyz](?:[- ]?axis)?", re.IGNORECASE)
+_WIDE = str.maketrans("（）［］，：", "()[],:")
+"""Signs that are as wide as an ideograph."""
 _NO_UNIT = re.compile(r"x[0-9a-f]{4}|txt|no[_ ]?units?|n|r|u", re.IGNORECASE)
 
 
 def parse_column(text: str) -> tuple[str, str | None]:
     """A column's name and its unit: "accel_x [m/s^2]" → ("accel_x", "m/s^2"); without brackets the unit is None.
 
-    Round brackets are read as well ("Acc_x (g)"); empty brackets are no unit, nor is a number or an axis ("acc[0]",
-    "Acc (X)"), nor the number of a message's field ("X Accel [x8004]").
+    Round brackets are read as well ("Acc_x (g)"), and a unit behind a comma ("acc x, g"); empty brackets are no unit,
+    nor is a number or an axis ("acc[0]", "Acc (X)"), nor the number of a message's field ("X Accel [x8004]").
     """
+    text = text.translate(_WIDE)
     match = re.fullmatch(r"\s*(.*?)\s*(?:\[([^\[\]]*)\]|\((.*)\))?\s*", text, re.DOTALL)
     if match is None:
         return text.strip(), None
     stated = (match[2] or match[3] or "").strip()
+    name, comma, behind = match[1].rpartition(",")
+    if comma and not stated and find_unit(behind):
+        return name, behind.strip()
     if _AXIS.fullmatch(stated) or (stated.isdigit() and not re.search(r"\s[\[(]", text)):  # unlike "attitude_w [1]"
         return f"{match[1]} {stated}".strip(), None
     if _NO_UNIT.fullmatch(stated):

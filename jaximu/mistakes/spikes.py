@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted, size
@@ -18,6 +19,8 @@ _TIMES = 10.0
 """Standard deviations, of the cubic's local misfit, from which a sample is no measurement."""
 _BRIEF = 0.04
 """Seconds within which hands turn nothing to and fro."""
+_WINDOW, _JUMP = 7, 5.0
+"""Readings of a thermometer that say what one of them should be, and K by which none is off without being wrong."""
 _MOST = 3000
 """Places that are looked at: beyond, the signal is not spiked but broken."""
 
@@ -54,7 +57,28 @@ def find(samples: Samples) -> list[Finding]:
                 without={name: rows},
             )
         )
+    for name in ("temperature", "ambient_temperature"):
+        signal = samples.recording.signals.get(name)
+        if signal is None or not len(rows := _wild(signal.si()[:, 0])):
+            continue
+        text = (
+            f"{name.replace('_', ' ')}: {counted(len(rows), 'reading')} far from those before and after, first "
+            f"{signal.values[rows[0], 0]:.4g}, as a thermometer gives for an error of transfer. They are left out."
+        )
+        findings.append(Finding("data.spikes", (int(rows[0]) + 1,), text, without={name: rows}))
     return findings
+
+
+def _wild(celsius: FloatArray) -> Rows:
+    """The rows of temperatures (n,) that leave for a few readings and come back; one reading may be held for rows."""
+    change = np.flatnonzero(np.diff(celsius, prepend=np.nan) != 0)
+    if len(change) < _WINDOW:
+        return np.zeros(0, np.int64)
+    values = celsius[change]
+    middle = np.median(sliding_window_view(np.pad(values, _WINDOW // 2, "edge"), _WINDOW), axis=1)
+    off = np.abs(values - middle)
+    wild = off > max(_JUMP, _TIMES * 1.4826 * float(np.median(off)))
+    return np.flatnonzero(np.repeat(wild, np.diff(change, append=len(celsius))))
 
 
 def _outliers(sensor: Sensor) -> Rows:

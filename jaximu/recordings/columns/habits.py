@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from unicodedata import combining, normalize
 
 from jaximu.ground.units import STANDARD_GRAVITY, find_unit, parse_column
 
@@ -16,16 +17,19 @@ __all__ = ["QUANTITIES", "Field", "fields_of", "last_of", "measures", "sensor_of
 
 _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
-    "beschleunigung gf f fb sf force specific",
+    "beschleunigung accelerazione aceleracion aceleracao versnelling przyspieszenie ускорение 加速度 가속도 "
+    "gf f fb sf force specific",
     "gyro": "g gy gyr gyro gyros gyroscope gyroscopes w wb om omega rot rotation rotational rate rates ars angvel "
-    "angularvelocity angularrate rotationrate as angvelocity gyroskop gyroskope drehrate drehraten",
-    "mag": "m mag mags magn magneto magnetometer magnetic b field compass",
-    "temperature": "temp temperature temperatures temperatur temperatura température tmp",
+    "angularvelocity angularrate rotationrate as angvelocity gyroskop gyroskope drehrate drehraten giroscopio giroskop "
+    "ω winkelgeschwindigkeit hoeksnelheid гироскоп 角速度 陀螺仪 각속도",
+    "mag": "m mag mags magn magneto magnetometer magnetic b field compass magnetometro magnetfeld 磁场 磁場 磁力计",
+    "temperature": "temp temperature temperatures temperatur temperatura temperatuur tmp температура 温度",
     "ambient_temperature": "ambient",
 }
 _ACCELERATIONS = {word for word in _SENSORS["accel"].split() if len(word) > 1}
 _WORDS = {word: sensor for sensor, words in _SENSORS.items() for word in words.split()}
-_HELPERS = {"angular": "gyro", "ang": "gyro", "velocity": "gyro", "vel": "gyro", "turn": "gyro", "speed": "gyro"}
+_TURNING = "angular ang angolare angulaire угловая".split()
+_HELPERS = dict.fromkeys([*_TURNING, *"velocity vel turn speed velocita velocidad vitesse скорость".split()], "gyro")
 """Words that name no sensor alone: an angular velocity is a gyroscope's, a velocity is not."""
 _NEUTRAL = set(
     "imu ins raw sensor sensors data device dev body frame cal calibrated calib uncal uncalibrated uncomp scaled adc "
@@ -47,7 +51,7 @@ _REFUSALS = {
     "in the world's axes": "earth world ned enu global nav",
     "an error": "error err",
     "a quaternion": "quat q quaternion",
-    "angles": "euler",
+    "angles": "euler angle angles winkel",
     "a set point": "setpoint",
 }
 _REFUSED = {word: reason for reason, words in _REFUSALS.items() for word in words.split()}
@@ -56,7 +60,7 @@ _ESTIMATED = {("b", "w"), ("b", "a"), ("b", "g")}
 """How the names of an estimated state's biases begin, as in EuRoC's b_w_RS_S_x."""
 _TIME = set(
     "t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec zeit temps "
-    "tiempo unix epoch tow sow tod sod utc".split()
+    "tiempo tempo tijd czas время 时间 時間 시간 unix epoch tow sow tod sod utc".split()
 )
 _TIME_ALONE = set("ms us ns sec secs seconds milliseconds microseconds nanoseconds epoch uptime".split())
 """Words that name a column of time where they are its whole name, and no other names one."""
@@ -98,6 +102,7 @@ _WITH, _WITHOUT = {"with", "including", "incl"}, {"without", "no", "excluding", 
 _BROWSER = {"beta": "x", "gamma": "y", "alpha": "z"}
 """Axes of the rotation rate in a browser's DeviceMotion."""
 _TURNS = {"roll": "x", "pitch": "y", "yaw": "z"}
+_TURN_RATE = re.compile(r"(roll|pitch|yaw)(?:rate|speed)")
 _INSTANCE = re.compile(r"([a-z]+)\d+")
 _ABOUT = 0.15  # of 1 g, that an accelerometer at rest may be off
 _FIELD = 15.0, 80.0  # uT of the Earth's field, disturbed indoors
@@ -127,8 +132,9 @@ def last_of(name: str) -> tuple[str, str | None]:
 
 
 def words_of(text: str) -> list[str]:
-    """The words of a name, lower case: split at signs, digits and capitals."""
-    return [part.lower() for part in re.findall(r"[A-Z]+(?![a-zµ])|[A-Z]?[a-zµ]+|\d+", text)]
+    """The words of a name, lower case, without accents: split at signs, digits, capitals, and where a script ends."""
+    bare = normalize("NFC", "".join(letter for letter in normalize("NFD", text) if not combining(letter)))
+    return [part.lower() for part in re.findall(r"[A-Z]+(?![a-zµ])|[A-Z]?[a-zµ]+|\d+|[^\W\d_a-zA-Zµ²³¹º]+", bare)]
 
 
 @dataclass(frozen=True)
@@ -277,6 +283,8 @@ def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
             return (*words[:at], match[1], *words[at + 1 :]), match[2]
         if match := _LEADING.fullmatch(word):
             return (*words[:at], match[2], *words[at + 1 :]), match[1]
+        if match := _TURN_RATE.fullmatch(word):
+            return (*words[:at], "rate", *words[at + 1 :]), _TURNS[match[1]]
     if words and words[-1] in ("0", "1", "2", "3"):
         return tuple(words[:-1]), words[-1]
     return tuple(words), None
@@ -305,9 +313,7 @@ def sensor_of(stem: tuple[str, ...]) -> tuple[str | None, str | None]:
             sensors.add(_WORDS.get(plain) or _HELPERS[plain])
         elif plain not in _NEUTRAL and not plain.isdigit():
             return None, None
-    names_one = any(
-        word in _WORDS or _INSTANCE.sub(r"\1", word) in _WORDS or word in ("angular", "ang") for word in stem
-    )
+    names_one = any(word in _WORDS or _INSTANCE.sub(r"\1", word) in _WORDS or word in _TURNING for word in stem)
     if why_not or not names_one:
         return None, why_not
     if "temperature" in sensors:

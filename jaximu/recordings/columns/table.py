@@ -19,6 +19,8 @@ AXES = b"jaximu.axes"
 """Key of Arrow's metadata: the map by which a writer has put a log in body axes."""
 FEW = 0.01
 """Share of the rows up to which one that holds no whole sample costs itself, and not the recording."""
+_MISSING = {"-", "--", "---", "*", "?", "none", "err", "error", "missing", "overflow", "ovf", "inv", "invalid"}
+"""Words that programs write for a reading that is not there, beside those that Arrow knows."""
 _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
 
 
@@ -106,7 +108,7 @@ class LogTable:
         """The column as int64 or float64 (NaN where empty).
 
         Of readings that are infinite, or larger than any is, a few count as empty. Raises InputError for more of them,
-        and for a cell that is no number.
+        and for a cell that is neither a number nor a word for a missing one.
         """
         column = self.columns[index]
         if column.dtype == object:
@@ -123,7 +125,7 @@ class LogTable:
         values = np.empty(len(self.columns[index]))
         for at, cell in enumerate(self.columns[index]):
             try:
-                values[at] = np.nan if cell is None else float(cell)
+                values[at] = np.nan if cell is None or str(cell).strip().lower() in _MISSING else float(cell)
             except (TypeError, ValueError):
                 text = repr((cell.decode(errors="replace") if isinstance(cell, bytes) else str(cell))[:40])
                 raise InputError(

@@ -17,7 +17,7 @@ import pyarrow.csv as pc
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import find_unit, parse_column
-from jaximu.recordings.columns.habits import fields_of, stated_rate
+from jaximu.recordings.columns.habits import fields_of, sensor_of, stated_rate, words_of
 from jaximu.recordings.columns.table import HEAD, LogTable, from_arrow, parse_name
 from jaximu.recordings.readers.clock import DAY, measured, seconds_of
 from jaximu.recordings.recording import Source
@@ -29,6 +29,7 @@ _CUT_OFF = "the file ends in zero bytes, as after a power loss: its last row is 
 _NUMBER = r"\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*"
 _VECTOR = re.compile(rf"[\[(]{_NUMBER}[,; ]{_NUMBER}[,; ]{_NUMBER}[\])]|{_NUMBER}\|{_NUMBER}\|{_NUMBER}")
 _SINGLE_BLOCK = 2**31 - 2
+_QUOTED, _FEW_NOTES = 60, 5
 
 
 @dataclass(frozen=True)
@@ -58,9 +59,11 @@ def read(path: Path, source: Source) -> LogTable:
         )
     layout = _layout(_lines(head), source.path)
     rows: np.ndarray | int = layout.first + 1
+    remarks: tuple[str, ...] = ()
     parsed = _read_straight(path, layout) if whole is None and layout.delimiter != " " else None
     if parsed is None:
-        table, rows = _read_cleaned(_lines(path.read_bytes() if whole is None else whole), layout, source.path)
+        data = _lines(path.read_bytes() if whole is None else whole)
+        table, rows, remarks = _read_cleaned(data, layout, source.path)
         parsed = [from_arrow(column) for column in table.columns], table.schema
     (columns, schema), names = parsed, layout.names or None
     midnight = 0
@@ -88,7 +91,7 @@ def read(path: Path, source: Source) -> LogTable:
             if names:
                 names = (*names[:at], f"{parse_column(names[at])[0]} [{with_unit[1]}]", *names[at + 1 :])
     table = LogTable(source, names, tuple(columns), rows, layout.rate)
-    notes = () if wide or whole is None else (_CUT_OFF,)
+    notes = remarks if wide or whole is None else (*remarks, _CUT_OFF)
     if midnight:
         notes = (*notes, f"the time of day passes midnight (row {table.row(midnight)}): it goes on from there.")
     return replace(table, notes=notes)
@@ -160,26 +163,34 @@ def _common(fields: Sequence[pa.Field]) -> pa.Field | None:
 
 def _comments(path: Path) -> bool:
     with path.open("rb") as file:
-        return any(b"#" in block for block in iter(partial(file.read, HEAD), b""))
+        return any(mark.encode() in block for block in iter(partial(file.read, HEAD), b"") for mark in _MARKS)
 
 
-def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np.ndarray]:
-    """The table and the line of each row, without comments and empty lines, of which a column may be of any types."""
+def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np.ndarray, tuple[str, ...]]:
+    """The table, the line of each row, and notes: without comments, empty lines, and what is no row.
+
+    A column may be of any types.
+    """
     body, rows = _body(data, layout)
-    try:
-        return _parse(pa.BufferReader(body), layout, block=min(len(body) + 1, _SINGLE_BLOCK)), rows
-    except pa.ArrowInvalid as error:
-        raise _bad_row(body, layout, rows, path) or InputError(
-            f"{path}: cannot be read as a table: {str(error).splitlines()[0][:200]}"
-        ) from None
+    notes: tuple[str, ...] = ()
+    for attempt in (1, 2):
+        try:
+            return _parse(pa.BufferReader(body), layout, block=min(len(body) + 1, _SINGLE_BLOCK)), rows, notes
+        except pa.ArrowInvalid as error:
+            if attempt == 1:
+                body, rows, notes = _without_remarks(body, layout, rows, path)
+                continue
+            raise InputError(f"{path}: cannot be read as a table: {str(error).splitlines()[0][:200]}") from None
+    raise AssertionError("the second attempt returns or raises")
 
 
 def _text(line: bytes) -> str:
-    """Header text; a file that is not UTF-8 is taken for Latin-1, which has the signs ° ² µ."""
+    """Header text; one that is not UTF-8 is in the encoding in which it names most sensors, else in Latin-1 (° ² µ)."""
     try:
         return line.decode()
     except UnicodeDecodeError:
-        return line.decode("latin-1")
+        texts = [line.decode(code, "replace") for code in _ENCODINGS]
+        return max(texts, key=lambda text: sum(bool(sensor_of((word,))[0]) for word in words_of(text)))
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
@@ -199,6 +210,7 @@ def _is_number(cell: str, decimal: str = ".") -> bool:
     return True
 
 
+_ENCODINGS = ("latin-1", "gb18030", "shift_jis", "cp1251")
 _MARKS = ("#", "//", "%")
 """Signs that a line is a remark, or the header behind such a sign."""
 _RULE = re.compile(r"[-=_+|\s]*")
@@ -288,7 +300,8 @@ def _commented_header(lines: list[str], delimiter: str, width: int) -> tuple[str
 def _body(data: bytes, layout: _Layout) -> tuple[bytes, np.ndarray]:
     """The lines of data alone, single-blank separated where blanks separate, and the line number of each row."""
     lines = data.split(b"\n")
-    kept = [at for at in range(layout.first, len(lines)) if (line := lines[at].strip()) and not line.startswith(b"#")]
+    marks = tuple(mark.encode() for mark in _MARKS)
+    kept = [at for at in range(layout.first, len(lines)) if (line := lines[at].strip()) and not line.startswith(marks)]
     data = b"\n".join(lines[at] for at in kept)
     if layout.delimiter == " ":
         data = data.replace(b"\t", b" ")
@@ -311,14 +324,24 @@ def _parse(file: pa.NativeFile, layout: _Layout, block: int) -> pa.Table:
     )
 
 
-def _bad_row(body: bytes, layout: _Layout, rows: np.ndarray, path: str) -> InputError | None:
-    """The first row with another number of cells than the rest."""
+def _without_remarks(
+    body: bytes, layout: _Layout, rows: np.ndarray, path: str
+) -> tuple[bytes, np.ndarray, tuple[str, ...]]:
+    """The lines that have as many cells as the rest and their numbers, without remarks.
+
+    Raises InputError for a row of numbers with another number of cells.
+    """
     lines = body.rstrip(b"\n").split(b"\n")
+    kept, notes = [], []
     for at, line in enumerate(lines):
-        cells = len(_cells(_text(line), layout.delimiter))
-        if cells != layout.width:
+        cells = _cells(_text(line), layout.delimiter)
+        if len(cells) == layout.width:
+            kept.append(at)
+        elif not any(_is_number(cell, layout.decimal) for cell in cells):
+            notes.append(f"row {rows[at]} is a remark and left out: {_text(line)[:_QUOTED]!r}.")
+        else:
             last = "; it is the last one: the file is cut off, delete that row" if at == len(lines) - 1 else ""
-            return InputError(
-                f"{path}, row {rows[at]}: holds {cells} cells where the others hold {layout.width}{last}."
+            raise InputError(
+                f"{path}, row {rows[at]}: holds {len(cells)} cells where the others hold {layout.width}{last}."
             )
-    return None
+    return b"\n".join(lines[at] for at in kept), rows[kept], tuple(notes[:_FEW_NOTES])

@@ -33,6 +33,7 @@ _LABELLED = re.compile(r"[A-Za-z_)\]\"]\s*[:=]\s*[\[(]?\s*#|->\s*#|^\[#\]\s*\$")
 _PROTOCOL = re.compile(r"[\w.\-]+(?:,[\w.\-]+=[\w.\-]+)* (?:[\w.\-]+=#i?,?)+ #")
 _DECLARED = re.compile(rb"^\$COL,IMU,(.*)$\n\$UNIT,IMU,(.*)$", re.MULTILINE)
 _HEX = re.compile(r"(?:[0-9A-Fa-f]{2}|[0-9A-Fa-f]{4})(?:[\s,]+(?:[0-9A-Fa-f]{2}|[0-9A-Fa-f]{4})){5,}\s*")
+_PARAMETER = re.compile(r"(?:\d+\s+\d+\s+)?[A-Z][A-Z0-9]*_\w+[\s,=]+[-+.\deE]+(?:\s.*)?$")
 _ARRAY = re.compile(r"\"[-+.\deE]+(?:\|[-+.\deE]+){2,}\"")
 _SENTENCE = re.compile(r"\[#\]\s*(\$\w+)")
 
@@ -93,6 +94,9 @@ def explained(head: bytes) -> str:
             "scale is the IMU's. Multiply by the scales of its manual, divide by the sampling interval, and write "
             "columns time [s], accel_x [m/s^2], … gyro_z [rad/s]"
         )
+    rows = [line for line in lines if not line.startswith("#")]
+    if sum(bool(_PARAMETER.match(line)) for line in rows) > 0.9 * len(rows) > 0:
+        return "is a list of an autopilot's parameters, not a log; `jaximu export` takes it with --in-force"
     words = [bool(_HEX.fullmatch(line)) for line in lines]
     if words and np.mean(words) > 0.9 and re.search("[A-Fa-f]", "".join(lines)):
         return (

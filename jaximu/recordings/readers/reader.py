@@ -69,6 +69,7 @@ _ENDS = sorted({2.0**bits * unit for bits in (16, 24, 32) for unit in (1e-9, 1e-
 _COUNTED, _FEW_COUNTED = 64.0, 4.0  # samples that a counter tells apart, and at the least
 _EVENLY = 0.8, 1.25  # sample intervals across the end of a counter of few samples
 _CARRIED = 10.0  # sample intervals between the last stamp before a clock started again and the first after
+_HALVED = 0.6  # of the usual step, and less: two rows where one is due
 _FEW_SHARED, _FEW_SHARES = 10, 0.02  # rows, and share of them, from which on repeated stamps are a habit
 _SHARED = 0.1  # of the messages may share a stamp
 
@@ -569,16 +570,17 @@ def extract(
     put_right = _ordered if table.messages else _rising
     disorder: list[str] = []
     if TIME in used:
+        table, unstamped = _stamped(table, used)
         table, wraps = _carried_on(table, used)
         table, disorder = put_right(table, used)
-        disorder = [*wraps, *disorder]
+        disorder = [*unstamped, *wraps, *disorder]
     stamps, origin, notes = _stamps(table, used, options)
     notes = [*table.notes, *disorder, *notes]
     signals: dict[str, Signal] = {}
     for key in sorted(groups & {group_of[name] for name in used if name != TIME}, key=list(GROUPS).index):
         places = [used[name] for name in GROUPS[key].columns]
         values = [(table.numbers(at), at, _per_second(unit, key, stamps)) for at, unit in places]
-        if key == "mag" and len(groups) > 1 and any(np.ptp(axis) == 0 for axis, *_ in values):
+        if key == "mag" and len(groups) > 1 and any(np.unique(axis[~np.isnan(axis)]).size == 1 for axis, *_ in values):
             notes.append("the magnetometer, or an axis of it, never changes: it is left out.")
             continue
         if "temperature" in key and places[0][1].quantity == "raw count":
@@ -607,6 +609,17 @@ def _per_second(unit: Unit, sensor: str, stamps: FloatArray) -> Unit:
     """The unit of a rate for increments over the sampling interval, any other unit as it is."""
     quantity = _INCREMENTS.get((sensor, unit.quantity))
     return Unit(unit.name, quantity, unit.factor / np.median(np.diff(stamps))) if quantity else unit
+
+
+def _stamped(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTable, list[str]]:
+    """The rows without a few that have no time, and a note."""
+    missing = np.isnan(table.numbers(used[TIME][0]))
+    if not 0 < missing.mean() <= FEW:
+        return table, []
+    first = table.row(np.argmax(missing))
+    return table.take(np.flatnonzero(~missing)), [
+        f"{counted(int(missing.sum()), 'row')} without a time left out (row {first})."
+    ]
 
 
 def _carried_on(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTable, list[str]]:
@@ -730,7 +743,8 @@ def _rising(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTabl
             notes = []  # the rows that are kept are in order
         notes.append(Defect("data.duplicate", text))
     kept_steps = np.diff(stamps[kept])
-    close, before = int(np.sum(kept_steps < 0.4 * usual)), int(np.sum((steps >= 0) & (steps < 0.4 * usual)))
+    # of two runs that are sorted into each other every other step is at most half of the usual one
+    close, before = (int(np.sum((gaps >= 0) & (gaps < _HALVED * usual))) for gaps in (kept_steps, steps))
     if len(back) and close > max(20, 0.02 * count) + before:
         row = back[np.argmin(steps[back - 1])]
         raise InputError(
