@@ -34,7 +34,7 @@ def with_open_choice(calibration: Calibration, base: State, effects: Sequence[st
     `base`: the fit without effects; `effects`: names of those that were chosen, which the calibration has.
     """
     variances = open_choice(base.evidence, effects) * base.fitted_sizes**2
-    added = dict(zip([base.names[place] for place in base.fitted], variances, strict=True))
+    added = dict(zip([base.names[row] for row in base.fitted], variances, strict=True))
     more = np.array([added.get(name, 0.0) for name in calibration.names])
     before = np.diag(calibration.covariance)
     wider = np.sqrt(1 + more / np.where(before > 0, before, 1.0))

@@ -67,6 +67,8 @@ _STEADY = ("bias_ramp", "temperature")
 _GUESSED = 10.0
 """Nats that effects must gain, having been chosen on the same data: those that explain a part of a misfit, beyond a
 smooth term, and those with which no error of what was left out is smaller."""
+_LESS = 0.05
+"""Share by which taking off a line must lessen the error of the rate at rest: less is what a refit does by chance."""
 _NOT_ASKED = "the noise was taken from this recording itself: it needs a recording at rest (--static) to compare with"
 
 _INSTANTS = Finding(
@@ -444,13 +446,12 @@ def _with_lines(diagnosis: Diagnosis, before: Diagnosis | None, lines: tuple[Mov
     if before is not None:
         old, new = (cross_validated(one.experiment, one.base).before for one in (before, diagnosis))
         gone = [effect.name for effect in before.effects if effect.name not in {one.name for one in diagnosis.effects}]
-        rest, unit = new.rms["static_gyroscope"]
-        errors = change(old.rms["static_gyroscope"][0], rest, unit)
+        (rest_before, unit), (rest, _) = (one.rms["static_gyroscope"] for one in (old, new))
         gain = (
-            f"on parts left out, rate at rest {errors}, χ² per condition "
+            f"on parts left out, rate at rest {change(rest_before, rest, unit)}, χ² per condition "
             f"{old.chi_squared / old.count:.2f} → {new.chi_squared / new.count:.2f}."
         )
-        if new.log_likelihood > old.log_likelihood or rest < old.rms["static_gyroscope"][0] or gone:
+        if gone or rest < (1 - _LESS) * rest_before:
             text = f"What it adds to the means at rest was fitted and taken off: {gain}"
         else:
             diagnosis, text = before, f"Taking off what it adds to the means at rest gains nothing: {gain}"

@@ -587,11 +587,11 @@ def _noise(diagnosis: Diagnosis, twin: Twin) -> Figure:
             tau, value, low, high = _allan(experiment, name)
             allan.plot(tau, value, "o-", color=colour, linewidth=1, markersize=4, label=label)
             allan.fill_between(tau, low, high, color=colour, alpha=0.2, linewidth=0)
-        middle = np.sqrt(np.median(density))
-        low, high = spectrum.get_ylim()
         for panel in (spectrum, allan):
             figures.logarithmic(panel)
             legend(panel)
+        middle = np.sqrt(np.median(density))
+        low, high = spectrum.get_ylim()
         dressed(
             spectrum,
             name,
