@@ -292,8 +292,9 @@ class Evidence:
         anywhere: a lag that all axes have in common moves nothing to first order.
         """
         inside = self.span(blocks)
-        covariance = np.linalg.inv(self._gram[np.ix_(inside, inside)] + np.eye(len(inside)) / _LARGE**2)
-        return np.asarray(covariance @ self._product[inside], np.float64), covariance
+        known = self._gram[np.ix_(inside, inside)] + np.eye(len(inside)) / _LARGE**2
+        covariance = np.asarray(np.linalg.inv(known), np.float64)
+        return covariance @ self._product[inside], covariance
 
 
 def _guard(outside: FloatArray, freedom: int) -> FloatArray:
