@@ -196,3 +196,13 @@ def test_repeated_faces_do_not_determine_misalignments(repeats, stated):
     np.testing.assert_allclose(triad.bias, [0.2, -0.1, 0.3], atol=5e-3)
     assert any("leave misalignments open" in note for note in calibration.notes)
     assert any("intervals are from their misfit" in note for note in calibration.notes) is not stated
+
+
+@pytest.mark.parametrize(("row", "axis"), [(0, "x up"), (4, "y down"), (5, "z down")])
+def test_a_face_with_the_wrong_sign_is_named(tmp_path, row, axis):
+    """Six faces of which one has another sign are five: the missing one is named, not a fit that does not converge."""
+    values = 9.8 * np.concatenate([np.eye(3), -np.eye(3)]) + [0.2, -0.1, 0.3]
+    values[row] *= -1
+    path = written(tmp_path / "means.csv", [name.replace("[g]", "[m/s^2]") for name in HEADER[:3]], values, 3)
+    with pytest.raises(NotPossibleError, match=f"none has {axis}. Check the signs of the rows"):
+        calibrate_means(read_means(path), GRAVITY)

@@ -18,6 +18,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import listed
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import PoseMeans
@@ -27,6 +28,8 @@ __all__ = ["calibrate_means"]
 
 _SPARE = 3
 """Poses beyond the parameters, from whose misfit an unknown noise is taken."""
+_SPANNED, _ON = 0.1, 0.5
+"""Least singular value of squares and directions that determine scale and bias, and cosine of a row on an axis."""
 _FACES, _UPRIGHT = 6, 0.1
 """Faces of a box, and the sine of the tilt below which all poses are on one."""
 _ACROSS = 0.01
@@ -131,6 +134,19 @@ def _with_few_poses(
         )
     scale = np.linalg.norm(nominal.accelerometer.gain, axis=1)
     sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
+    up = signal.si() / np.linalg.norm(signal.si(), axis=1, keepdims=True)
+    if np.linalg.svd(np.hstack([up**2, up]), compute_uv=False)[-1] < _SPANNED:
+        lacks = [
+            f"{axis} {way}"
+            for way, side in (("up", up), ("down", -up))
+            for axis, part in zip("xyz", side.T, strict=True)
+            if part.max() < _ON
+        ]
+        raise NotPossibleError(
+            f"{means.recording.name}: the rows do not determine every axis' scale and bias: "
+            f"{f'none has {listed(lacks)}' if lacks else 'their directions are too much alike'}. Check the signs of "
+            "the rows, and measure each axis up and down."
+        )
     prior = Prior(tuple(across), np.zeros(len(across)), np.diag(1 / sigma))
     if means.accelerometer_sigma is None:
         spread = np.full((len(signal), 3), _step(signal.values) / np.sqrt(12))  # of rounding
