@@ -41,7 +41,6 @@ def compute(jobs: Sequence[Job], indices: Sequence[int], settings: Settings, wor
         register_all(effects)
         return read_job(job, settings)
 
-    @ray.remote(num_cpus=0, num_gpus=1 if graphics else 0, max_restarts=-1, max_task_retries=-1)
     class FittingActor:
         """Fits batches of prepared recordings, and keeps its compiled programs."""
 
@@ -52,6 +51,9 @@ def compute(jobs: Sequence[Job], indices: Sequence[int], settings: Settings, wor
         def rows(self, *prepared: ReadJob) -> list[dict[str, Any]]:
             return finish(prepared, settings)
 
+    fitting: Any = ray.remote(num_cpus=0, num_gpus=1 if graphics else 0, max_restarts=-1, max_task_retries=-1)(
+        FittingActor
+    )
     left = iter(batches(indices, settings, workers))
     running: dict[Any, tuple[Any, list[int]]] = {}
 
@@ -60,7 +62,7 @@ def compute(jobs: Sequence[Job], indices: Sequence[int], settings: Settings, wor
             running[actor.rows.remote(*[read.remote(jobs[index]) for index in batch])] = actor, batch
 
     try:
-        for actor in [FittingActor.remote() for _ in range(graphics or workers)] * _AHEAD:
+        for actor in [fitting.remote() for _ in range(graphics or workers)] * _AHEAD:
             give_work(actor)
         while running:
             ready, _ = ray.wait(list(running), timeout=PATIENCE)
