@@ -153,3 +153,9 @@ def test_lines_of_a_measured_board(data_folder):
 
 def test_a_quiet_unit_of_the_board_has_no_line_that_moves(data_folder):
     assert not measured(data_folder, "unit6_session1")
+
+
+def test_a_hand_that_trembles_is_no_line_that_moves(data_folder):
+    options = ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100.0)
+    recording = read_recording(data_folder / "mikoff_mpu9150/imu1.log", options=options)
+    assert not moving_lines(calibrate(recording).segmentations)
