@@ -17,6 +17,8 @@ from jaximu.cli.app import main
 from jaximu.data.attitude import EXCESS_NAMES
 from jaximu.diagnosis import diagnose_against_attitude
 from jaximu.diagnosis.experiment import Experiment
+from jaximu.estimation.fitting import effect_numbers
+from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.reference_filter import SetupReferenceFilter
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
@@ -125,6 +127,40 @@ def test_reactions_are_the_changes_of_the_conditions(calibrated):
         both = [(each @ inverse.T)[..., None] for each, inverse in zip((pushed, turned), inverses, strict=True)]
         found = np.asarray(about.details.reactions.react(*both, windows))[:, 0]
         np.testing.assert_allclose(found, wanted, atol=5e-4 * np.abs(wanted).max())
+
+
+def test_columns_are_the_derivatives_of_the_conditions(calibrated):
+    """By every number of the mounting and of effects, against differences of the conditions as they are."""
+    calibration, experiment = calibrated
+    mounted = calibration.imu.all_effects().values()
+    effects = (
+        CATALOGUE["accel.step"].make([0.01, 0.02, -0.01], onset=20.0),
+        CATALOGUE["gyro.g_sensitivity"].make(1e-4 * np.arange(9.0)),
+        *mounted,
+    )
+    imu = jax.tree.map(np.asarray, calibration.imu.with_effects(*effects))
+    names, _, sizes = effect_numbers(imu)
+    about, bare = experiment.data.about_one(imu), calibration.imu.with_effects()
+
+    def conditions(number, change):
+        moved = replace(effect_of(number), coefficients=coefficients(number, change))
+        others = [effect for effect in imu.all_effects().values() if effect.name != moved.name]
+        return np.asarray(experiment.data.about_one(imu.with_effects(*others, moved)).conditions(bare))
+
+    def effect_of(number):
+        return imu.all_effects()[names[number].owner, names[number].effect]
+
+    def coefficients(number, change):
+        values = np.array(effect_of(number).coefficients)
+        values[names[number].axes] += change
+        return values
+
+    tried = [k for k, name in enumerate(names) if name.part == "coefficients" and sizes[k] > 0]
+    assert {names[k].owner for k in tried} >= {"accelerometer", "gyroscope", "setup"}
+    for k in tried:
+        step = 1e-3 * sizes[k]
+        wanted = (conditions(k, step) - conditions(k, -step)) / (2 * step)
+        np.testing.assert_allclose(about.columns[:, k], wanted, atol=2e-3 * np.abs(wanted).max(), err_msg=names[k])
 
 
 def test_noise_of_the_attitude_reaches_rotations_and_forces_alike(calibrated):

@@ -29,20 +29,21 @@ from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axi
 from jaximu.estimation.track import TRIADS, Track, added, stimuli
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.differences import interpolated
+from jaximu.ground.differences import interpolated, value_and_jacobian
 from jaximu.ground.rotation import (
     conjugate,
     exponential,
     inverse_matrix,
     logarithm,
     multiply,
+    right_jacobian,
     rotate,
     rotation_matrix,
     rotation_matrix_on_host,
 )
-from jaximu.model.effects import Effect
+from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.reference_filter import behind
-from jaximu.model.mounting import Mounting
+from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
@@ -80,6 +81,11 @@ came out a tenth too small in recordings of 30 s, which show too little of the n
 _MARGIN = 3
 _SMOOTH = 0.05
 """Seconds over which the slope of the rate is taken."""
+_FIELDS = {
+    kind: name for kind, name in zip(MOUNTING_EFFECTS, Mounting._fields, strict=True) if kind is not AccelLeverArm
+}
+_LATE, _STOOD = ("delay", "clock_scale"), ("rotation", "tilt", "filter_variance")
+"""Fields of `Mounting` that move the reference's stamps, and that turn what it says."""
 _WINDOWS, _SAMPLES = 4, 16
 """Lengths are padded to multiples of these: few programs, and few rows for nothing in matrices of all conditions."""
 
@@ -129,8 +135,8 @@ class Reactions(eqx.Module):
         """Return how the conditions react to additions to the specific force and to the rate at every sample."""
         both = jnp.einsum("tsij,tsjk->tik", self.reaction, jnp.concatenate([rate, force], axis=1)[self.sample])
         turned, pushed = both[:, :3], both[:, 3:]
-        summed = jnp.sum(pushed.reshape(windows, -1, *pushed.shape[1:]), axis=1)
-        return jnp.concatenate([turned.reshape(-1, turned.shape[-1]), summed.reshape(-1, turned.shape[-1])])
+        summed = jnp.sum(pushed.reshape(windows, len(pushed) // windows, *pushed.shape[1:]), axis=1)
+        return jnp.concatenate([turned, summed]).reshape(3 * (len(turned) + windows), both.shape[-1])
 
 
 @dataclass(frozen=True)
@@ -173,11 +179,11 @@ class Intervals(eqx.Module):
     gravity: Float[Array, ""]
 
 
-def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Array, "k 4"]:
+def _smoothed(imu: Imu, mounting: Mounting, data: Intervals, stamps: Float[Array, " k"]) -> Float[Array, "k 4"]:
     """Return the rotations by which the unit stands behind what a smoothed reference says, at times of the log."""
     time, matrix = (data.since + data.until) / 2, imu.triads()["gyroscope"].inverse()[:, :3]
     acceleration, jerk = (interpolated(time, slope, stamps) @ matrix.T for slope in (data.slope, data.curve))
-    return exponential(behind(Mounting.of(imu).filter_variance, acceleration, jerk))
+    return exponential(behind(mounting.filter_variance, acceleration, jerk))
 
 
 def reference_sigmas(excess: Mapping[str, float]) -> tuple[float, float]:
@@ -186,40 +192,31 @@ def reference_sigmas(excess: Mapping[str, float]) -> tuple[float, float]:
     return attitude, velocity
 
 
-def _added(imu: Imu, data: Intervals, around: Stimulus | None) -> tuple[Array, Array]:
-    """Return what effects add to both outputs (m, 3), along the path that the unit without them tells, taken twice.
+def _added(imu: Imu, data: Intervals, around: Stimulus) -> dict[str, Float[Array, "m 3"]]:
+    """Return what effects add to both outputs, along the path that the unit without them tells, taken twice.
 
-    around: what else the unit went through; None where it has no effects but those of how the reference is mounted.
+    around: what else the unit went through.
     """
     bare, time = imu.with_effects(), (data.since + data.until) / 2
-    force, rate = jnp.zeros_like(data.force), jnp.zeros_like(data.rate)
-    unit = replace(imu, setup=_recorded(imu))
-    if around is None:
-        return force, rate
+    outputs = {"accelerometer": jnp.zeros_like(data.force), "gyroscope": jnp.zeros_like(data.rate)}
     for _ in range(2):
-        turning = bare.gyroscope.recover(data.rate - rate)  # pyright: ignore[reportOptionalMemberAccess]
+        turning = bare.triads()["gyroscope"].recover(data.rate - outputs["gyroscope"])
         inner = (turning[2:] - turning[:-2]) / (time[2:] - time[:-2])[:, None]
         stimulus = replace(
             around,
-            specific_force=bare.accelerometer.recover(data.force - force),
+            specific_force=bare.accelerometer.recover(data.force - outputs["accelerometer"]),
             angular_rate=turning,
             time=time,
             angular_acceleration=jnp.concatenate([inner[:1], inner, inner[-1:]]),
         )
-        outputs = added(unit, dict.fromkeys(TRIADS, Track(stimulus, jnp.zeros(len(time), int))))
-        force, rate = (outputs[name] for name in TRIADS)
-    return force, rate
-
-
-def _recorded(imu: Imu) -> tuple[Effect, ...]:
-    """Return the effects of the set-up that are of the recording, and not of how the reference is mounted."""
-    return tuple(effect for effect in imu.setup if effect.scope != "fixture")
+        outputs = added(imu, dict.fromkeys(TRIADS, Track(stimulus, jnp.zeros(len(time), int))))
+    return outputs
 
 
 def evaluated(
     imu: Imu,
+    mounting: Mounting,
     data: Intervals,
-    around: Stimulus | None,
     samples: Int[Array, "T S"],
     noise: Float[Array, "3 3"],
     group: int,
@@ -229,25 +226,23 @@ def evaluated(
     Reactions: of a window's mean force to the rotation vector by which the reference stands wrong at an interval's
     start (T, 3, 3), and of all conditions to samples.
 
-    **Arguments:** `around`: what else the unit went through, for its effects; `samples`: samples of each interval, with
-    some beside it; `noise`: density of the gyroscope's, output² s; `group`: intervals to a window of the force.
+    **Arguments:** `imu`: without effects; `mounting`: of the reference; `samples`: samples of each interval, with some
+    beside it; `noise`: density of the gyroscope's, output² s; `group`: intervals to a window of the force.
     """
-    bare = imu.with_effects()
-    gyroscope, mounting = bare.triads()["gyroscope"], Mounting.of(imu)
-    force, rate = _added(imu, data, around)
+    gyroscope, accelerometer = imu.triads()["gyroscope"], imu.accelerometer
     stamps = mounting.on_log(data.stamp)
     held = jnp.minimum(data.until[samples], stamps[1:, None]) - jnp.maximum(data.since[samples], stamps[:-1, None])
     held = jnp.maximum(held, 0.0) / (1 + mounting.clock_scale)  # of the reference's time, in which rates are meant
-    turning, sensed = (data.rate - rate)[samples], (data.force - force)[samples]
-    whole = preintegrate_samples(gyroscope.recover(turning), bare.accelerometer.recover(sensed), held)
+    turning, sensed = data.rate[samples], data.force[samples]
+    whole = preintegrate_samples(gyroscope.recover(turning), accelerometer.recover(sensed), held)
     inverse = gyroscope.inverse()[:, :3]
     spread = white_covariance(whole.reaction[..., :3, :3], inverse @ noise @ inverse.T, held)
-    true = multiply(multiply(data.attitude, mounting.turned), _smoothed(imu, data, stamps))
+    true = multiply(multiply(data.attitude, mounting.turned), _smoothed(imu, mounting, data, stamps))
     before, after = true[:-1], true[1:]
     target = multiply(conjugate(before), after)
     turn_slope, swung = jnp.split(linear_slope(whole.reaction[..., :6, :3], turning), 2, axis=1)
     slope = linear_slope(whole.reaction[..., 3:6, 3:], sensed)
-    sculled = whole.velocity - jnp.einsum("tijk,jk->ti", slope, bare.accelerometer.inverse())
+    sculled = whole.velocity - jnp.einsum("tijk,jk->ti", slope, accelerometer.inverse())
     upright = rotation_matrix(multiply(mounting.tilted, before))
     duration = jnp.sum(held, axis=1) * data.used
     windows = len(samples) // group
@@ -356,10 +351,10 @@ class AgainstAttitude(OfOneUnit):
         """Intervals to a window of the specific force."""
         return self._knots[1]
 
-    def _places(self, imu: Imu) -> NDArray[np.int64]:
+    def _places(self, mounting: Mounting) -> NDArray[np.int64]:
         """Samples (T, S) of each interval, with some more on either side for the delay to move."""
         data = self.intervals
-        stamps = Mounting.of(imu).on_log(data.stamp)
+        stamps = mounting.on_log(data.stamp)
         first = np.searchsorted(data.until, stamps[:-1]) - _MARGIN
         longest = np.searchsorted(data.until, stamps[1:]) - first + _MARGIN
         size = -(-longest[data.used].max() // _SAMPLES) * _SAMPLES
@@ -368,7 +363,7 @@ class AgainstAttitude(OfOneUnit):
     def unsmoothed(self, imu: Imu) -> Attitude:
         """Return the reference as it would be without the filter that a fitted unit's set-up says it has."""
         mounting = Mounting.of(imu)
-        smoothed = _smoothed(imu, self.intervals, mounting.on_log(self.attitude.time + self.offset))
+        smoothed = _smoothed(imu, mounting, self.intervals, mounting.on_log(self.attitude.time + self.offset))
         sharp = mounting.reported(multiply(mounting.unit_attitude(self.attitude.quaternion), smoothed))
         return replace(self.attitude, quaternion=np.asarray(sharp))
 
@@ -429,29 +424,63 @@ class AgainstAttitude(OfOneUnit):
 
     def about_one(self, imu: Imu) -> About:
         """Return the conditions about the unit, their covariance, and columns of effects, of the set-up's included."""
-        group, samples = self.group, self._places(imu)
+        group, bare, mounting, effects = self.group, imu.with_effects(), Mounting.of(imu), imu.all_effects()
+        data, slopes = self._freed(imu)
         noise, white = self.densities()
-        parameters = Parameters.select(imu, lambda name: name.effect is not None)
-        touched = _recorded(imu) or any(triad.effects for triad in imu.triads().values())
-        around = self.around(imu) if touched else None
 
-        def compute(imu, parameters, data, around, samples, noise):
-            conditions, spread, duration, leaning, reactions = evaluated(imu, data, around, samples, noise, group)
+        def compute(imu, mounting, data, samples, noise):
+            def of(numbers):
+                parts = evaluated(imu, mounting._replace(**numbers), data, samples, noise, group)
+                return parts[0](imu), parts
 
-            def of(z):
-                varied = evaluated(parameters.model(imu, z), data, around, samples, noise, group)[0]
-                return varied(imu.with_effects())
+            # only what is late moves the ends of the integrals, whose derivatives take long
+            late, stood = ({name: jnp.asarray(getattr(mounting, name)) for name in names} for names in (_LATE, _STOOD))
+            by_late, parts = jax.jacfwd(of, has_aux=True)(late)
+            return *parts, by_late | jax.jacfwd(lambda numbers: of(numbers)[0])(stood)
 
-            columns = jax.jacfwd(of)(jnp.zeros(len(parameters.index))) / parameters.size
-            return conditions, spread, duration, leaning, reactions, columns
+        def by_samples(imu, conditions, reactions, slopes):
+            force, rate = (inverse_matrix(imu.triads()[name].gain) @ slopes[name] for name in TRIADS)
+            columns = -reactions.react(force, rate, len(conditions.window))
+            turns = 3 * len(conditions.turn)
+            error = conditions(imu)[:turns].reshape(-1, 3)
+            turned = jnp.linalg.solve(right_jacobian(error), columns[:turns].reshape(*error.shape, columns.shape[1]))
+            return jnp.concatenate([turned.reshape(turns, columns.shape[1]), columns[turns:]])
 
-        description = f"against attitude {group} {' '.join(effect.name for effect in imu.all_effects().values())}"
-        conditions, spread, duration, leaning, reactions, columns = stored.call(
-            compute, description, imu, parameters, self.intervals, around, samples, noise
+        conditions, spread, duration, leaning, reactions, by_mounting = stored.call(
+            compute, f"against attitude {group}", bare, mounting, data, self._places(mounting), noise, quick=False
         )
+        columns = stored.call(by_samples, "against attitude by samples", bare, conditions, reactions, slopes)
+        parted = []
+        for effect in effects.values():
+            if field := _FIELDS.get(type(effect)):
+                parted.append(by_mounting[field].reshape(len(columns), -1))
+            else:
+                mine, columns = np.split(columns, [effect.size + len(effect.inner)], axis=1)
+                parted.append(mine)
+        columns = free_columns(effects, np.concatenate([*parted, columns], axis=1))
         covariance = self._covariance(conditions, spread, duration, leaning, white)
-        details = AttitudeDetails(duration, reactions, self, imu)
-        return About(conditions, covariance, free_columns(imu.all_effects(), columns), details=details)
+        return About(conditions, covariance, columns, details=AttitudeDetails(duration, reactions, self, imu))
+
+    def _freed(self, imu: Imu) -> tuple[Intervals, dict[str, FloatArray]]:
+        """Return what was recorded without what effects add, and the slopes (m, 3, q) of that by their numbers.
+
+        Effects of how the reference is mounted add nothing, but for the lever arm.
+        """
+        data, bare = self.intervals, imu.with_effects()
+        adding = bare.with_effects(*(effect for effect in imu.all_effects().values() if type(effect) not in _FIELDS))
+        parameters = Parameters.select(adding, lambda name: name.effect is not None)
+        if not parameters.names:
+            return data, dict.fromkeys(TRIADS, np.zeros((*data.rate.shape, 0)))
+
+        def compute(imu, parameters, data, around):
+            return value_and_jacobian(
+                lambda z: _added(parameters.model(imu, z), data, around), jnp.zeros(len(parameters.index))
+            )
+
+        outputs, slopes = stored.call(compute, "added against attitude", adding, parameters, data, self.around(imu))
+        force, rate = (values - outputs[name] for name, values in zip(TRIADS, (data.force, data.rate), strict=True))
+        slopes = {name: slope / parameters.size for name, slope in slopes.items()}
+        return eqx.tree_at(lambda data: (data.force, data.rate), data, (force, rate)), slopes
 
     def reactions(self, details: AttitudeDetails):
         """Return how rotations and mean forces react to effects of a unit that stands as the reference says."""

@@ -374,10 +374,12 @@ class _Unit(NamedTuple):
             loss,
         )
 
-    def evaluated(self, problem: _Whitened, z: Array, residual: Array, jacobian: Array) -> _Evaluated:
-        """Return what follows from residual and Jacobian at z."""
+    def evaluated(self, problem: _Whitened, estimated: bool, z: Array, residual: Array, jacobian: Array) -> _Evaluated:
+        """Return what follows from residual and Jacobian at z; the excess is improved where it is estimated."""
         information = jacobian.T @ jacobian + self.root.T @ self.root
-        if problem.loss == "linear":
+        if not estimated:
+            better = self.excess
+        elif problem.loss == "linear":
             better = update_excess(self.covariances, problem.weights, residual, jacobian, information, self.excess)
         else:
             kinds = zip(self.covariances, parts_of(self.covariances), strict=True)
@@ -396,20 +398,24 @@ class _Unit(NamedTuple):
 
 
 class _Solving(NamedTuple):
-    """How the problem of a pass is solved: `solver`, where it is not ours, and what tells it apart from every other."""
+    """How the problem of a pass is solved: `solver`, where it is not ours, and what tells it apart from every other.
+
+    estimated: whether the excess is.
+    """
 
     loss: str
-    solver: Any = None
-    name: str = ""
+    estimated: bool
+    solver: Any
+    name: str
 
     @classmethod
-    def by(cls, loss: str, solver: Any) -> _Solving:
+    def by(cls, loss: str, estimated: bool, solver: Any) -> _Solving:
         """Return the way of solving by a loss and an optimistix solver, or None."""
         try:
             name = "" if solver is None else hashlib.sha256(pickle.dumps(solver)).hexdigest()
         except (pickle.PicklingError, AttributeError, TypeError):  # a function without a name inside
             name = secrets.token_hex()
-        return cls(loss, solver, f"{loss} {name}")
+        return cls(loss, estimated, solver, f"{loss} {estimated} {name}")
 
 
 def _single_pass(how: _Solving, like: Imu, parameters: Parameters, unit: _Unit) -> _Pass:
@@ -417,7 +423,7 @@ def _single_pass(how: _Solving, like: Imu, parameters: Parameters, unit: _Unit) 
     zero = jnp.zeros(len(unit.mean))
     before = problem.objective(zero)
     solution = solve(problem, zero, MAX_STEPS, _CLOSE, how.solver)
-    there = unit.evaluated(problem, solution.z, solution.residual, solution.jacobian)
+    there = unit.evaluated(problem, how.estimated, solution.z, solution.residual, solution.jacobian)
     z = solution.z
     if how.loss == "linear":  # what the solver's tolerance leaves, taken off by a last Newton step
         z = jnp.where(unit.damping == 0, z - there.covariance @ there.gradient, z)
@@ -437,7 +443,7 @@ def _no_step(how: _Solving, like: Imu, parameters: Parameters, unit: _Unit) -> _
     problem = unit.problem(how.loss, like, parameters)
     zero = jnp.zeros(len(unit.mean))
     residual, jacobian = value_and_jacobian(lambda z: problem.objective(z)[0], zero)
-    return unit.evaluated(problem, zero, residual, jacobian)
+    return unit.evaluated(problem, how.estimated, zero, residual, jacobian)
 
 
 def _run(
@@ -511,8 +517,8 @@ def fit(
     farthest = np.inf if most is None else numerics.asarray(most, float)
     begin = [size for kind in measured for size in kind.coarse] if excess is None else excess
     blunted = estimate_excess and (is_traced(begin) or bool(np.any(begin)))
-    how = _Solving.by(loss, solver)
-    passes = _Passes(imu, measured, free, prior, how, estimate_excess, follow, farthest, max_passes, blunted, numerics)
+    how = _Solving.by(loss, estimate_excess, solver)
+    passes = _Passes(imu, measured, free, prior, how, follow, farthest, max_passes, blunted, numerics)
     begin = numerics.asarray(begin, float)
     begin = numerics.broadcast_to(begin, (len(imu.accelerometer.bias), begin.shape[-1]))
     fitted = passes.traced(begin) if numerics is jnp else passes.run(begin)
@@ -553,7 +559,6 @@ class _Passes:
     free: Callable[[Name], bool] | None
     prior: Prior | None
     how: _Solving
-    estimated: bool
     follow: bool
     most: FloatArray | float
     max_passes: int
@@ -685,7 +690,7 @@ class _Passes:
         blunt = numerics.asarray((number == 0) & self.blunted)
         worse = out.start > state.least
         fine, excess = ~worse, state.excess
-        way = numerics.minimum(out.there.excess, self.most) - excess if self.estimated else 0.0 * excess
+        way = numerics.minimum(out.there.excess, self.most) - excess if self.how.estimated else 0.0 * excess
         # where a large component has drowned a small one for long, both count by their relative change
         drowning = number >= _DROWNED
         scale = numerics.where(drowning, 1 + excess, 1.0)
@@ -772,7 +777,7 @@ class _Passes:
             there = self.once(_no_step, at(x), lanes)
             step = jnp.einsum("upq,uq->up", there.covariance, there.gradient)[:, : len(self.names)] * self.sizes
             numbers = (x[1] - self.numbers).at[:, np.flatnonzero(self.kept)].set(step[:, self.base :])
-            way = x[2] - (jnp.clip(there.excess, 0.0, self.most) if self.estimated else excess)
+            way = x[2] - (jnp.clip(there.excess, 0.0, self.most) if self.how.estimated else excess)
             return step[:, : self.base], numbers, way
 
         def passes(_, x):

@@ -298,15 +298,14 @@ def robot_information(
     samples = jnp.clip(
         _SPLIT * jnp.arange(count)[:, None] + jnp.arange(-_BESIDE, _SPLIT + 1 + _BESIDE), 0, _SPLIT * count
     )
-    mounting = Mounting.effects(rotation=0.0, delay=0.0, tilt=0.0, filter_variance=0.0)
-    sizes, effects_of = ravel_pytree([effect.typical_sizes(1.0) for effect in mounting])
+    effects = Mounting.effects(rotation=0.0, delay=0.0, tilt=0.0, filter_variance=0.0)
+    sizes, effects_of = ravel_pytree([effect.typical_sizes(1.0) for effect in effects])
     known = len(parameters.names)
 
     def found(z):
         reported = _reported(parameters.model(imu, z[:known]), design, accuracy, gravity, count)
-        conditions, spread, length, leaning, _ = evaluated(
-            unit.with_effects(*effects_of(sizes * z[known:])), reported, None, samples, accuracy.density, group
-        )
+        mounting = Mounting.of(unit.with_effects(*effects_of(sizes * z[known:])))
+        conditions, spread, length, leaning, _ = evaluated(unit, mounting, reported, samples, accuracy.density, group)
         return conditions(unit), (spread, length, leaning, conditions.target)
 
     size = known + len(sizes)
