@@ -588,10 +588,10 @@ def _noise(diagnosis: Diagnosis, twin: Twin) -> Figure:
             allan.plot(tau, value, "o-", color=colour, linewidth=1, markersize=4, label=label)
             allan.fill_between(tau, low, high, color=colour, alpha=0.2, linewidth=0)
         middle = np.sqrt(np.median(density))
-        low, high = spectrum.get_ylim()
         for panel in (spectrum, allan):
             figures.logarithmic(panel)
             legend(panel)
+        low, high = spectrum.get_ylim()  # of the logarithmic scale: a linear one may begin below zero
         dressed(
             spectrum,
             name,
