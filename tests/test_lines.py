@@ -13,7 +13,7 @@ from jaximu import ReadOptions, diagnose, read_recording
 from jaximu.calibration.recipe import calibrate
 from jaximu.diagnosis.attribution import attributed_lines
 from jaximu.diagnosis.lines import MOVING_LINE, MovingLine, coincident, line_findings, moving_lines
-from jaximu.noise.lines import Line, follow, swing, windows_at_rest
+from jaximu.noise.lines import SpectralLine, follow, swing, windows_at_rest
 from jaximu.report.html import write_report
 
 RATE, DURATION = 50.0, 200.0
@@ -166,7 +166,9 @@ def part(unit, session, *courses):
         place=f"unit {unit} in session {session}",
         lines=tuple(
             MovingLine(
-                0, "gyroscope", Line(2, times, np.linspace(*ends, 20), np.ones(20, bool), 1e-3, 60.0, 0.1, 90.0, 0.0)
+                0,
+                "gyroscope",
+                SpectralLine(2, times, np.linspace(*ends, 20), np.ones(20, bool), 1e-3, 60.0, 0.1, 90.0, 0.0),
             )
             for ends in courses
         ),

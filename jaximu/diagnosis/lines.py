@@ -12,7 +12,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted, size
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.base import Sensor
-from jaximu.noise.lines import Line, follow, spectra, swing, windows_at_rest
+from jaximu.noise.lines import SpectralLine, follow, spectra, swing, windows_at_rest
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation
@@ -30,7 +30,7 @@ class MovingLine:
 
     recording: int
     triad: str
-    line: Line
+    line: SpectralLine
 
     @property
     def axis(self) -> str:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.noise.cleaning import FALSE_LINE
 
-__all__ = ["Line", "follow", "spectra", "swing", "windows_at_rest"]
+__all__ = ["SpectralLine", "follow", "spectra", "swing", "windows_at_rest"]
 
 _OVER = 2
 """Points of the frequency grid an ordinate: a line between two loses 4 % of its size."""
@@ -53,7 +53,7 @@ _MOST = 30
 
 
 @dataclass(frozen=True)
-class Line:
+class SpectralLine:
     """A spectral line of one axis that was followed over windows at rest.
 
     times (k,): middles of the windows, s. frequency (k,): Hz, continued beyond zero and half the rate. visible (k,):
@@ -118,7 +118,7 @@ def windows_at_rest(time: FloatArray, rests: FloatArray, rate: float) -> tuple[N
     return first[even], width
 
 
-def follow(parts: FloatArray, times: FloatArray, rate: float) -> list[Line]:
+def follow(parts: FloatArray, times: FloatArray, rate: float) -> list[SpectralLine]:
     """Return the lines that windows at rest show, axis by axis, the surest first.
 
     **Arguments:** `parts` (k, w, a): samples of k windows in a axes; `times` (k,): their middles, s; `rate`: Hz.
@@ -138,7 +138,7 @@ def spectra(parts: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return tapered, power, _beside(power)
 
 
-def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> list[Line]:
+def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> list[SpectralLine]:
     """Follow one line after the other; what a line covers says nothing of the next."""
     (count, width), lobe = parts.shape, _LOBE * _OVER
     tapered, power, noise = spectra(parts)
@@ -152,7 +152,7 @@ def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> li
     hidden[:, :lobe] = hidden[:, -lobe:] = True
     odds = (_POWERS / (1 + _POWERS))[:, None, None] * ordinates - np.log1p(_POWERS)[:, None, None]
     odds = np.minimum(odds, _CAP)
-    lines: list[Line] = []
+    lines: list[SpectralLine] = []
     window = np.arange(count)
     while len(lines) < _MOST:
         odds = np.where(hidden, 0.0, odds)
@@ -169,7 +169,7 @@ def _of_axis(parts: FloatArray, times: FloatArray, rate: float, axis: int) -> li
         near = np.abs(np.arange(odds.shape[2]) - at[:, None]) <= lobe
         steady = np.where(near, odds, 0.0).sum(axis=1).max()
         size = _size(tapered / total, frequency, times, rate, noise[window, at] / total**2, visible)
-        lines.append(Line(axis, times, frequency, visible, size, rate, rate / width, whole, float(steady)))
+        lines.append(SpectralLine(axis, times, frequency, visible, size, rate, rate / width, whole, float(steady)))
         hidden |= _covered(ordinates, at)
     return sorted(lines, key=lambda line: -line.evidence)
 
@@ -275,7 +275,7 @@ def _size(
     return float(2 * np.sqrt(np.maximum(np.mean((height**2 - noise)[visible]), 0.0)))
 
 
-def swing(values: FloatArray, time: FloatArray, line: Line) -> tuple[float, float]:
+def swing(values: FloatArray, time: FloatArray, line: SpectralLine) -> tuple[float, float]:
     """Return what a line adds to the mean of samples at rest (n,), and the variance beyond that of their noise.
 
     Its size is known beforehand, its phase is not, and its frequency to what a window resolves: the posterior mean over
@@ -285,10 +285,10 @@ def swing(values: FloatArray, time: FloatArray, line: Line) -> tuple[float, floa
     length = len(time) * (time[1] - time[0])
     frequency = np.interp(time, line.times, line.frequency)
     drift, middle = np.polyfit(centred, frequency, 1)
-    hidden, reach = _LOBE * line.resolution, _OFF / length
-    reach = max(reach, hidden) if np.abs(middle - line.rate * np.round(middle / line.rate)) < hidden else reach
+    hidden, extent = _LOBE * line.resolution, _OFF / length
+    extent = max(extent, hidden) if np.abs(middle - line.rate * np.round(middle / line.rate)) < hidden else extent
     offsets, bends = np.meshgrid(
-        np.arange(-reach, reach, 1 / (8 * length)), np.linspace(-_OFF, _OFF, 2 * _LOBE * 4 + 1) / length**2
+        np.arange(-extent, extent, 1 / (8 * length)), np.linspace(-_OFF, _OFF, 2 * _LOBE * 4 + 1) / length**2
     )
     turns = (middle + offsets.ravel()[:, None]) * centred + (drift + bends.ravel()[:, None]) * centred**2 / 2
     rows = np.stack([np.ones_like(turns), np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], axis=1)
