@@ -195,3 +195,10 @@ def test_lines_anywhere_coincide_by_chance_as_often_as_stated():
         wrong += p_value < 0.05
         assert len(group) != 1
     assert scipy.stats.binom.sf(wrong - 1, trials, 0.05) > 1e-3
+
+
+def test_a_hand_that_sways_in_some_poses_is_no_line_that_moves(data_folder):
+    options = ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100)
+    for unit in range(3):
+        recording = read_recording(data_folder / f"mikoff_mpu9150/imu{unit}.log", options=options)
+        assert not moving_lines(calibrate(recording).segmentations)

@@ -40,8 +40,9 @@ _MOVES = np.array([(0.0, 0.1), (0.0, 0.5), *((drift / 2, 0.5) for drift in range
 by more than its main lobe within a window is no line there."""
 _ENOUGH = np.log(1 / FALSE_LINE)
 """Logarithm of a likelihood ratio that noise exceeds with the probability of a false line."""
-_CAP = _ENOUGH / 2
-"""Most that a single window may count for: a tone in one window is not followed."""
+_CAP = _ENOUGH / 3
+"""Most that a single window may count for, which keeps the mean of the sum at one or below: what shows in a few windows
+alone, such as a hand's tremor, is not followed."""
 _FEWEST = 8
 """Windows below which no course is followed."""
 _LONGEST = 1024
