@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from simulated_board import board
 
 from jaximu import ReadOptions, diagnose, read_recording
 from jaximu.calibration.recipe import calibrate
-from jaximu.diagnosis.lines import MOVING_LINE, line_findings, moving_lines
-from jaximu.noise.lines import follow, swing, windows_at_rest
+from jaximu.diagnosis.attribution import attributed_lines
+from jaximu.diagnosis.lines import MOVING_LINE, MovingLine, coincident, line_findings, moving_lines
+from jaximu.noise.lines import SpectralLine, follow, swing, windows_at_rest
 from jaximu.report.html import write_report
 
 RATE, DURATION = 50.0, 200.0
@@ -155,7 +157,48 @@ def test_a_quiet_unit_of_the_board_has_no_line_that_moves(data_folder):
     assert not measured(data_folder, "unit6_session1")
 
 
-def test_a_hand_that_trembles_is_no_line_that_moves(data_folder):
-    options = ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100.0)
-    recording = read_recording(data_folder / "mikoff_mpu9150/imu1.log", options=options)
-    assert not moving_lines(calibrate(recording).segmentations)
+def part(unit, session, *courses):
+    """A recording's lines, of which attribution asks no more; each from one frequency to another."""
+    times = np.linspace(0.0, 100.0, 20)
+    return SimpleNamespace(
+        unit=unit,
+        session=session,
+        place=f"unit {unit} in session {session}",
+        lines=tuple(
+            MovingLine(
+                0,
+                "gyroscope",
+                SpectralLine(2, times, np.linspace(*ends, 20), np.ones(20, bool), 1e-3, 60.0, 0.1, 90.0, 0.0),
+            )
+            for ends in courses
+        ),
+    )
+
+
+def test_lines_go_to_the_unit_to_the_session_or_to_neither():
+    parts = [part(unit, session) for unit in "1234" for session in "123"]
+    for session, shift in zip("123", (0.0, 0.3, -0.2), strict=True):
+        parts.append(part("5", session, (12.0 + shift, 13.0 + shift)))
+    parts += [part(unit, "4", (20.0, 24.0 + 0.05 * int(unit))) for unit in "1234"]
+    parts.append(part("6", "1", (3.0, 5.0)))
+    (own, common), apart = attributed_lines(parts, 0.05)
+    assert (own.belongs_to, own.units, own.sessions) == ("unit", ("5",), ("1", "2", "3"))
+    assert (common.belongs_to, common.units, common.sessions) == ("session", ("1", "2", "3", "4"), ("4",))
+    assert own.p_value < 0.05 and sorted(own.values["5"]) == pytest.approx([12.3, 12.5, 12.8]) and own.unit == "Hz"
+    assert apart == {MOVING_LINE: ["unit 6 in session 1"]}
+
+
+def test_lines_anywhere_coincide_by_chance_as_often_as_stated():
+    random, wrong, trials = np.random.default_rng(54), 0, 400
+    for _ in range(trials):
+        group, p_value = coincident(list("112344"), random.uniform(0, 30, (6, 1)), 30.0)
+        wrong += p_value < 0.05
+        assert len(group) != 1
+    assert scipy.stats.binom.sf(wrong - 1, trials, 0.05) > 1e-3
+
+
+def test_a_hand_that_sways_in_some_poses_is_no_line_that_moves(data_folder):
+    options = ReadOptions(columns="accel [m/s^2],gyro [rad/s]", rate=100)
+    for unit in range(3):
+        recording = read_recording(data_folder / f"mikoff_mpu9150/imu{unit}.log", options=options)
+        assert not moving_lines(calibrate(recording).segmentations)

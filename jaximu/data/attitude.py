@@ -41,6 +41,7 @@ from jaximu.ground.rotation import (
     rotation_matrix,
     rotation_matrix_on_host,
 )
+from jaximu.model.effects import Effect
 from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.reference_filter import behind
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
@@ -81,7 +82,7 @@ came out a tenth too small in recordings of 30 s, which show too little of the n
 _MARGIN = 3
 _SMOOTH = 0.05
 """Seconds over which the slope of the rate is taken."""
-_FIELDS = {
+_FIELDS: dict[type[Effect], str] = {
     kind: name for kind, name in zip(MOUNTING_EFFECTS, Mounting._fields, strict=True) if kind is not AccelLeverArm
 }
 _LATE, _STOOD = ("delay", "clock_scale"), ("rotation", "tilt", "filter_variance")

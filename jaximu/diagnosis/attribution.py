@@ -12,7 +12,7 @@ compared with what drift as large and as slow in each unit, but independent, has
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import PurePath
 from typing import Any
@@ -25,6 +25,7 @@ from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
 from jaximu.diagnosis.drift import DRAWS
 from jaximu.diagnosis.evidence import BLIND, FEWEST_DIMENSIONS, Evidence
 from jaximu.diagnosis.improvement import cross_validated
+from jaximu.diagnosis.lines import MOVING_LINE, MovingLine, coincident
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray
@@ -91,6 +92,7 @@ class BoardRecording:
 
     diagnosis: the document. named: the effects that it names. chi2_heldout: per condition, on parts left out, with the
     effects in the model. alone: the verdict with what the session has in common. without_drift: that was taken off.
+    lines: at rest, that move.
     """
 
     file: str
@@ -103,6 +105,7 @@ class BoardRecording:
     rests: Rests
     alone: str
     without_drift: bool = False
+    lines: tuple[MovingLine, ...] = ()
 
     @classmethod
     def of(cls, file: str, unit: str, session: str, diagnosis: Diagnosis) -> BoardRecording:
@@ -132,6 +135,7 @@ class BoardRecording:
             base.evidence,
             rests,
             diagnosis.verdict,
+            lines=diagnosis.lines,
         )
 
     @property
@@ -642,7 +646,8 @@ def attribute(
             if repeated is not None:
                 parts[index] = min(replace(repeated, alone=part.alone, without_drift=True), part, key=_rank)
     split_up, single = attributed(list(parts.values()), common, level)
-    findings = (*map(_of_drift, common), *split_up)
+    lines, apart = attributed_lines(list(parts.values()), level)
+    findings, single = (*map(_of_drift, common), *split_up, *lines), single | apart
     return Attribution(tuple(parts.values()), findings, tuple(drifts), single, skipped, gravity.latitude)
 
 
@@ -696,3 +701,59 @@ def attributed(
         else:
             single[name] = [part.place for part in parts if name in [effect.name for effect in part.named]]
     return findings, single
+
+
+def attributed_lines(parts: Sequence[BoardRecording], level: float) -> tuple[list[Attributed], dict[str, list[str]]]:
+    """Return what lines that move belong to, and where there are some that belong to nothing.
+
+    A line belongs to a unit if it lies closer to where it lay in other sessions than chance has it, and to a session if
+    several units show it at the same frequency at the start and at the end. Of all that are said to belong to something
+    a share of `level` may be wrong (Y. Benjamini and Y. Hochberg, Journal of the Royal Statistical Society B 57, 1995).
+    """
+    lines = [(part, one) for part in parts for one in part.lines]
+    groups = sorted(_coincidences(lines, level))
+    steps = [p_value * len(groups) / (rank + 1) for rank, (p_value, *_) in enumerate(groups)]
+    kept = max((rank + 1 for rank, step in enumerate(steps) if step < level), default=0)
+    shared: dict[str, dict[int, float]] = {"unit": {}, "session": {}}
+    for step, (_, kind, members) in zip(steps[:kept], groups, strict=False):
+        shared[kind] |= dict.fromkeys(members, step)
+    findings = []
+    for kind, members in shared.items():
+        if members:
+            mine = [lines[index] for index in members]
+            values: dict[str, list[float]] = {}
+            for part, one in mine:
+                values.setdefault(getattr(part, kind), []).append(one.middle)
+            units, sessions = (_in_order(getattr(part, name) for part, _ in mine) for name in ("unit", "session"))
+            share, p_value = len(members) / len(lines), min(members.values())
+            findings.append(Attributed(MOVING_LINE, kind, tuple(units), tuple(sessions), share, p_value, values, "Hz"))
+    apart = [part.place for index, (part, _) in enumerate(lines) if index not in shared["unit"] | shared["session"]]
+    return findings, {MOVING_LINE: list(dict.fromkeys(apart))} if apart else {}
+
+
+def _coincidences(
+    lines: Sequence[tuple[BoardRecording, MovingLine]], level: float
+) -> Iterator[tuple[float, str, list[int]]]:
+    """Yield groups of lines that lie close together: how probable by chance, what they have in common, their places.
+
+    Of a unit's axis over sessions, where each lies in the middle; of a session's units, where each begins and ends.
+    """
+    questions: dict[tuple[str, str, str], list[int]] = {}
+    for index, (part, one) in enumerate(lines):
+        questions.setdefault(("unit", part.unit, one.axis), []).append(index)
+        questions.setdefault(("session", part.session, one.triad), []).append(index)
+    for (kind, *_), left in questions.items():
+        while len({lines[index][0].place for index in left}) > 1:
+            parts, moving = zip(*(lines[index] for index in left), strict=True)
+            if kind == "unit":
+                at = np.array([[one.middle] for one in moving])
+            else:
+                ends = np.array([one.line.times[[0, -1]] for one in moving])
+                times = [ends[:, 0].max(), ends[:, 1].min()]
+                at = np.array([np.interp(times, one.line.times, one.line.recorded) for one in moving])
+            labels = [part.session if kind == "unit" else part.unit for part in parts]
+            group, p_value = coincident(labels, at, max(one.line.rate / 2 for one in moving))
+            yield p_value, kind, [left[index] for index in group]
+            if p_value >= level:
+                break
+            left = [index for number, index in enumerate(left) if number not in group]

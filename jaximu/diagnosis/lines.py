@@ -17,7 +17,7 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation
 
-__all__ = ["MOVING_LINE", "MovingLine", "line_findings", "moving_lines", "spectrum_at_rest", "swings_of"]
+__all__ = ["MOVING_LINE", "MovingLine", "coincident", "line_findings", "moving_lines", "spectrum_at_rest", "swings_of"]
 
 MOVING_LINE = "data.moving_line"
 _NAMED = 3
@@ -36,6 +36,11 @@ class MovingLine:
     def axis(self) -> str:
         """The triad's axis."""
         return f"{self.triad} {'xyz'[self.line.axis]}"
+
+    @property
+    def middle(self) -> float:
+        """The frequency that it is recorded at, Hz, in the median of the time in which it shows."""
+        return float(np.median(self.line.recorded[self.line.visible]))
 
     @property
     def words(self) -> str:
@@ -119,3 +124,26 @@ def line_findings(lines: Sequence[MovingLine], gain: str = "") -> list[Finding]:
         text = f"{axis}: {'; '.join(texts)}{more}. {gain if slow else ''}".rstrip()
         findings.append(Finding(MOVING_LINE, (), text[0].upper() + text[1:]))
     return findings
+
+
+def coincident(labels: Sequence[str], frequencies: FloatArray, highest: float) -> tuple[list[int], float]:
+    """Return which lines, of different units or sessions, lie closest together, and the probability of it by chance.
+
+    By chance lines lie anywhere up to the highest frequency: the range of n of them is below r of that with the
+    probability n rⁿ⁻¹ − (n − 1) rⁿ, for each of the groups that could be made of them.
+
+    **Arguments:** `labels` (k,): their units or sessions; `frequencies` (k, q): at q times, Hz; `highest`: Hz.
+    """
+    groups = np.prod([1.0 + labels.count(label) for label in set(labels)]) - len(labels) - 1  # of two or more
+    best: tuple[list[int], float] = [], 1.0
+    order = np.argsort(frequencies.mean(axis=1)).tolist()
+    for start in range(len(order)):
+        for stop in range(start + 2, len(order) + 1):
+            group = order[start:stop]
+            if len({labels[index] for index in group}) < len(group):
+                break
+            share, count = min(float(np.ptp(frequencies[group], axis=0).max()) / highest, 1.0), len(group)
+            p_value = groups * (count * share ** (count - 1) - (count - 1) * share**count)
+            if p_value < best[1]:
+                best = group, float(p_value)
+    return best
