@@ -19,8 +19,6 @@ from jaximu.recordings.alignment import angle_of, rotation_of, signed_permutatio
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, apply_axes, spelled_axes
 
-__all__ = ["arrangement", "axes_unlike", "unusual_gains"]
-
 _EXPLAINED = 0.5
 """Share of the turning of gravity that a gyroscope must explain for its axes to be judged by it."""
 _MOUNTED = np.radians(5.0)

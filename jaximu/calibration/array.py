@@ -41,8 +41,6 @@ from jaximu.recordings.recording import Reading, Recording, Signal
 from jaximu.recordings.reference import Integral
 from jaximu.recordings.segmentation import rest_statistics
 
-__all__ = ["calibrate_array"]
-
 _WINDOWS = 128
 """Intervals of motion in which two units are compared."""
 _LENGTH = 8

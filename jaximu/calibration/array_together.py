@@ -31,8 +31,6 @@ from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.segmentation import observed_poses
 
-__all__ = ["LeftOutTurns", "Together", "fit_together", "leave_out_turns"]
-
 _FEWEST = 6
 """Turns that all units measured, without which nothing is left to fit once half of them are left out."""
 

@@ -13,8 +13,6 @@ from jaximu.ground.document import Document
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.page import Result
 
-__all__ = ["Array", "ArrayUnit", "Averaged"]
-
 SCHEMA = "jaximu.array/1"
 _SUSPECT = 2.0
 """Times the median scatter of the units from which on one is said to disturb the array."""

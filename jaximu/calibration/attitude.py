@@ -37,15 +37,6 @@ from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral
 
-__all__ = [
-    "Mounted",
-    "calibrate_against_attitude",
-    "delay_of_speeds",
-    "fitted_mounting",
-    "mounted_on",
-    "reference_summary",
-]
-
 _NEAR = 10.0
 """Seconds within which the reference's clock is believed, unless another offset explains far more."""
 _APART = 1e6

@@ -34,16 +34,6 @@ from jaximu.recordings.segmentation import Segmentation
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "MAGNETIC",
-    "Calibration",
-    "concluded",
-    "effect_named",
-    "load_calibration",
-    "provenance",
-    "require_calibration",
-]
-
 SCHEMA = "jaximu.calibration/1"
 MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
 """What a document with a magnetometer says beside its triad."""

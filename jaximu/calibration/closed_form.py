@@ -9,8 +9,6 @@ from jaxtyping import ArrayLike, Float
 
 from jaximu.ground.array_types import Array
 
-__all__ = ["ferraris", "linear_least_squares", "remove_curvature", "six_position", "turn_pairs"]
-
 Matrix = Float[Array, "... 3 3"]
 Vector = Float[Array, "... 3"]
 Rows = Float[Array, "... S 3"]

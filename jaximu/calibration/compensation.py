@@ -18,8 +18,6 @@ from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal, recordings_of, smoothed_slope
 
-__all__ = ["compensate"]
-
 _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
 
 

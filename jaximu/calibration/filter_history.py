@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["History"]
-
 
 @dataclass(frozen=True)
 class History:

@@ -20,8 +20,6 @@ from jaximu.ground.precision import require_float64
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
 
-__all__ = ["Method", "fit_hand_held"]
-
 Method = Literal["joint", "two-step", "two-step-rk4", "accelerometer"]
 
 

@@ -14,8 +14,6 @@ from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
 
-__all__ = ["ENOUGH", "Identifiability", "Separation", "identifiable", "separated"]
-
 _TOLD = 0.05
 """Share of a shape that smooth functions of temperature must leave of it."""
 ENOUGH = 0.1

@@ -57,8 +57,6 @@ from jaximu.recordings.observations import POWER_ON
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import segment
 
-__all__ = ["FilterInUse", "FilterState", "follow", "followed_in_use"]
-
 INTERVAL = 0.5
 """Seconds of an interval."""
 _QUIET, _LOUD, _TURNING = 3.0, 10.0, np.radians(0.5)

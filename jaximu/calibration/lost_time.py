@@ -31,8 +31,6 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Turns
 from jaximu.recordings.recording import Recording
 
-__all__ = ["lost_share", "tells_losses", "without_lost_stretches"]
-
 _FEWEST = 6
 """Turns from which on the others tell what one should have been."""
 _GATE = 9.0

@@ -38,18 +38,6 @@ from jaximu.simulation.protocols.positions import spiral
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-__all__ = [
-    "FieldStrength",
-    "Heading",
-    "MagneticLog",
-    "calibrate_magnetometer",
-    "carried_headings",
-    "ellipsoid",
-    "field_advice",
-    "field_start",
-    "heading_errors",
-]
-
 _TYPICAL = 50.0
 """µT, about what the Earth's field has in the middle latitudes: the strength where only counts are known."""
 _WEAKEST, _STRONGEST = 22.0, 67.0

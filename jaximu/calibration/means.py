@@ -24,8 +24,6 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import PoseMeans
 from jaximu.recordings.segmentation import observe_means
 
-__all__ = ["calibrate_means"]
-
 _SPARE = 3
 """Poses beyond the parameters, from whose misfit an unknown noise is taken."""
 _SPANNED, _ON = 0.1, 0.5

@@ -11,8 +11,6 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.alignment import Turning, angle_of, rotation_of, signed_permutation, turning
 from jaximu.recordings.recording import Recording
 
-__all__ = ["as_stated", "nominal_imu"]
-
 _EXPLAINED = 0.5
 _KNOWN = 0.2
 """Standard deviation, of an entry, beyond which the gyroscope's matrix against gravity is not used."""

@@ -37,14 +37,6 @@ from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, same_outputs
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, observed_poses, segment
 
-__all__ = [
-    "Choices",
-    "calibrate",
-    "calibrate_ready",
-    "errors_of",
-    "require_gravity",
-]
-
 _SAME = 1e-9
 """Share by which two statements of one gravity may differ."""
 _ROUNDS = 4

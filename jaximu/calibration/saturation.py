@@ -15,8 +15,6 @@ from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.recordings.finding import Finding
 
-__all__ = ["saturation"]
-
 _LIMITS = 1.01, 1.03, 1.08, 1.2, 1.4
 """Limits that are tried, over the greatest rate of all turns."""
 _COARSE = 500.0

@@ -52,22 +52,6 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, find_stops, rest_statistics
 
-__all__ = [
-    "FIELD",
-    "NEIGHBOURS",
-    "calibrate_by_filter",
-    "disturbances",
-    "field_of",
-    "known_scale",
-    "noise_at_rest",
-    "places_of",
-    "plausible_sizes",
-    "require_gyroscope",
-    "seen_from_outside",
-    "state_advice",
-    "state_effect",
-]
-
 DRIFTS = 2
 """Gauss–Markov processes an axis that stand for all of a noise model's."""
 SHORTEST = 1.0

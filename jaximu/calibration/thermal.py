@@ -48,8 +48,6 @@ from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady", "steady_change"]
-
 SCHEMA = "jaximu.thermal/1"
 THERMAL = (*POWERS, *RATES, *HISTORY, *BESIDE, LEARNED, NETWORK, SCALE)
 _GRID = 41

@@ -15,8 +15,6 @@ from jaximu.estimation.leave_out import LeftOut, leave_out, off, orthonormal
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise_model import NoiseModel
 
-__all__ = ["Held", "Whitened"]
-
 
 @dataclass(frozen=True)
 class Held:

@@ -33,8 +33,6 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.model.effects.network import UNITS, WEIGHTS, network
 
-__all__ = ["patterned", "with_network"]
-
 _PRIORS = ((0.5, 3.0), (1.5, 1.5), (5.0, 0.7))
 """Standard deviations a priori that are tried, the stiffest last: of the output's weights, over the rms that
 temperature does, and of those inside tanh, whose inputs run from −1 to 1."""

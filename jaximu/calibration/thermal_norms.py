@@ -23,8 +23,6 @@ from jaximu.ground.gravity import STANDARD
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 
-__all__ = ["calibrate_norms"]
-
 _NOISE = 1e-4
 """m/s², of a norm at an excess of zero: less than any window's, whose scatter is found."""
 _BLIND = 1e-7  # share of the largest singular value below which a combination of numbers is not determined

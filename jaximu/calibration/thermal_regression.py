@@ -11,8 +11,6 @@ from jaximu.calibration.thermal_selection import exchanged
 from jaximu.estimation.leave_out import leave_out, off, orthonormal
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["multifactor"]
-
 _FOLDS = 5
 
 

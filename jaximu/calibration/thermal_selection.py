@@ -33,24 +33,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import PREFIXES
 from jaximu.model.effects.network import WEIGHTS
 
-__all__ = [
-    "CUBIC",
-    "PAYS",
-    "VAGUE",
-    "Candidate",
-    "best_by_axis",
-    "beyond_bias",
-    "candidate_of",
-    "completed",
-    "exchanged",
-    "families_of",
-    "parameters_of",
-    "richest",
-    "stepwise",
-    "terms_of",
-    "tuned",
-]
-
 T = TypeVar("T")
 CUBIC = "cubic"
 _ZOOMS = 4  # grids of inner parameters, each between the neighbours of the last one's best

@@ -29,8 +29,6 @@ from jaximu.model.effects.learned import ZERO_CELSIUS, AccelLearnedTemperature
 from jaximu.model.effects.network import WEIGHTS
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["GRID", "ThermalShapes"]
-
 GRID = 12
 """Values of an inner parameter that are tried at once."""
 

@@ -10,24 +10,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import SHAPES
 
-__all__ = [
-    "BESIDE",
-    "HISTORY",
-    "LEARNED",
-    "NETWORK",
-    "POWERS",
-    "RATES",
-    "SCALE",
-    "SPLINES",
-    "Model",
-    "Net",
-    "ThermalTerm",
-    "at_inner",
-    "history",
-    "memories",
-    "net_of",
-]
-
 POWERS = ("temperature", "temperature_squared", "temperature_cubed")
 RATES = ("temperature_rate", "temperature_rate_squared", "temperature_times_rate")
 HISTORY = {"thermal_lag": "time_constant", "thermal_hysteresis": "half_width"}

@@ -43,8 +43,6 @@ from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.network import UNITS
 from jaximu.model.sensor import Imu
 
-__all__ = ["TriadFit", "fit_triad"]
-
 
 @dataclass(frozen=True)
 class TriadFit:

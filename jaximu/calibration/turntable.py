@@ -43,13 +43,6 @@ _RECORD = (
     "rests."
 )
 
-__all__ = [
-    "calibrate_table_ready",
-    "calibrate_turntable",
-    "fit_turntable",
-    "free_on_table",
-]
-
 
 def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss: Loss = "linear") -> Fit:
     """Fit gains and biases to known poses and turns; one unit, or a batch with one leading axis on every array.

@@ -31,8 +31,6 @@ from jaximu.model.noise_model import NoiseModel
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation, rest_statistics
 
-__all__ = ["calibrate_at_stops"]
-
 _SECONDS, _STRAIGHT = 4.0, np.radians(30.0)
 """Seconds after and before a stop whose speeds show where forward is, while the vehicle turns by less than this."""
 _FEWEST_STOPS, _WIDEST, _ONE_WAY = 3, np.radians(20.0), 0.5

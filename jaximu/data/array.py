@@ -28,8 +28,6 @@ from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
 
-__all__ = ["IN_COMMON", "SharedConditions", "UnitsOnOneBody"]
-
 IN_COMMON = "turns, in common"
 """The component of the excess that all units' turns share: what the body does between samples that all take alike."""
 

@@ -50,18 +50,6 @@ from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, smoothed_slope
 from jaximu.recordings.reference import Integral
 
-__all__ = [
-    "EXCESS_NAMES",
-    "INTERVALS",
-    "WINDOW",
-    "AgainstAttitude",
-    "AttitudeConditions",
-    "Intervals",
-    "evaluated",
-    "reference_sigmas",
-    "shared_ends",
-]
-
 EXCESS_NAMES = ("gyroscope", "reference attitude", "gyroscope bias walk", "accelerometer", "reference velocity")
 _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
 """Standard deviation of each component at an excess of one: rad/√s, rad, rad/s/√s, m/s²·√s, m/s."""

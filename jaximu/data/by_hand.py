@@ -39,8 +39,6 @@ from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observed_poses
 
-__all__ = ["RecordedByHand"]
-
 
 @dataclass
 class RecordedByHand(OfOneUnit):

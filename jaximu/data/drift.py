@@ -27,24 +27,6 @@ from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.segmentation import Segmentation
 
-__all__ = [
-    "DRIFT_ESTIMATED",
-    "USUAL_DRIFT",
-    "EstimatedDrift",
-    "about_biases",
-    "drift_components",
-    "drifting",
-    "estimated_drift",
-    "mean_output_reactions",
-    "means_by_hand",
-    "power_on_text",
-    "restricted_likelihood",
-    "slow_units",
-    "with_drift",
-    "with_noise",
-    "with_usual_drift",
-]
-
 _POWER_ON = "power-on"
 USUAL_DRIFT = {"bias instability": (0.4, 1.2), "random walk": (0.1, 1.0), _POWER_ON: (5.0, 1.5)}
 """Median of each kind's standard deviation and the spread of its logarithm, of MEMS sensors: bias instability B over

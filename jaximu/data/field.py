@@ -36,8 +36,6 @@ from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral
 
-__all__ = ["EXCESS_NAMES", "FieldConditions", "FieldSamples", "FieldWindows", "MagneticField", "windows_of"]
-
 EXCESS_NAMES = ("magnetometer", "carried field", "angle to gravity")
 RESIDUALS = (
     ResidualKind("field_strength", "strength of the field", "uT", 1),

@@ -14,8 +14,6 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Turns
 
-__all__ = ["across", "gravity_direction", "gravity_direction_error", "level", "turn_rotations", "unit_vectors"]
-
 
 def unit_vectors(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     """Return vectors scaled to length one."""

@@ -13,8 +13,6 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Poses
 
-__all__ = ["gravity_norm", "gravity_norm_error", "recover_specific_force", "recovery_jacobian"]
-
 
 def recover_specific_force(imu: Imu, poses: Poses, stimulus: Stimulus | None = None) -> Float[Array, "P 3"]:
     """Return each pose's specific force (m/s²) from its mean output; `stimulus` (P,): what else its effects need."""

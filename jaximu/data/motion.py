@@ -58,24 +58,6 @@ from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral
 
-__all__ = [
-    "FARTHEST_UNSEEN",
-    "LONGEST_MOTION",
-    "Disturbances",
-    "IntervalsOfMotion",
-    "MotionIntervals",
-    "MotionPath",
-    "carried",
-    "cut",
-    "first_field",
-    "first_knowledge",
-    "interval_rows",
-    "longest_rest",
-    "merged_drift",
-    "sees_earth",
-    "turned",
-]
-
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
 _LEVEL, _HEADING, _STILL = 0.5, 1e-3, 1e-4

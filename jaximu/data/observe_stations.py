@@ -37,8 +37,6 @@ from jaximu.simulation.protocols.motion import smooth_course
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-__all__ = ["NODES", "TYPICAL_NOISE", "attitudes", "observe_stations", "scheme_stations"]
-
 NODES = 32
 """Nodes of a station: a mean square rate over a turn that ramps is right to some 1e-3."""
 TYPICAL_NOISE = NoiseModel(AxisNoise.of_white(1e-3**2), AxisNoise.of_white(1e-4**2))

@@ -61,28 +61,6 @@ from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observed_poses, segment
 
-__all__ = [
-    "COARSE_EXCESS",
-    "EXCESS_NAMES",
-    "NO_FIXTURE",
-    "RESIDUALS",
-    "Condensed",
-    "HandHeldConditions",
-    "PosesAndTurns",
-    "as_observations",
-    "condense",
-    "condensed",
-    "felt_by_hand",
-    "forces_and_angles",
-    "observe",
-    "only",
-    "pose_rows",
-    "residual_rms",
-    "resized",
-    "stack",
-    "with_gyroscope",
-]
-
 EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
 NO_FIXTURE = "a hand-held recording has no set-up to compare with"
 COARSE_EXCESS = (1e2, 1e4, 1e2)

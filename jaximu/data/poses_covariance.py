@@ -24,14 +24,6 @@ from jaximu.ground.rotation import conjugate, inverse_matrix, rotate, rotation_m
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.observations import Observations, Turns
 
-__all__ = [
-    "Sensitivities",
-    "condition_covariance",
-    "sensitivities",
-    "turn_noise",
-    "turned_by",
-]
-
 
 class Sensitivities(eqx.Module):
     """How the conditions react to what was measured, to first order (the means at rest react as they are)."""

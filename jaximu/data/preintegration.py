@@ -41,17 +41,6 @@ from jaximu.ground.rotation import (
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 
-__all__ = [
-    "Preintegrated",
-    "Turned",
-    "increments",
-    "linear_slope",
-    "preintegrate",
-    "preintegrate_samples",
-    "turned_by_rates",
-    "white_covariance",
-]
-
 
 def increments(
     rates: Float[Array, "... S 3"], forces: Float[Array, "... S 3"], intervals: Float[Array, "... S"]

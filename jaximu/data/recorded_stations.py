@@ -30,8 +30,6 @@ from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.reference import Entry, entries_of_columns
 
-__all__ = ["AtStations", "RecordedStations", "output_reaction", "station_means", "station_of"]
-
 
 @dataclass(frozen=True)
 class AtStations:

@@ -23,8 +23,6 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.sensor import Imu
 
-__all__ = ["RestOverTemperature", "mean_terms", "over_blocks", "padded_count"]
-
 _ROWS = 256
 """Blocks are padded to a multiple of so many: few shapes to compile."""
 

@@ -21,20 +21,6 @@ from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.columns.names import COUNTS_ADVICE
 from jaximu.recordings.recording import Recording, Signal, recordings_of, same_outputs, smoothed_slope
 
-__all__ = [
-    "LEAST_RANGE",
-    "RATE_BANDWIDTH",
-    "RATIO",
-    "WAYS",
-    "Leg",
-    "RestBlocks",
-    "correlation_times",
-    "folds_of",
-    "joined",
-    "rest_blocks",
-    "without_startup",
-]
-
 LEAST_RANGE = 3.0
 """K of change below which nothing is said about temperature."""
 RATE_BANDWIDTH = 0.578 / TEMPERATURE_WINDOW

@@ -30,8 +30,6 @@ from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
 
-__all__ = ["Resting", "RestingConditions"]
-
 _FREE = (1.0, 0.1)  # m/s² and rad/s: how far a rest, or a smooth function of temperature, may lie off, as good as free
 _IN_POSES = ("accel.scale_temperature", "accel.misalignment_temperature")
 _PLACES = 40  # at which a step is sought

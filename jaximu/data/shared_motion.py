@@ -18,8 +18,6 @@ from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral
 
-__all__ = ["shared_stations"]
-
 _MARGIN = 4
 """Samples of the first unit on either side of an interval, for the other's clock to move in."""
 _BUCKET = 32

@@ -28,8 +28,6 @@ from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.model.mounting import Mounting
 
-__all__ = ["SIZE", "AttitudeSeen", "FieldSeen", "Sighting", "Standing", "VelocitySeen"]
-
 SIZE = 9
 """Numbers of a `Standing` that follow from a unit's outputs: rate, specific force, angular acceleration."""
 

@@ -8,8 +8,6 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations
 
-__all__ = ["static_gyroscope"]
-
 
 def static_gyroscope(
     imu: Imu, observations: Observations, weights: Float[Array, "P 3 3"], stimulus: Stimulus | None = None

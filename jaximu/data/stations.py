@@ -21,22 +21,6 @@ from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 
-__all__ = [
-    "RESIDUALS",
-    "KnownStations",
-    "StationConditions",
-    "StationErrors",
-    "station_covariance",
-    "station_covariances",
-    "station_errors",
-    "station_excess",
-    "station_rms",
-    "station_rows",
-    "station_weights",
-    "turntable",
-]
-
-
 RESIDUALS = (
     ResidualKind("accelerometer", "specific force in the poses", "m/s^2", 3),
     ResidualKind("turns", "rate over the turns", "rad/s", 3),

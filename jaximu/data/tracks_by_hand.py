@@ -27,8 +27,6 @@ from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation
 
-__all__ = ["SamplesByHand", "during_turns", "pose_means", "rest_shifts", "samples_by_hand", "tracks_by_hand"]
-
 _NONE = np.iinfo(np.int64).max
 """Stands for the pose or the turn of a sample that is of none, and for a sample that there is not."""
 

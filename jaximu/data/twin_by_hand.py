@@ -17,8 +17,6 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation
 
-__all__ = ["twin_recordings"]
-
 
 def twin_recordings(
     segmentations: Sequence[Segmentation],

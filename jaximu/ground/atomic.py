@@ -8,8 +8,6 @@ from pathlib import Path
 
 from jaximu.ground.errors import InputError
 
-__all__ = ["atomic_write", "write_files", "write_folder"]
-
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:

@@ -8,8 +8,6 @@ from jaxtyping import Float
 from jaximu.ground.array_types import Array
 from jaximu.ground.tracing import array_module
 
-__all__ = ["interpolated", "slopes", "value_and_jacobian"]
-
 
 def slopes(values: Float[Array, "... n m"], time: Float[Array, "... n"]) -> Float[Array, "... n m"]:
     """Return dv/dt at every sample: of the parabola through it and its neighbours, one-sided at the ends.

@@ -3,21 +3,6 @@
 import numpy as np
 import scipy
 
-__all__ = [
-    "chi2_isf",
-    "chi2_median",
-    "chi2_sf",
-    "f_tails",
-    "gamma_mean_sf",
-    "holm",
-    "kolmogorov_sf",
-    "noncentral_chi2_sf",
-    "normal_isf",
-    "normal_sf",
-    "student_cdf",
-    "student_isf",
-]
-
 
 def chi2_sf(value, freedom):
     """Return the probability that χ² of so many degrees of freedom exceeds a value."""

@@ -14,8 +14,6 @@ from jaximu._version import __version__
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.errors import InputError, NotPossibleError, name_of, readable
 
-__all__ = ["SOFTWARE", "Document", "damage", "digest", "file_digest", "read_document", "read_toml"]
-
 SOFTWARE = {"name": "jaximu", "version": __version__}
 """What a document says that it was written by."""
 

@@ -11,19 +11,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = [
-    "InputError",
-    "JaximuError",
-    "NotPossibleError",
-    "command_line",
-    "name_of",
-    "nearest",
-    "one_of",
-    "only",
-    "readable",
-    "worded",
-]
-
 _READING = "columns gyro-columns rate axes accel-scale accel-offset gyro-scale gyro-offset topic instance stamp".split()
 _ARGUMENTS = {
     "--gravity, or --latitude and --height": "gravity=, such as jaximu.wgs84_gravity(latitude, height)",

@@ -11,8 +11,6 @@ from jaximu.ground.reexport import later
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Code", "Items", "Matrices", "Page", "Part", "Picture", "Result", "Section", "Statement", "Table"]
-
 
 @dataclass(frozen=True)
 class Statement:

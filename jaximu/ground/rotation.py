@@ -18,30 +18,6 @@ from jaxtyping import Float
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.prefixes import running
 
-__all__ = [
-    "Matrix",
-    "Quaternion",
-    "Vector",
-    "apply_matrix",
-    "compose_rotation_vectors",
-    "conjugate",
-    "exponential",
-    "integrate_rates",
-    "inverse_matrix",
-    "logarithm",
-    "multiply",
-    "product",
-    "right_jacobian",
-    "right_jacobian_rows",
-    "rotate",
-    "rotation_matrix",
-    "rotation_matrix_on_host",
-    "rotation_rows",
-    "rotation_vectors",
-    "running_rotations",
-    "transport",
-]
-
 Vector = Float[Array, "... 3"]
 Vectors = Float[Array, "... S 3"]
 """Of S samples."""

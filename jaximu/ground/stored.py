@@ -24,8 +24,6 @@ from typing import Any, TypeVar, cast
 from jaximu.ground.errors import InputError
 from jaximu.ground.tracing import is_traced
 
-__all__ = ["cache", "call", "compiled", "compiling", "folder", "forget", "prepare_process", "tell_apart"]
-
 _folder: Path | None = None
 _at_first: Callable[[], None] | None = None
 _loaded: dict[str, Callable] = {}

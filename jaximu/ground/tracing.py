@@ -4,8 +4,6 @@ import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-__all__ = ["array_module", "first", "is_traced", "lifted", "one_by_one", "repeated"]
-
 Result = TypeVar("Result")
 State = TypeVar("State")
 Tree = TypeVar("Tree")

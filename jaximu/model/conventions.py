@@ -25,21 +25,6 @@ from jax.core import Tracer
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import Matrix, Vector, inverse_matrix
 
-__all__ = [
-    "FrameChange",
-    "ImuTk",
-    "Kalibr",
-    "PartsPerMillion",
-    "ReciprocalScale",
-    "ScaleMisalignment",
-    "SimplifiedScaleMisalignment",
-    "Tedaldi",
-    "first_order_inverse",
-    "lower_triangular_frame",
-    "rotate_body_frame",
-    "upper_triangular_frame",
-]
-
 _PPM = 1e6
 _SINGULAR = 1e-9
 """Smallest singular value or diagonal of a matrix whose rows are scaled to unit length, and a rotation's departure."""

@@ -22,8 +22,6 @@ from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.sensor import Imu
 
-__all__ = ["MOUNTING_EFFECTS", "Mounting"]
-
 MOUNTING_EFFECTS = (
     SetupReferenceRotation,
     SetupReferenceDelay,

@@ -24,8 +24,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.page import Result
 from jaximu.model.processes import RATIO
 
-__all__ = ["AxisNoise", "NoiseModel"]
-
 _LONGEST = 4.0
 """Longest correlation time, in lengths of the recording: slower than this looks like a random walk in it."""
 _FELT = 4.0

@@ -24,19 +24,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.model.state_space import LinearSystem, linear_system
 
-__all__ = [
-    "BiasInstability",
-    "BiasRepeatability",
-    "FirstOrderGaussMarkov",
-    "Process",
-    "Quantisation",
-    "RandomConstant",
-    "RandomWalk",
-    "RateRamp",
-    "SecondOrderGaussMarkov",
-    "White",
-]
-
 
 @dataclass(frozen=True)
 class Process:

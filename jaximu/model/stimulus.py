@@ -11,8 +11,6 @@ from jaximu.ground.differences import slopes
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import Quaternion, Vector
 
-__all__ = ["REFERENCE_TEMPERATURE", "Stimulus", "rate_of_change"]
-
 Numbers = Float[Array, " ..."]
 REFERENCE_TEMPERATURE = 25.0
 """°C at which gain and bias are stated, unless a triad says otherwise."""

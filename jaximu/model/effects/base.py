@@ -22,21 +22,6 @@ from jaximu.ground.rotation import Vector
 from jaximu.ground.units import SENSORS
 from jaximu.model.stimulus import Stimulus
 
-__all__ = [
-    "BiasEffect",
-    "Effect",
-    "Extent",
-    "Inner",
-    "InputEffect",
-    "Place",
-    "Scalar",
-    "ScaleEffect",
-    "SetupEffect",
-    "inner_owners",
-    "on_triad",
-    "pair",
-]
-
 Place = TypeVar("Place", bound=Hashable)
 Scalar = Float[Array, "..."] | float
 """An inner parameter."""

@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.base import BiasEffect
 
-__all__ = ["EFFECTS", "MagCurrent"]
-
 
 class MagCurrent(BiasEffect):
     """An output in proportion to a current: by Biot and Savart's law the field of a wire at a fixed place."""

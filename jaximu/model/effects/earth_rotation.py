@@ -6,8 +6,6 @@ from numpy.typing import NDArray
 from jaximu.ground.rotation import conjugate, rotate
 from jaximu.model.effects.base import Effect
 
-__all__ = ["EARTH_RATE", "EFFECTS", "GyroEarthRotation"]
-
 EARTH_RATE = 7.292115e-5
 """Rate of the Earth's rotation, rad/s (WGS 84)."""
 _DEFLECTED = 1e-3

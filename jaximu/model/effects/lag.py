@@ -4,8 +4,6 @@ import jax.numpy as jnp
 
 from jaximu.model.effects.base import Effect
 
-__all__ = ["EFFECTS", "GyroLag", "MagLag"]
-
 
 class GyroLag(Effect):
     """−τ_i ω̇_i: each axis's output is late by τ_i, to first order in the delay; a positive τ is a delay.

@@ -17,27 +17,6 @@ from jaxtyping import Float
 from jaximu.ground.array_types import Array
 from jaximu.model.effects.base import Effect, Inner, Scalar, pair
 
-__all__ = [
-    "EFFECTS",
-    "SHAPES",
-    "AccelLearnedForce",
-    "AccelLearnedForceX",
-    "AccelLearnedForceY",
-    "AccelLearnedForceZ",
-    "AccelLearnedTemperature",
-    "AccelLearnedTemperatureRate",
-    "AccelLearnedTime",
-    "GyroLearnedForce",
-    "GyroLearnedForceX",
-    "GyroLearnedForceY",
-    "GyroLearnedForceZ",
-    "GyroLearnedRate",
-    "GyroLearnedTemperature",
-    "GyroLearnedTemperatureRate",
-    "GyroLearnedTime",
-    "Learned",
-]
-
 ZERO_CELSIUS = 273.15
 SPLINES = 10
 ROUGHNESS, SHAPES = np.linalg.eigh(np.diff(np.eye(SPLINES), 2, axis=0).T @ np.diff(np.eye(SPLINES), 2, axis=0))

@@ -12,8 +12,6 @@ from jaximu.ground.array_types import Array
 from jaximu.model.effects.base import Effect, Inner, Scalar, pair
 from jaximu.model.effects.learned import ZERO_CELSIUS
 
-__all__ = ["EFFECTS", "UNITS", "WEIGHTS", "AccelLearnedNetwork", "GyroLearnedNetwork", "network"]
-
 UNITS = 4
 WEIGHTS = 4 * UNITS
 """Numbers of an axis: each unit's share of the output, its weights of T and of Ṫ, and its constant."""

@@ -7,9 +7,6 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import conjugate, exponential, multiply, rotate
 from jaximu.model.effects.base import SetupEffect
 
-__all__ = ["EFFECTS", "SetupReferenceFilter", "behind"]
-
-
 _SHARP = 1e-5
 """s²; a variance around zero counts as of a lag of 3 ms in the third order, so that there is a derivative at zero."""
 

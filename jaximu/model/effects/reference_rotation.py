@@ -3,8 +3,6 @@
 from jaximu.ground.rotation import conjugate, exponential, multiply, rotate
 from jaximu.model.effects.base import SetupEffect
 
-__all__ = ["EFFECTS", "SetupReferenceRotation"]
-
 
 class SetupReferenceRotation(SetupEffect):
     """The unit's axes are the reference's body axes turned by the rotation vector α, the same at all times.

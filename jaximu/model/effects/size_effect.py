@@ -5,8 +5,6 @@ import jax.numpy as jnp
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.lever_arm import LEVER_RECOVERY, lever_acceleration
 
-__all__ = ["EFFECTS", "AccelSizeEffect"]
-
 
 class AccelSizeEffect(Effect):
     """Each axis senses the force at its own place r_i, given from the point that `specific_force` belongs to.

@@ -7,8 +7,6 @@ import jax.numpy as jnp
 from jaximu.ground.rotation import conjugate, exponential, multiply, rotate
 from jaximu.model.effects.base import SetupEffect
 
-__all__ = ["EFFECTS", "SetupTableTilt"]
-
 
 class SetupTableTilt(SetupEffect):
     """The table is turned by (α_x, α_y) against the level frame, so its poses' "up" is not gravity's.

@@ -2,16 +2,6 @@
 
 from jaximu.model.effects.base import BiasEffect, pair
 
-__all__ = [
-    "EFFECTS",
-    "AccelTemperatureRate",
-    "AccelTemperatureRateSquared",
-    "AccelTemperatureTimesRate",
-    "GyroTemperatureRate",
-    "GyroTemperatureRateSquared",
-    "GyroTemperatureTimesRate",
-]
-
 
 class _TemperatureRate(BiasEffect):
     """A bias in proportion to how quickly the temperature changes."""

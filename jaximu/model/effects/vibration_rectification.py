@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.base import BiasEffect, pair
 
-__all__ = ["EFFECTS", "AccelVibrationRectification", "GyroVibrationRectification"]
-
 
 class _VibrationRectification(BiasEffect):
     """A bias in proportion to the mean square of the vibration's acceleration, all directions together.
