@@ -141,50 +141,32 @@ def _mapped(option: str) -> Callable[[Recording], Recording]:
 def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
     """Name scales that are a whole factor off the data sheet's, or off by more than sensors are."""
     sizes = np.linalg.norm(np.asarray(triad.gain), axis=1) / scale
+    logarithm = np.log(sizes)
+    usual, odd = float(np.exp(np.mean(logarithm))), np.abs(logarithm) > _ODD
     option = "--accel-scale" if name == "accelerometer" else "--gyro-scale"
-    findings = []
-    whole = np.zeros(3)
     like = "another full-scale range" + (", or a sample rate that is as far off" if name == "gyroscope" else "")
+    whole = np.zeros(3)
     for factor in _FACTORS:
         whole[np.abs(np.log(sizes / factor)) < _NEAR] = factor
+
+    def of_range(sensor: str, size: float, text: str) -> Finding:
+        return Finding("data.range", (), f"{sensor}: its gain is {size:.3g} times the nominal{text}")
+
     if whole.all() and len(set(whole)) == 1:
-        return [
-            Finding(
-                "data.range",
-                (),
-                f"{name}: its gain is {np.exp(np.mean(np.log(sizes))):.3g} times the nominal on all axes, as with "
-                f"{like}. State the range that was set ({option}); the calibration includes it.",
-            )
-        ]
-    usual = float(np.exp(np.mean(np.log(sizes))))
-    if (np.abs(np.log(sizes)) > _ODD).all() and np.ptp(np.log(sizes)) < _NEAR:
-        return [
-            Finding(
-                "data.range",
-                (),
-                f"{name}: its gain is {usual:.3g} times the nominal on all axes, more than such sensors differ. Check "
-                f"{option}; the calibration includes it.",
-            )
-        ]
-    for index, axis in enumerate("xyz"):
-        if whole[index]:
-            findings.append(
-                Finding(
-                    "data.range",
-                    (),
-                    f"{name} {axis}: its gain is {sizes[index]:.3g} times the nominal, a whole factor, as with another "
-                    "full-scale range or unit on this axis. The calibration includes it.",
-                )
-            )
-        elif abs(np.log(sizes[index])) > _ODD:
-            findings.append(
-                Finding(
-                    "data.range",
-                    (),
-                    f"{name} {axis}: its gain is {sizes[index]:.3g} times the nominal, more than such sensors differ. "
-                    f"Check {option}.",
-                )
-            )
+        text = f" on all axes, as with {like}. State the range that was set ({option}); the calibration includes it."
+        return [of_range(name, usual, text)]
+    if odd.all() and np.ptp(logarithm) < _NEAR:
+        text = f" on all axes, more than such sensors differ. Check {option}; the calibration includes it."
+        return [of_range(name, usual, text)]
+    another = (
+        ", a whole factor, as with another full-scale range or unit on this axis. The calibration includes it.",
+        f", more than such sensors differ. Check {option}.",
+    )
+    findings = [
+        of_range(f"{name} {axis}", size, another[0 if factor else 1])
+        for axis, size, factor, far in zip("xyz", sizes, whole, odd, strict=True)
+        if factor or far
+    ]
     if name == "gyroscope" and not findings and abs(usual - 1) > _SLOW and np.ptp(sizes) < _ALIKE:
         findings.append(
             Finding(

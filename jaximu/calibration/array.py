@@ -17,7 +17,7 @@ import scipy
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
-from jaximu.calibration.attitude import delay_of_speeds, fitted_mounting
+from jaximu.calibration.attitude import delays_of_speeds, fitted_mounting
 from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import calibrate
@@ -37,8 +37,8 @@ from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.alignment import turning_best
 from jaximu.recordings.observations import Stations
-from jaximu.recordings.recording import Reading, Recording, Signal
-from jaximu.recordings.reference import Integral
+from jaximu.recordings.recording import Reading, Recording
+from jaximu.recordings.reference import means_over
 from jaximu.recordings.segmentation import rest_statistics
 
 _WINDOWS = 128
@@ -152,7 +152,7 @@ class _Shared:
         near = _NEAR / slowest
         measured = np.searchsorted(unseen, start - near) == np.searchsorted(unseen, start + length + near)
         start = start[~still & measured]
-        speed = np.linalg.norm(_means(gyroscopes[0], np.stack([start, start + length], axis=1)), axis=1)
+        speed = np.linalg.norm(means_over(gyroscopes[0], np.stack([start, start + length], axis=1)), axis=1)
         start, speed = start[speed > _SLOW], speed[speed > _SLOW]
         if len(start) < _FEWEST or len(rests) < 3:
             raise NotPossibleError(
@@ -169,11 +169,7 @@ class _Shared:
     def means(self, recording: Recording, delay: float) -> tuple[FloatArray, FloatArray]:
         """Return a unit's mean forces at rest (P, 3) and mean rates in motion (S, 3)."""
         gyroscope = recording.signals["gyroscope"]
-        return _means(recording.accelerometer, self.rests - delay), _means(gyroscope, self.moving - delay)
-
-
-def _means(signal: Signal, span: FloatArray) -> FloatArray:
-    return Integral(signal, signal.values).over(*span.T) / np.diff(span)
+        return means_over(recording.accelerometer, self.rests - delay), means_over(gyroscope, self.moving - delay)
 
 
 def _later(recording: Recording, first: Recording) -> float:
@@ -186,7 +182,8 @@ def _coarse_delay(recording: Recording, first: Recording) -> float:
     """Return by how much (s) the first's stamps are late, to a sample."""
     gyroscope, later = first.signals["gyroscope"], _later(recording, first)
     speed = np.linalg.norm(gyroscope.values, axis=1)
-    return delay_of_speeds(recording.signals["gyroscope"], gyroscope.time + later, speed, 1 / gyroscope.rate) - later
+    delays = delays_of_speeds(recording.signals["gyroscope"], gyroscope.time + later, speed, 1 / gyroscope.rate)
+    return delays[0] - later
 
 
 # --- one unit beside the first ----------------------------------------------------------------------------------------
@@ -212,7 +209,7 @@ def _pair(
         shared_stations(recording, shared.first, span - delay, delay, noise, gravity.value, still)
         for span, still in ((shared.rests, True), (shared.moving, False))
     ]
-    measurements = [KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[None], part)) for part in stations]
+    measurements = list(map(KnownStations, stations))
     prior = _prior(start, calibration, known, back)
     fitted = fit(start, measurements, lambda name: name in prior.names, prior=prior, loss=loss)
     require_solved(fitted, recording.name)
@@ -337,7 +334,7 @@ def _averaged(shared: _Shared, corrected: Sequence[Recording], units: Sequence[A
         outputs = []
         for recording, unit in zip(corrected, units, strict=True):
             begin = start + unit.time_offset + _later(recording, shared.first)
-            values = _means(recording.signals[name], np.stack([begin, begin + _BLOCK], axis=1))
+            values = means_over(recording.signals[name], np.stack([begin, begin + _BLOCK], axis=1))
             values = Rotation.from_quat(unit.rotation, scalar_first=True).inv().apply(values)
             means = np.stack([np.bincount(rest, axis) for axis in values.T], 1) / np.bincount(rest)[:, None]
             outputs.append(values - means[rest])

@@ -21,6 +21,8 @@ from jaximu.estimation.fitting import Prior, fit
 from jaximu.estimation.problem import Loss, Name, without_equipment_or_effects
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.differences import interpolated
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.precision import require_float64
@@ -205,8 +207,7 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     what a first-order lag of that variance has.
     """
     data, imu = measurement.intervals, calibration.imu
-    assert imu.gyroscope is not None
-    matrix = np.asarray(imu.gyroscope.inverse())
+    matrix = np.asarray(imu.triads()["gyroscope"].inverse())
     rate, slope = np.asarray(data.rate) @ matrix[:, :3].T + matrix[:, 3], np.asarray(data.slope) @ matrix[:, :3].T
     spread = abs(float(Mounting.of(imu).filter_variance))
     delay = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
@@ -240,7 +241,7 @@ def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: Array) -> tuple
     return Mounting.of(imu), Mounting(*map(of, MOUNTING_EFFECTS))
 
 
-def reference_summary(calibration: Calibration) -> dict[str, Any]:
+def reference_summary(calibration: Calibration) -> Json:
     """Return what `calibration.json` says of the reference; the lever arm is from it to the unit, in its axes."""
     mounting, covariance = fitted_mounting(calibration.imu, calibration.names, calibration.covariance)
     turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation)
@@ -270,8 +271,7 @@ def reference_summary(calibration: Calibration) -> dict[str, Any]:
 
 def _coarse(recording: Recording, attitude: Attitude) -> _Start:
     """Find the reference's delay and mounting, and whether its quaternions run the other way or have w last."""
-    gyroscope = recording.gyroscope
-    assert gyroscope is not None
+    gyroscope = recording.signals["gyroscope"]
     later = attitude.start - float(recording.start)
     name = recording.name
     if abs(later) < _APART:
@@ -385,8 +385,7 @@ def _same_unit(recording: Recording, start: _Start, imu: Imu) -> list[str]:
     Compared are second differences of the mean rates over a few samples, where the unit moves least: there what both
     share is noise.
     """
-    gyroscope = recording.gyroscope
-    assert gyroscope is not None
+    gyroscope = recording.signals["gyroscope"]
     mounting = Mounting.of(imu)
     turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation).as_matrix()
     unit, reference, time = _rates(recording, start.attitude, float(mounting.delay))
@@ -415,8 +414,7 @@ def _same_unit(recording: Recording, start: _Start, imu: Imu) -> list[str]:
 
 def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the unit's and the reference's mean rates (n, 3) between the latter's stamps, and when (n,)."""
-    gyroscope = recording.gyroscope
-    assert gyroscope is not None
+    gyroscope = recording.signals["gyroscope"]
     stride = max(1, round(4 / gyroscope.rate / attitude.period))
     thin = replace(
         attitude, time=attitude.time[::stride], quaternion=attitude.quaternion[::stride], velocity=None, position=None
@@ -433,19 +431,16 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
 
 def _delays(recording: Recording, attitude: Attitude) -> list[float]:
     """Return by how much (s) the reference's stamps may be late, likeliest first, from the sizes of both rates."""
-    assert recording.gyroscope is not None
     turned = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
     good, middle = ~np.isnan(turned), (attitude.time[1:] + attitude.time[:-1]) / 2
-    return _delays_of_speeds(recording.gyroscope, middle[good], turned[good], attitude.period)
+    return delays_of_speeds(recording.signals["gyroscope"], middle[good], turned[good], attitude.period)
 
 
-def delay_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, period: float) -> float:
-    """Return by how much (s) the stamps of another's angular speed (n,), rad/s, are late against a gyroscope's."""
-    return _delays_of_speeds(gyroscope, stamps, speeds, period)[0]
+def delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, period: float) -> list[float]:
+    """Return by how much (s) the stamps of another's angular speed (n,), rad/s, are late against a gyroscope's.
 
-
-def _delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, period: float) -> list[float]:
-    """Return the delay (s) of the speeds, and others at which they are nearly as much alike."""
+    The likeliest first, then others at which both are nearly as much alike.
+    """
     rate = gyroscope.si()
     size = np.linalg.norm(rate - np.median(rate, axis=0), axis=1)
     step = max(period, 1 / gyroscope.rate, 5e-3)
@@ -501,7 +496,7 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
 
 def _forces(recording: Recording, attitude: Attitude, time: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
     """Return the accelerometer's output and upwards in the reference's body, (n, 3) each, at times (n,)."""
-    force = np.stack([np.interp(time, recording.accelerometer.time, axis) for axis in _smooth(recording).T], 1)
+    force = interpolated(recording.accelerometer.time, _smooth(recording), time)
     known = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay)
     return force, known.inv().apply([0.0, 0.0, 1.0])
 
@@ -512,8 +507,7 @@ def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Star
     The accelerometer alone says how the reference is mounted, the gyroscope alone how its rates hang together with the
     reference's.
     """
-    gyroscope = recording.gyroscope
-    assert gyroscope is not None
+    gyroscope = recording.signals["gyroscope"]
     unit, reference, time = _rates(recording, attitude, delay)
     if len(unit) < 16:
         return None

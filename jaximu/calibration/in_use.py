@@ -461,10 +461,8 @@ def follow(
 
     Raises `NotPossibleError` where the unit never rests.
     """
-    gyroscope, accelerometer = recording.signals["gyroscope"], recording.accelerometer
-    force = accelerometer.values
-    if not np.array_equal(accelerometer.time, gyroscope.time):
-        force = np.stack([np.interp(gyroscope.time, accelerometer.time, axis) for axis in force.T], 1)
+    gyroscope = recording.signals["gyroscope"]
+    force = recording.accelerometer.at(gyroscope.time)
     fields, steps, diverged = None, [], None
     if field is not None:
         outside = {"left": np.nan, "right": np.nan}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -22,16 +21,18 @@ from jaximu.estimation.fitting import Fit, Prior, fit, informed
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import UNDETERMINED, allowing_for_neighbours
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.magnetic_field import HIGHEST, LOWEST, FieldStrength
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
+from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes import Prepared, prepare, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
-from jaximu.recordings.alignment import signed_permutation
+from jaximu.recordings.alignment import ARRANGEMENTS, signed_permutation
 from jaximu.recordings.recording import Reading, Recording, Signal
 from jaximu.simulation.protocols.positions import spiral
 
@@ -124,7 +125,7 @@ class Heading:
     before: FloatArray
     scatter: float
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return root mean squares over the headings of a level unit and largest errors of any attitude, degrees."""
         return {
             "rms": float(np.sqrt(np.mean(self.sigma[0] ** 2) + self.scatter**2)),
@@ -186,8 +187,7 @@ def _chosen(effects: Sequence[str | Effect], logs: Sequence[MagneticLog]) -> lis
 def _ready(log: MagneticLog, ready: Prepared) -> MagneticLog:
     """Return a log without rows that are no measurement, of the magnetometer (`ready`) and of the other sensors."""
     other = None if log.recording is None else prepare(log.recording)
-    signal = ready.recording.magnetometer
-    assert signal is not None
+    signal = ready.signals["magnetometer"]
     notes = (*log.notes, *(() if other is None else other.notes), *ready.notes)
     return replace(log, magnetometer=signal, recording=None if other is None else other.recording, notes=notes)
 
@@ -260,7 +260,7 @@ def _calibrated(
         calibration = replace(calibration, notes=(*calibration.notes, _UPWARD))
     heading = None if dip is None else heading_errors(calibration, start, known, dip)
     measurement = _measured(windows, field)
-    magnetic: dict[str, Any] = {
+    magnetic: Json = {
         "field": {
             "strength": {"value": known, "sigma": field.sigma, "unit": "uT"},
             "dip": None if dip is None else {"value": np.degrees(dip), "sigma": np.degrees(dip_sigma), "unit": "deg"},
@@ -458,15 +458,9 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
     if windows.alone:
         return np.eye(3)
     field = windows.output - centre
-    turns = [
-        np.array(signs)[:, None] * np.eye(3)[list(order)]
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-    ]
-    turns = [turn for turn in turns if np.linalg.det(turn) > 0]  # the first turns nothing
     calm = windows.level & (windows.off < _CALM)
     costs = []
-    for turn in turns:
+    for turn in ARRANGEMENTS:
         body = field @ turn  # turnᵀ applied to every row
         length = np.linalg.norm(body, axis=1)
         cost = 0.0
@@ -476,7 +470,7 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
         if calm.any():
             cost += float(np.var(np.sum(windows.up[calm] * body[calm], axis=1) / length[calm]))
         costs.append(cost)
-    best = turns[0 if min(costs) > 0.8 * costs[0] else int(np.argmin(costs))]
+    best = ARRANGEMENTS[0 if min(costs) > 0.8 * costs[0] else int(np.argmin(costs))]
     if southern is not None and windows.level.any():
         dip = np.median(np.sum(windows.up * (field @ best), axis=1)[windows.level])
         best = -best if (dip > 0) != southern else best
@@ -722,8 +716,7 @@ def carried_headings(windows: FieldWindows, imu: Imu, rows: NDArray[np.int64]) -
         up, calm = windows.up[part], (windows.used & windows.level & (windows.off < _CALM))[part]
         if not windows.turn.any() or calm.sum() < _FEWEST_HEADINGS:
             continue
-        east = np.cross(field[part], up)
-        east /= np.linalg.norm(east, axis=1, keepdims=True)
+        east = unit_vectors(np.cross(field[part], up))
         level = np.stack([east, np.cross(up, east), up], axis=1)
         carried, yaw = level[0], []
         for frame, row in zip(level, part, strict=True):
@@ -742,8 +735,7 @@ def carried_headings(windows: FieldWindows, imu: Imu, rows: NDArray[np.int64]) -
 
 def coverage(imu: Imu, windows: FieldWindows) -> float:
     """Return the share of all directions that the field had, in the magnetometer's axes, to within 15°."""
-    field = windows.field(imu)[windows.used]
-    field /= np.linalg.norm(field, axis=1, keepdims=True)
+    field = unit_vectors(windows.field(imu)[windows.used])
     return float(np.mean((spiral(400) @ field.T).max(axis=1) > _NEAR))
 
 
@@ -807,7 +799,7 @@ def _reactions(names: Sequence[Name], field: FloatArray, gain: FloatArray) -> Fl
     return np.linalg.inv(gain) @ change
 
 
-def next_directions(calibration: Calibration, measurement: MagneticField, dip: float, count: int = 6) -> dict[str, Any]:
+def next_directions(calibration: Calibration, measurement: MagneticField, dip: float, count: int = 6) -> Json:
     """Return where the field should be seen next, in the unit's axes, and what that buys a level heading.
 
     `calibration`: fitted to `measurement`; `dip`: rad. One after another the direction whose strength, measured as well
@@ -861,13 +853,13 @@ def _longest(direction: FloatArray) -> str:
     return "xyz"[int(np.argmax(np.abs(direction)))]
 
 
-def _data(logs: Sequence[MagneticLog], windows: FieldWindows) -> dict[str, Any]:
+def _data(logs: Sequence[MagneticLog], windows: FieldWindows) -> Json:
     recordings = [log.recording for log in logs if log.recording is not None]
     source = provenance(recordings) if recordings else {"file": logs[0].name}
     return source | {"windows": int(windows.used.sum())}
 
 
-def _gyroscope_bias(calibration: Calibration) -> dict[str, Any] | None:
+def _gyroscope_bias(calibration: Calibration) -> Json | None:
     """Return the gyroscope's bias (3), output units, that the carried field tells."""
     if not any(name.owner == "gyroscope" for name in calibration.names):
         return None

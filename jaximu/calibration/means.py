@@ -19,6 +19,7 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
+from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import PoseMeans
@@ -132,7 +133,7 @@ def _with_few_poses(
         )
     scale = np.linalg.norm(nominal.accelerometer.gain, axis=1)
     sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
-    up = signal.si() / np.linalg.norm(signal.si(), axis=1, keepdims=True)
+    up = unit_vectors(signal.si())
     if np.linalg.svd(np.hstack([up**2, up]), compute_uv=False)[-1] < _SPANNED:
         lacks = [
             f"{axis} {way}"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
 
 import jax
 import numpy as np
@@ -36,6 +35,7 @@ from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, typi
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import label, pose_advice
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
@@ -123,9 +123,7 @@ def field_of(calibration: Calibration, recording: Recording) -> Signal:
         )
     if "magnetometer" not in calibration.triads():
         raise InputError("the calibration given for the magnetometer holds none: make one with `jaximu magnetometer`.")
-    field = compensate(calibration, recording).magnetometer
-    assert field is not None
-    return field
+    return compensate(calibration, recording).signals["magnetometer"]
 
 
 def require_gyroscope(recording: Recording) -> None:
@@ -260,7 +258,7 @@ def _summary(
     names: Sequence[Name],
     correlation_time: FloatArray,
     scale: Mapping[str, float],
-) -> dict[str, Any]:
+) -> Json:
     """Return the states of the filter, the scale of its noise, how large innovations were, and what it leaves open.
 
     Of effects, weak directions that are determined all the same are no open states.

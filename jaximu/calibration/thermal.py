@@ -35,7 +35,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import Document
+from jaximu.ground.document import Document, Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.page import Result
@@ -87,11 +87,11 @@ class ThermalCalibration(Result, Document, page="thermal"):
         value, sigma = change(self.calibration, triad, THERMAL, temperature, rate=rate)
         return value / scale, sigma / scale
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return everything as the JSON document of schema `jaximu.thermal/1`."""
         grid = np.linspace(*self.blocks.range, _GRID)
 
-        def triad(name: str, fit: TriadFit) -> dict[str, Any]:
+        def triad(name: str, fit: TriadFit) -> Json:
             value, sigma = self.bias(name, grid)
             return {
                 "unit": SENSOR_UNITS[name],
@@ -369,7 +369,7 @@ def _calibration(
     ), notes
 
 
-def _data(blocks: RestBlocks, base: Calibration | None) -> dict[str, Any]:
+def _data(blocks: RestBlocks, base: Calibration | None) -> Json:
     """Return where a calibration comes from, as `Calibration.data` has it."""
     signals = blocks.recordings[0].signals
     data = provenance(blocks.recordings) | {

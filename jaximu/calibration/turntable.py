@@ -25,6 +25,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import counted
+from jaximu.ground.rotation import unit_vectors
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
@@ -61,17 +62,12 @@ def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss
 
     **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`; nothing is raised.
     """
-    require_float64()
-    single = np.ndim(stations.gravity) == 0
-    lift = (lambda leaf: np.asarray(leaf)[None]) if single else np.asarray
-    start, stations = jax.tree.map(lift, (start, stations))
     on_table, force = free_on_table(start, free), bool(np.any(stations.accelerometer_used))
 
     def seen(name: Name) -> bool:
         return on_table(name) and (force or name.owner != "accelerometer" or name.effect is not None)
 
-    fitted = fit(start, KnownStations(stations), seen, loss=loss, follow=True)
-    return jax.tree.map(lambda leaf: leaf[0], fitted) if single else fitted
+    return fit(start, KnownStations(stations), seen, loss=loss, follow=True)
 
 
 def free_on_table(imu: Imu, free: Sequence[str] = ()) -> Callable[[Name], bool]:
@@ -205,7 +201,7 @@ def _turned_as_a_whole(calibration: Calibration) -> list[str]:
     notes = []
     for sensor in sorted({name.owner for name in calibration.names if name.part == "gain"} - open_gains):
         gain = np.asarray(calibration.triads()[sensor].gain)
-        rotation, _ = scipy.linalg.polar(gain / np.linalg.norm(gain, axis=1, keepdims=True))
+        rotation, _ = scipy.linalg.polar(unit_vectors(gain))
         vector = scipy.spatial.transform.Rotation.from_matrix(rotation).as_rotvec(degrees=True)
         if _TURNED < np.linalg.norm(vector) < _ARRANGED:
             about = ", ".join(f"{axis} {angle:+.2g}°" for axis, angle in zip("xyz", vector, strict=True))

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration, provenance
@@ -24,8 +25,10 @@ from jaximu.estimation.information_filter import Knowledge, WhiteRows, advance, 
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import student_isf
+from jaximu.ground.document import Json
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.quantities import Z95
+from jaximu.ground.rotation import unit_vectors
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.recordings.recording import Signal
@@ -44,6 +47,8 @@ _MOST = 200
 """Stops, the longest, of which the bias is estimated: more take minutes and show little more."""
 _SHORTEST = 1e-9
 """Share of a drift's size that a step drives it by at the least."""
+_STEP = 1e-5
+"""rad by which axes are turned to see how their angles follow."""
 _OPEN = (
     "Gyroscope scale and misalignment: a vehicle turns about the vertical, and nothing here measures how far.",
     "Accelerometer scale, misalignment and bias: all stops have one orientation. A bias tilts the mounting, by 0.6° "
@@ -93,8 +98,7 @@ def calibrate_at_stops(
     scale = gyroscope.nominal_scale
     covariance = rate.covariance + scale[:, None] * spread * scale
     nominal = as_stated(recording)
-    assert nominal.gyroscope is not None
-    unit = replace(nominal, gyroscope=replace(nominal.gyroscope, bias=rate.bias))
+    unit = replace(nominal, gyroscope=replace(nominal.triads()["gyroscope"], bias=rate.bias))
     still = np.sqrt(np.mean(np.square(rate.left + (rate.bias - gyroscope.nominal_offset) / scale)))
     steady = np.diag(scale[:, None] * spread * scale)
     calibration = Calibration(
@@ -129,7 +133,7 @@ def calibrate_at_stops(
     return replace(calibration, filter=summary), history
 
 
-def _undetermined(vehicle: dict[str, Any]) -> list[str]:
+def _undetermined(vehicle: Json) -> list[str]:
     texts = []
     if vehicle["roll"]["sigma"] is None:
         texts.append(
@@ -262,8 +266,8 @@ def _by_site(values: FloatArray, sites: NDArray[np.int64]) -> FloatArray:
 
 def _mean_direction(force: FloatArray) -> FloatArray:
     """Return the direction (3,) in which forces (P, 3) point on average."""
-    mean = np.mean(force / np.linalg.norm(force, axis=1, keepdims=True), axis=0)
-    return mean / np.linalg.norm(mean)
+    mean = np.mean(unit_vectors(force), axis=0)
+    return unit_vectors(mean)
 
 
 def _mounted(
@@ -273,26 +277,25 @@ def _mounted(
     up: FloatArray,
     bias: FloatArray,
     gravity: LocalGravity,
-) -> dict[str, Any]:
+) -> Json:
     """Return how a unit is mounted in the vehicle, by the force (P, 3) at its stops and the speeds beside these.
 
     **Arguments:** `sites` (P,): of the stops; `bias` (3,): of the gyroscope, rad/s.
     """
     across = np.linalg.svd(up[None])[2][1:]
     across[1] = np.cross(up, across[0])
-    tilts = force / np.linalg.norm(force, axis=1, keepdims=True) @ across.T
+    tilts = unit_vectors(force) @ across.T
     different = _by_site(tilts, sites)
     covariance = _of_mean(different)
     sides, speeds = _speeds(stops, force, across, up, bias)
     forward, sigma, alike = _forward(sides, speeds)
     determined = sigma is not None and Z95 * sigma < _WIDEST and alike > _ONE_WAY
     ahead = forward @ across
-    axes = np.stack([ahead, np.cross(up, ahead), up])
-    angles = _angles(axes)
-    turns = np.vstack([across, up])
-    slopes = np.stack([_angles(axes @ _turned(turn)) - _angles(axes @ _turned(-turn)) for turn in turns], 1) / (
-        2 * _STEP
-    )
+    axes = np.stack([ahead, np.cross(up, ahead), up])  # the vehicle's, in the unit: Rz(yaw) Ry(pitch) Rx(roll)
+    rotation = scipy.spatial.transform.Rotation
+    turns = rotation.from_rotvec(_STEP * np.vstack([np.zeros(3), across, up, -across, -up]))
+    angles, *moved = (rotation.from_matrix(axes) * turns).as_euler("ZYX")[:, ::-1]
+    slopes = (np.array(moved[:3]) - moved[3:]).T / (2 * _STEP)
     whole = np.zeros((3, 3))
     if covariance is not None:
         quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a turn about one direction moves up along the other
@@ -325,20 +328,6 @@ def _mounted(
             "m/s^2",
         ),
     }
-
-
-_STEP = 1e-5
-
-
-def _turned(turn: FloatArray) -> FloatArray:
-    """Return the matrix that turns by a small step about a direction."""
-    return np.eye(3) + _STEP * np.cross(np.eye(3), -turn)
-
-
-def _angles(axes: FloatArray) -> FloatArray:
-    """Return roll, pitch and yaw (rad) of a unit from the vehicle's axes in it, as rows: Rz(yaw) Ry(pitch) Rx(roll)."""
-    (x, y, z) = axes
-    return np.array([np.arctan2(z[1], z[2]), -np.arcsin(np.clip(z[0], -1, 1)), np.arctan2(y[0], x[0])])
 
 
 def _of_mean(values: FloatArray) -> FloatArray | None:
@@ -401,7 +390,7 @@ def _forward(sides: NDArray[np.int64], speeds: FloatArray) -> tuple[FloatArray, 
     return direction, float(scatter * student_isf(0.025, count - 1) / Z95), alike
 
 
-def _entry(value: Any, sigma: Any, unit: str) -> dict[str, Any]:
+def _entry(value: Any, sigma: Any, unit: str) -> Json:
     """Return a number, or several, with what it is known to, as the JSON document has it; not finite ones are null."""
 
     def plain(number: Any) -> Any:

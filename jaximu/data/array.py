@@ -15,15 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu.data.gravity_direction import across, unit_vectors
+from jaximu.data.gravity_direction import across
 from jaximu.data.poses import EXCESS_NAMES, HandHeldConditions, condense
 from jaximu.data.poses_covariance import turn_noise
 from jaximu.estimation.covariance import Covariance, mean_root
 from jaximu.estimation.data import About, Conditions, OfOneUnit
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix
-from jaximu.ground.tracing import first
+from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix, unit_vectors
+from jaximu.ground.tracing import first, stacked
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
@@ -66,7 +66,7 @@ class SharedConditions(Conditions):
 
 def _stacked(board: Board) -> Imu:
     """Return the units of a board along a leading axis, without effects."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(unit.with_effects() for unit in board.units()))
+    return stacked([unit.with_effects() for unit in board.units()])
 
 
 def _mountings(board: Board) -> Float[Array, "U-1 3"]:

@@ -39,6 +39,7 @@ from jaximu.ground.rotation import (
     rotate,
     rotation_matrix,
     rotation_matrix_on_host,
+    unit_vectors,
 )
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_filter import behind
@@ -48,7 +49,6 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, smoothed_slope
-from jaximu.recordings.reference import Integral
 
 EXCESS_NAMES = ("gyroscope", "reference attitude", "gyroscope bias walk", "accelerometer", "reference velocity")
 _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
@@ -299,7 +299,7 @@ class AgainstAttitude(OfOneUnit):
     def intervals(self) -> Intervals:
         """What was recorded, the reference thinned to some two hundred intervals."""
         attitude, (accelerometer, gyroscope) = self.attitude, map(self.recording.signals.__getitem__, TRIADS)
-        time, edges = gyroscope.time, Integral(gyroscope, gyroscope.values).edges
+        time, edges = gyroscope.time, gyroscope.edges
         stamps = attitude.time + self.offset
         knots, group = self._knots
         count = len(knots) - 1
@@ -319,7 +319,7 @@ class AgainstAttitude(OfOneUnit):
             gyroscope.values,
             slope,
             curve,
-            interpolated(accelerometer.time, accelerometer.values, time),
+            accelerometer.at(time),
             edges[:-1],
             edges[1:],
             stamps[knots],
@@ -401,7 +401,7 @@ class AgainstAttitude(OfOneUnit):
         covariates = {TIME: middle} | by_axis("rate", "°/s", np.where(rotations, np.degrees(rate), np.nan))
         covariates |= by_axis("specific force", "m/s²", np.where(rotations, np.nan, force))
         if warmth := signals.get("temperature"):
-            covariates[TEMPERATURE] = np.interp(middle, warmth.time, warmth.values[:, 0])
+            covariates[TEMPERATURE] = warmth.at(middle)[:, 0]
         length = np.concatenate([np.where(used, np.diff(stamps), 1.0), np.ones(len(window))])
         return Rows(
             kinds=RESIDUALS,
@@ -482,7 +482,7 @@ class AgainstAttitude(OfOneUnit):
             return np.asarray(details.reactions.react(*both, windows))
 
         share = (np.asarray(stimulus.time) - stamps[0]) / np.ptp(stamps)
-        return Observed(react, share, up=force / np.linalg.norm(force, axis=1, keepdims=True))
+        return Observed(react, share, up=unit_vectors(force))
 
     def without(self, observation: int) -> AgainstAttitude:
         """Return the recording with a window of the force left out, and the rotations in it."""

@@ -29,7 +29,7 @@ from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.rotation import rotation_matrix_on_host
+from jaximu.ground.rotation import rotation_matrix_on_host, unit_vectors
 from jaximu.ground.tracing import first
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -158,7 +158,7 @@ class RecordedByHand(OfOneUnit):
         return Observed(
             react,
             (time - time.min()) / max(np.ptp(time), 1e-9),
-            up=(force / np.linalg.norm(force, axis=1, keepdims=True))[real],
+            up=unit_vectors(force[real]),
             still=np.ones(len(real), bool),
             number=real,
             alone=real,

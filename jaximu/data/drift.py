@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.data.poses_covariance import Sensitivities
-from jaximu.data.rest_blocks import RATIO, correlation_times
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import OutputMeans
 from jaximu.estimation.fitting import Fit, unwhitened
@@ -24,6 +23,7 @@ from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import size
 from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.processes import RATIO, correlation_times
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.segmentation import Segmentation
 

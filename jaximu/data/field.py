@@ -28,13 +28,11 @@ from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.estimation.track import Track, added
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.differences import interpolated
-from jaximu.ground.rotation import exponential, inverse_matrix, rotate
+from jaximu.ground.rotation import exponential, inverse_matrix, rotate, unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.reference import Integral
 
 EXCESS_NAMES = ("magnetometer", "carried field", "angle to gravity")
 RESIDUALS = (
@@ -208,7 +206,7 @@ class FieldWindows:
 
     def bent(self, field: FloatArray) -> FloatArray:
         """Return how the sine (n,) of the angle from up to a field (n, 3) reacts to what `vertical` is of, (n, 12)."""
-        along = field / np.linalg.norm(field, axis=1, keepdims=True)
+        along = unit_vectors(field)
         across = along - np.sum(along * self.up, axis=1, keepdims=True) * self.up
         by_gain = np.einsum("ni,nj->nij", across, self.up).reshape(len(self), 9)
         return np.concatenate([by_gain, across], axis=1)
@@ -267,11 +265,11 @@ def windows_of(
     up, off = np.zeros((len(centre), 3)), np.ones(len(centre))
     if motion is not None:
         force = motion.accelerometer
-        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, interpolated(force.time, force.values, time[index]))
+        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, force.at(time[index]))
         length = np.linalg.norm(mean, axis=1)
         up, off = mean / length[:, None], np.abs(length / STANDARD_GRAVITY - 1)
     known = {} if motion is None else motion.signals
-    known = {name: interpolated(part.time, part.values, time[index]) for name, part in known.items()}
+    known = {name: part.at(time[index]) for name, part in known.items()}
     warm, flow = (known[name][..., 0] if name in known else None for name in ("temperature", "current"))
     stimulus = Stimulus(time=time[index], temperature=warm, current=flow, angular_rate=known.get("gyroscope"))  # pyright: ignore
     window = np.where(weight > 0, np.arange(len(count))[:, None], len(count))
@@ -338,7 +336,7 @@ def _carried(gyroscope: Signal):
 
     Both against the frame in which the recording began.
     """
-    edges, count = Integral(gyroscope, gyroscope.values).edges, len(gyroscope)
+    edges, count = gyroscope.edges, len(gyroscope)
     padding = (0, (1 << count.bit_length()) - count)  # few shapes are compiled
     rates, held = np.pad(gyroscope.values, (padding, (0, 0))), np.pad(np.diff(edges), padding)
     running, sweep = (leaf[:count] for leaf in stored.call(turned_by_rates, "carried attitude", rates, held))
@@ -468,8 +466,7 @@ class MagneticField(OfOneUnit):
 
 def _across(field: FloatArray) -> FloatArray:
     """Two unit vectors (n, 2, 3) across each vector and each other."""
-    along = field / np.linalg.norm(field, axis=1, keepdims=True)
+    along = unit_vectors(field)
     other = np.eye(3)[np.argmin(np.abs(along), axis=1)]
-    first = np.cross(along, other)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    first = unit_vectors(np.cross(along, other))
     return np.stack([first, np.cross(along, first)], axis=1)

@@ -9,23 +9,18 @@ from jaxtyping import Float
 
 from jaximu.data.gravity_norm import recover_specific_force
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import conjugate, integrate_rates, multiply, rotate
+from jaximu.ground.rotation import conjugate, integrate_rates, multiply, rotate, unit_vectors
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Turns
 
 
-def unit_vectors(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """Return vectors scaled to length one."""
-    return vectors / jnp.sqrt(jnp.sum(vectors**2, axis=-1, keepdims=True))
-
-
 def level(attitude: Float[Array, "4"], force: Float[Array, "3"]) -> Float[Array, "4"]:
     """Return the attitude turned the shortest way so that a specific force measured at rest points up."""
-    x, y, z = rotate(attitude, force / jnp.linalg.norm(force))
+    x, y, z = rotate(attitude, unit_vectors(force))
     half_turn = jnp.array([0.0, 1.0, 0.0, 0.0])  # where it points straight down
     turned = jnp.where(1 + z > 1e-9, jnp.stack([1 + z, y, -x, 0 * z]), half_turn)
-    return multiply(turned / jnp.linalg.norm(turned), attitude)
+    return multiply(unit_vectors(turned), attitude)
 
 
 def turn_rotations(

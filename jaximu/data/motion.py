@@ -46,9 +46,9 @@ from jaximu.estimation.information_filter import Knowledge, WhiteRows, estimate,
 from jaximu.estimation.problem import flatten
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.differences import interpolated, value_and_jacobian
+from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import NotPossibleError
-from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
+from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, unit_vectors
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import NoiseModel
@@ -56,7 +56,6 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.reference import Integral
 
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
@@ -615,8 +614,7 @@ def cut(
     """
     gyroscope, accelerometer = recording.signals["gyroscope"], recording.accelerometer
     time, period = gyroscope.time, 1 / gyroscope.rate
-    force = interpolated(accelerometer.time, accelerometer.values, time)
-    edges = Integral(gyroscope, gyroscope.values).edges
+    force, edges = accelerometer.at(time), gyroscope.edges
     step = np.diff(time, prepend=time[0] - period, append=time[-1] + period)
     missing = np.where(step > 2.5 * period, step - period, 0.0)
     lost = (missing[1:] + missing[:-1]) / 2
@@ -909,7 +907,7 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
         now = reckoned(start, False)[k]
         placed = sighting.placed(now, Mounting.from_numbers(numbers))
         heading = multiply(placed, conjugate(now)) * jnp.array([1.0, 0.0, 0.0, 1.0])
-        start = multiply(heading / jnp.linalg.norm(heading), start)
+        start = multiply(unit_vectors(heading), start)
     attitudes = jnp.concatenate([start[None], reckoned(start, True)])
     return MotionPath(attitudes, jnp.zeros((len(attitudes), 3)))
 
@@ -940,5 +938,4 @@ def _moved(path: MotionPath, moved: Array) -> MotionPath:
 
 def turned(attitude: Float[Array, "... 4"], vector: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
     """Return an attitude turned in the body frame by a rotation vector, of length one."""
-    attitude = multiply(attitude, exponential(vector))
-    return attitude / jnp.linalg.norm(attitude, axis=-1, keepdims=True)
+    return unit_vectors(multiply(attitude, exponential(vector)))

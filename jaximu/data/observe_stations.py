@@ -24,12 +24,13 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import unit_vectors
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.recordings.observations import POWER_ON, Stations
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.reference import Entry, Integral, match_reference, rest_rate
+from jaximu.recordings.reference import Entry, Integral, match_reference, means_over, rest_rate
 from jaximu.recordings.segmentation import noise_by_model, require_model, rest_statistics
 from jaximu.simulation.protocols import Environment, Protocol, attitude_of
 from jaximu.simulation.protocols.motion import smooth_course
@@ -140,7 +141,7 @@ def _means(signal: Signal, span: FloatArray) -> FloatArray:
     """Return the means (n, 3) of a signal over spans; zero where it has no samples."""
     if not len(signal):
         return np.zeros((len(span), 3))
-    return Integral(signal, signal.values).over(*span.T) / np.diff(span)
+    return means_over(signal, span)
 
 
 def _mean_covariance(signal: Signal, span: FloatArray, turn: NDArray[np.bool_], name: str) -> FloatArray:
@@ -187,13 +188,13 @@ def _recorded_stimulus(
         stimulus = _stimulus(entries, attitudes(entries), course, gravity)
     temperature = np.full(time.shape, temperature_reference)
     if recording.temperature is not None:
-        temperature = np.interp(time, recording.temperature.time, recording.temperature.values[:, 0])
+        temperature = recording.temperature.at(time)[..., 0]
     return replace(stimulus, time=time, temperature=temperature)
 
 
 def _along(attitude: Signal, nodes: FloatArray, gravity: float) -> Stimulus:
     """Force, rate and attitude (S, Q) where the reference tells the attitude at all times."""
-    quaternion = attitude.values / np.linalg.norm(attitude.values, axis=1, keepdims=True)
+    quaternion = unit_vectors(attitude.values)
     clipped = np.clip(nodes, attitude.time[0], attitude.time[-1])
 
     def rotation(array):

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from jaximu.data.gravity_direction import gravity_direction_error, unit_vectors
+from jaximu.data.gravity_direction import gravity_direction_error
 from jaximu.data.gravity_norm import gravity_norm_error
 from jaximu.data.poses_covariance import Sensitivities, condition_covariance, sensitivities, turned_by
 from jaximu.data.preintegration import Turned, linear_slope
@@ -51,8 +51,9 @@ from jaximu.ground.rotation import (
     inverse_matrix,
     multiply,
     rotate,
+    unit_vectors,
 )
-from jaximu.ground.tracing import array_module, first, lifted, one_by_one, repeated
+from jaximu.ground.tracing import array_module, first, lifted, one_by_one, repeated, stacked
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import NoiseModel
@@ -396,7 +397,7 @@ def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
             "these units' data differ in kind (gyroscope, thermometer, slow noise, its intervals, samples, number of "
             "recordings): stack those alike."
         )
-    return jax.tree.map(lambda *leaves: array_module(leaves).stack(leaves), *wide)
+    return stacked(wide)
 
 
 def resized(leaf: Array, *lengths: int, numerics: Any = np) -> Array:

@@ -15,12 +15,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu.data.gravity_direction import unit_vectors
 from jaximu.data.gravity_norm import recover_specific_force, recovery_jacobian
 from jaximu.data.preintegration import Turned, turned_by_rates, white_covariance
 from jaximu.estimation.covariance import Chain, Covariance, following, in_order, mean_root
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import conjugate, inverse_matrix, rotate, rotation_matrix
+from jaximu.ground.rotation import conjugate, inverse_matrix, rotate, rotation_matrix, unit_vectors
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.observations import Observations, Turns
 

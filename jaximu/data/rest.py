@@ -40,8 +40,7 @@ class _WhiteOutputs(Conditions):
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the combinations, axis after axis."""
-        assert imu.gyroscope is not None
-        bias = jnp.where(self.gyroscope == 1, imu.gyroscope.bias, imu.accelerometer.bias)
+        bias = jnp.where(self.gyroscope == 1, imu.triads()["gyroscope"].bias, imu.accelerometer.bias)
         return self.output - self.bias @ bias
 
 

@@ -17,6 +17,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
 from jaximu.mistakes import prepared
 from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.processes import RATIO, correlation_times
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.columns.names import COUNTS_ADVICE
 from jaximu.recordings.recording import Recording, Signal, recordings_of, same_outputs, smoothed_slope
@@ -28,8 +29,6 @@ RATE_BANDWIDTH = 0.578 / TEMPERATURE_WINDOW
 3 (sin x − x cos x) / x³ with x = π f window."""
 WAYS = 4
 """Ways of the temperature from which on they are left out whole."""
-RATIO = 4.0
-"""Of neighbouring correlation times of the processes that make flicker noise."""
 _FOLDS = 8  # parts that are left out in turn, at most
 _MOST_BLOCKS = 600
 _FEWEST_BLOCKS = 30
@@ -363,8 +362,7 @@ def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
 
 def _cut(recording: Recording, block: float) -> RestBlocks:
     """Return block means of one recording, and its temperature's path."""
-    accelerometer, temperature = recording.accelerometer, recording.temperature
-    assert temperature is not None
+    accelerometer, temperature = recording.accelerometer, recording.signals["temperature"]
     half = 0.5 / accelerometer.rate  # a sample stands for the time about its stamp
     begin, end = float(accelerometer.time[0]) - half, float(accelerometer.time[-1]) + half
     nodes = max(int(np.ceil((end - begin) / block * _NODES)), 2)
@@ -504,12 +502,6 @@ def _startup(signal: Signal) -> int:
             break
         end = int(row) + 1
     return end
-
-
-def correlation_times(shortest: float, longest: float) -> FloatArray:
-    """Return the correlation times (s) of Gauss–Markov processes that together are flicker noise, `RATIO` apart."""
-    count = 1 + int(np.ceil(np.log(longest / shortest) / np.log(RATIO)))
-    return np.asarray(shortest * RATIO ** np.arange(count), np.float64)
 
 
 def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.differences import interpolated
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.reference import Integral
+from jaximu.recordings.reference import means_over
 
 _MARGIN = 4
 """Samples of the first unit on either side of an interval, for the other's clock to move in."""
@@ -42,14 +41,14 @@ def shared_stations(
     """
     accelerometer, gyroscope = (first.signals[name] for name in TRIADS)
     time, rate = gyroscope.time - delay, gyroscope.values
-    force = interpolated(accelerometer.time, accelerometer.values, gyroscope.time)
+    force = accelerometer.at(gyroscope.time)
     count, size = len(span), -(-len(span) // _BUCKET) * _BUCKET
     used = np.arange(size) < count
     span = np.concatenate([span, np.repeat(span[:1], size - count, axis=0)])
     start, stop = span.T
     length = np.diff(span)
     if still:
-        means = (Integral(Signal(time, values, "1"), values).over(start, stop) / length for values in (force, rate))
+        means = (means_over(Signal(time, values, "1"), span) for values in (force, rate))
         force, rate = (np.repeat(mean[:, None], 2, axis=1) for mean in means)
         stimulus = Stimulus(force, rate, angular_acceleration=0 * rate, time=span)
         weight = np.full(span.shape, 0.5)
@@ -58,10 +57,7 @@ def shared_stations(
         weight = held / held.sum(axis=1, keepdims=True)
         turning = np.gradient(rate, time, axis=0)
         stimulus = Stimulus(force[index], rate[index], angular_acceleration=turning[index], time=time[index])
-    force_mean, rate_mean = (
-        Integral(signal, signal.values).over(start, stop) / length
-        for signal in (recording.signals[name] for name in TRIADS)
-    )
+    force_mean, rate_mean = (means_over(recording.signals[name], span) for name in TRIADS)
     variances = (np.where(used, np.diagonal(axes)[:, None] / length[:, 0], 1.0) for axes in density)
     force_covariance, rate_covariance = (variance[:, :, None] * np.eye(size) for variance in variances)
     return Stations(

@@ -18,6 +18,7 @@ from jaximu.estimation.problem import axis_scales
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
+from jaximu.ground.tracing import lifted
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 
@@ -124,13 +125,13 @@ def station_covariance(stations: Stations) -> Covariance:
 
 
 class KnownStations(Data):
-    """Stations of units, one leading axis on every array."""
+    """Stations of a unit, or of units with a leading axis on every array."""
 
     effects_inside = True
     coarse = (0.0, 0.0, 0.0)
 
     def __init__(self, stations: Stations):
-        self.stations = stations
+        self.stations = lifted(stations) if np.ndim(stations.gravity) == 0 else stations
 
     def take(self, lanes: NDArray[np.int64]) -> KnownStations:
         """Return the measurement of some of the units."""

@@ -11,7 +11,7 @@ from jaximu.data.poses import PosesAndTurns
 from jaximu.data.twin_signal import twin_signal
 from jaximu.estimation.track import Track
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.rotation import rotation_matrix_on_host
+from jaximu.ground.rotation import rotation_matrix_on_host, unit_vectors
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
@@ -47,7 +47,7 @@ def twin_recordings(
             for values in (track["accelerometer"].stimulus.specific_force, track["accelerometer"].observation)
         )
         at_rest = pose < count
-        force[at_rest] *= gravity / np.linalg.norm(force[at_rest], axis=1, keepdims=True)
+        force[at_rest] = gravity * unit_vectors(force[at_rest])
         rate, attitude = (
             np.array(getattr(track["gyroscope"].stimulus, name))[: len(signals["gyroscope"])]
             for name in ("angular_rate", "attitude")

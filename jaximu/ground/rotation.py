@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.prefixes import running
+from jaximu.ground.tracing import array_module
 
 Vector = Float[Array, "... 3"]
 Vectors = Float[Array, "... S 3"]
@@ -41,6 +42,11 @@ def inverse_matrix(matrix: Matrix) -> Matrix:
     columns = [jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)]
     determinant = jnp.sum(a * columns[0], axis=-1)
     return jnp.stack(columns, axis=-1) / determinant[..., None, None]
+
+
+def unit_vectors(vectors: Float[Array, "... m"]) -> Float[Array, "... m"]:
+    """Return vectors scaled to length one, with NumPy or under a trace with JAX."""
+    return vectors / array_module(vectors).sqrt((vectors**2).sum(axis=-1, keepdims=True))
 
 
 def product(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:

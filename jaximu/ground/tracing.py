@@ -1,7 +1,7 @@
 """One text for arrays on the host and for arrays that are being traced."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 Result = TypeVar("Result")
@@ -41,6 +41,13 @@ def lifted(tree: Tree) -> Tree:
     return jax.tree.map(lambda leaf: array_module(leaf).asarray(leaf)[None], tree)
 
 
+def stacked(trees: Sequence[Tree]) -> Tree:
+    """Return trees alike as one, every array with a leading axis."""
+    import jax
+
+    return jax.tree.map(lambda *leaves: array_module(leaves).stack(leaves), *trees)
+
+
 def repeated(step: Callable[[State], State], state: State, times: int, *others: Any) -> State:
     """Return a state after so many steps: one after the other, or where JAX traces it or `others`, in a loop of JAX.
 
@@ -64,4 +71,4 @@ def one_by_one(function: Callable[..., Result], *trees: Any) -> Result:
         return jax.lax.map(lambda entry: function(*entry), trees)
     count = len(jax.tree.leaves(trees)[0])
     results = [function(*jax.tree.map(lambda leaf, k=k: leaf[k], trees)) for k in range(count)]
-    return jax.tree.map(lambda *leaves: array_module().stack(leaves), *results)
+    return stacked(results)

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import Vector
 from jaximu.ground.units import SENSORS
@@ -173,7 +174,7 @@ class Effect(eqx.Module):
         plain = output_unit if cls.unit == "output" or "/" not in output_unit else f"({output_unit})"
         return cls.unit.replace("output", plain)
 
-    def document(self, output_unit: str) -> dict[str, Any]:
+    def document(self, output_unit: str) -> Json:
         """Return the effect of a triad with this output unit as JSON documents have it."""
         return {
             "coefficients": np.asarray(self.coefficients).tolist(),
