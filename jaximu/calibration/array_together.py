@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.array_units import Array
@@ -22,7 +21,7 @@ from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.poses import EXCESS_NAMES, condensed
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import Name, without_equipment
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.tracing import stacked
@@ -139,7 +138,7 @@ def _observed(array: Array) -> Observations:
     return stacked(observed)
 
 
-def _fitted(array: Array, observations: Observations, left_out: Sequence[int] | NDArray[np.int64]) -> Together:
+def _fitted(array: Array, observations: Observations, left_out: Sequence[int] | IntArray) -> Together:
     mask = np.array(observations.turns.mask)
     mask[:, list(left_out)] = False
     observations = eqx.tree_at(lambda tree: tree.turns.mask, observations, mask)

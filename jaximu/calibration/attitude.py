@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from jaximu.calibration.arrangement import arrangement
-from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, notes_of, provenance
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import errors_of
 from jaximu.calibration.refusals import require_determined
@@ -140,13 +140,7 @@ def calibrate_against_attitude(
         rms=[errors_of([measurement], unit) for unit in (imu, fitted.imu)],
         known=list(filter(of_setup, fitted.names)),
         data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
-        notes=[
-            *likeness,
-            *ready.notes,
-            *recording.notes,
-            *start.attitude.notes,
-            *(() if noise is None else noise.notes),
-        ],
+        notes=[*likeness, *notes_of(ready, recording, start.attitude, noise)],
         nominal=imu.with_effects(),
         reading=recording.reading,
     )

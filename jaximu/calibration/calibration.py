@@ -356,6 +356,11 @@ def _checked(stimulus: Stimulus, quantities: Sequence[str]) -> Stimulus:
     return replace(stimulus, **arrays)
 
 
+def notes_of(*sources: Any) -> list[str]:
+    """Return the notes of recordings, of what was found in them, of a noise model; None has none."""
+    return [note for source in sources if source is not None for note in source.notes]
+
+
 def clock_sigma(segmentations: Sequence[Segmentation]) -> float:
     """Return one sigma of the share by which the gyroscope's clock runs fast, the largest of all recordings."""
     gyroscopes = [part.recording.gyroscope for part in segmentations]
@@ -510,11 +515,7 @@ def _from_document(document: Json) -> Calibration:
         data=document["data"],
         notes=tuple(fit["notes"]),
         software=document["software"],
-        diagnosis=document.get("diagnosis"),
-        reference=document.get("reference"),
-        trace=document.get("trace"),
-        digest=document.get("digest"),
-        filter=document.get("filter"),
+        **{name: document.get(name) for name in ("diagnosis", "reference", "trace", "digest", "filter")},
         absent=("accelerometer",) if accelerometer is None else (),
         reading=None if document.get("reading") is None else Reading.from_document(document["reading"]),
         bias_sigma_recording={

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.data.by_hand import RecordedByHand
@@ -22,7 +21,7 @@ from jaximu.data.handling import missed_by_sampling
 from jaximu.data.poses import condensed
 from jaximu.estimation.fitting import effect_numbers, linearise, unwhitened
 from jaximu.estimation.problem import without_equipment
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import conjugate, multiply, rotate, unit_vectors
 from jaximu.ground.tracing import first, lifted
@@ -81,13 +80,13 @@ class _Turned:
 
     gram: FloatArray
     pull: FloatArray
-    real: NDArray[np.int64]
+    real: IntArray
     scatter: FloatArray
     sampling: FloatArray
     lost: FloatArray
     constant: float = 0.0
 
-    def at(self, covariance: FloatArray) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    def at(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return NᵀPN and NᵀPr where the turns scatter by `covariance` (T, 2, 2), by Woodbury's identity."""
         inner = np.eye(len(self.pull)) + self.gram @ _diagonal(covariance)
         return np.linalg.solve(inner, self.gram), np.linalg.solve(inner, self.pull)
@@ -143,7 +142,7 @@ class _Turned:
             constant=self.constant + gained,
         )
 
-    def without(self, turns: NDArray[np.int64]) -> _Turned:
+    def without(self, turns: IntArray) -> _Turned:
         """Return the same with some turns, by place, free."""
         free = np.ravel(2 * turns[:, None] + np.arange(2))
         size = np.sqrt(_FREE)

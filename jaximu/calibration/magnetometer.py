@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, notes_of, provenance
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import Choices, calibrate_ready
@@ -20,7 +19,7 @@ from jaximu.data.field import EXCESS_NAMES, FieldWindows, MagneticField, windows
 from jaximu.estimation.fitting import Fit, Prior, fit, informed
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import UNDETERMINED, allowing_for_neighbours
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -188,7 +187,7 @@ def _ready(log: MagneticLog, ready: Prepared) -> MagneticLog:
     """Return a log without rows that are no measurement, of the magnetometer (`ready`) and of the other sensors."""
     other = None if log.recording is None else prepare(log.recording)
     signal = ready.signals["magnetometer"]
-    notes = (*log.notes, *(() if other is None else other.notes), *ready.notes)
+    notes = tuple(notes_of(log, other, ready))
     return replace(log, magnetometer=signal, recording=None if other is None else other.recording, notes=notes)
 
 
@@ -250,7 +249,7 @@ def _calibrated(
         data=_data(logs, windows),
         nominal=start,
         advice=field_advice,
-        notes=[*(note for log in logs for note in log.notes), *notes, *stretches],
+        notes=[*notes_of(*logs), *notes, *stretches],
         reading=next(filter(None, readings), None if base is None else base.reading),
     )
     dip, dip_sigma = _dip(windows, fit)
@@ -571,7 +570,7 @@ def _undisturbed(
     return fit, windows, [note] if left.any() else []
 
 
-def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> NDArray[np.bool_]:
+def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> BoolArray:
     """Return in which of `whole` (n,) the field is another than in `windows`, by its strength or its angle to gravity.
 
     What is next to such a window is asked at a lower level, and what lies between two is one, too: a disturbance that
@@ -649,7 +648,7 @@ def _require_covered(fit: Fit, windows: FieldWindows, where: str) -> None:
         )
 
 
-def _open_words(names: Sequence[Name], wide: NDArray[np.bool_]) -> str:
+def _open_words(names: Sequence[Name], wide: BoolArray) -> str:
     """Name what is known no better than from the data sheet; where no number is by itself, their combinations."""
     axes: dict[str, list[str]] = {}
     for name, open_ in zip(names, wide, strict=True):
@@ -705,7 +704,7 @@ def _left_out(
     return spreads, turned or None
 
 
-def carried_headings(windows: FieldWindows, imu: Imu, rows: NDArray[np.int64]) -> FloatArray:
+def carried_headings(windows: FieldWindows, imu: Imu, rows: IntArray) -> FloatArray:
     """Return by how much (rad) the heading of each calm window leaves the one that the gyroscope carries.
 
     rows: windows in order. Less a straight line, for the gyroscope's bias, over each recording.

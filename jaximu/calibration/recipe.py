@@ -10,7 +10,7 @@ import numpy as np
 
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.bias_drift import knowing_drift
-from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, effect_named, provenance
+from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, effect_named, notes_of, provenance
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
 from jaximu.calibration.nominal import nominal_imu
@@ -111,7 +111,7 @@ def calibrate(
         raise InputError("a start is for data of several kinds: recordings by hand begin at the data sheet's values.")
     with prepared(by_hand, repair, gyroscope=method != "accelerometer") as ready:
         calibration, unusual = calibrate_ready([one.recording for one in ready], choices, repair)
-    notes = [*(note for item in ready for note in item.notes), *(item.text for item in unusual)]
+    notes = [*notes_of(*ready), *(item.text for item in unusual)]
     calibration = replace(calibration, notes=tuple(dict.fromkeys((*notes, *calibration.notes))))
     return _with_drift(calibration, noise_of(static))
 
@@ -137,8 +137,8 @@ def _calibrated_jointly(
             parts = tuple(segment(one.recording, choices.segmentation) for one in ready)
             kinds = [RecordedByHand(parts, observed_poses(parts, choices.gravity.value, noise=noise)), *kinds]
     recorded = [recording for kind in kinds for recording in kind.recordings]
-    notes = [*(note for one in ready for note in one.notes), *(same_outputs(recorded) if recorded else ())]
-    notes += [note for part in (*recorded, *parts, *([] if noise is None else [noise])) for note in part.notes]
+    mixed = same_outputs(recorded) if recorded else ()
+    notes = [*notes_of(*ready), *mixed, *notes_of(*recorded, *parts, noise)]
     if noise is None and recorded:
         notes.append(f"{_NO_DRIFT}, unless data were observed with a noise model.")
     remarks: tuple[str, ...] = ()
@@ -310,11 +310,10 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         require_determined(fitted, where, prior=prior)
         observations = measurement.along(fitted.imu, tuple(fitted.imu.all_effects().values())).observations
     notes = (
-        *(note for recording in recordings for note in recording.notes),
+        *notes_of(*recordings),
         *notes,
         *mixed,
-        *(() if noise is None else noise.notes),
-        *(note for part in segmentations for note in part.notes),
+        *notes_of(noise, *segmentations),
     )
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaximu.calibration.attitude import Mounted, mounted_on, reference_summary
-from jaximu.calibration.calibration import Calibration, concluded, effect_named
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, notes_of
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.filter_history import History
 from jaximu.calibration.recipe import Choices, calibrate_ready
@@ -231,8 +231,7 @@ def calibrate_by_filter(
         known=known_before.names,
         data=start.data,
         notes=[
-            *ready.notes,
-            *(() if mounted is None else mounted.attitude.notes),
+            *notes_of(ready, mounted and mounted.attitude),
             *(finding.text for finding in findings),
             *start.notes,
             *notes,

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebvander
-from numpy.typing import NDArray
 
 from jaximu.calibration.thermal_linear import Whitened
 from jaximu.calibration.thermal_selection import Candidate, candidate_of, parameters_of
@@ -29,7 +28,7 @@ from jaximu.data.rest import padded_count
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.solver import solve
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.model.effects.network import UNITS, WEIGHTS, network
 
@@ -59,7 +58,7 @@ def patterned(data: Whitened, model: Model, scale: FloatArray) -> bool:
 
 
 def with_network(
-    data: Whitened, more: Sequence[str], rated: bool, folds: Sequence[NDArray[np.int64]], scales: FloatArray
+    data: Whitened, more: Sequence[str], rated: bool, folds: Sequence[IntArray], scales: FloatArray
 ) -> tuple[Candidate, FloatArray]:
     """Fit a network of temperature and, if `rated`, its rate, beside a straight line in temperature and `more`.
 

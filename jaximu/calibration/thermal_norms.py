@@ -20,6 +20,7 @@ from jaximu.estimation.problem import Name, without_equipment
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD
+from jaximu.ground.rotation import Number
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 
@@ -31,14 +32,14 @@ _BLIND = 1e-7  # share of the largest singular value below which a combination o
 class _Norms(Conditions):
     mean: Float[Array, "n 3"]
     celsius: Float[Array, " n"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of gravity's norm, m/s²."""
         force = imu.accelerometer.recover(self.mean, Stimulus(temperature=self.celsius))
         return gravity_norm_error(force, self.magnitude)
 
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> _Norms:
+    def at_magnitude(self, magnitude: Number) -> _Norms:
         """Return the same with another gravity."""
         return eqx.tree_at(lambda norms: norms.magnitude, self, magnitude)
 

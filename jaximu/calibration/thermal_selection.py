@@ -9,7 +9,6 @@ from math import comb, log
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration.identifiability import Identifiability
 from jaximu.calibration.thermal_linear import Held, Whitened
@@ -29,7 +28,7 @@ from jaximu.calibration.thermal_terms import (
     memories,
     net_of,
 )
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.units import PREFIXES
 from jaximu.model.effects.network import WEIGHTS
 
@@ -258,9 +257,7 @@ def best_by_axis(candidates: Sequence[Candidate]) -> list[int]:
     return chosen
 
 
-def candidate_of(
-    data: Whitened, family: str, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray
-) -> Candidate:
+def candidate_of(data: Whitened, family: str, model: Model, folds: Sequence[IntArray], scale: FloatArray) -> Candidate:
     """Return a model with how it did where folds were left out; `scale` (3,): of the noise's variance."""
     numbers = np.array([parameters_of(terms) for terms in model])
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(model)])

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from jaximu.calibration.bias_drift import knowing_drift
-from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, notes_of, provenance
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.refusals import require_determined
 from jaximu.data.observe_stations import observe_stations
@@ -161,8 +161,7 @@ def calibrate_table_ready(
     fitted = _at_rest_where_open(fitted, start)
     notes = (
         *(note for recording in recordings for note in recording.remarks),
-        *(note for one in ready for note in one.notes),
-        *(() if noise is None else noise.notes),
+        *notes_of(*ready, noise),
         *remarks,
     )
     calibration = concluded(

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.filter_history import History
@@ -23,7 +22,7 @@ from jaximu.data.drift import about_biases, estimated_drift
 from jaximu.estimation.data import OutputMeans
 from jaximu.estimation.information_filter import Knowledge, WhiteRows, advance, estimate
 from jaximu.estimation.problem import Name
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import student_isf
 from jaximu.ground.document import Json
 from jaximu.ground.gravity import LocalGravity
@@ -70,7 +69,6 @@ class _Rate:
     change_sigma: FloatArray
     left: FloatArray
     excess: FloatArray
-    noise: NoiseModel
     notes: tuple[str, ...]
 
 
@@ -195,7 +193,7 @@ def _rate(
         change, change_sigma = np.full((2, 3), np.nan)
     trend = np.square(scale) * np.maximum(change**2 - np.square(Z95 * change_sigma), 0.0)
     after = after + np.diag(np.nan_to_num(trend))  # what changed beyond chance may go on changing
-    rate = _Rate(bias, after, sigmas["gyroscope"], change, change_sigma, left, excess, noise, notes)
+    rate = _Rate(bias, after, sigmas["gyroscope"], change, change_sigma, left, excess, notes)
     return rate, _followed(names, start, stop, values.reshape(-1, 3), variance["gyroscope"], noise, scale)
 
 
@@ -254,12 +252,12 @@ def _followed(
 # --- the mounting -----------------------------------------------------------------------------------------------------
 
 
-def _sites(intervals: FloatArray) -> NDArray[np.int64]:
+def _sites(intervals: FloatArray) -> IntArray:
     """Return the site (P,) of each stop: after a few seconds of motion a vehicle stands on the same slope again."""
     return np.append(0, np.cumsum(intervals[1:, 0] - intervals[:-1, 1] > _ELSEWHERE))
 
 
-def _by_site(values: FloatArray, sites: NDArray[np.int64]) -> FloatArray:
+def _by_site(values: FloatArray, sites: IntArray) -> FloatArray:
     """Return the mean (S, k) over each site of values (P, k) at stops."""
     return np.array([values[sites == site].mean(axis=0) for site in range(sites[-1] + 1)])
 
@@ -272,7 +270,7 @@ def _mean_direction(force: FloatArray) -> FloatArray:
 
 def _mounted(
     stops: Segmentation,
-    sites: NDArray[np.int64],
+    sites: IntArray,
     force: FloatArray,
     up: FloatArray,
     bias: FloatArray,
@@ -341,7 +339,7 @@ def _of_mean(values: FloatArray) -> FloatArray | None:
 
 def _speeds(
     stops: Segmentation, force: FloatArray, across: FloatArray, up: FloatArray, bias: FloatArray
-) -> tuple[NDArray[np.int64], FloatArray]:
+) -> tuple[IntArray, FloatArray]:
     """Return the stop beside each speed (n,), and speeds (n, 2), m/s, along `across` (2, 3), as if driven forwards.
 
     Speeds are gained after a stop and lost before one. The gyroscope carries the axes in which they add up, so that
@@ -370,7 +368,7 @@ def _speeds(
     return np.array(sides, int), np.array(speeds).reshape(-1, 2)
 
 
-def _forward(sides: NDArray[np.int64], speeds: FloatArray) -> tuple[FloatArray, float | None, float]:
+def _forward(sides: IntArray, speeds: FloatArray) -> tuple[FloatArray, float | None, float]:
     """Return the direction (2,) along which speeds (n, 2) lie, its sigma (rad) if any, and how one-sided they are.
 
     The last is the sum of squared speeds one way less that of those the other way, over that of all: backwards is

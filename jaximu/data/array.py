@@ -22,7 +22,16 @@ from jaximu.estimation.covariance import Covariance, mean_root
 from jaximu.estimation.data import About, Conditions, OfOneUnit
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix, unit_vectors
+from jaximu.ground.rotation import (
+    Number,
+    conjugate,
+    exponential,
+    logarithm,
+    multiply,
+    rotate,
+    rotation_matrix,
+    unit_vectors,
+)
 from jaximu.ground.tracing import first, stacked
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
@@ -40,7 +49,7 @@ class SharedConditions(Conditions):
 
     separate: HandHeldConditions
     basis: Float[Array, "P 2 3"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return each unit's conditions, directions (rad), two a pose and other unit, and turns (rad), one each."""

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from jaximu.data.preintegration import linear_slope, preintegrate_samples, white_covariance
 from jaximu.estimation.covariance import Covariance
@@ -28,9 +27,10 @@ from jaximu.estimation.problem import Parameters
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import TRIADS, Track, added, stimuli
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.differences import interpolated
 from jaximu.ground.rotation import (
+    Number,
     conjugate,
     exponential,
     inverse_matrix,
@@ -90,7 +90,7 @@ class AttitudeConditions(Conditions):
     gain: Float[Array, "W 3"]
     turn: Bool[Array, " T"]
     window: Bool[Array, " W"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of the rotations (rad) and of the mean forces (m/s²)."""
@@ -158,7 +158,7 @@ class Intervals(eqx.Module):
     attitude: Float[Array, "T+1 4"]
     velocity: Float[Array, "T 3"]
     used: Bool[Array, " T"]
-    gravity: Float[Array, ""]
+    gravity: Number
 
 
 def _smoothed(imu: Imu, data: Intervals, stamps: Float[Array, " k"]) -> Float[Array, "k 4"]:
@@ -330,7 +330,7 @@ class AgainstAttitude(OfOneUnit):
         )  # pyright: ignore
 
     @cached_property
-    def _knots(self) -> tuple[NDArray[np.int64], int]:
+    def _knots(self) -> tuple[IntArray, int]:
         """Rows of the reference between which the intervals lie, and how many intervals make a window of the force."""
         gyroscope, attitude = self.recording.signals["gyroscope"], self.attitude
         margin, stamps = 3 / gyroscope.rate, attitude.time + self.offset
@@ -344,7 +344,7 @@ class AgainstAttitude(OfOneUnit):
         """Intervals to a window of the specific force."""
         return self._knots[1]
 
-    def _places(self, imu: Imu) -> NDArray[np.int64]:
+    def _places(self, imu: Imu) -> IntArray:
         """Samples (T, S) of each interval, with some more on either side for the delay to move."""
         data = self.intervals
         stamps = Mounting.of(imu).on_log(data.stamp)

@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.data.poses_covariance import Sensitivities
 from jaximu.estimation.covariance import Chain, Covariance
@@ -20,7 +19,7 @@ from jaximu.estimation.fitting import Fit, unwhitened
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.estimation.problem import Name
 from jaximu.estimation.track import TRIADS
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.quantities import size
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import RATIO, correlation_times
@@ -157,7 +156,7 @@ def estimated_drift(
     measured: FloatArray,
     excess: Sequence[FloatArray],
     means: OutputMeans,
-    used: NDArray[np.bool_] | slice = slice(None),
+    used: BoolArray | slice = slice(None),
 ) -> EstimatedDrift:
     """Return the drift of biases that conditions show, estimated together with the excess of their noise.
 

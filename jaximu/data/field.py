@@ -27,8 +27,8 @@ from jaximu.estimation.data import About, Conditions, OfOneUnit
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.estimation.track import Track, added
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.rotation import exponential, inverse_matrix, rotate, unit_vectors
+from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
+from jaximu.ground.rotation import Number, exponential, inverse_matrix, rotate, unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
@@ -73,8 +73,8 @@ class FieldConditions(Conditions):
     window: Bool[Array, " n"]
     turn: Bool[Array, " n"]
     level: Bool[Array, " n"]
-    magnitude: Float[Array, ""]
-    sine: Float[Array, ""]
+    magnitude: Number
+    sine: Number
     alone: bool = eqx.field(static=True, default=False)
 
     def field(self, imu: Imu) -> Float[Array, "n 3"]:
@@ -171,9 +171,9 @@ class FieldWindows:
     angle: FloatArray
     time: FloatArray
     count: FloatArray
-    used: NDArray[np.bool_]
-    turn: NDArray[np.bool_]
-    level: NDArray[np.bool_]
+    used: BoolArray
+    turn: BoolArray
+    level: BoolArray
     noise: float
     origin: FloatArray
     samples: FieldSamples
@@ -211,7 +211,7 @@ class FieldWindows:
         by_gain = np.einsum("ni,nj->nij", across, self.up).reshape(len(self), 9)
         return np.concatenate([by_gain, across], axis=1)
 
-    def without(self, left_out: NDArray[np.bool_]) -> FieldWindows:
+    def without(self, left_out: BoolArray) -> FieldWindows:
         """Return the same with some windows left out (n,)."""
         used = self.used & ~left_out
         following = np.append(used[1:], False)
@@ -319,7 +319,7 @@ def _frames(
     return turned, carried, swept, angle
 
 
-def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> NDArray[np.int64]:
+def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> IntArray:
     """Samples at which windows begin and end: equal lengths of the field's path, rests counting a little."""
     smooth = np.asarray(scipy.ndimage.uniform_filter1d(values, max(1, round(_SMOOTHED * rate)), axis=0))
     centred = smooth - (smooth.max(axis=0) + smooth.min(axis=0)) / 2

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import Number
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Poses
@@ -29,7 +30,7 @@ def recovery_jacobian(imu: Imu, poses: Poses) -> Float[Array, "P 3 3"]:
     return jax.vmap(jax.jacfwd(recover))(poses.accelerometer_mean, poses.temperature)
 
 
-def gravity_norm_error(force: Float[Array, "P 3"], gravity: Float[Array, ""]) -> Float[Array, " P"]:
+def gravity_norm_error(force: Float[Array, "P 3"], gravity: Number) -> Float[Array, " P"]:
     """Return (g0² − |f̂|²) / 2 g0 in m/s²."""
     return (gravity**2 - jnp.sum(force**2, axis=-1)) / (2 * gravity)
 

@@ -26,7 +26,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 
 from jaximu.data.gravity_direction import gravity_direction_error
 from jaximu.data.gravity_norm import gravity_norm_error
@@ -40,10 +39,11 @@ from jaximu.estimation.problem import Name, axis_scales
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import Track, added, mean_outputs
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.rotation import (
+    Number,
     apply_matrix,
     conjugate,
     exponential,
@@ -93,7 +93,7 @@ class HandHeldConditions(Conditions):
     rotation: Float[Array, "T 4"]
     slope: Float[Array, "T 3 3 4"]
     linear: Float[Array, "3 4"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
 
     def rotations(self, imu: Imu) -> Float[Array, "T 4"]:
         """Return the turns' rotations, quaternions from the last body frame to the first, at a unit close by."""
@@ -232,7 +232,7 @@ class PosesAndTurns(Observations, Data):
         owners = {"norm": ("accelerometer",), "turning": ("gyroscope",)}.get(self.conditions)
         return super().free(name) and (owners is None or name.owner in owners)
 
-    def take(self, lanes: NDArray[np.int64]) -> Self:
+    def take(self, lanes: IntArray) -> Self:
         """Return the data of some of the units."""
         return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self._by_unit())
 

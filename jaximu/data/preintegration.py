@@ -28,6 +28,10 @@ from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import (
+    Matrix,
+    Numbers,
+    Quaternion,
+    Vector,
     apply_matrix,
     conjugate,
     exponential,
@@ -68,7 +72,7 @@ class Turned(NamedTuple):
     sweep: Float[Array, "... S 3 3"]
 
     @property
-    def rotation(self) -> Float[Array, "... 4"]:
+    def rotation(self) -> Quaternion:
         """From the last body frame to the first."""
         return self.running[..., -1, :]
 
@@ -78,7 +82,7 @@ class Turned(NamedTuple):
         return self.back[..., None, :, :] @ self.sweep
 
     @property
-    def back(self) -> Float[Array, "... 3 3"]:
+    def back(self) -> Matrix:
         """The matrix that takes vectors of the first frame to the last."""
         return rotation_matrix(conjugate(self.rotation))
 
@@ -119,10 +123,10 @@ class Preintegrated(NamedTuple):
     that it fitted, `parameters[:, places] @ C @ parameters[:, places].T` is its part of the increments' covariance.
     """
 
-    rotation: Float[Array, "... 4"]
-    velocity: Float[Array, "... 3"]
-    displacement: Float[Array, "... 3"]
-    duration: Float[Array, " ..."]
+    rotation: Quaternion
+    velocity: Vector
+    displacement: Vector
+    duration: Numbers
     reaction: Float[Array, "... S 9 6"]
     parameters: Float[Array, "... 9 m"] | None = None
 

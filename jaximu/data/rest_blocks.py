@@ -12,7 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS, Track
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
 from jaximu.mistakes import prepared
@@ -60,7 +60,7 @@ class Leg:
     rates: K/s, between which four fifths of the way were gone.
     """
 
-    blocks: NDArray[np.int64]
+    blocks: IntArray
     begin: float
     end: float
     rate: float
@@ -93,9 +93,9 @@ class RestBlocks:
     recordings: tuple[Recording, ...]
     start: FloatArray
     stop: FloatArray
-    log: NDArray[np.int64]
-    rest: NDArray[np.int64]
-    level: NDArray[np.int64]
+    log: IntArray
+    rest: IntArray
+    level: IntArray
     temperature: FloatArray
     rate: FloatArray
     means: dict[str, FloatArray]
@@ -199,7 +199,7 @@ class RestBlocks:
                 )
         return legs
 
-    def only(self, keep: NDArray[np.bool_]) -> RestBlocks:
+    def only(self, keep: BoolArray) -> RestBlocks:
         """Return the blocks that are kept (n,), with the whole path of temperature."""
         numbers = np.full(len(self) + 1, int(keep.sum()))
         numbers[:-1][keep] = np.arange(keep.sum())
@@ -224,13 +224,13 @@ class RestBlocks:
         return replace(self, level=np.unique(level, return_inverse=True)[1])
 
 
-def _about(group: NDArray[np.int64], values: FloatArray) -> FloatArray:
+def _about(group: IntArray, values: FloatArray) -> FloatArray:
     """Return the mean of values (n, m) over the group of each, (n, m)."""
     member = np.eye(int(group.max(initial=-1)) + 1)[group]
     return member @ (member.T @ values / member.sum(axis=0)[:, None])
 
 
-def folds_of(legs: Sequence[Leg]) -> list[NDArray[np.int64]]:
+def folds_of(legs: Sequence[Leg]) -> list[IntArray]:
     """Return the blocks that are left out in turn: whole legs where there are enough, else stretches of them."""
     parts = [leg.blocks for leg in legs]
     if len(parts) < WAYS:
@@ -331,7 +331,7 @@ def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
     def whole(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    def counted(name: str, counts: Iterable[int]) -> NDArray[np.int64]:
+    def counted(name: str, counts: Iterable[int]) -> IntArray:
         """Return indices that each part counts from zero, counted on from part to part."""
         starts = np.cumsum([0, *counts])[:-1]
         return np.concatenate([getattr(part, name) + start for part, start in zip(parts, starts, strict=True)])

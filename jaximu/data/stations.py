@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from jaximu.data.station_error import turntable_error
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
@@ -17,7 +16,8 @@ from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import axis_scales
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array
+from jaximu.ground.array_types import Array, IntArray
+from jaximu.ground.rotation import Number
 from jaximu.ground.tracing import lifted
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
@@ -43,7 +43,7 @@ class StationConditions(Conditions):
         """Return the errors, zero where a station is not used."""
         return turntable_error(imu, self.stations).T.reshape(-1)
 
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> StationConditions:
+    def at_magnitude(self, magnitude: Number) -> StationConditions:
         """Return the same with another gravity: specific force is in proportion to it."""
         stations = self.stations
         force = stations.stimulus.specific_force * (magnitude / stations.gravity)
@@ -133,7 +133,7 @@ class KnownStations(Data):
     def __init__(self, stations: Stations):
         self.stations = lifted(stations) if np.ndim(stations.gravity) == 0 else stations
 
-    def take(self, lanes: NDArray[np.int64]) -> KnownStations:
+    def take(self, lanes: IntArray) -> KnownStations:
         """Return the measurement of some of the units."""
         return KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self.stations))
 

@@ -19,6 +19,9 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.prefixes import running
 from jaximu.ground.tracing import array_module
 
+Number = Float[Array, ""]
+Numbers = Float[Array, "..."]
+"""One number, and numbers of any shape."""
 Vector = Float[Array, "... 3"]
 Vectors = Float[Array, "... S 3"]
 """Of S samples."""
@@ -156,16 +159,13 @@ def right_jacobian_rows(vector: Sequence[Any], first: Any, second: Any) -> list[
     ]
 
 
-def _normalised(parts):
-    length = jnp.sqrt(sum(part**2 for part in parts))
-    return tuple(part / length for part in parts)
-
-
 def _prefixes(rotation_vectors):
     """Return exp(θ_1)…exp(θ_k) for every k as four (S, ...) arrays."""
     cosine, sine = _half_angle(rotation_vectors)
     parts = (cosine, *(sine * component for component in _parts(rotation_vectors)))
-    return _normalised(running(product, tuple(jnp.moveaxis(part, -1, 0) for part in parts)))
+    whole = running(product, tuple(jnp.moveaxis(part, -1, 0) for part in parts))
+    length = jnp.sqrt(sum(part**2 for part in whole))
+    return tuple(part / length for part in whole)
 
 
 def running_rotations(rotation_vectors: Vectors) -> Float[Array, "... S 4"]:
@@ -250,24 +250,19 @@ def _integrate_rk4(rates, intervals):
     last = jnp.concatenate([jnp.where(followed, meeting, rates[..., :-1, :]), rates[..., -1:, :]], axis=-2)
 
     def derivative(q, rate):
-        return tuple(part / 2 for part in product(q, (jnp.zeros_like(rate[0]), *rate)))
-
-    def add(q, slope, step):
-        return tuple(a + step * b for a, b in zip(q, slope, strict=True))
+        return multiply(q, jnp.concatenate([jnp.zeros_like(rate[..., :1]), rate], axis=-1)) / 2
 
     def advance(q, sample):
         first, middle, last, step = sample
         k1 = derivative(q, first)
-        k2 = derivative(add(q, k1, step / 2), middle)
-        k3 = derivative(add(q, k2, step / 2), middle)
-        k4 = derivative(add(q, k3, step), last)
-        total = tuple((a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
-        return _normalised(add(q, total, step)), None
+        k2 = derivative(q + k1 * step / 2, middle)
+        k3 = derivative(q + k2 * step / 2, middle)
+        k4 = derivative(q + k3 * step, last)
+        return unit_vectors(q + (k1 + 2 * k2 + 2 * k3 + k4) * step / 6), None
 
-    samples = (*(_parts(jnp.moveaxis(array, -2, 0)) for array in (first, rates, last)), jnp.moveaxis(intervals, -1, 0))
-    start = tuple(jnp.full(rates.shape[:-2], part, rates.dtype) for part in (1.0, 0.0, 0.0, 0.0))
-    final, _ = jax.lax.scan(advance, start, samples)
-    return jnp.stack(final, axis=-1)
+    samples = tuple(jnp.moveaxis(array, -2, 0) for array in (first, rates, last, intervals[..., None]))
+    start = jnp.zeros((*rates.shape[:-2], 4), rates.dtype).at[..., 0].set(1.0)
+    return jax.lax.scan(advance, start, samples)[0]
 
 
 def integrate_rates(rates: Vectors, intervals: Float[Array, "... S"], method: str = "exponential") -> Quaternion:

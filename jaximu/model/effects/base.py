@@ -19,12 +19,12 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
-from jaximu.ground.rotation import Vector
+from jaximu.ground.rotation import Numbers, Vector
 from jaximu.ground.units import SENSORS
 from jaximu.model.stimulus import Stimulus
 
 Place = TypeVar("Place", bound=Hashable)
-Scalar = Float[Array, "..."] | float
+Scalar = Numbers | float
 """An inner parameter."""
 
 _TRIADS = {
@@ -215,7 +215,7 @@ class BiasEffect(Effect):
 
     scope = "device"
 
-    def factor(self, stimulus: Stimulus) -> Float[Array, " ..."]:
+    def factor(self, stimulus: Stimulus) -> Numbers:
         """Return the number (...) that each axis's coefficient multiplies."""
         raise NotImplementedError
 

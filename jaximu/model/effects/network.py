@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import Numbers, Vector
 from jaximu.model.effects.base import Effect, Inner, Scalar, pair
 from jaximu.model.effects.learned import ZERO_CELSIUS
 
@@ -17,7 +18,7 @@ WEIGHTS = 4 * UNITS
 """Numbers of an axis: each unit's share of the output, its weights of T and of Ṫ, and its constant."""
 
 
-def network(weights: Float[Array, "... 16"], x: Float[Array, " ..."], r: Float[Array, " ..."]) -> Float[Array, " ..."]:
+def network(weights: Float[Array, "... 16"], x: Numbers, r: Numbers) -> Numbers:
     """Return the outputs of networks with one hidden layer of tanh units, without a constant, at inputs x and r."""
     out, of_x, of_r, constant = jnp.split(weights, 4, axis=-1)
     return jnp.sum(out * jnp.tanh(of_x * x[..., None] + of_r * r[..., None] + constant), axis=-1)
@@ -53,7 +54,7 @@ class _LearnedNetwork(Effect):
         }
     )
 
-    def value(self, temperature: Scalar, rate: Scalar) -> Float[Array, "... 3"]:
+    def value(self, temperature: Scalar, rate: Scalar) -> Vector:
         """Return the networks' outputs (..., 3) at absolute temperatures, K, and rates, K/s."""
         # the range is where the data was, and not for a fit to move
         low, high, largest = jax.lax.stop_gradient((self.low, self.high, self.reach))
