@@ -6,7 +6,7 @@ columns are called. They are mistakes where somebody relies on the file's axes a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -112,7 +112,14 @@ def _axes(arranged: FloatArray) -> Finding:
     elif np.array_equal(arranged, -np.eye(3)):
         rivals.append("data.order")
         text += " Rows in reverse, or both sensors in left-handed axes, look exactly the same."
-    return Finding("data.swapped_axes", (), text, f'--axes "{option}"', tuple(rivals), apply=_mapped(option))
+    return Finding(
+        "data.swapped_axes",
+        (),
+        text,
+        f'--axes "{option}"',
+        tuple(rivals),
+        apply=lambda recording: apply_axes(recording, option),
+    )
 
 
 def _wrong(matrix: FloatArray) -> int:
@@ -132,10 +139,6 @@ def _described(matrix: FloatArray) -> str:
         which = "all three axes" if len(negative) == 3 else f"its {listed(negative)} {'axis' if one else 'axes'}"
         parts.append(f"{which} {'has' if one else 'have'} the wrong sign")
     return ", and ".join(parts)
-
-
-def _mapped(option: str) -> Callable[[Recording], Recording]:
-    return lambda recording: apply_axes(recording, option)
 
 
 def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:

@@ -146,8 +146,8 @@ def calibrate_against_attitude(
     )
     calibration = replace(calibration, covariance=calibration.covariance + _of_shape(calibration, measurement))
     notes = (*(finding.text for finding in arrangement(recording, calibration)), *calibration.notes)
-    calibration = replace(calibration, notes=tuple(dict.fromkeys(notes)))
-    return replace(calibration, reference=reference_summary(calibration)), measurement
+    summary = reference_summary(calibration)
+    return replace(calibration, notes=tuple(dict.fromkeys(notes)), reference=summary), measurement
 
 
 @dataclass(frozen=True)

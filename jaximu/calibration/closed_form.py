@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import Matrix, Vector
 
-Matrix = Float[Array, "... 3 3"]
-Vector = Float[Array, "... 3"]
 Rows = Float[Array, "... S 3"]
 Number = Float[ArrayLike, "..."]
 

@@ -65,21 +65,19 @@ def _second_step(first: Fit, observations: Observations, method: str, loss: str)
     def beside(one: Array, other: Array) -> Array:
         return np.concatenate([one, other], axis=1)
 
+    fields = "sizes", "values", "magnitude_sensitivity", "residual"
     excess = beside(first.excess[:, :1], second.excess[:, 1:])
     return Fit(
         imu=second.imu,
         names=(*first.names, *second.names),
-        sizes=beside(first.sizes, second.sizes),
-        values=beside(first.values, second.values),
         covariance=_two_step_covariance(second.imu, observations, excess),
-        magnitude_sensitivity=beside(first.magnitude_sensitivity, second.magnitude_sensitivity),
-        residual=beside(first.residual, second.residual),
         jacobian=scipy.linalg.block_diag(first.jacobian, second.jacobian),
         excess=excess,
         cost=first.cost + second.cost,
         steps=np.maximum(first.steps, second.steps),
         converged=first.converged & second.converged,
         finite=first.finite & second.finite,
+        **{name: beside(getattr(first, name), getattr(second, name)) for name in fields},
     )
 
 

@@ -78,7 +78,7 @@ def with_network(
 
 
 def _about(plain: Sequence[ThermalTerm], net: Net) -> tuple[ThermalTerm, ...]:
-    return (*plain, *(ThermalTerm(NETWORK, (), k, net) for k in range(WEIGHTS)))
+    return (*plain, *(ThermalTerm(NETWORK, shape=k, net=net) for k in range(WEIGHTS)))
 
 
 def _functions(data: Whitened, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:

@@ -161,7 +161,7 @@ def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
         for term in best:
             name, bounds = term.name, data.shapes.grids[term.name][[0, -1]]
             around = np.geomspace(1 / spacing[name], spacing[name], GRID)
-            grids[name] = np.clip(term.inner[0][1] * around, *bounds)
+            grids[name] = np.clip(term.inner * around, *bounds)
             spacing[name] **= 2 / (GRID - 1)
     return at(best)
 
@@ -195,7 +195,7 @@ def terms_of(names: Sequence[str], shapes: ThermalShapes) -> tuple[ThermalTerm, 
     for name in names:
         leader = BESIDE.get(name, name)
         if name == LEARNED:
-            terms += [ThermalTerm(LEARNED, (), k) for k in range(SPLINES)]
+            terms += [ThermalTerm(LEARNED, shape=k) for k in range(SPLINES)]
         elif leader in HISTORY:
             terms.append(history(name, shapes.grids[leader][GRID // 2]))
         else:

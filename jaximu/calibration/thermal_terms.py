@@ -34,10 +34,10 @@ class Net:
 
 
 class ThermalTerm(NamedTuple):
-    """A column group of the fit: a catalogue effect without its prefix, inner parameters, and which of its shapes."""
+    """A column group of the fit: a catalogue effect without its prefix, inner parameter, and which of its shapes."""
 
     name: str
-    inner: tuple[tuple[str, float], ...] = ()
+    inner: float = 0.0  # of what has a memory
     shape: int = 0  # of an axis: of the learned curve, or the weight of the network
     net: Net | None = None  # about which the network is linear
 
@@ -48,7 +48,7 @@ Model = tuple[tuple[ThermalTerm, ...], ...]
 
 def history(name: str, value: float) -> ThermalTerm:
     """Return the term of an effect with memory at a value of its inner parameter."""
-    return ThermalTerm(name, ((HISTORY[BESIDE.get(name, name)], float(value)),))
+    return ThermalTerm(name, float(value))
 
 
 def memories(names: Iterable[str]) -> set[str]:

@@ -38,7 +38,6 @@ from jaximu.ground.rotation import (
     multiply,
     rotate,
     rotation_matrix,
-    rotation_matrix_on_host,
     unit_vectors,
 )
 from jaximu.model.effects import Effect
@@ -517,7 +516,7 @@ class AgainstAttitude(OfOneUnit):
             whole[rows.ravel()] = factor
             return (whole.T * used).T
 
-        back = rotation_matrix_on_host(conditions.target).swapaxes(1, 2)
+        back = rotation_matrix(conditions.target).swapaxes(1, 2)
         ends = np.zeros((n, 3 * (turns + 1)))
         ends[rows.ravel()] = shared_ends(back)
         for interval in range(turns):

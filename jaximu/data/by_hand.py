@@ -29,7 +29,7 @@ from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.rotation import rotation_matrix_on_host, unit_vectors
+from jaximu.ground.rotation import rotation_matrix, unit_vectors
 from jaximu.ground.tracing import first
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -229,5 +229,5 @@ def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
         pose, row = np.unique(track.observation, return_index=True)
         inside = pose < poses
         attitude = np.asarray(track.stimulus.attitude)[row[inside]]
-        axes[pose[inside]] = rotation_matrix_on_host(attitude).reshape(-1, 9)
+        axes[pose[inside]] = rotation_matrix(attitude).reshape(-1, 9)
     return axes

@@ -4,7 +4,6 @@ Tedaldi, Pretto, Menegatti, ICRA 2014, eq. 10: r = g0² − |f̂|², here over 2
 squared: to first order the error of the norm.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
@@ -19,15 +18,6 @@ def recover_specific_force(imu: Imu, poses: Poses, stimulus: Stimulus | None = N
     """Return each pose's specific force (m/s²) from its mean output; `stimulus` (P,): what else its effects need."""
     known = Stimulus(temperature=poses.temperature) if stimulus is None else stimulus
     return imu.accelerometer.recover(poses.accelerometer_mean, known)
-
-
-def recovery_jacobian(imu: Imu, poses: Poses) -> Float[Array, "P 3 3"]:
-    """Return ∂f̂/∂y of each pose: how noise in the mean output reaches the specific force."""
-
-    def recover(output, temperature):
-        return imu.accelerometer.recover(output, Stimulus(temperature=temperature))
-
-    return jax.vmap(jax.jacfwd(recover))(poses.accelerometer_mean, poses.temperature)
 
 
 def gravity_norm_error(force: Float[Array, "P 3"], gravity: Number) -> Float[Array, " P"]:

@@ -11,7 +11,7 @@ from jaximu.data.poses import PosesAndTurns
 from jaximu.data.twin_signal import twin_signal
 from jaximu.estimation.track import Track
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.rotation import rotation_matrix_on_host, unit_vectors
+from jaximu.ground.rotation import rotation_matrix, unit_vectors
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
@@ -72,7 +72,7 @@ def _correction(attitude: FloatArray, after: FloatArray, duration: float) -> Flo
     `attitude` (n, 4) is the body's after each sample, level at the start; to first order a rotation δ of the last frame
     is the sum of the rates' parts brought there.
     """
-    matrix = rotation_matrix_on_host(attitude)  # body to level
+    matrix = rotation_matrix(attitude)  # body to level
     lab = np.array([0.0, 0.0, 1.0])
     carried = matrix[-1].T @ lab
     delta = np.cross(after, carried)  # turning the frame by δ moves a fixed direction by −δ × u
