@@ -15,12 +15,10 @@ from jaximu.estimation.uncertainty import WeakDirection, gains_open
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
 from jaximu.model.sensor import Imu, Triad
-from jaximu.recordings.alignment import angle_of, rotation_of, signed_permutation
+from jaximu.recordings.alignment import EXPLAINED, angle_of, rotation_of, signed_permutation
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, apply_axes, spelled_axes
 
-_EXPLAINED = 0.5
-"""Share of the turning of gravity that a gyroscope must explain for its axes to be judged by it."""
 _MOUNTED = np.radians(5.0)
 """Rotation of the gyroscope against the accelerometer beyond which it is a mounting and no misalignment."""
 _BETWEEN = np.radians(20.0)
@@ -79,7 +77,7 @@ def unusual_gains(imu: Imu, weak: Sequence[WeakDirection], scales: Mapping[str, 
 def axes_unlike(recording: Recording, imu: Imu) -> str:
     """Say which axes of a recording are not those of a calibrated unit, as gravity turns in it; else nothing."""
     motion, gyroscope = recording.turning, recording.gyroscope
-    if motion is None or motion.explained < _EXPLAINED or gyroscope is None or imu.gyroscope is None:
+    if motion is None or motion.explained < EXPLAINED or gyroscope is None or imu.gyroscope is None:
         return ""
     arranged = signed_permutation(motion.matrix @ (np.asarray(imu.gyroscope.gain) / gyroscope.nominal_scale[:, None]))
     if np.array_equal(arranged, np.eye(3)):

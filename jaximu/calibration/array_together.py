@@ -22,6 +22,7 @@ from jaximu.data.poses import EXCESS_NAMES, condensed
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.tracing import stacked
@@ -115,7 +116,7 @@ def leave_out_turns(found: Array, parts: int = 2) -> LeftOutTurns:
         errors.append([angle[:, turns].ravel() for angle in met])
         common.append(fitted.in_common)
     whole = [np.concatenate(angles) for angles in zip(*errors, strict=True)]
-    alone, apart_alone, together, apart = (float(np.sqrt(np.mean(angles**2))) for angles in whole)
+    alone, apart_alone, together, apart = map(rms, whole)
     return LeftOutTurns(len(whole[0]), (alone, together), (apart_alone, apart), float(np.mean(common)))
 
 

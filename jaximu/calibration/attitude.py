@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax
 import numpy as np
 import scipy
 
@@ -25,7 +24,7 @@ from jaximu.ground.differences import interpolated
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
-from jaximu.ground.precision import require_float64
+from jaximu.ground.tracing import on_host
 from jaximu.mistakes import prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_delay import SetupReferenceDelay
@@ -107,7 +106,6 @@ def calibrate_against_attitude(
     Raises `InputError` where the reference does not overlap the recording or is none, `NotPossibleError` where it
     stands still, moves otherwise than the unit, or determines next to nothing.
     """
-    require_float64()
     gravity = as_gravity(gravity)
     if recording.gyroscope is None:
         raise InputError(f"{recording.name}: a reference attitude calibrates a gyroscope, and there is none.")
@@ -117,19 +115,14 @@ def calibrate_against_attitude(
         start = _coarse(recording, attitude.usable())
         start = replace(start, attitude=_right_handed(recording, start))
         measurement = AgainstAttitude(recording, start.attitude, gravity.value, noise)
-        chosen = [effect_named(effect) for effect in effects]
-        imu = _begin(recording, start, chosen, unit)
-        prior = Prior.of_effects(imu, effect_sigmas)
-        of_setup = _of_setup(imu)
+        imu = _begin(recording, start, list(map(effect_named, effects)), unit)
+        prior, of_setup = Prior.of_effects(imu, effect_sigmas), _of_setup(imu)
 
-        def biases_and_setup(name: Name) -> bool:
-            return name.part == "bias" or of_setup(name)
+        def free(name: Name) -> bool:
+            return without_equipment_or_effects(name) if unit is None else name.part == "bias" or of_setup(name)
 
-        free = without_equipment_or_effects if unit is None else biases_and_setup
         fitted = fit(imu, measurement, free, prior=prior, loss=loss)
-        where = recording.name
-        require_determined(fitted, where, f"{attitude.name} shows too few turns, which", _RECORD, prior)
-    likeness = _same_unit(recording, start, fitted.imu)
+        require_determined(fitted, recording.name, f"{attitude.name} shows too few turns, which", _RECORD, prior)
     calibration = concluded(
         fitted,
         gravity=gravity,
@@ -140,14 +133,14 @@ def calibrate_against_attitude(
         rms=[errors_of([measurement], unit) for unit in (imu, fitted.imu)],
         known=list(filter(of_setup, fitted.names)),
         data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
-        notes=[*likeness, *notes_of(ready, recording, start.attitude, noise)],
+        notes=[*_same_unit(recording, start, fitted.imu), *notes_of(ready, recording, start.attitude, noise)],
         nominal=imu.with_effects(),
         reading=recording.reading,
     )
     calibration = replace(calibration, covariance=calibration.covariance + _of_shape(calibration, measurement))
     notes = (*(finding.text for finding in arrangement(recording, calibration)), *calibration.notes)
-    summary = reference_summary(calibration)
-    return replace(calibration, notes=tuple(dict.fromkeys(notes)), reference=summary), measurement
+    calibration = replace(calibration, notes=tuple(dict.fromkeys(notes)), reference=reference_summary(calibration))
+    return calibration, measurement
 
 
 @dataclass(frozen=True)
@@ -221,7 +214,13 @@ def _begin(recording: Recording, start: _Start, effects: Sequence[Effect], unit:
     if unit is None and imu.gyroscope is not None:
         imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ start.arranged))
     by_name = {effect.name: effect for effect in (*setup, *imu.all_effects().values(), *effects)}
-    return jax.tree.map(np.asarray, imu.with_effects(*by_name.values()))
+    return on_host(imu.with_effects(*by_name.values()))
+
+
+def later_zero(start: float, other: float) -> float:
+    """Return how much later (s) one zero of time is than another; none where the two are not on one clock."""
+    later = float(start) - float(other)
+    return later if abs(later) < _APART else 0.0
 
 
 def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: Array) -> tuple[Mounting, Mounting]:
@@ -266,10 +265,8 @@ def reference_summary(calibration: Calibration) -> Json:
 def _coarse(recording: Recording, attitude: Attitude) -> _Start:
     """Find the reference's delay and mounting, and whether its quaternions run the other way or have w last."""
     gyroscope = recording.signals["gyroscope"]
-    later = attitude.start - float(recording.start)
     name = recording.name
-    if abs(later) < _APART:
-        attitude = replace(attitude, time=attitude.time + later)
+    attitude = replace(attitude, time=attitude.time + later_zero(attitude.start, recording.start))
     span = gyroscope.time[[0, -1]]
     if attitude.time[0] > span[1] or attitude.time[-1] < span[0]:
         raise InputError(

@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from jaximu.estimation.fitting import Fit
@@ -24,6 +23,7 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.reexport import later
 from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.tracing import on_host
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu, Triad
@@ -319,7 +319,7 @@ def concluded(
     excess: dict[str, float] = dict(zip(excess_names, np.asarray(fitted.excess).tolist(), strict=False))
     clock = clock_sigma(working.get("segmentations", ()))
     return Calibration(
-        imu=jax.tree.map(np.asarray, fitted.imu),
+        imu=on_host(fitted.imu),
         names=fitted.names,
         covariance=fitted.total_covariance(gravity.sigma, clock),
         gravity=gravity,
@@ -515,7 +515,11 @@ def _from_document(document: Json) -> Calibration:
         data=document["data"],
         notes=tuple(fit["notes"]),
         software=document["software"],
-        **{name: document.get(name) for name in ("diagnosis", "reference", "trace", "digest", "filter")},
+        diagnosis=document.get("diagnosis"),
+        reference=document.get("reference"),
+        trace=document.get("trace"),
+        digest=document.get("digest"),
+        filter=document.get("filter"),
         absent=("accelerometer",) if accelerometer is None else (),
         reading=None if document.get("reading") is None else Reading.from_document(document["reading"]),
         bias_sigma_recording={

@@ -74,7 +74,7 @@ def _second_step(first: Fit, observations: Observations, method: str, loss: str)
         jacobian=scipy.linalg.block_diag(first.jacobian, second.jacobian),
         excess=excess,
         cost=first.cost + second.cost,
-        steps=np.maximum(first.steps, second.steps),
+        steps=beside(first.steps[:, None], second.steps[:, None]).max(axis=1),
         converged=first.converged & second.converged,
         finite=first.finite & second.finite,
         **{name: beside(getattr(first, name), getattr(second, name)) for name in fields},

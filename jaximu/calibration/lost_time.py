@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.data.by_hand import RecordedByHand
@@ -86,7 +87,7 @@ class _Turned:
     lost: FloatArray
     constant: float = 0.0
 
-    def at(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def at(self, covariance: FloatArray) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Return NᵀPN and NᵀPr where the turns scatter by `covariance` (T, 2, 2), by Woodbury's identity."""
         inner = np.eye(len(self.pull)) + self.gram @ _diagonal(covariance)
         return np.linalg.solve(inner, self.gram), np.linalg.solve(inner, self.pull)

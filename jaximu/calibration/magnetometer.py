@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 import scipy
 
@@ -17,9 +16,10 @@ from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import relative_covariance, require_determined
 from jaximu.data.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.estimation.fitting import Fit, Prior, fit, informed
-from jaximu.estimation.problem import Name
+from jaximu.estimation.problem import Name, axis_scales
 from jaximu.estimation.uncertainty import UNDETERMINED, allowing_for_neighbours
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -27,11 +27,12 @@ from jaximu.ground.magnetic_field import HIGHEST, LOWEST, FieldStrength
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.tracing import on_host
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes import Prepared, prepare, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
-from jaximu.recordings.alignment import ARRANGEMENTS, signed_permutation
+from jaximu.recordings.alignment import ARRANGEMENTS, EXPLAINED, signed_permutation
 from jaximu.recordings.recording import Reading, Recording, Signal
 from jaximu.simulation.protocols.positions import spiral
 
@@ -48,8 +49,6 @@ _SCALE = 0.05
 _SHEET_GAIN, _SHEET_BIAS = 0.02, 0.05
 """Scale and misalignment of an accelerometer, and its bias over gravity, by a data sheet (MPU-6050: 3 %, 2 %, 50 mg on
 x and y and 80 mg on z at the most)."""
-_EXPLAINED = 0.5
-"""Share of gravity's turning that the gyroscope must explain for its axes to be taken from it."""
 _FOLDS = 5
 _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
@@ -127,9 +126,9 @@ class Heading:
     def document(self) -> Json:
         """Return root mean squares over the headings of a level unit and largest errors of any attitude, degrees."""
         return {
-            "rms": float(np.sqrt(np.mean(self.sigma[0] ** 2) + self.scatter**2)),
+            "rms": float(np.hypot(rms(self.sigma[0]), self.scatter)),
             "worst": float(np.hypot(self.sigma.max(), self.scatter)),
-            "before": {"rms": float(np.sqrt(np.mean(self.before[0] ** 2))), "worst": float(self.before.max())},
+            "before": {"rms": rms(self.before[0]), "worst": float(self.before.max())},
         }
 
 
@@ -170,7 +169,7 @@ def calibrate_magnetometer(
 
 def _chosen(effects: Sequence[str | Effect], logs: Sequence[MagneticLog]) -> list[Effect]:
     """Return the effects to be fitted. Raises `InputError` for one of another sensor, or whose input logs lack."""
-    chosen = [effect_named(effect) for effect in effects]
+    chosen = list(map(effect_named, effects))
     for effect in chosen:
         if effect.owner != "magnetometer":
             raise InputError(f"{effect.name} is no effect of a magnetometer: `jaximu effects` lists those, mag.*.")
@@ -324,9 +323,9 @@ def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
     if recording is None:
         return Imu.nominal()
     unit, turning = as_stated(recording), recording.turning
-    if turning is None or turning.explained < _EXPLAINED or unit.gyroscope is None:
+    if turning is None or turning.explained < EXPLAINED or unit.gyroscope is None:
         return unit
-    if turning.correlation > 0 and turning.correlation**2 > _EXPLAINED * turning.explained:
+    if turning.correlation > 0 and turning.correlation**2 > EXPLAINED * turning.explained:
         return unit  # as the data sheet has it: an axis that hardly turned gravity must not be turned round
     gain = unit.gyroscope.gain @ signed_permutation(turning.matrix).T
     return replace(unit, gyroscope=replace(unit.gyroscope, gain=gain))
@@ -387,7 +386,7 @@ def _start(
             "to be turned."
         )
     triad = Triad(scale * turn, np.asarray(centre, float), quantity="magnetic_field", output_unit=signal.unit)
-    return jax.tree.map(np.asarray, replace(unit.with_effects(), magnetometer=triad)), field, notes
+    return on_host(replace(unit.with_effects(), magnetometer=triad)), field, notes
 
 
 def field_start(
@@ -521,7 +520,7 @@ def _magnetometer(imu: Imu) -> Triad:
 
 def _scale_of(imu: Imu) -> float:
     """Output units of the magnetometer to a µT."""
-    return float(np.mean(np.linalg.norm(_magnetometer(imu).gain, axis=1)))
+    return float(np.mean(axis_scales(_magnetometer(imu))))
 
 
 def _strengths(imu: Imu, output: FloatArray) -> FloatArray:
@@ -535,7 +534,7 @@ def _white(imu: Imu, windows: FieldWindows) -> float:
 
 
 def _spread(imu: Imu, windows: FieldWindows, strength: float) -> float:
-    return float(np.sqrt(np.mean((np.linalg.norm(windows.field(imu)[windows.used], axis=1) - strength) ** 2)))
+    return rms(np.linalg.norm(windows.field(imu)[windows.used], axis=1) - strength)
 
 
 def _contradicted(fit: Fit, windows: FieldWindows, field: FieldStrength) -> bool:
@@ -700,7 +699,7 @@ def _left_out(
             values = np.concatenate(parts)
             spreads[name] = float(np.std(values) / np.mean(values))
     off = {name: np.concatenate([np.zeros(0), *parts]) for name, parts in headings.items()}
-    turned = {name: float(np.degrees(np.sqrt(np.mean(errors**2)))) for name, errors in off.items() if len(errors)}
+    turned = {name: rms(np.degrees(errors)) for name, errors in off.items() if len(errors)}
     return spreads, turned or None
 
 

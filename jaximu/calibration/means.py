@@ -12,11 +12,10 @@ from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.refusals import require_determined
 from jaximu.data.poses import EXCESS_NAMES, PosesAndTurns, residual_rms
 from jaximu.estimation.fitting import Prior, fit
-from jaximu.estimation.problem import Loss, Name, names_of, without_equipment_or_effects
+from jaximu.estimation.problem import Loss, Name, axis_scales, names_of, without_equipment_or_effects
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
-from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
@@ -48,24 +47,19 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     Raises `NotPossibleError` where the poses do not span enough orientations or are fewer, or the fit does not
     converge.
     """
-    require_float64()
-    gravity = as_gravity(gravity)
-    recording = means.recording
-    where, poses = recording.name, len(recording.accelerometer)
-    observations = observe_means(means, gravity.value)
+    gravity, recording = as_gravity(gravity), means.recording
+    poses, observations = len(recording.accelerometer), observe_means(means, gravity.value)
     nominal, notes = nominal_imu(recording)
     method = "accelerometer" if recording.gyroscope is None else "joint"
     free = [name for name in names_of(nominal) if name.owner == "accelerometer" and without_equipment_or_effects(name)]
     few = means.accelerometer_sigma is None and poses < len(free) + _SPARE
-    prior, measured, estimated = None, observations, True
+    prior, measured, excess = None, observations, None
     if few or (poses >= _FACES and _open(means)):
         prior = _misalignments(nominal, free)
         spare = poses - (len(free) - len(prior.names))
         _require_axes(means, len(free), spare)
-        if means.accelerometer_sigma is None:
-            rounding = np.full((poses, 3), _step(recording.accelerometer.values) / np.sqrt(12))
-            measured = observe_means(replace(means, accelerometer_sigma=rounding), gravity.value)
-        estimated = spare >= _SPARE
+        measured = observe_means(_as_written(means), gravity.value)
+        excess = None if spare >= _SPARE else np.zeros(len(EXCESS_NAMES))
         notes += (
             f"{poses} poses leave misalignments open: they were taken to be zero within ±{200 * _ACROSS:g} % (95 %), "
             "as data sheets state the cross-axis sensitivity."
@@ -73,9 +67,8 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
             * " The means are taken to be as good as their digits.",
         )
     at_rest = PosesAndTurns.of(measured, "norm" if method == "accelerometer" else "all")
-    excess = None if estimated else np.zeros(len(EXCESS_NAMES))
-    fitted = fit(nominal, at_rest, prior=prior, loss=loss, excess=excess, estimate_excess=estimated)
-    require_determined(fitted, where, poses=poses)
+    fitted = fit(nominal, at_rest, prior=prior, loss=loss, excess=excess, estimate_excess=excess is None)
+    require_determined(fitted, recording.name, poses=poses)
     if method == "accelerometer":
         fitted = replace(fitted, imu=Imu(fitted.imu.accelerometer, None))
     stated = {"accelerometer": means.accelerometer_sigma is not None or few}
@@ -100,8 +93,7 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
         nominal=nominal,
         reading=recording.reading,
     )
-    known = {name: size for name, size in calibration.excess.items() if stated.get(name)}
-    return replace(calibration, excess=known)
+    return replace(calibration, excess={name: size for name, size in calibration.excess.items() if stated.get(name)})
 
 
 def _open(means: PoseMeans) -> bool:
@@ -112,6 +104,14 @@ def _open(means: PoseMeans) -> bool:
     values = means.recording.accelerometer.si()
     upright = (values - (values.max(axis=0) + values.min(axis=0)) / 2) / STANDARD_GRAVITY
     return bool(np.sort(np.abs(upright), axis=1)[:, 1].max() < _UPRIGHT)
+
+
+def _as_written(means: PoseMeans) -> PoseMeans:
+    """Return the means as good as their digits, where they do not state how good they are."""
+    if means.accelerometer_sigma is not None:
+        return means
+    values = means.recording.accelerometer.values
+    return replace(means, accelerometer_sigma=np.full(values.shape, _step(values) / np.sqrt(12)))
 
 
 def _step(values: FloatArray) -> float:
@@ -127,7 +127,7 @@ def _step(values: FloatArray) -> float:
 def _misalignments(nominal: Imu, free: Sequence[Name]) -> Prior:
     """Return what is known of the misalignments beforehand: they are zero within what sensors have."""
     across = tuple(name for name in free if name.part == "gain" and name.axes[0] != name.axes[1])
-    scale = np.linalg.norm(nominal.accelerometer.gain, axis=1)
+    scale = axis_scales(nominal.accelerometer)
     sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
     return Prior(across, np.zeros(len(across)), np.diag(1 / sigma))
 

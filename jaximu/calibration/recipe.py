@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 
 from jaximu.calibration.arrangement import arrangement
@@ -25,7 +24,7 @@ from jaximu.estimation.problem import Loss
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
-from jaximu.ground.tracing import first, lifted
+from jaximu.ground.tracing import first, lifted, on_host
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
@@ -150,7 +149,7 @@ def _calibrated_jointly(
     if unit.setup and sum(not one.no_fixture for one in data) > 1:
         raise InputError("the start has effects of one set-up, and two of the data have separate ones: fit them apart.")
     effects = {effect.name: effect for effect in (*map(effect_named, choices.effects), *unit.all_effects().values())}
-    unit = jax.tree.map(np.asarray, unit.with_effects(*effects.values()))
+    unit = on_host(unit.with_effects(*effects.values()))
     prior = Prior.of_effects(unit, choices.effect_sigmas)
     fitted = fit(unit, kinds, prior=prior, loss=choices.loss)
     where = ", ".join(recording.name for recording in recorded) or "these data"
@@ -269,7 +268,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     mixed = same_outputs(recordings)
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
     method = choices.method if has_gyroscope else "accelerometer"
-    chosen = [effect_named(effect) for effect in choices.effects]
+    chosen = list(map(effect_named, choices.effects))
     if chosen and method != "joint":
         raise InputError(
             f"{chosen[0].name} is fitted jointly with gain and bias of both sensors, which needs the joint method and "
@@ -304,7 +303,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
             chosen, sigmas = [*chosen, earth], sigmas | {earth.name: spread}
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
-        start = jax.tree.map(np.asarray, fitted.imu).with_effects(*chosen)
+        start = on_host(fitted.imu).with_effects(*chosen)
         prior = Prior.of_effects(start, sigmas)
         fitted = fit(start, measurement, prior=prior, loss=loss, excess=fitted.excess)
         require_determined(fitted, where, prior=prior)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-import jax
 import numpy as np
 
 from jaximu.calibration.attitude import Mounted, mounted_on, reference_summary
@@ -40,6 +39,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import sentence
+from jaximu.ground.tracing import on_host
 from jaximu.mistakes import prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
@@ -197,7 +197,7 @@ def calibrate_by_filter(
         unknown = GyroEarthRotation.dormant(), np.full(3, EARTH_RATE)
         earth, spread = unknown if latitude is None else GyroEarthRotation.at(latitude)
         chosen = [effect for effect in chosen if effect.name != earth.name]
-        imu = jax.tree.map(np.asarray, start.imu.with_effects(earth, *chosen, *outside))
+        imu = on_host(start.imu.with_effects(earth, *chosen, *outside))
         stated = {**{effect.name: effect.known for effect in outside}, **(effect_sigmas or {}), earth.name: spread}
         known_before, prior = Prior.of_effects(imu, stated), Prior.of_effects(imu, plausible_sizes(imu) | stated)
         assert known_before is not None and prior is not None
@@ -207,7 +207,7 @@ def calibrate_by_filter(
             if mounted is None:  # else the attitude tells what poses and turns leave open
                 _require_enough_turned(fitted, start, recording.name)
             require_solved(fitted, recording.name)
-            imu = jax.tree.map(np.asarray, fitted.imu)
+            imu = on_host(fitted.imu)
             followed = _followed(measurement, imu, free, prior, gravity, start)
             matched = _matched(measurement, followed)
             if matched is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
@@ -26,6 +25,7 @@ from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.tracing import on_host
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
@@ -139,7 +139,7 @@ def calibrate_table_ready(
     nominal = as_stated(recordings[0])
     if recordings[0].gyroscope is None:
         nominal = Imu(nominal.accelerometer, None)
-    chosen = [effect_named(effect) for effect in effects]
+    chosen = list(map(effect_named, effects))
     if latitude is not None:
         _require_headings(recordings, references)
         known = GyroEarthRotation.make(earth_rate(np.radians(latitude)))
@@ -151,7 +151,7 @@ def calibrate_table_ready(
                 f"{effect.name} needs to know how the unit was turned about the vertical in every pose: state headings "
                 "in the reference, or all turns between the poses."
             )
-    start = jax.tree.map(np.asarray, nominal.with_effects(*chosen))
+    start = on_host(nominal.with_effects(*chosen))
     fitted = fit_turntable(start, stations, free, loss)
     where = ", ".join(recording.name for recording in recordings)
     used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
@@ -222,7 +222,7 @@ def _at_rest_where_open(fitted: Fit, start: Imu) -> Fit:
     if not len(free):
         return fitted
     back = moved - free.T @ (free @ moved)
-    model = jax.tree.map(np.asarray, parameters.model(start, jnp.asarray(back)))
+    model = on_host(parameters.model(start, jnp.asarray(back)))
     return replace(fitted, imu=model, values=values + fitted.sizes * back)
 
 

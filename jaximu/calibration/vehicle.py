@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 import scipy
 
@@ -23,11 +22,12 @@ from jaximu.estimation.data import OutputMeans
 from jaximu.estimation.information_filter import Knowledge, WhiteRows, advance, estimate
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray, IntArray
-from jaximu.ground.distributions import student_isf
+from jaximu.ground.distributions import rms, student_isf
 from jaximu.ground.document import Json
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.quantities import Z95
 from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.tracing import on_host
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.recordings.recording import Signal
@@ -97,16 +97,16 @@ def calibrate_at_stops(
     covariance = rate.covariance + scale[:, None] * spread * scale
     nominal = as_stated(recording)
     unit = replace(nominal, gyroscope=replace(nominal.triads()["gyroscope"], bias=rate.bias))
-    still = np.sqrt(np.mean(np.square(rate.left + (rate.bias - gyroscope.nominal_offset) / scale)))
+    still = rms(rate.left + (rate.bias - gyroscope.nominal_offset) / scale)
     steady = np.diag(scale[:, None] * spread * scale)
     calibration = Calibration(
-        imu=jax.tree.map(np.asarray, unit),
+        imu=on_host(unit),
         names=history.names,
         covariance=covariance,
         gravity=gravity,
         method="filter",
         loss="linear",
-        rms={"static_gyroscope": (float(still), float(np.sqrt(np.mean(rate.left**2))), "rad/s")},
+        rms={"static_gyroscope": (still, rms(rate.left), "rad/s")},
         rank=3,
         weak=(),
         excess={"gyroscope": float(rate.excess[0])},

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-import jax
 import numpy as np
 
 from jaximu.data.drift import drift_components, mean_output_reactions, means_by_hand
@@ -30,7 +29,7 @@ from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.rotation import rotation_matrix, unit_vectors
-from jaximu.ground.tracing import first
+from jaximu.ground.tracing import first, on_host
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
@@ -61,7 +60,7 @@ class RecordedByHand(OfOneUnit):
     advice = staticmethod(pose_advice)
 
     def __post_init__(self):
-        self.observations = jax.tree.map(np.asarray, self.observations)
+        self.observations = on_host(self.observations)
 
     @cached_property
     def data(self) -> PosesAndTurns:
@@ -80,7 +79,7 @@ class RecordedByHand(OfOneUnit):
 
     def along(self, imu: Imu, effects: tuple[Effect, ...]) -> Along:
         """Return the recordings about a unit with effects: the tracks, and the observations without what they add."""
-        along = jax.tree.map(np.asarray, self.data.along(imu, effects))
+        along = on_host(self.data.along(imu, effects))
         return along._replace(observations=as_observations(along.observations))
 
     def reactions(self, details: Along):

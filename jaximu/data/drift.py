@@ -263,8 +263,8 @@ def means_by_hand(
         for name, rows in zip(TRIADS, mean_output_reactions(reaction), strict=True)
         if name in scales
     }
-    scatter = {"accelerometer": poses.accelerometer_covariance, "gyroscope": poses.gyroscope_covariance}
-    variances = {name: np.diagonal(np.asarray(scatter[name])[real], axis1=1, axis2=2) for name in reactions}
+    scatter = {name: np.asarray(getattr(poses, f"{name}_covariance"))[real] for name in reactions}
+    variances = {name: np.diagonal(covariance, axis1=1, axis2=2) for name, covariance in scatter.items()}
     start, stop = np.asarray(poses.start)[real], np.asarray(poses.stop)[real]
     return OutputMeans.of(start, stop, np.repeat(np.arange(len(counts)), counts)[real], reactions, scales, variances)
 

@@ -28,6 +28,7 @@ from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.estimation.track import Track, added
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.rotation import Number, exponential, inverse_matrix, rotate, unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
@@ -222,7 +223,7 @@ class FieldWindows:
         """Return windows of several recordings of one unit as one."""
         names = ("output", "slope", "carried", "swept", "up", "off", "angle", "time", "count", "used", "turn", "level")
         together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        noise = float(np.sqrt(np.mean([part.noise**2 for part in parts])))
+        noise = rms([part.noise for part in parts])
         samples = FieldSamples.joined([part.samples for part in parts])
         return cls(**together, noise=noise, origin=parts[0].origin, samples=samples, vertical=parts[0].vertical)
 
@@ -233,7 +234,7 @@ def white_noise(signal: Signal) -> float:
     spread = 1.4826 * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / np.sqrt(20.0)
     levels = [np.unique(axis[:20000]).tolist() for axis in signal.values.T]
     rounding = [min(np.diff(values).tolist(), default=0.0) / np.sqrt(12.0) for values in levels]
-    return float(np.sqrt(np.mean(np.maximum(spread, rounding) ** 2)))
+    return rms(np.maximum(spread, rounding))
 
 
 def windows_of(

@@ -40,6 +40,7 @@ from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axi
 from jaximu.estimation.track import Track, added, mean_outputs
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.rotation import (
@@ -53,7 +54,7 @@ from jaximu.ground.rotation import (
     rotate,
     unit_vectors,
 )
-from jaximu.ground.tracing import array_module, first, lifted, one_by_one, repeated, stacked
+from jaximu.ground.tracing import array_module, first, lifted, on_host, one_by_one, repeated, stacked
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import NoiseModel
@@ -414,7 +415,7 @@ def resized(leaf: Array, *lengths: int, numerics: Any = np) -> Array:
 
 def pose_rows(imu: Imu, observations: Observations) -> Rows:
     """Return what each of the conditions of poses and turns is, by a unit close to this one."""
-    poses, turns = jax.tree.map(np.asarray, (observations.poses, observations.turns))
+    poses, turns = on_host((observations.poses, observations.turns))
     gyroscope = imu.triads()["gyroscope"]
     pose, turn = np.arange(len(poses.mask)), np.arange(len(turns.mask))
 
@@ -478,14 +479,14 @@ def residual_rms(
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
     force, angle = forces_and_angles(imu, observations) if known is None else known
     norm = np.linalg.norm(force[poses], axis=1) - float(observations.gravity)
-    sizes = {"gravity_norm": (_rms(norm), "m/s^2")}
+    sizes = {"gravity_norm": (rms(norm), "m/s^2")}
     if imu.gyroscope is None or not gyroscope:
         return sizes
     if turns.any():
-        sizes["gravity_direction"] = (_rms(np.degrees(angle)[turns]), "deg")
+        sizes["gravity_direction"] = (rms(np.degrees(angle)[turns]), "deg")
     rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
     scale = axis_scales(imu.gyroscope)
-    sizes["static_gyroscope"] = (_rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
+    sizes["static_gyroscope"] = (rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
     return sizes
 
 
@@ -503,7 +504,3 @@ def forces_and_angles(
 def with_gyroscope(imu: Imu) -> Imu:
     """Return the unit; where it has no gyroscope with one that puts out rad/s, as the conditions need one."""
     return imu if "gyroscope" in imu.triads() else Imu(imu.accelerometer, Imu.nominal().gyroscope)
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

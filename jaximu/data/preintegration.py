@@ -32,6 +32,7 @@ from jaximu.ground.rotation import (
     Numbers,
     Quaternion,
     Vector,
+    Vectors,
     apply_matrix,
     conjugate,
     exponential,
@@ -46,9 +47,7 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 
 
-def increments(
-    rates: Float[Array, "... S 3"], forces: Float[Array, "... S 3"], intervals: Float[Array, "... S"]
-) -> tuple[Float[Array, "... S 3"], Float[Array, "... S 3"]]:
+def increments(rates: Vectors, forces: Vectors, intervals: Float[Array, "... S"]) -> tuple[Vectors, Vectors]:
     """Return each sample's rotation vector θ (rad) with coning, and its ∫f dt (m/s) with sculling, ν.
 
     Rotation and velocity together are a rigid motion whose twist is the dual number ω + ε f (ε² = 0), so what holds of
@@ -87,14 +86,14 @@ class Turned(NamedTuple):
         return rotation_matrix(conjugate(self.rotation))
 
 
-def turned_by_rates(rates: Float[Array, "... S 3"], intervals: Float[Array, "... S"]) -> Turned:
+def turned_by_rates(rates: Vectors, intervals: Float[Array, "... S"]) -> Turned:
     """Return the rotations of rates (rad/s) that hold over `intervals` (s; zero for padding)."""
     vectors = rotation_vectors(rates, intervals)
     running = running_rotations(vectors)
     return Turned(running, transport(running, vectors) * intervals[..., None, None])
 
 
-def linear_slope(reaction: Float[Array, "... S k 3"], output: Float[Array, "... S 3"]) -> Float[Array, "... k 3 4"]:
+def linear_slope(reaction: Float[Array, "... S k 3"], output: Vectors) -> Float[Array, "... k 3 4"]:
     """Return how sums react to (A | c), of samples A y + c, by their reaction to each sample and its output y."""
     with_one = jnp.concatenate([output, jnp.ones_like(output[..., :1])], axis=-1)
     sums = _flat(reaction).swapaxes(-1, -2) @ with_one
@@ -143,9 +142,7 @@ class Preintegrated(NamedTuple):
         )
 
 
-def preintegrate_samples(
-    rates: Float[Array, "... S 3"], forces: Float[Array, "... S 3"], intervals: Float[Array, "... S"]
-) -> Preintegrated:
+def preintegrate_samples(rates: Vectors, forces: Vectors, intervals: Float[Array, "... S"]) -> Preintegrated:
     """Return the increments of rates (rad/s) and specific forces (m/s²) that hold over `intervals` (s)."""
     vectors, gained = increments(rates, forces, intervals)
     left_jacobian = jnp.swapaxes(right_jacobian(vectors), -1, -2)

@@ -22,7 +22,7 @@ from jaximu.estimation.track import TRIADS, Track, added, mean_outputs, stimuli
 from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import interpolated
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
-from jaximu.ground.tracing import first, lifted
+from jaximu.ground.tracing import first, lifted, on_host
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
@@ -55,7 +55,7 @@ class RecordedStations(OfOneUnit):
     coarse = KnownStations.coarse
 
     def __post_init__(self):
-        self.stations = jax.tree.map(np.asarray, self.stations)
+        self.stations = on_host(self.stations)
 
     @classmethod
     def of(

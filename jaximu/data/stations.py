@@ -17,8 +17,9 @@ from jaximu.estimation.problem import axis_scales
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, IntArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.rotation import Number
-from jaximu.ground.tracing import lifted
+from jaximu.ground.tracing import lifted, on_host
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 
@@ -52,7 +53,7 @@ class StationConditions(Conditions):
 
 def station_rows(imu: Imu, stations: Stations) -> Rows:
     """Return what each error of a mean output is, by a unit close to this one."""
-    stations = jax.tree.map(np.asarray, stations)
+    stations = on_host(stations)
     count, turn, start, stop = len(stations.turn), stations.turn, stations.start, stations.stop
     station, stimulus = np.repeat(np.arange(count), 6), stations.stimulus
     kind = np.repeat(np.stack([np.zeros(count, np.int64), np.where(turn, 1, 2)], axis=1), 3, axis=1).ravel()
@@ -171,7 +172,7 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
         return turntable_error(imu, stations), jnp.sqrt(variance)
 
     error, sigma = map(np.asarray, stored.call(compute, "station errors", imu, stations, excess))
-    stations = jax.tree.map(np.asarray, stations)
+    stations = on_host(stations)
     scale = [axis_scales(triad)[:, None] for triad in imu.triads().values()]
     gyroscope, turn = stations.gyroscope_used, stations.turn
     degrees = np.degrees(stations.stop - stations.start)
@@ -192,7 +193,7 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
 def station_rms(imu: Imu, stations: Stations) -> dict[str, tuple[float, str]]:
     """Return the rms of each kind of error, as vectors, with its unit."""
     return {
-        kind.name: (float(np.sqrt(np.mean(np.sum(kind.error**2, axis=0)))), kind.unit)
+        kind.name: (rms(np.linalg.norm(kind.error, axis=0)), kind.unit)
         for kind in station_errors(imu, stations, np.zeros(len(KnownStations.coarse)))
         if len(kind.station)
     }

@@ -41,6 +41,14 @@ def lifted(tree: Tree) -> Tree:
     return jax.tree.map(lambda leaf: array_module(leaf).asarray(leaf)[None], tree)
 
 
+def on_host(tree: Tree) -> Tree:
+    """Return every array as one of NumPy."""
+    import jax
+    import numpy
+
+    return jax.tree.map(numpy.asarray, tree)
+
+
 def stacked(trees: Sequence[Tree]) -> Tree:
     """Return trees alike as one, every array with a leading axis."""
     import jax

@@ -18,6 +18,7 @@ from jaximu.ground.distributions import student_isf
 __all__ = [
     "ARRANGEMENTS",
     "CORRELATED",
+    "EXPLAINED",
     "BlockMeans",
     "Carried",
     "Clocks",
@@ -54,6 +55,10 @@ _WELL = 0.8
 _SHEARS = [np.diag([1.0, -1.0, 0.0]), np.diag([0.0, 1.0, -1.0])]
 """A basis (5, 3, 3) of the symmetric matrices without a common scale."""
 _SHEARS += [np.eye(3)[[a]].T @ np.eye(3)[[b]] + np.eye(3)[[b]].T @ np.eye(3)[[a]] for a, b in ((0, 1), (0, 2), (1, 2))]
+
+
+EXPLAINED = 0.5
+"""Share of the turning of gravity that a gyroscope must explain for anything to be judged by it."""
 
 
 class Turning(NamedTuple):
