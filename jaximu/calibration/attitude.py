@@ -20,7 +20,7 @@ from jaximu.estimation.fitting import Prior, fit
 from jaximu.estimation.problem import Loss, Name, without_equipment_or_effects
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.differences import interpolated
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -321,15 +321,17 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
 def _turned_up(attitude: Attitude) -> Attitude:
     """Return a reference whose frame's z points down (north, east, down) with x, −y, −z for its axes."""
     w, x, y, z = attitude.quaternion.T
-    flip = np.array([1.0, -1.0, -1.0])
-    note = f"{attitude.name}: its frame's z points down; its axes were taken as x, −y, −z."
-    return replace(
-        attitude,
-        quaternion=np.stack([-x, w, -z, y], axis=1),
-        notes=(*attitude.notes, note),
-        velocity=None if attitude.velocity is None else attitude.velocity * flip,
-        position=None if attitude.position is None else attitude.position * flip,
+    turned = replace(attitude, quaternion=np.stack([-x, w, -z, y], axis=1))
+    return _mirrored(
+        turned, np.array([1.0, -1.0, -1.0]), "its frame's z points down; its axes were taken as x, −y, −z."
     )
+
+
+def _mirrored(attitude: Attitude, signs: FloatArray, note: str) -> Attitude:
+    """Return a reference whose velocity and position have some axes turned round, and say why."""
+    paths = {name: getattr(attitude, name) for name in ("velocity", "position")}
+    changed = {name: values * signs for name, values in paths.items() if values is not None}
+    return replace(attitude, notes=(*attitude.notes, f"{attitude.name}: {note}"), **changed)
 
 
 def _right_handed(recording: Recording, start: _Start) -> Attitude:
@@ -360,14 +362,10 @@ def _right_handed(recording: Recording, start: _Start) -> Attitude:
         return attitude
     axes = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
     note = (
-        f"{attitude.name}: its velocity or position runs against its attitude along {axes}, as in a left-handed frame; "
-        "it was turned round there."
+        f"its velocity or position runs against its attitude along {axes}, as in a left-handed frame; it was turned "
+        "round there."
     )
-    turned = {
-        name: None if (values := getattr(attitude, name)) is None else values * signs
-        for name in ("velocity", "position")
-    }
-    return replace(attitude, notes=(*attitude.notes, note), **turned)
+    return _mirrored(attitude, signs, note)
 
 
 def _same_unit(recording: Recording, start: _Start, imu: Imu) -> list[str]:
@@ -417,13 +415,13 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
     turned = thin.turned() / length
     good &= ~np.isnan(turned).any(axis=1)
     unit = Integral(gyroscope, gyroscope.si()).over(stamps[:-1], stamps[1:]) / length
-    return unit[good], turned[good], ((stamps[1:] + stamps[:-1]) / 2)[good]
+    return unit[good], turned[good], midpoints(stamps)[good]
 
 
 def _delays(recording: Recording, attitude: Attitude) -> list[float]:
     """Return by how much (s) the reference's stamps may be late, likeliest first, from the sizes of both rates."""
     turned = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
-    good, middle = ~np.isnan(turned), (attitude.time[1:] + attitude.time[:-1]) / 2
+    good, middle = ~np.isnan(turned), midpoints(attitude.time)
     return delays_of_speeds(recording.signals["gyroscope"], middle[good], turned[good], attitude.period)
 
 

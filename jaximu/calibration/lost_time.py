@@ -23,6 +23,7 @@ from jaximu.data.poses import condensed
 from jaximu.estimation.fitting import effect_numbers, linearise, unwhitened
 from jaximu.estimation.problem import without_equipment
 from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.differences import midpoints
 from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import conjugate, multiply, rotate, unit_vectors
 from jaximu.ground.tracing import first, lifted
@@ -283,7 +284,7 @@ class _Recorded:
             np.asarray(rotate(back, np.broadcast_to(gravity, (len(running), 3))))[:-1] for gravity in (before, after)
         )
         rate = self.gyroscope.recover_on_host(self.output[real][: len(running)])
-        middle = (rate[1:] + rate[:-1]) / 2
+        middle = midpoints(rate)
         speed = np.maximum(np.linalg.norm(middle, axis=1), 1e-9)
         axis = middle / speed[:, None]
         along = np.sum((wanted - carried) * axis, axis=1)

@@ -94,15 +94,14 @@ def calibrate_at_stops(
     longest = np.sort(np.argsort(-np.diff(stops.intervals)[:, 0])[:_MOST])
     rate, history = _rate(gyroscope, stops.intervals[longest], earth, known)
     scale = gyroscope.nominal_scale
-    covariance = rate.covariance + scale[:, None] * spread * scale
+    felt = scale[:, None] * spread * scale  # of the Earth's rotation, the same throughout
     nominal = as_stated(recording)
     unit = replace(nominal, gyroscope=replace(nominal.triads()["gyroscope"], bias=rate.bias))
     still = rms(rate.left + (rate.bias - gyroscope.nominal_offset) / scale)
-    steady = np.diag(scale[:, None] * spread * scale)
     calibration = Calibration(
         imu=on_host(unit),
         names=history.names,
-        covariance=covariance,
+        covariance=rate.covariance + felt,
         gravity=gravity,
         method="filter",
         loss="linear",
@@ -117,7 +116,7 @@ def calibrate_at_stops(
         nominal=nominal,
         absent=("accelerometer",),
         reading=recording.reading,
-        bias_sigma_recording={"gyroscope": np.sqrt(rate.sigma_recording**2 + steady)},
+        bias_sigma_recording={"gyroscope": np.sqrt(rate.sigma_recording**2 + np.diag(felt))},
     )
     vehicle = _mounted(stops, sites, force, up, (rate.bias - gyroscope.nominal_offset) / scale, gravity)
     vehicle["bias_change"] = _entry(rate.change, rate.change_sigma, "rad/s")
@@ -287,20 +286,16 @@ def _mounted(
     covariance = _of_mean(different)
     sides, speeds = _speeds(stops, force, across, up, bias)
     forward, sigma, alike = _forward(sides, speeds)
-    determined = sigma is not None and Z95 * sigma < _WIDEST and alike > _ONE_WAY
+    determined = Z95 * sigma < _WIDEST and alike > _ONE_WAY
     ahead = forward @ across
     axes = np.stack([ahead, np.cross(up, ahead), up])  # the vehicle's, in the unit: Rz(yaw) Ry(pitch) Rx(roll)
     rotation = scipy.spatial.transform.Rotation
     turns = rotation.from_rotvec(_STEP * np.vstack([np.zeros(3), across, up, -across, -up]))
     angles, *moved = (rotation.from_matrix(axes) * turns).as_euler("ZYX")[:, ::-1]
     slopes = (np.array(moved[:3]) - moved[3:]).T / (2 * _STEP)
-    whole = np.zeros((3, 3))
-    if covariance is not None:
-        quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a turn about one direction moves up along the other
-        whole[:2, :2] = quarter @ covariance @ quarter.T
-    whole[2, 2] = 0.0 if sigma is None else sigma**2
+    quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a turn about one direction moves up along the other
+    whole = scipy.linalg.block_diag(quarter @ covariance @ quarter.T, np.nan_to_num(sigma) ** 2)
     sigmas = np.sqrt(np.diag(slopes @ whole @ slopes.T))
-    shown = [None if covariance is None else float(value) for value in sigmas]
     norm = np.linalg.norm(force, axis=1)
     scatter = _of_mean(norm[:, None])
     return {
@@ -311,28 +306,28 @@ def _mounted(
         "seconds": float(np.sum(np.diff(stops.intervals))),
         "up": up.tolist(),
         "forward": ahead.tolist() if determined else None,
-        "roll": _entry(angles[0], shown[0], "rad"),
-        "pitch": _entry(angles[1], shown[1], "rad"),
-        "yaw": _entry(angles[2], shown[2], "rad") if determined else None,
-        "slope": None if covariance is None else float(np.sqrt(np.sum(different.var(axis=0, ddof=1)))),
+        "roll": _entry(angles[0], sigmas[0], "rad"),
+        "pitch": _entry(angles[1], sigmas[1], "rad"),
+        "yaw": _entry(angles[2], sigmas[2], "rad") if determined else None,
+        "slope": None if len(different) < 2 else float(np.sqrt(np.sum(different.var(axis=0, ddof=1)))),
         "speeds": [
             {"stop": int(side), "along": float(along), "left": float(left)}
             for side, (along, left) in zip(sides, speeds @ across @ axes[:2].T, strict=True)
         ],
         "forward_share": (1 + alike) / 2 if determined else None,
         "norm_error": _entry(
-            float(norm.mean() - gravity.value),
-            None if scatter is None else float(np.hypot(np.sqrt(scatter[0, 0]), gravity.sigma)),
+            norm.mean() - gravity.value,
+            np.hypot(np.sqrt(scatter[0, 0]), gravity.sigma),
             "m/s^2",
         ),
     }
 
 
-def _of_mean(values: FloatArray) -> FloatArray | None:
-    """Return the covariance of the mean of values (n, k), widened so that 1.96 of its sigmas hold 95 %; None of one."""
-    count = len(values)
+def _of_mean(values: FloatArray) -> FloatArray:
+    """Return the covariance of the mean of values (n, k), widened so that 1.96 of its sigmas hold 95 %; NaN of one."""
+    count, size = values.shape
     if count < 2:
-        return None
+        return np.full((size, size), np.nan)
     widened = student_isf(0.025, count - 1) / Z95
     return widened**2 / count * np.atleast_2d(np.cov(values.T))
 
@@ -368,14 +363,14 @@ def _speeds(
     return np.array(sides, int), np.array(speeds).reshape(-1, 2)
 
 
-def _forward(sides: IntArray, speeds: FloatArray) -> tuple[FloatArray, float | None, float]:
-    """Return the direction (2,) along which speeds (n, 2) lie, its sigma (rad) if any, and how one-sided they are.
+def _forward(sides: IntArray, speeds: FloatArray) -> tuple[FloatArray, float, float]:
+    """Return the direction (2,) along which speeds (n, 2) lie, its sigma (rad) or NaN, and how one-sided they are.
 
     The last is the sum of squared speeds one way less that of those the other way, over that of all: backwards is
     slow. Speeds beside one stop share its slope, so the scatter that counts is that of stops.
     """
     if not len(speeds):
-        return np.array([1.0, 0.0]), None, 0.0
+        return np.array([1.0, 0.0]), np.nan, 0.0
     direction = np.linalg.svd(speeds, full_matrices=False)[2][0]
     direction = direction * (np.sign(speeds.sum(axis=0) @ direction) or 1.0)
     along, across = speeds @ direction, speeds @ np.array([-direction[1], direction[0]])
@@ -383,7 +378,7 @@ def _forward(sides: IntArray, speeds: FloatArray) -> tuple[FloatArray, float | N
     pulls = np.bincount(sides, along * across)[np.unique(sides)]
     count = len(pulls)
     if count < _FEWEST_STOPS:
-        return direction, None, alike
+        return direction, np.nan, alike
     scatter = np.sqrt(np.sum(pulls**2) * count / (count - 1)) / np.sum(along**2)
     return direction, float(scatter * student_isf(0.025, count - 1) / Z95), alike
 
@@ -392,7 +387,6 @@ def _entry(value: Any, sigma: Any, unit: str) -> Json:
     """Return a number, or several, with what it is known to, as the JSON document has it; not finite ones are null."""
 
     def plain(number: Any) -> Any:
-        listed = np.asarray(number, float) if number is not None else None
-        return None if listed is None or not np.isfinite(listed).all() else listed.tolist()
+        return np.asarray(number, float).tolist() if np.isfinite(number).all() else None
 
     return {"value": plain(value), "sigma": plain(sigma), "unit": unit}

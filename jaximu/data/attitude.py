@@ -28,7 +28,7 @@ from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axi
 from jaximu.estimation.track import TRIADS, Track, added, stimuli
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
-from jaximu.ground.differences import interpolated
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.rotation import (
     Number,
     conjugate,
@@ -393,7 +393,7 @@ class AgainstAttitude(OfOneUnit):
         ends = stamps[::group]
         window = np.arange(len(ends) - 1)
         observation = np.repeat(np.concatenate([np.repeat(window, group), window]), 3)
-        middle = np.concatenate([(stamps[1:] + stamps[:-1]) / 2, (ends[1:] + ends[:-1]) / 2])
+        middle = np.concatenate([midpoints(stamps), midpoints(ends)])
         rotations = (np.arange(len(middle)) < len(used))[:, None]
         signals = self.recording.signals
         force, rate = (interpolated(signals[name].time, signals[name].si(), middle) for name in TRIADS)
@@ -542,7 +542,7 @@ class AgainstAttitude(OfOneUnit):
         turn, window = conditions.turn, conditions.window
         rate = values[: 3 * len(turn)].reshape(-1, 3)[turn] / about.details.duration[turn, None]
         stamps = self.intervals.stamp
-        middle = (stamps[1:] + stamps[:-1]) / 2
+        middle = midpoints(stamps)
         forces = values[3 * len(turn) :].reshape(-1, 3)[window]
         return {
             "rotation": (middle[turn], np.degrees(rate), "deg/s"),

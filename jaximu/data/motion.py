@@ -45,7 +45,7 @@ from jaximu.estimation.information_filter import Knowledge, WhiteRows, estimate,
 from jaximu.estimation.problem import flatten
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
-from jaximu.ground.differences import value_and_jacobian
+from jaximu.ground.differences import midpoints, value_and_jacobian
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.rotation import (
     Number,
@@ -627,7 +627,7 @@ def cut(
     force, edges = accelerometer.at(time), gyroscope.edges
     step = np.diff(time, prepend=time[0] - period, append=time[-1] + period)
     missing = np.where(step > 2.5 * period, step - period, 0.0)
-    lost = (missing[1:] + missing[:-1]) / 2
+    lost = midpoints(missing)
     resting = np.searchsorted(time, rests + np.array([_SETTLING, -_SETTLING]))
     marks = np.zeros(0) if attitude is None else np.asarray((mounting or Mounting()).on_log(attitude.time))
     pieces = _Pieces.of(gyroscope, edges, lost, resting, marks, still)

@@ -20,7 +20,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import TRIADS, Track, added, mean_outputs, stimuli
 from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
-from jaximu.ground.differences import interpolated
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.tracing import first, lifted, on_host
 from jaximu.model.noise_model import NoiseModel
@@ -251,7 +251,7 @@ def _path(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track
         signal = recording.signals[name]
         station = station_of(signal.time, stations)
         inside = station < count
-        nearest = np.clip(np.searchsorted((nodes.time[1:] + nodes.time[:-1]) / 2, signal.time), 0, len(nodes.time) - 1)
+        nearest = np.clip(np.searchsorted(midpoints(nodes.time), signal.time), 0, len(nodes.time) - 1)
         motion = {field: np.array(getattr(known, field)) for field in ("specific_force", "angular_rate")}
         for field, values in motion.items():
             values[inside] = interpolated(nodes.time, getattr(nodes, field), signal.time[inside])

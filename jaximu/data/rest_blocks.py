@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS, Track
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.differences import midpoints
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
 from jaximu.mistakes import prepared
@@ -367,7 +368,7 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
     begin, end = float(accelerometer.time[0]) - half, float(accelerometer.time[-1]) + half
     nodes = max(int(np.ceil((end - begin) / block * _NODES)), 2)
     edges = begin + block / _NODES * np.arange(nodes + 1)
-    time = (edges[1:] + edges[:-1]) / 2
+    time = midpoints(edges)
     count = nodes // _NODES
     good, moved, means = np.ones(count, bool), np.zeros(count, bool), {}
     for name in TRIADS:
@@ -420,7 +421,7 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
 def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
     """Return means between edges of the line through a signal's samples, which goes on as it ends."""
     time, values = signal.time, signal.values[:, 0]
-    whole = np.concatenate([[0.0], np.cumsum(np.diff(time) * (values[1:] + values[:-1]) / 2)])
+    whole = np.concatenate([[0.0], np.cumsum(np.diff(time) * midpoints(values))])
     inside = np.clip(edges, time[0], time[-1])
     k = np.clip(np.searchsorted(time, inside, side="right") - 1, 0, len(time) - 2)
     integral = whole[k] + (inside - time[k]) * (values[k] + np.interp(inside, time, values)) / 2

@@ -12,6 +12,7 @@ import numpy as np
 from jaximu.data.observe_stations import assembled
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.differences import midpoints
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, Signal
@@ -60,7 +61,7 @@ def shared_stations(
 def _held(time: FloatArray, span: FloatArray, rate: float) -> tuple[IntArray, FloatArray]:
     """Return which samples lie in each span, some beside it included, and how long each holds in it (S, Q), s."""
     edges = np.concatenate([[2 * time[0] - time[1]], time, [2 * time[-1] - time[-2]]])
-    edges = (edges[1:] + edges[:-1]) / 2
+    edges = midpoints(edges)
     begin = np.searchsorted(edges, span[:, 0], side="right") - 1 - _MARGIN
     nodes = int(np.ceil(np.max(np.diff(span)) * rate - 1e-6)) + 2 * _MARGIN + 1
     index = np.clip(begin, 0, len(time) - nodes)[:, None] + np.arange(nodes)

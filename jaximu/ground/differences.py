@@ -29,6 +29,11 @@ def slopes(values: Float[Array, "... n m"], time: Float[Array, "... n"]) -> Floa
     return numerics.concatenate([chord[..., :1, :], inner, chord[..., -1:, :]], axis=-2)
 
 
+def midpoints(values: Float[Array, "n ..."]) -> Float[Array, "n-1 ..."]:
+    """Return the means of neighbours along the first axis."""
+    return (values[1:] + values[:-1]) / 2
+
+
 def interpolated(time: Float[Array, " n"], values: Float[Array, "n k"], wanted: Numbers) -> Float[Array, "... k"]:
     """Return values at other times, along straight lines; the first and last value beyond the ends."""
     numerics = array_module(time, values, wanted)
