@@ -192,6 +192,10 @@ class Effect(eqx.Module):
         size = self.typical * (scale if self.unit.startswith("output") else 1.0)
         return type(self)(np.ones(self.size) * size, **jax.tree.map(np.float64, self._typical_inner()))
 
+    def needed(self, stimulus: Stimulus) -> list[Array]:
+        """Return the fields of a stimulus that the effect needs, in their order. Raises `InputError` as `need` does."""
+        return [stimulus.need(field, self.name) for field in self.needs]
+
     def term(self, stimulus: Stimulus) -> Vector:
         """Return the term (..., 3), in output units or SI as `refers_to` says, of stimuli with any leading axes."""
         raise NotImplementedError
@@ -216,8 +220,8 @@ class BiasEffect(Effect):
     scope = "device"
 
     def factor(self, stimulus: Stimulus) -> Numbers:
-        """Return the number (...) that each axis's coefficient multiplies."""
-        raise NotImplementedError
+        """Return the number (...) that each axis's coefficient multiplies: what the effect needs first, as a rule."""
+        return stimulus.need(self.needs[0], self.name)
 
     def term(self, stimulus):
         return self.coefficients * self.factor(stimulus)[..., None]

@@ -15,8 +15,5 @@ class MagCurrent(BiasEffect):
     source = "Biot and Savart's law; the current compensation of PX4 (CAL_MAGn_xCOMP) and ArduPilot (COMPASS_MOT_x)"
     typical = 2.0
 
-    def factor(self, stimulus):
-        return stimulus.need("current", self.name)
-
 
 EFFECTS = (MagCurrent,)

@@ -50,8 +50,8 @@ class MagLag(Effect):
     refers_to = "input"
 
     def term(self, stimulus):
-        rate = stimulus.need("angular_rate", self.name)
-        return self.coefficients * jnp.cross(rate, stimulus.need("magnetic_field", self.name))
+        field, rate = self.needed(stimulus)
+        return self.coefficients * jnp.cross(rate, field)
 
 
 EFFECTS = (GyroLag, MagLag)

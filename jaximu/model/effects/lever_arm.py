@@ -32,8 +32,7 @@ class AccelLeverArm(Effect):
     recovery = LEVER_RECOVERY
 
     def term(self, stimulus):
-        rate = stimulus.need("angular_rate", self.name)
-        return lever_acceleration(self.coefficients, rate, stimulus.need("angular_acceleration", self.name))
+        return lever_acceleration(self.coefficients, *self.needed(stimulus))
 
 
 EFFECTS = (AccelLeverArm,)

@@ -68,9 +68,10 @@ class _LearnedNetwork(Effect):
         return replace(sizes, coefficients=np.where(of_output, sizes.coefficients, 1.0))
 
     def term(self, stimulus):
-        rate = stimulus.need("temperature_rate", self.name)
-        temperature = stimulus.need("temperature", self.name) + ZERO_CELSIUS
-        return self.value(temperature, rate) - self.value(stimulus.temperature_reference + ZERO_CELSIUS, 0.0)
+        temperature, rate = self.needed(stimulus)
+        return self.value(temperature + ZERO_CELSIUS, rate) - self.value(
+            stimulus.temperature_reference + ZERO_CELSIUS, 0.0
+        )
 
 
 EFFECTS = AccelLearnedNetwork, GyroLearnedNetwork = pair(

@@ -42,7 +42,7 @@ class SetupReferenceFilter(SetupEffect):
     cause = False
 
     def act(self, stimulus, quantity):
-        rate, acceleration, time = (stimulus.need(field, self.name) for field in self.needs)
+        rate, acceleration, time = self.needed(stimulus)
         if time.ndim == 0 or time.shape[-1] < 2:
             raise InputError(f"the effect {self.name} needs a path in time, not one instant.")
         vector = behind(self.coefficients[0], acceleration, slopes(acceleration, time))

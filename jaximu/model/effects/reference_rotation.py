@@ -22,8 +22,7 @@ class SetupReferenceRotation(SetupEffect):
     cause = False
 
     def act(self, stimulus, quantity):
-        for name in self.needs:
-            stimulus.need(name, self.name)
+        self.needed(stimulus)
         turn = exponential(self.coefficients)
         stimulus = stimulus.changed(lambda attitude: multiply(attitude, turn), "attitude")
         return stimulus.changed(

@@ -31,9 +31,8 @@ class AccelSizeEffect(Effect):
 
     def term(self, stimulus):
         arms = self.coefficients.reshape(3, 3)
-        rate = stimulus.need("angular_rate", self.name)
-        acceleration = stimulus.need("angular_acceleration", self.name)
-        return jnp.stack([lever_acceleration(arms[i], rate, acceleration)[..., i] for i in range(3)], axis=-1)
+        motion = self.needed(stimulus)
+        return jnp.stack([lever_acceleration(arms[i], *motion)[..., i] for i in range(3)], axis=-1)
 
 
 EFFECTS = (AccelSizeEffect,)

@@ -27,10 +27,9 @@ class SetupTableTilt(SetupEffect):
     known = 0.05
 
     def act(self, stimulus, quantity):
-        attitude = stimulus.need("attitude", self.name)
+        force, attitude = self.needed(stimulus)
         tilted = multiply(exponential(jnp.append(self.coefficients, 0.0)), attitude)
-        force = rotate(conjugate(tilted), rotate(attitude, stimulus.need("specific_force", self.name)))
-        return replace(stimulus, specific_force=force, attitude=tilted)
+        return replace(stimulus, specific_force=rotate(conjugate(tilted), rotate(attitude, force)), attitude=tilted)
 
 
 EFFECTS = (SetupTableTilt,)

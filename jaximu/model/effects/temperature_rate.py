@@ -13,9 +13,6 @@ class _TemperatureRate(BiasEffect):
     excited_by = "ramps of several rates, up and down"
     source = "IEEE Std 952-2020, bias temperature-ramp sensitivity"
 
-    def factor(self, stimulus):
-        return stimulus.need("temperature_rate", self.name)
-
 
 class _TemperatureRateSquared(_TemperatureRate):
     """A bias in proportion to the square of how quickly the temperature changes."""
@@ -40,7 +37,7 @@ class _TemperatureTimesRate(_TemperatureRate):
     source = "IEEE Std 952-2020, bias temperature-ramp sensitivity, its change over temperature"
 
     def factor(self, stimulus):
-        return stimulus.warmth(self.name) * super().factor(stimulus)
+        return stimulus.warmth(self.name) * stimulus.need("temperature_rate", self.name)
 
 
 AccelTemperatureRate, GyroTemperatureRate = pair(

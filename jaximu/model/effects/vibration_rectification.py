@@ -15,9 +15,6 @@ class _VibrationRectification(BiasEffect):
     excited_by = "vibration of several strengths"
     source = "IEEE Std 1293-2018, vibration rectification error"
 
-    def factor(self, stimulus):
-        return stimulus.need("vibration_power", self.name)
-
 
 EFFECTS = AccelVibrationRectification, GyroVibrationRectification = pair(
     _VibrationRectification, "vibration_rectification", (1e-3, 1e-4), "step"
