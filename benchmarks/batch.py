@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -25,14 +26,15 @@ from scipy.optimize import least_squares
 from scipy_problem import two_step_weights
 
 import jaximu
-from jaximu.data.gravity_direction import gravity_direction
 from jaximu.data.gravity_norm import gravity_norm
 from jaximu.data.poses import PosesAndTurns
-from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.problem import without_equipment
 from jaximu.recordings.segmentation import observed_poses, segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from whitened_by_hand import gravity_direction, static_gyroscope
 
 jax.config.update("jax_enable_x64", True)
 NOMINAL = jax.tree.map(np.asarray, jaximu.Imu.nominal())

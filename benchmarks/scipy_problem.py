@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
-from jaximu.data.gravity_direction import unit_vectors
 from jaximu.data.gravity_norm import recover_specific_force
 from jaximu.data.poses_covariance import condition_covariance
 from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.problem import TOLERANCE
+from jaximu.ground.rotation import unit_vectors
 
 LOWER = np.tril_indices(3)
 

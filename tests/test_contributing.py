@@ -15,12 +15,14 @@ from centrifuge import Centrifuge
 
 import jaximu
 from jaximu.cli import main
+from jaximu.data.observe_stations import scheme_stations
 from jaximu.data.stations import KnownStations
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Triad
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.readers import read_recording
 from jaximu.simulation import draw_imu
+from jaximu.simulation.protocols import Positions
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "CONTRIBUTING.md"
@@ -151,6 +153,6 @@ def test_what_is_not_diagnosed_says_so():
     with pytest.raises(jaximu.InputError, match="are for recordings, and data were given"):
         jaximu.diagnose(data, repair=True)
     with pytest.raises(jaximu.InputError, match="KnownStations cannot be diagnosed: give the recording"):
-        jaximu.diagnose(KnownStations(None))
+        jaximu.diagnose(KnownStations(scheme_stations(Positions(6))))
     with pytest.raises(jaximu.InputError, match=r"no effect 'accel\.quadrat'"):
         jaximu.diagnose(data, candidates=["accel.quadrat"])

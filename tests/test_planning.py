@@ -11,14 +11,13 @@ import pytest
 from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from whitened_by_hand import gravity_direction, static_gyroscope
 
 from jaximu import InputError, LocalGravity
 from jaximu.calibration import fit_hand_held
 from jaximu.cli import main
-from jaximu.data.gravity_direction import gravity_direction
 from jaximu.data.gravity_norm import gravity_norm
 from jaximu.data.poses_covariance import condition_covariance
-from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.problem import Name, Parameters, flatten, names_of, without_equipment
 from jaximu.model.effects import CATALOGUE

@@ -7,13 +7,12 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from synthetic import GRAVITY, POSES, recording, simulated
+from whitened_by_hand import gravity_direction, static_gyroscope, turn_rotations
 
 from jaximu.data import forces_and_angles
-from jaximu.data.gravity_direction import gravity_direction, turn_rotations
 from jaximu.data.gravity_norm import gravity_norm
 from jaximu.data.poses import condense
 from jaximu.data.poses_covariance import condition_covariance
-from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.covariance import inverse_cholesky
 from jaximu.estimation.problem import Parameters, Problem, without_equipment
 from jaximu.estimation.solver import solve

@@ -89,7 +89,7 @@ def test_data_alone_are_calibrated_and_wrong_ones_refused(tmp_path):
     with pytest.raises(jaximu.InputError, match="without gyroscope"):
         jaximu.calibrate([jaximu.Recording(log.accelerometer), data], EXACT)
     with pytest.raises(jaximu.InputError, match="KnownStations cannot be fitted"):
-        jaximu.calibrate(KnownStations(None), EXACT)
+        jaximu.calibrate(KnownStations(scheme_stations(Positions(6))), EXACT)
     half = replace(log, accelerometer=replace(log.accelerometer, values=log.accelerometer.values / 9.80665, unit="g"))
     table = RecordedStations(log, scheme_stations(Positions(6)))
     with pytest.raises(jaximu.InputError, match="different units or scales"):

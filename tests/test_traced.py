@@ -9,13 +9,12 @@ import numpy as np
 import optimistix as optx
 import pytest
 from synthetic import GRAVITY, POSES, SAMPLES, recording, simulated
+from whitened_by_hand import gravity_direction, static_gyroscope
 
 import jaximu
-from jaximu.data.gravity_direction import gravity_direction
 from jaximu.data.gravity_norm import gravity_norm
 from jaximu.data.poses import PosesAndTurns, condense
 from jaximu.data.poses_covariance import turned_by
-from jaximu.data.static_gyroscope import static_gyroscope
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.estimation.projection import output_error, sensitivity
 from jaximu.estimation.track import Recorded

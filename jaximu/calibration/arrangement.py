@@ -6,7 +6,7 @@ columns are called. They are mistakes where somebody relies on the file's axes a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -15,14 +15,10 @@ from jaximu.estimation.uncertainty import WeakDirection, gains_open
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
 from jaximu.model.sensor import Imu, Triad
-from jaximu.recordings.alignment import angle_of, rotation_of, signed_permutation
+from jaximu.recordings.alignment import EXPLAINED, angle_of, rotation_of, signed_permutation
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, apply_axes, spelled_axes
 
-__all__ = ["arrangement", "axes_unlike", "unusual_gains"]
-
-_EXPLAINED = 0.5
-"""Share of the turning of gravity that a gyroscope must explain for its axes to be judged by it."""
 _MOUNTED = np.radians(5.0)
 """Rotation of the gyroscope against the accelerometer beyond which it is a mounting and no misalignment."""
 _BETWEEN = np.radians(20.0)
@@ -81,7 +77,7 @@ def unusual_gains(imu: Imu, weak: Sequence[WeakDirection], scales: Mapping[str, 
 def axes_unlike(recording: Recording, imu: Imu) -> str:
     """Say which axes of a recording are not those of a calibrated unit, as gravity turns in it; else nothing."""
     motion, gyroscope = recording.turning, recording.gyroscope
-    if motion is None or motion.explained < _EXPLAINED or gyroscope is None or imu.gyroscope is None:
+    if motion is None or motion.explained < EXPLAINED or gyroscope is None or imu.gyroscope is None:
         return ""
     arranged = signed_permutation(motion.matrix @ (np.asarray(imu.gyroscope.gain) / gyroscope.nominal_scale[:, None]))
     if np.array_equal(arranged, np.eye(3)):
@@ -114,7 +110,14 @@ def _axes(arranged: FloatArray) -> Finding:
     elif np.array_equal(arranged, -np.eye(3)):
         rivals.append("data.order")
         text += " Rows in reverse, or both sensors in left-handed axes, look exactly the same."
-    return Finding("data.swapped_axes", (), text, f'--axes "{option}"', tuple(rivals), apply=_mapped(option))
+    return Finding(
+        "data.swapped_axes",
+        (),
+        text,
+        f'--axes "{option}"',
+        tuple(rivals),
+        apply=lambda recording: apply_axes(recording, option),
+    )
 
 
 def _wrong(matrix: FloatArray) -> int:
@@ -136,57 +139,35 @@ def _described(matrix: FloatArray) -> str:
     return ", and ".join(parts)
 
 
-def _mapped(option: str) -> Callable[[Recording], Recording]:
-    return lambda recording: apply_axes(recording, option)
-
-
 def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
     """Name scales that are a whole factor off the data sheet's, or off by more than sensors are."""
     sizes = np.linalg.norm(np.asarray(triad.gain), axis=1) / scale
+    logarithm = np.log(sizes)
+    usual, odd = float(np.exp(np.mean(logarithm))), np.abs(logarithm) > _ODD
     option = "--accel-scale" if name == "accelerometer" else "--gyro-scale"
-    findings = []
-    whole = np.zeros(3)
     like = "another full-scale range" + (", or a sample rate that is as far off" if name == "gyroscope" else "")
+    whole = np.zeros(3)
     for factor in _FACTORS:
         whole[np.abs(np.log(sizes / factor)) < _NEAR] = factor
+
+    def of_range(sensor: str, size: float, text: str) -> Finding:
+        return Finding("data.range", (), f"{sensor}: its gain is {size:.3g} times the nominal{text}")
+
     if whole.all() and len(set(whole)) == 1:
-        return [
-            Finding(
-                "data.range",
-                (),
-                f"{name}: its gain is {np.exp(np.mean(np.log(sizes))):.3g} times the nominal on all axes, as with "
-                f"{like}. State the range that was set ({option}); the calibration includes it.",
-            )
-        ]
-    usual = float(np.exp(np.mean(np.log(sizes))))
-    if (np.abs(np.log(sizes)) > _ODD).all() and np.ptp(np.log(sizes)) < _NEAR:
-        return [
-            Finding(
-                "data.range",
-                (),
-                f"{name}: its gain is {usual:.3g} times the nominal on all axes, more than such sensors differ. Check "
-                f"{option}; the calibration includes it.",
-            )
-        ]
-    for index, axis in enumerate("xyz"):
-        if whole[index]:
-            findings.append(
-                Finding(
-                    "data.range",
-                    (),
-                    f"{name} {axis}: its gain is {sizes[index]:.3g} times the nominal, a whole factor, as with another "
-                    "full-scale range or unit on this axis. The calibration includes it.",
-                )
-            )
-        elif abs(np.log(sizes[index])) > _ODD:
-            findings.append(
-                Finding(
-                    "data.range",
-                    (),
-                    f"{name} {axis}: its gain is {sizes[index]:.3g} times the nominal, more than such sensors differ. "
-                    f"Check {option}.",
-                )
-            )
+        text = f" on all axes, as with {like}. State the range that was set ({option}); the calibration includes it."
+        return [of_range(name, usual, text)]
+    if odd.all() and np.ptp(logarithm) < _NEAR:
+        text = f" on all axes, more than such sensors differ. Check {option}; the calibration includes it."
+        return [of_range(name, usual, text)]
+    another = (
+        ", a whole factor, as with another full-scale range or unit on this axis. The calibration includes it.",
+        f", more than such sensors differ. Check {option}.",
+    )
+    findings = [
+        of_range(f"{name} {axis}", size, another[0 if factor else 1])
+        for axis, size, factor, far in zip("xyz", sizes, whole, odd, strict=True)
+        if factor or far
+    ]
     if name == "gyroscope" and not findings and abs(usual - 1) > _SLOW and np.ptp(sizes) < _ALIKE:
         findings.append(
             Finding(

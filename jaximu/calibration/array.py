@@ -11,13 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-import jax
 import numpy as np
 import scipy
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.array_units import Array, ArrayUnit, Averaged
-from jaximu.calibration.attitude import delay_of_speeds, fitted_mounting
+from jaximu.calibration.attitude import delays_of_speeds, fitted_mounting, later_zero
 from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.recipe import calibrate
@@ -27,21 +26,21 @@ from jaximu.data.stations import KnownStations, station_errors
 from jaximu.estimation.fitting import Fit, Prior, fit
 from jaximu.estimation.problem import Loss, flatten, names_of, typical_sizes
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import right_jacobian
+from jaximu.ground.tracing import on_host
 from jaximu.mistakes import prepare
 from jaximu.model.mounting import Mounting
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.alignment import turning_best
 from jaximu.recordings.observations import Stations
-from jaximu.recordings.recording import Reading, Recording, Signal
-from jaximu.recordings.reference import Integral
+from jaximu.recordings.recording import Reading, Recording
+from jaximu.recordings.reference import means_over
 from jaximu.recordings.segmentation import rest_statistics
-
-__all__ = ["calibrate_array"]
 
 _WINDOWS = 128
 """Intervals of motion in which two units are compared."""
@@ -55,8 +54,6 @@ _FEWEST = 32
 """Intervals of motion."""
 _ALIKE = 0.5
 """Share of a unit's rotation that the first must explain."""
-_APART = 1e6
-"""Seconds between both first stamps from which on they do not count from the same zero: both begin together."""
 _LITTLE = 1e-6
 """Standard deviation, in typical sizes, below which no number is known: keeps a covariance regular."""
 _BLOCK = 0.25  # s, of the means whose scatter at rest is the noise
@@ -154,7 +151,7 @@ class _Shared:
         near = _NEAR / slowest
         measured = np.searchsorted(unseen, start - near) == np.searchsorted(unseen, start + length + near)
         start = start[~still & measured]
-        speed = np.linalg.norm(_means(gyroscopes[0], np.stack([start, start + length], axis=1)), axis=1)
+        speed = np.linalg.norm(means_over(gyroscopes[0], np.stack([start, start + length], axis=1)), axis=1)
         start, speed = start[speed > _SLOW], speed[speed > _SLOW]
         if len(start) < _FEWEST or len(rests) < 3:
             raise NotPossibleError(
@@ -171,24 +168,15 @@ class _Shared:
     def means(self, recording: Recording, delay: float) -> tuple[FloatArray, FloatArray]:
         """Return a unit's mean forces at rest (P, 3) and mean rates in motion (S, 3)."""
         gyroscope = recording.signals["gyroscope"]
-        return _means(recording.accelerometer, self.rests - delay), _means(gyroscope, self.moving - delay)
-
-
-def _means(signal: Signal, span: FloatArray) -> FloatArray:
-    return Integral(signal, signal.values).over(*span.T) / np.diff(span)
-
-
-def _later(recording: Recording, first: Recording) -> float:
-    """Return how much later (s) the first's zero of time is, where both count from the same zero."""
-    later = float(first.start) - float(recording.start)
-    return later if abs(later) < _APART else 0.0
+        return means_over(recording.accelerometer, self.rests - delay), means_over(gyroscope, self.moving - delay)
 
 
 def _coarse_delay(recording: Recording, first: Recording) -> float:
     """Return by how much (s) the first's stamps are late, to a sample."""
-    gyroscope, later = first.signals["gyroscope"], _later(recording, first)
+    gyroscope, later = first.signals["gyroscope"], later_zero(first.start, recording.start)
     speed = np.linalg.norm(gyroscope.values, axis=1)
-    return delay_of_speeds(recording.signals["gyroscope"], gyroscope.time + later, speed, 1 / gyroscope.rate) - later
+    delays = delays_of_speeds(recording.signals["gyroscope"], gyroscope.time + later, speed, 1 / gyroscope.rate)
+    return delays[0] - later
 
 
 # --- one unit beside the first ----------------------------------------------------------------------------------------
@@ -208,18 +196,18 @@ def _pair(
     back = _rotation(shared, corrected, delay)
     turned = Rotation.from_matrix(back)
     setup = Mounting.effects(np.ptp(shared.moving), rotation=turned.as_rotvec(), delay=0.0, lever_arm=0.0)
-    start = jax.tree.map(np.asarray, calibration.imu.with_effects(*setup))
+    start = on_host(calibration.imu.with_effects(*setup))
     noise = _noise(recording, shared, start, back, delay)
     stations = [
         shared_stations(recording, shared.first, span - delay, delay, noise, gravity.value, still)
         for span, still in ((shared.rests, True), (shared.moving, False))
     ]
-    measurements = [KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[None], part)) for part in stations]
+    measurements = list(map(KnownStations, stations))
     prior = _prior(start, calibration, known, back)
     fitted = fit(start, measurements, lambda name: name in prior.names, prior=prior, loss=loss)
     require_solved(fitted, recording.name)
     unit, errors = _unit(recording.name, calibration, fitted, delay, stations[1])
-    return replace(unit, time_offset=unit.time_offset - _later(recording, shared.first)), errors
+    return replace(unit, time_offset=unit.time_offset - later_zero(shared.first.start, recording.start)), errors
 
 
 def _rotation(shared: _Shared, corrected: Recording, delay: float) -> FloatArray:
@@ -289,7 +277,7 @@ def _unit(
     errors = {kind.name: kind.error for kind in station_errors(fitted.imu, motion, np.zeros(3))}
     length = np.asarray(motion.stop - motion.start)[np.asarray(motion.gyroscope_used)]
     both = np.concatenate([back @ errors["specific_force"], back @ (np.radians(errors["turn_angle"]) / length)]).T
-    rate, force = (float(np.sqrt(np.mean(both[:, columns] ** 2))) for columns in (slice(3, 6), slice(3)))
+    rate, force = (rms(both[:, columns]) for columns in (slice(3, 6), slice(3)))
     unit = ArrayUnit(
         name,
         calibration,
@@ -338,8 +326,8 @@ def _averaged(shared: _Shared, corrected: Sequence[Recording], units: Sequence[A
     for name in ("gyroscope", "accelerometer"):
         outputs = []
         for recording, unit in zip(corrected, units, strict=True):
-            begin = start + unit.time_offset + _later(recording, shared.first)
-            values = _means(recording.signals[name], np.stack([begin, begin + _BLOCK], axis=1))
+            begin = start + unit.time_offset + later_zero(shared.first.start, recording.start)
+            values = means_over(recording.signals[name], np.stack([begin, begin + _BLOCK], axis=1))
             values = Rotation.from_quat(unit.rotation, scalar_first=True).inv().apply(values)
             means = np.stack([np.bincount(rest, axis) for axis in values.T], 1) / np.bincount(rest)[:, None]
             outputs.append(values - means[rest])

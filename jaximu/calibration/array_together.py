@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from jaximu.calibration.array_units import Array
@@ -23,15 +21,15 @@ from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.poses import EXCESS_NAMES, condensed
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import Name, without_equipment
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
+from jaximu.ground.tracing import stacked
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.segmentation import observed_poses
-
-__all__ = ["LeftOutTurns", "Together", "fit_together", "leave_out_turns"]
 
 _FEWEST = 6
 """Turns that all units measured, without which nothing is left to fit once half of them are left out."""
@@ -118,7 +116,7 @@ def leave_out_turns(found: Array, parts: int = 2) -> LeftOutTurns:
         errors.append([angle[:, turns].ravel() for angle in met])
         common.append(fitted.in_common)
     whole = [np.concatenate(angles) for angles in zip(*errors, strict=True)]
-    alone, apart_alone, together, apart = (float(np.sqrt(np.mean(angles**2))) for angles in whole)
+    alone, apart_alone, together, apart = map(rms, whole)
     return LeftOutTurns(len(whole[0]), (alone, together), (apart_alone, apart), float(np.mean(common)))
 
 
@@ -138,14 +136,14 @@ def _observed(array: Array) -> Observations:
         if effects := tuple(imu.all_effects().values()):
             observations = RecordedByHand((part,), observations).along(imu, effects).observations
         observed.append(observations)
-    return _stacked(observed)
+    return stacked(observed)
 
 
-def _fitted(array: Array, observations: Observations, left_out: Sequence[int] | NDArray[np.int64]) -> Together:
+def _fitted(array: Array, observations: Observations, left_out: Sequence[int] | IntArray) -> Together:
     mask = np.array(observations.turns.mask)
     mask[:, list(left_out)] = False
     observations = eqx.tree_at(lambda tree: tree.turns.mask, observations, mask)
-    alone = fit_hand_held(_stacked([unit.calibration.imu.with_effects() for unit in array.units]), observations)
+    alone = fit_hand_held(stacked([unit.calibration.imu.with_effects() for unit in array.units]), observations)
     back = Rotation.from_quat([unit.rotation for unit in array.units], scalar_first=True).inv()
     turned = [
         unit.with_effects(SetupReferenceRotation.make(vector))
@@ -169,8 +167,7 @@ def _most_in_common(alone: Fit, observations: Observations) -> float:
 
     A few turns would else do without a maximum of the likelihood: the gains that all units share run after this size.
     """
-    assert alone.imu.gyroscope is not None
-    back = np.linalg.inv(alone.imu.gyroscope.gain)
+    back = np.linalg.inv(alone.imu.triads()["gyroscope"].gain)
     noise = np.trace(back @ observations.turns.noise @ back.swapaxes(1, 2), axis1=1, axis2=2)
     return float(np.max(alone.excess[:, EXCESS_NAMES.index("turns")] * noise) / noise[0])
 
@@ -186,7 +183,7 @@ def _met(units: Sequence[Imu], mounted: FloatArray, observations: Observations) 
 
     mounted: quaternions (U − 1, 4), w first, from the first unit's axes to the others'.
     """
-    carried = condensed(_stacked([unit.with_effects() for unit in units]), observations)
+    carried = condensed(stacked([unit.with_effects() for unit in units]), observations)
     turned = [Rotation.from_quat(turns, scalar_first=True) for turns in np.asarray(carried.conditions.rotation)]
     apart = []
     for other, quaternion in zip(turned[1:], mounted, strict=True):
@@ -199,7 +196,3 @@ def _mountings(units: Sequence[Imu]) -> FloatArray:
     """Return quaternions (U − 1, 4), w first, from the first unit's axes to the others'."""
     vectors = [unit.coefficients(SetupReferenceRotation) for unit in units[1:]]
     return Rotation.from_rotvec(vectors).inv().as_quat(scalar_first=True)
-
-
-def _stacked(trees: Sequence[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import Document
+from jaximu.ground.document import Document, Json
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.page import Result
-
-__all__ = ["Array", "ArrayUnit", "Averaged"]
 
 SCHEMA = "jaximu.array/1"
 _SUSPECT = 2.0
@@ -44,7 +41,7 @@ class ArrayUnit:
     rate_scatter: float | None = None
     force_scatter: float | None = None
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the unit as `array.json` has it."""
         return {
             "file": self.name,
@@ -70,7 +67,7 @@ class Averaged:
     rate: tuple[float, float, float]
     force: tuple[float, float, float]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return it as `array.json` has it."""
         return {
             name: dict(zip(("unit", "mean", "expected"), values, strict=True))
@@ -87,7 +84,7 @@ class Array(Result, Document, page="array"):
     gravity: LocalGravity
     notes: tuple[str, ...] = ()
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the array as the JSON document of schema `jaximu.array/1`."""
         sources = [unit.calibration.data for unit in self.units]
         return {

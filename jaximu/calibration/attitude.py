@@ -6,12 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax
 import numpy as np
 import scipy
 
 from jaximu.calibration.arrangement import arrangement
-from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, notes_of, provenance
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import errors_of
 from jaximu.calibration.refusals import require_determined
@@ -21,9 +20,11 @@ from jaximu.estimation.fitting import Prior, fit
 from jaximu.estimation.problem import Loss, Name, without_equipment_or_effects
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.differences import interpolated, midpoints
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
-from jaximu.ground.precision import require_float64
+from jaximu.ground.tracing import on_host
 from jaximu.mistakes import prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_delay import SetupReferenceDelay
@@ -36,15 +37,6 @@ from jaximu.recordings.alignment import signed_permutation, turning_best
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral
-
-__all__ = [
-    "Mounted",
-    "calibrate_against_attitude",
-    "delay_of_speeds",
-    "fitted_mounting",
-    "mounted_on",
-    "reference_summary",
-]
 
 _NEAR = 10.0
 """Seconds within which the reference's clock is believed, unless another offset explains far more."""
@@ -114,7 +106,6 @@ def calibrate_against_attitude(
     Raises `InputError` where the reference does not overlap the recording or is none, `NotPossibleError` where it
     stands still, moves otherwise than the unit, or determines next to nothing.
     """
-    require_float64()
     gravity = as_gravity(gravity)
     if recording.gyroscope is None:
         raise InputError(f"{recording.name}: a reference attitude calibrates a gyroscope, and there is none.")
@@ -124,19 +115,14 @@ def calibrate_against_attitude(
         start = _coarse(recording, attitude.usable())
         start = replace(start, attitude=_right_handed(recording, start))
         measurement = AgainstAttitude(recording, start.attitude, gravity.value, noise)
-        chosen = [effect_named(effect) for effect in effects]
-        imu = _begin(recording, start, chosen, unit)
-        prior = Prior.of_effects(imu, effect_sigmas)
-        of_setup = _of_setup(imu)
+        imu = _begin(recording, start, list(map(effect_named, effects)), unit)
+        prior, of_setup = Prior.of_effects(imu, effect_sigmas), _of_setup(imu)
 
-        def biases_and_setup(name: Name) -> bool:
-            return name.part == "bias" or of_setup(name)
+        def free(name: Name) -> bool:
+            return without_equipment_or_effects(name) if unit is None else name.part == "bias" or of_setup(name)
 
-        free = without_equipment_or_effects if unit is None else biases_and_setup
         fitted = fit(imu, measurement, free, prior=prior, loss=loss)
-        where = recording.name
-        require_determined(fitted, where, f"{attitude.name} shows too few turns, which", _RECORD, prior)
-    likeness = _same_unit(recording, start, fitted.imu)
+        require_determined(fitted, recording.name, f"{attitude.name} shows too few turns, which", _RECORD, prior)
     calibration = concluded(
         fitted,
         gravity=gravity,
@@ -147,20 +133,14 @@ def calibrate_against_attitude(
         rms=[errors_of([measurement], unit) for unit in (imu, fitted.imu)],
         known=list(filter(of_setup, fitted.names)),
         data=provenance([recording]) | {"reference": attitude.name, "intervals": int(measurement.intervals.used.sum())},
-        notes=[
-            *likeness,
-            *ready.notes,
-            *recording.notes,
-            *start.attitude.notes,
-            *(() if noise is None else noise.notes),
-        ],
+        notes=[*_same_unit(recording, start, fitted.imu), *notes_of(ready, recording, start.attitude, noise)],
         nominal=imu.with_effects(),
         reading=recording.reading,
     )
     calibration = replace(calibration, covariance=calibration.covariance + _of_shape(calibration, measurement))
     notes = (*(finding.text for finding in arrangement(recording, calibration)), *calibration.notes)
-    calibration = replace(calibration, notes=tuple(dict.fromkeys(notes)))
-    return replace(calibration, reference=reference_summary(calibration)), measurement
+    calibration = replace(calibration, notes=tuple(dict.fromkeys(notes)), reference=reference_summary(calibration))
+    return calibration, measurement
 
 
 @dataclass(frozen=True)
@@ -214,8 +194,7 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     what a first-order lag of that variance has.
     """
     data, imu = measurement.intervals, calibration.imu
-    assert imu.gyroscope is not None
-    matrix = np.asarray(imu.gyroscope.inverse())
+    matrix = np.asarray(imu.triads()["gyroscope"].inverse())
     rate, slope = np.asarray(data.rate) @ matrix[:, :3].T + matrix[:, 3], np.asarray(data.slope) @ matrix[:, :3].T
     spread = abs(float(Mounting.of(imu).filter_variance))
     delay = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
@@ -235,7 +214,13 @@ def _begin(recording: Recording, start: _Start, effects: Sequence[Effect], unit:
     if unit is None and imu.gyroscope is not None:
         imu = replace(imu, gyroscope=replace(imu.gyroscope, gain=np.asarray(imu.gyroscope.gain) @ start.arranged))
     by_name = {effect.name: effect for effect in (*setup, *imu.all_effects().values(), *effects)}
-    return jax.tree.map(np.asarray, imu.with_effects(*by_name.values()))
+    return on_host(imu.with_effects(*by_name.values()))
+
+
+def later_zero(start: float, other: float) -> float:
+    """Return how much later (s) one zero of time is than another; none where the two are not on one clock."""
+    later = float(start) - float(other)
+    return later if abs(later) < _APART else 0.0
 
 
 def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: Array) -> tuple[Mounting, Mounting]:
@@ -249,7 +234,7 @@ def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: Array) -> tuple
     return Mounting.of(imu), Mounting(*map(of, MOUNTING_EFFECTS))
 
 
-def reference_summary(calibration: Calibration) -> dict[str, Any]:
+def reference_summary(calibration: Calibration) -> Json:
     """Return what `calibration.json` says of the reference; the lever arm is from it to the unit, in its axes."""
     mounting, covariance = fitted_mounting(calibration.imu, calibration.names, calibration.covariance)
     turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation)
@@ -279,12 +264,9 @@ def reference_summary(calibration: Calibration) -> dict[str, Any]:
 
 def _coarse(recording: Recording, attitude: Attitude) -> _Start:
     """Find the reference's delay and mounting, and whether its quaternions run the other way or have w last."""
-    gyroscope = recording.gyroscope
-    assert gyroscope is not None
-    later = attitude.start - float(recording.start)
+    gyroscope = recording.signals["gyroscope"]
     name = recording.name
-    if abs(later) < _APART:
-        attitude = replace(attitude, time=attitude.time + later)
+    attitude = replace(attitude, time=attitude.time + later_zero(attitude.start, recording.start))
     span = gyroscope.time[[0, -1]]
     if attitude.time[0] > span[1] or attitude.time[-1] < span[0]:
         raise InputError(
@@ -339,15 +321,17 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
 def _turned_up(attitude: Attitude) -> Attitude:
     """Return a reference whose frame's z points down (north, east, down) with x, −y, −z for its axes."""
     w, x, y, z = attitude.quaternion.T
-    flip = np.array([1.0, -1.0, -1.0])
-    note = f"{attitude.name}: its frame's z points down; its axes were taken as x, −y, −z."
-    return replace(
-        attitude,
-        quaternion=np.stack([-x, w, -z, y], axis=1),
-        notes=(*attitude.notes, note),
-        velocity=None if attitude.velocity is None else attitude.velocity * flip,
-        position=None if attitude.position is None else attitude.position * flip,
+    turned = replace(attitude, quaternion=np.stack([-x, w, -z, y], axis=1))
+    return _mirrored(
+        turned, np.array([1.0, -1.0, -1.0]), "its frame's z points down; its axes were taken as x, −y, −z."
     )
+
+
+def _mirrored(attitude: Attitude, signs: FloatArray, note: str) -> Attitude:
+    """Return a reference whose velocity and position have some axes turned round, and say why."""
+    paths = {name: getattr(attitude, name) for name in ("velocity", "position")}
+    changed = {name: values * signs for name, values in paths.items() if values is not None}
+    return replace(attitude, notes=(*attitude.notes, f"{attitude.name}: {note}"), **changed)
 
 
 def _right_handed(recording: Recording, start: _Start) -> Attitude:
@@ -378,14 +362,10 @@ def _right_handed(recording: Recording, start: _Start) -> Attitude:
         return attitude
     axes = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0)
     note = (
-        f"{attitude.name}: its velocity or position runs against its attitude along {axes}, as in a left-handed frame; "
-        "it was turned round there."
+        f"its velocity or position runs against its attitude along {axes}, as in a left-handed frame; it was turned "
+        "round there."
     )
-    turned = {
-        name: None if (values := getattr(attitude, name)) is None else values * signs
-        for name in ("velocity", "position")
-    }
-    return replace(attitude, notes=(*attitude.notes, note), **turned)
+    return _mirrored(attitude, signs, note)
 
 
 def _same_unit(recording: Recording, start: _Start, imu: Imu) -> list[str]:
@@ -394,8 +374,7 @@ def _same_unit(recording: Recording, start: _Start, imu: Imu) -> list[str]:
     Compared are second differences of the mean rates over a few samples, where the unit moves least: there what both
     share is noise.
     """
-    gyroscope = recording.gyroscope
-    assert gyroscope is not None
+    gyroscope = recording.signals["gyroscope"]
     mounting = Mounting.of(imu)
     turned = scipy.spatial.transform.Rotation.from_rotvec(mounting.rotation).as_matrix()
     unit, reference, time = _rates(recording, start.attitude, float(mounting.delay))
@@ -424,8 +403,7 @@ def _same_unit(recording: Recording, start: _Start, imu: Imu) -> list[str]:
 
 def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the unit's and the reference's mean rates (n, 3) between the latter's stamps, and when (n,)."""
-    gyroscope = recording.gyroscope
-    assert gyroscope is not None
+    gyroscope = recording.signals["gyroscope"]
     stride = max(1, round(4 / gyroscope.rate / attitude.period))
     thin = replace(
         attitude, time=attitude.time[::stride], quaternion=attitude.quaternion[::stride], velocity=None, position=None
@@ -437,24 +415,21 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
     turned = thin.turned() / length
     good &= ~np.isnan(turned).any(axis=1)
     unit = Integral(gyroscope, gyroscope.si()).over(stamps[:-1], stamps[1:]) / length
-    return unit[good], turned[good], ((stamps[1:] + stamps[:-1]) / 2)[good]
+    return unit[good], turned[good], midpoints(stamps)[good]
 
 
 def _delays(recording: Recording, attitude: Attitude) -> list[float]:
     """Return by how much (s) the reference's stamps may be late, likeliest first, from the sizes of both rates."""
-    assert recording.gyroscope is not None
     turned = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
-    good, middle = ~np.isnan(turned), (attitude.time[1:] + attitude.time[:-1]) / 2
-    return _delays_of_speeds(recording.gyroscope, middle[good], turned[good], attitude.period)
+    good, middle = ~np.isnan(turned), midpoints(attitude.time)
+    return delays_of_speeds(recording.signals["gyroscope"], middle[good], turned[good], attitude.period)
 
 
-def delay_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, period: float) -> float:
-    """Return by how much (s) the stamps of another's angular speed (n,), rad/s, are late against a gyroscope's."""
-    return _delays_of_speeds(gyroscope, stamps, speeds, period)[0]
+def delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, period: float) -> list[float]:
+    """Return by how much (s) the stamps of another's angular speed (n,), rad/s, are late against a gyroscope's.
 
-
-def _delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, period: float) -> list[float]:
-    """Return the delay (s) of the speeds, and others at which they are nearly as much alike."""
+    The likeliest first, then others at which both are nearly as much alike.
+    """
     rate = gyroscope.si()
     size = np.linalg.norm(rate - np.median(rate, axis=0), axis=1)
     step = max(period, 1 / gyroscope.rate, 5e-3)
@@ -510,7 +485,7 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
 
 def _forces(recording: Recording, attitude: Attitude, time: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
     """Return the accelerometer's output and upwards in the reference's body, (n, 3) each, at times (n,)."""
-    force = np.stack([np.interp(time, recording.accelerometer.time, axis) for axis in _smooth(recording).T], 1)
+    force = interpolated(recording.accelerometer.time, _smooth(recording), time)
     known = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay)
     return force, known.inv().apply([0.0, 0.0, 1.0])
 
@@ -521,8 +496,7 @@ def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Star
     The accelerometer alone says how the reference is mounted, the gyroscope alone how its rates hang together with the
     reference's.
     """
-    gyroscope = recording.gyroscope
-    assert gyroscope is not None
+    gyroscope = recording.signals["gyroscope"]
     unit, reference, time = _rates(recording, attitude, delay)
     if len(unit) < 16:
         return None

@@ -16,8 +16,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.noise_model import NoiseModel
 
-__all__ = ["knowing_drift", "with_gravity"]
-
 
 def knowing_drift(
     calibration: Calibration,

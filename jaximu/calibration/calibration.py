@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from jaximu.estimation.fitting import Fit
@@ -15,14 +14,16 @@ from jaximu.estimation.problem import TOLERANCE, Name, flatten, names_of, typica
 from jaximu.estimation.projection import OutputUncertainty, output_uncertainty
 from jaximu.estimation.uncertainty import WeakDirection, describe, gains_open, pose_advice, weak_directions
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document, damage, read_document
-from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.document import SOFTWARE, Document, Json, damage, read_document
+from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.page import Result
 from jaximu.ground.parameters import Parameter, ParameterTable
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed, unit_text
 from jaximu.ground.reexport import later
+from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.tracing import on_host
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu, Triad
@@ -33,16 +34,6 @@ from jaximu.recordings.segmentation import Segmentation
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = [
-    "MAGNETIC",
-    "Calibration",
-    "concluded",
-    "effect_named",
-    "load_calibration",
-    "provenance",
-    "require_calibration",
-]
 
 SCHEMA = "jaximu.calibration/1"
 MAGNETIC = ("field", "heading_error", "coverage", "norm_spread", "gyroscope_bias", "disturbed", "next")
@@ -89,7 +80,7 @@ class Calibration(Result, Document, page="calibration"):
     weak: tuple[WeakDirection, ...]
     excess: dict[str, float]
     solver: str
-    data: dict[str, Any]
+    data: Json
     notes: tuple[str, ...] = ()
     software: dict[str, str] = field(default_factory=SOFTWARE.copy)
     fit: Fit | None = None
@@ -97,12 +88,12 @@ class Calibration(Result, Document, page="calibration"):
     stations: Stations | None = None
     segmentations: tuple[Segmentation, ...] = ()
     nominal: Imu | None = None
-    diagnosis: dict[str, Any] | None = None
-    reference: dict[str, Any] | None = None
-    magnetic: dict[str, Any] | None = None
-    trace: dict[str, Any] | None = None
+    diagnosis: Json | None = None
+    reference: Json | None = None
+    magnetic: Json | None = None
+    trace: Json | None = None
     digest: str | None = None
-    filter: dict[str, Any] | None = None
+    filter: Json | None = None
     absent: tuple[str, ...] = ()
     reading: Reading | None = None
     bias_sigma_recording: Mapping[str, FloatArray] = field(default_factory=dict)
@@ -229,11 +220,11 @@ class Calibration(Result, Document, page="calibration"):
         held = np.linalg.eigvalsh(rest).min(initial=0.0) > -_ROUNDING  # C − s sᵀ is a covariance
         return shift if held else np.zeros(len(shift))
 
-    def _effects(self, owner: str, model: Triad) -> dict[str, Any]:
+    def _effects(self, owner: str, model: Triad) -> Json:
         """Return the effects of a triad as the JSON document has them."""
         sigmas = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)).tolist(), strict=True))
 
-        def entry(position: int, effect: Effect) -> dict[str, Any]:
+        def entry(position: int, effect: Effect) -> Json:
             sigma = [sigmas.get(Name(owner, "coefficients", (i,), position)) for i in range(effect.size)]
             written = effect.document(model.output_unit)
             for name, entry_of_inner in written["inner"].items():
@@ -242,10 +233,10 @@ class Calibration(Result, Document, page="calibration"):
 
         return {effect.name: entry(position, effect) for position, effect in enumerate(model.effects)}
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the calibration as the JSON document of schema `jaximu.calibration/1`."""
 
-        def triad(name: str, model: Triad) -> dict[str, Any]:
+        def triad(name: str, model: Triad) -> Json:
             gain_sigma, bias_sigma = self.sigma(name)
             return {
                 "output_unit": model.output_unit,
@@ -328,7 +319,7 @@ def concluded(
     excess: dict[str, float] = dict(zip(excess_names, np.asarray(fitted.excess).tolist(), strict=False))
     clock = clock_sigma(working.get("segmentations", ()))
     return Calibration(
-        imu=jax.tree.map(np.asarray, fitted.imu),
+        imu=on_host(fitted.imu),
         names=fitted.names,
         covariance=fitted.total_covariance(gravity.sigma, clock),
         gravity=gravity,
@@ -365,13 +356,18 @@ def _checked(stimulus: Stimulus, quantities: Sequence[str]) -> Stimulus:
     return replace(stimulus, **arrays)
 
 
+def notes_of(*sources: Any) -> list[str]:
+    """Return the notes of recordings, of what was found in them, of a noise model; None has none."""
+    return [note for source in sources if source is not None for note in source.notes]
+
+
 def clock_sigma(segmentations: Sequence[Segmentation]) -> float:
     """Return one sigma of the share by which the gyroscope's clock runs fast, the largest of all recordings."""
     gyroscopes = [part.recording.gyroscope for part in segmentations]
     return max((0.0 if gyroscope is None else gyroscope.clock_sigma for gyroscope in gyroscopes), default=0.0)
 
 
-def provenance(recordings: Sequence[Recording]) -> dict[str, Any]:
+def provenance(recordings: Sequence[Recording]) -> Json:
     """Return files and rates of recordings as `Calibration.data` has them."""
     sources = [source for recording in recordings for source in recording.sources]
     files = [{"file": str(s.path), "sha256": s.sha256, "rows": s.rows} for s in sources]
@@ -413,7 +409,7 @@ def require_calibration(candidate: object) -> None:
         )
 
 
-def load_calibration(path: str | os.PathLike[str], effects: Sequence[type[Effect]] = ()) -> Calibration:
+def load_calibration(path: FilePath, effects: Sequence[type[Effect]] = ()) -> Calibration:
     """Read a `calibration.json`.
 
     **Arguments:** `effects`: of your own, that the calibration holds; they are registered.
@@ -431,7 +427,7 @@ def load_calibration(path: str | os.PathLike[str], effects: Sequence[type[Effect
         return _from_document(document)
 
 
-def _require_known_effects(document: dict[str, Any], path: str) -> None:
+def _require_known_effects(document: Json, path: str) -> None:
     """Raise `InputError` for an effect that the catalogue lacks; the file is not to blame for it."""
     from jaximu.model.effects.catalogue import CATALOGUE
 
@@ -457,10 +453,10 @@ def _numbers(value: Any, shape: tuple[int, ...]) -> FloatArray:
     return array
 
 
-def _from_document(document: dict[str, Any]) -> Calibration:
+def _from_document(document: Json) -> Calibration:
     from jaximu.model.effects.catalogue import CATALOGUE
 
-    def effects_of(entries: dict[str, Any]) -> tuple:
+    def effects_of(entries: Json) -> tuple:
         effects = []
         for name, entry in entries.items():
             kind = CATALOGUE[name]
@@ -468,9 +464,9 @@ def _from_document(document: dict[str, Any]) -> Calibration:
             effects.append(kind.make(_numbers(entry["coefficients"], (kind.size,)), **inner))
         return tuple(effects)
 
-    def triad(part: dict[str, Any], quantity: str) -> Triad:
+    def triad(part: Json, quantity: str) -> Triad:
         gain = _numbers(part["gain"], (3, 3))
-        if abs(np.linalg.det(gain / np.linalg.norm(gain, axis=1, keepdims=True))) < 1e-6:
+        if abs(np.linalg.det(unit_vectors(gain))) < 1e-6:
             raise ValueError("the gain is singular")
         effects = effects_of(part["effects"])
         return Triad(

@@ -8,11 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import ArrayLike, Float
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import Matrix, Vector
 
-__all__ = ["ferraris", "linear_least_squares", "remove_curvature", "six_position", "turn_pairs"]
-
-Matrix = Float[Array, "... 3 3"]
-Vector = Float[Array, "... 3"]
 Rows = Float[Array, "... S 3"]
 Number = Float[ArrayLike, "..."]
 

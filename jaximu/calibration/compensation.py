@@ -10,15 +10,12 @@ import numpy as np
 
 from jaximu.calibration.calibration import Calibration, require_calibration
 from jaximu.estimation.track import TEMPERATURE_WINDOW
-from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal, recordings_of, smoothed_slope
-
-__all__ = ["compensate"]
 
 _BEYOND = 0.5  # K outside the calibrated range from which a bias is extrapolated
 
@@ -60,10 +57,10 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
         time = signal.time
         key = time.tobytes()
         if key not in results:
-            outputs = {other: _at(signal, time) for other, signal in signals.items()}
+            outputs = {other: signal.at(time) for other, signal in signals.items()}
             stimulus = Stimulus(time=time)
             if recording.temperature is not None:
-                temperature = _at(recording.temperature, time)[:, 0]
+                temperature = recording.temperature.at(time)[:, 0]
                 slope = smoothed_slope(time, temperature, TEMPERATURE_WINDOW)
                 stimulus = replace(stimulus, temperature=temperature, temperature_rate=slope)
             force = outputs["accelerometer"] if "accelerometer" in outputs else np.zeros((len(time), 3))
@@ -90,11 +87,10 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
 
 def _field(triad: Triad, recording: Recording, rate: Signal | None) -> Signal:
     """Return a magnetometer's samples as the field, µT, without its effects; rate: corrected, rad/s."""
-    signal = recording.magnetometer
-    assert signal is not None
+    signal = recording.signals["magnetometer"]
     time = signal.time
     others = {"temperature": recording.temperature, "current": recording.current, "angular_rate": rate}
-    known: dict[str, Any] = {name: _at(signal, time) for name, signal in others.items() if signal is not None}
+    known: dict[str, Any] = {name: signal.at(time) for name, signal in others.items() if signal is not None}
     known |= {name: known[name][:, 0] for name in ("temperature", "current") if name in known}
     field = eqx.filter_jit(Triad.recover)(triad, signal.values, Stimulus(time=time, **known))
     return Signal(time, np.asarray(field), "uT")
@@ -114,9 +110,3 @@ def _extrapolated(calibration: Calibration, recording: Recording) -> list[str]:
         f"extrapolated: {100 * share:.2g} % of the temperatures ({spanned}) lie outside the {low:.1f} to {high:.1f} °C "
         "that were calibrated"
     ]
-
-
-def _at(signal: Signal, time: FloatArray) -> FloatArray:
-    if np.array_equal(signal.time, time):
-        return signal.values
-    return np.stack([np.interp(time, signal.time, column) for column in signal.values.T], axis=1)

@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.estimation.problem import Name
-from jaximu.ground.array_types import FloatArray
-
-__all__ = ["History"]
+from jaximu.ground.array_types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
@@ -23,7 +20,7 @@ class History:
     """
 
     time: FloatArray
-    rest: NDArray[np.bool_]
+    rest: BoolArray
     names: tuple[Name, ...]
     values: FloatArray
     sigmas: FloatArray

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 
 from jaximu.data.poses import PosesAndTurns, condense, only
 from jaximu.estimation.covariance import inverse_cholesky
@@ -16,11 +17,10 @@ from jaximu.estimation.problem import TOLERANCE, Loss, Parameters, without_equip
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import one_of
-from jaximu.ground.precision import require_float64
+from jaximu.ground.tracing import first as first_of
+from jaximu.ground.tracing import lifted
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
-
-__all__ = ["Method", "fit_hand_held"]
 
 Method = Literal["joint", "two-step", "two-step-rk4", "accelerometer"]
 
@@ -40,19 +40,15 @@ def fit_hand_held(nominal: Imu, observations: Observations, method: Method = "jo
     **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`: failures do not raise, so that
     one bad unit does not stop a batch.
     """
-    require_float64()
     one_of("method", method, get_args(Method))
-    single = np.ndim(observations.gravity) == 0
-    # NumPy from here on: slicing lanes out of JAX arrays compiles a program for every shape
-    lift = (lambda leaf: np.asarray(leaf)[None]) if single else np.asarray
-    nominal, observations = jax.tree.map(lift, (nominal, observations))
     if method == "joint":
-        fitted = fit(nominal, PosesAndTurns.of(observations), loss=loss)
-    else:
-        fitted = fit(nominal, PosesAndTurns.of(observations, "norm"), loss=loss)
-        if method != "accelerometer":
-            fitted = _second_step(fitted, observations, "rk4" if method.endswith("rk4") else "exponential", loss)
-    return jax.tree.map(lambda leaf: leaf[0], fitted) if single else fitted
+        return fit(nominal, PosesAndTurns.of(observations), loss=loss)
+    single = np.ndim(observations.gravity) == 0
+    nominal, observations = lifted((nominal, observations)) if single else (nominal, observations)
+    fitted = fit(nominal, PosesAndTurns.of(observations, "norm"), loss=loss)
+    if method != "accelerometer":
+        fitted = _second_step(fitted, observations, "rk4" if method.endswith("rk4") else "exponential", loss)
+    return first_of(fitted) if single else fitted
 
 
 def _second_step(first: Fit, observations: Observations, method: str, loss: str) -> Fit:
@@ -66,30 +62,22 @@ def _second_step(first: Fit, observations: Observations, method: str, loss: str)
     turning = PosesAndTurns.of(observations, "turning", accelerometer_excess=first.excess[:, 0], method=method)
     second = fit(first.imu, turning, loss=loss)
 
-    def block(a, b) -> Array:
-        rows, columns = a.shape[1] + b.shape[1], a.shape[2] + b.shape[2]
-        out = np.zeros((len(a), rows, columns))
-        out[:, : a.shape[1], : a.shape[2]], out[:, a.shape[1] :, a.shape[2] :] = a, b
-        return out
-
     def beside(one: Array, other: Array) -> Array:
         return np.concatenate([one, other], axis=1)
 
+    fields = "sizes", "values", "magnitude_sensitivity", "residual"
     excess = beside(first.excess[:, :1], second.excess[:, 1:])
     return Fit(
         imu=second.imu,
         names=(*first.names, *second.names),
-        sizes=beside(first.sizes, second.sizes),
-        values=beside(first.values, second.values),
         covariance=_two_step_covariance(second.imu, observations, excess),
-        magnitude_sensitivity=beside(first.magnitude_sensitivity, second.magnitude_sensitivity),
-        residual=beside(first.residual, second.residual),
-        jacobian=block(first.jacobian, second.jacobian),
+        jacobian=scipy.linalg.block_diag(first.jacobian, second.jacobian),
         excess=excess,
         cost=first.cost + second.cost,
         steps=beside(first.steps[:, None], second.steps[:, None]).max(axis=1),
         converged=first.converged & second.converged,
         finite=first.finite & second.finite,
+        **{name: beside(getattr(first, name), getattr(second, name)) for name in fields},
     )
 
 

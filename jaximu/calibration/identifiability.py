@@ -14,8 +14,6 @@ from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
 
-__all__ = ["ENOUGH", "Identifiability", "Separation", "identifiable", "separated"]
-
 _TOLD = 0.05
 """Share of a shape that smooth functions of temperature must leave of it."""
 ENOUGH = 0.1
@@ -114,19 +112,16 @@ def identifiable(blocks: RestBlocks, shapes: ThermalShapes) -> Identifiability:
             "cycle: the same range up and down, then again at another rate."
         )
     elif hidden or alike:
-        separate = [name for name in (*RATES, *HISTORY) if name not in hidden and name not in alike]
-        sentences = [
-            f"This path of temperature separates {listed([_WORDS[name] for name in separate])}." if separate else ""
-        ]
-        lacking = [_WORDS[name] for name in hidden]
-        sentences.append(
-            f"It cannot separate {listed(lacking, 'or')} from plain temperature dependence." if hidden else ""
-        )
+        separate = [_WORDS[name] for name in (*RATES, *HISTORY) if name not in hidden and name not in alike]
+        sentences = [f"This path of temperature separates {listed(separate)}."] if separate else []
+        if hidden:
+            lacking = listed([_WORDS[name] for name in hidden], "or")
+            sentences.append(f"It cannot separate {lacking} from plain temperature dependence.")
         if alike:
             share = 100 * (1 - min(parts[name].apart for name in alike))
             sentences.append(f"The other effects imitate {listed([_WORDS[name] for name in alike])} to {share:.2g} %.")
-        sentences.append("Record a cycle, then again at another rate, to separate them." if hidden else "")
-        words.append(" ".join(filter(None, sentences)))
+        sentences += ["Record a cycle, then again at another rate, to separate them."] if hidden else []
+        words.append(" ".join(sentences))
     else:
         words.append("This path of temperature separates every rate term, a lag and a hysteresis.")
     base = orthonormal(np.concatenate([np.eye(blocks.levels)[blocks.level], shapes.smooth()], axis=1))

@@ -37,7 +37,7 @@ from jaximu.data.motion import (
 )
 from jaximu.data.sightings import AttitudeSeen, FieldSeen, Sighting, VelocitySeen
 from jaximu.estimation.information_filter import Knowledge, WhiteRows, advance, estimate
-from jaximu.estimation.problem import Parameters, flatten, unflatten
+from jaximu.estimation.problem import Parameters, axis_scales, flatten, unflatten
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
@@ -56,8 +56,6 @@ from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.observations import POWER_ON
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import segment
-
-__all__ = ["FilterInUse", "FilterState", "follow", "followed_in_use"]
 
 INTERVAL = 0.5
 """Seconds of an interval."""
@@ -247,15 +245,13 @@ class FilterInUse:
         ahead = [mark for mark, *_ in self._pending if now - half < mark <= until]
         return count >= most or not ahead or ahead[0] <= now + half
 
-    def _field_seen(self, end: float, begins: bool) -> tuple[Sighting, ...]:
+    def _field_seen(self, field: FloatArray, end: float, begins: bool) -> tuple[Sighting, ...]:
         """Return the mean field of an interval; it counts where a rest begins, of which more would say no more."""
         if not self._magnetic:
             return ()
-        values = np.stack([sample.field for sample in self._waiting])
-        values = values[np.isfinite(values).all(axis=1)]
-        if not len(values):
-            return (_sighting(FieldSeen, end, end, False, np.zeros(3)),)
-        return (_sighting(FieldSeen, end, end, begins, values.mean(axis=0)),)
+        field = field[np.isfinite(field).all(axis=1)]
+        mean = field.mean(axis=0) if len(field) else np.zeros(3)
+        return (_sighting(FieldSeen, end, end, begins and len(field) > 0, mean),)
 
     def _begin_field(self, sightings: tuple[Sighting, ...]) -> None:
         """Take the field, of which nothing was known, as it is where it is seen first; its noise is a share of it."""
@@ -292,13 +288,7 @@ class FilterInUse:
     def _rests(self, rate: FloatArray, force: FloatArray, lost: float) -> tuple[bool, bool, bool, float]:
         """Return whether the unit rests in an interval, arrives at a rest, begins one; and its mean speed, rad/s."""
         triads = self.imu.triads()
-        outputs = np.concatenate(
-            [
-                rate / np.linalg.norm(triads["gyroscope"].gain, axis=1),
-                force / np.linalg.norm(triads["accelerometer"].gain, axis=1),
-            ],
-            axis=1,
-        )
+        outputs = np.hstack([rate / axis_scales(triads["gyroscope"]), force / axis_scales(triads["accelerometer"])])
         mean = outputs.mean(axis=0)
         scatter, floor = (values.reshape(2, 3).sum(axis=1) for values in (outputs.var(axis=0, ddof=1), self._floor))
         self._least = np.minimum(self._least, scatter)
@@ -311,9 +301,7 @@ class FilterInUse:
         return rest, arrival, begins, float(np.linalg.norm(mean[:3]))
 
     def _interval(self) -> list[FilterState]:
-        time = np.array([sample.time for sample in self._waiting])
-        force = np.stack([sample.accelerometer for sample in self._waiting])
-        rate = np.stack([sample.gyroscope for sample in self._waiting])
+        time, force, rate, field = (np.array(values) for values in zip(*self._waiting, strict=True))
         period = 1 / self._rate
         start, end = time[0] - period if self._last is None else self._last, float(time[-1])
         self._last = end
@@ -323,13 +311,14 @@ class FilterInUse:
         sightings = self._sightings(start + period / 2, end + period / 2, rest or arrival)
         absolute = bool(sightings)
         measured = absolute and bool(sightings[0].measured)
-        sightings = (*sightings, *self._field_seen(end + period / 2, begins))
-        if self._known is None and not (rest and (measured or not absolute)):
+        located = measured or not absolute
+        sightings = (*sightings, *self._field_seen(field, end + period / 2, begins))
+        if self._known is None and not (rest and located):
             return []
         self._moving = 0.0 if rest else self._moving + float(end - start)
         self._unseen = 0.0 if rest else self._unseen + lost * speed
         lost_track = self._moving > LONGEST_MOTION or self._unseen > FARTHEST_UNSEEN
-        if lost_track and not (arrival and (measured or not absolute)):
+        if lost_track and not (arrival and located):
             return []
         if lost_track:  # attitude is determined again; what is known of the unit stays
             self._path = self._upright(force, sightings)
@@ -463,10 +452,8 @@ def follow(
 
     Raises `NotPossibleError` where the unit never rests.
     """
-    gyroscope, accelerometer = recording.signals["gyroscope"], recording.accelerometer
-    force = accelerometer.values
-    if not np.array_equal(accelerometer.time, gyroscope.time):
-        force = np.stack([np.interp(gyroscope.time, accelerometer.time, axis) for axis in force.T], 1)
+    gyroscope = recording.signals["gyroscope"]
+    force = recording.accelerometer.at(gyroscope.time)
     fields, steps, diverged = None, [], None
     if field is not None:
         outside = {"left": np.nan, "right": np.nan}

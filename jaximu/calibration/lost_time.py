@@ -13,25 +13,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.data.by_hand import RecordedByHand
 from jaximu.data.handling import missed_by_sampling
-from jaximu.data.poses import Condensed, condensed
+from jaximu.data.poses import condensed
 from jaximu.estimation.fitting import effect_numbers, linearise, unwhitened
 from jaximu.estimation.problem import without_equipment
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.differences import midpoints
 from jaximu.ground.quantities import counted
-from jaximu.ground.rotation import conjugate, multiply, rotate
+from jaximu.ground.rotation import conjugate, multiply, rotate, unit_vectors
+from jaximu.ground.tracing import first, lifted
 from jaximu.mistakes import without_rows
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Turns
 from jaximu.recordings.recording import Recording
-
-__all__ = ["lost_share", "tells_losses", "without_lost_stretches"]
 
 _FEWEST = 6
 """Turns from which on the others tell what one should have been."""
@@ -83,7 +82,7 @@ class _Turned:
 
     gram: FloatArray
     pull: FloatArray
-    real: NDArray[np.int64]
+    real: IntArray
     scatter: FloatArray
     sampling: FloatArray
     lost: FloatArray
@@ -145,7 +144,7 @@ class _Turned:
             constant=self.constant + gained,
         )
 
-    def without(self, turns: NDArray[np.int64]) -> _Turned:
+    def without(self, turns: IntArray) -> _Turned:
         """Return the same with some turns, by place, free."""
         free = np.ravel(2 * turns[:, None] + np.arange(2))
         size = np.sqrt(_FREE)
@@ -186,17 +185,20 @@ class _Recorded:
     """A calibration's recordings, its turns' conditions, and the samples of each turn."""
 
     def __init__(self, calibration: Calibration) -> None:
-        fitted, observations, gyroscope = calibration.fit, calibration.observations, calibration.imu.gyroscope
-        assert fitted is not None and observations is not None and gyroscope is not None
+        fitted, observations, gyroscope = (
+            calibration.fit,
+            calibration.observations,
+            calibration.imu.triads()["gyroscope"],
+        )
+        assert fitted is not None and observations is not None
         self.calibration, self.observations, self.gyroscope = calibration, observations, gyroscope
         self.signals = [part.recording.signals["gyroscope"] for part in calibration.segmentations]
-        unit = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (fitted.imu.with_effects(), observations))
-        about: Condensed = condensed(*unit)
+        about = condensed(*lifted((fitted.imu.with_effects(), observations)))
         assert about.reaction is not None and about.running is not None
         self.turns: Turns = observations.turns
         self.force, self.running = about.force[0], np.asarray(about.running)
         self.output, self.interval = np.asarray(self.turns.output), np.asarray(self.turns.interval)
-        chain = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance)
+        chain = first(about.covariance)
         self.residual, slope = (rows[np.asarray(chain.used) > 0] for rows in unwhitened(fitted, chain))
         covariance = chain.dense()
         self.used = covariance.used > 0
@@ -207,8 +209,8 @@ class _Recorded:
         weighted = inverse @ slope
         self.projector = inverse - weighted @ np.linalg.pinv(slope.T @ weighted, 1e-12, hermitian=True) @ weighted.T
         real = np.flatnonzero(self.turns.mask)
-        first = len(observations.poses.mask) + 2 * real[:, None]
-        rows = self.rows = (np.cumsum(self.used) - 1)[first + np.arange(2)]
+        start = len(observations.poses.mask) + 2 * real[:, None]
+        rows = self.rows = (np.cumsum(self.used) - 1)[start + np.arange(2)]
         # (T, S, 2): what a sample that is lost takes off its turn
         self.lacking = -np.einsum(
             "tasi,tsi->tsa",
@@ -259,10 +261,10 @@ class _Recorded:
             bends.append(bend)
         usual = float(np.median(np.concatenate([bends[p][a : b - 1] for p, a, b in self.samples])))
         jumps = []
-        for part, first, last in self.samples:
-            beside = np.arange(first, last - 1)[:, None] + np.array([-3, -2, 2, 3])
+        for part, start, stop in self.samples:
+            beside = np.arange(start, stop - 1)[:, None] + np.array([-3, -2, 2, 3])
             around = np.mean(bends[part][np.clip(beside, 0, len(bends[part]) - 1)] ** 2, axis=1)
-            jumps.append(bends[part][first : last - 1] / np.sqrt(around + (_LEAST_JUMP * usual) ** 2 + 1e-30))
+            jumps.append(bends[part][start : stop - 1] / np.sqrt(around + (_LEAST_JUMP * usual) ** 2 + 1e-30))
         return jumps
 
     def missing(self, turn: int, off: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -274,16 +276,15 @@ class _Recorded:
         """
         real = int(self.turned.real[turn])
         force = self.force[real + 1]
-        after = force / np.linalg.norm(force)
-        before = after - np.asarray(self.turns.basis)[real].T @ off
-        before /= np.linalg.norm(before)
+        after = unit_vectors(force)
+        before = unit_vectors(after - np.asarray(self.turns.basis)[real].T @ off)
         running = self.running[real][: self.counts[turn]]
         back = multiply(conjugate(running), np.broadcast_to(running[-1], running.shape))
         carried, wanted = (
             np.asarray(rotate(back, np.broadcast_to(gravity, (len(running), 3))))[:-1] for gravity in (before, after)
         )
         rate = self.gyroscope.recover_on_host(self.output[real][: len(running)])
-        middle = (rate[1:] + rate[:-1]) / 2
+        middle = midpoints(rate)
         speed = np.maximum(np.linalg.norm(middle, axis=1), 1e-9)
         axis = middle / speed[:, None]
         along = np.sum((wanted - carried) * axis, axis=1)

@@ -4,51 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, notes_of, provenance
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import relative_covariance, require_determined
 from jaximu.data.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.estimation.fitting import Fit, Prior, fit, informed
-from jaximu.estimation.problem import Name
+from jaximu.estimation.problem import Name, axis_scales
 from jaximu.estimation.uncertainty import UNDETERMINED, allowing_for_neighbours
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.distributions import rms
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.magnetic_field import HIGHEST, LOWEST, FieldStrength
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
+from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.tracing import on_host
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes import Prepared, prepare, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
-from jaximu.recordings.alignment import signed_permutation
+from jaximu.recordings.alignment import ARRANGEMENTS, EXPLAINED, signed_permutation
 from jaximu.recordings.recording import Reading, Recording, Signal
 from jaximu.simulation.protocols.positions import spiral
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
-
-__all__ = [
-    "FieldStrength",
-    "Heading",
-    "MagneticLog",
-    "calibrate_magnetometer",
-    "carried_headings",
-    "ellipsoid",
-    "field_advice",
-    "field_start",
-    "heading_errors",
-]
 
 _TYPICAL = 50.0
 """µT, about what the Earth's field has in the middle latitudes: the strength where only counts are known."""
@@ -60,8 +49,6 @@ _SCALE = 0.05
 _SHEET_GAIN, _SHEET_BIAS = 0.02, 0.05
 """Scale and misalignment of an accelerometer, and its bias over gravity, by a data sheet (MPU-6050: 3 %, 2 %, 50 mg on
 x and y and 80 mg on z at the most)."""
-_EXPLAINED = 0.5
-"""Share of gravity's turning that the gyroscope must explain for its axes to be taken from it."""
 _FOLDS = 5
 _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
@@ -136,12 +123,12 @@ class Heading:
     before: FloatArray
     scatter: float
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return root mean squares over the headings of a level unit and largest errors of any attitude, degrees."""
         return {
-            "rms": float(np.sqrt(np.mean(self.sigma[0] ** 2) + self.scatter**2)),
+            "rms": float(np.hypot(rms(self.sigma[0]), self.scatter)),
             "worst": float(np.hypot(self.sigma.max(), self.scatter)),
-            "before": {"rms": float(np.sqrt(np.mean(self.before[0] ** 2))), "worst": float(self.before.max())},
+            "before": {"rms": rms(self.before[0]), "worst": float(self.before.max())},
         }
 
 
@@ -182,7 +169,7 @@ def calibrate_magnetometer(
 
 def _chosen(effects: Sequence[str | Effect], logs: Sequence[MagneticLog]) -> list[Effect]:
     """Return the effects to be fitted. Raises `InputError` for one of another sensor, or whose input logs lack."""
-    chosen = [effect_named(effect) for effect in effects]
+    chosen = list(map(effect_named, effects))
     for effect in chosen:
         if effect.owner != "magnetometer":
             raise InputError(f"{effect.name} is no effect of a magnetometer: `jaximu effects` lists those, mag.*.")
@@ -198,9 +185,8 @@ def _chosen(effects: Sequence[str | Effect], logs: Sequence[MagneticLog]) -> lis
 def _ready(log: MagneticLog, ready: Prepared) -> MagneticLog:
     """Return a log without rows that are no measurement, of the magnetometer (`ready`) and of the other sensors."""
     other = None if log.recording is None else prepare(log.recording)
-    signal = ready.recording.magnetometer
-    assert signal is not None
-    notes = (*log.notes, *(() if other is None else other.notes), *ready.notes)
+    signal = ready.signals["magnetometer"]
+    notes = tuple(notes_of(log, other, ready))
     return replace(log, magnetometer=signal, recording=None if other is None else other.recording, notes=notes)
 
 
@@ -262,7 +248,7 @@ def _calibrated(
         data=_data(logs, windows),
         nominal=start,
         advice=field_advice,
-        notes=[*(note for log in logs for note in log.notes), *notes, *stretches],
+        notes=[*notes_of(*logs), *notes, *stretches],
         reading=next(filter(None, readings), None if base is None else base.reading),
     )
     dip, dip_sigma = _dip(windows, fit)
@@ -272,7 +258,7 @@ def _calibrated(
         calibration = replace(calibration, notes=(*calibration.notes, _UPWARD))
     heading = None if dip is None else heading_errors(calibration, start, known, dip)
     measurement = _measured(windows, field)
-    magnetic: dict[str, Any] = {
+    magnetic: Json = {
         "field": {
             "strength": {"value": known, "sigma": field.sigma, "unit": "uT"},
             "dip": None if dip is None else {"value": np.degrees(dip), "sigma": np.degrees(dip_sigma), "unit": "deg"},
@@ -337,9 +323,9 @@ def _unit(logs: Sequence[MagneticLog], base: Calibration | None) -> Imu:
     if recording is None:
         return Imu.nominal()
     unit, turning = as_stated(recording), recording.turning
-    if turning is None or turning.explained < _EXPLAINED or unit.gyroscope is None:
+    if turning is None or turning.explained < EXPLAINED or unit.gyroscope is None:
         return unit
-    if turning.correlation > 0 and turning.correlation**2 > _EXPLAINED * turning.explained:
+    if turning.correlation > 0 and turning.correlation**2 > EXPLAINED * turning.explained:
         return unit  # as the data sheet has it: an axis that hardly turned gravity must not be turned round
     gain = unit.gyroscope.gain @ signed_permutation(turning.matrix).T
     return replace(unit, gyroscope=replace(unit.gyroscope, gain=gain))
@@ -400,7 +386,7 @@ def _start(
             "to be turned."
         )
     triad = Triad(scale * turn, np.asarray(centre, float), quantity="magnetic_field", output_unit=signal.unit)
-    return jax.tree.map(np.asarray, replace(unit.with_effects(), magnetometer=triad)), field, notes
+    return on_host(replace(unit.with_effects(), magnetometer=triad)), field, notes
 
 
 def field_start(
@@ -470,15 +456,9 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
     if windows.alone:
         return np.eye(3)
     field = windows.output - centre
-    turns = [
-        np.array(signs)[:, None] * np.eye(3)[list(order)]
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-    ]
-    turns = [turn for turn in turns if np.linalg.det(turn) > 0]  # the first turns nothing
     calm = windows.level & (windows.off < _CALM)
     costs = []
-    for turn in turns:
+    for turn in ARRANGEMENTS:
         body = field @ turn  # turnᵀ applied to every row
         length = np.linalg.norm(body, axis=1)
         cost = 0.0
@@ -488,7 +468,7 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
         if calm.any():
             cost += float(np.var(np.sum(windows.up[calm] * body[calm], axis=1) / length[calm]))
         costs.append(cost)
-    best = turns[0 if min(costs) > 0.8 * costs[0] else int(np.argmin(costs))]
+    best = ARRANGEMENTS[0 if min(costs) > 0.8 * costs[0] else int(np.argmin(costs))]
     if southern is not None and windows.level.any():
         dip = np.median(np.sum(windows.up * (field @ best), axis=1)[windows.level])
         best = -best if (dip > 0) != southern else best
@@ -540,7 +520,7 @@ def _magnetometer(imu: Imu) -> Triad:
 
 def _scale_of(imu: Imu) -> float:
     """Output units of the magnetometer to a µT."""
-    return float(np.mean(np.linalg.norm(_magnetometer(imu).gain, axis=1)))
+    return float(np.mean(axis_scales(_magnetometer(imu))))
 
 
 def _strengths(imu: Imu, output: FloatArray) -> FloatArray:
@@ -554,7 +534,7 @@ def _white(imu: Imu, windows: FieldWindows) -> float:
 
 
 def _spread(imu: Imu, windows: FieldWindows, strength: float) -> float:
-    return float(np.sqrt(np.mean((np.linalg.norm(windows.field(imu)[windows.used], axis=1) - strength) ** 2)))
+    return rms(np.linalg.norm(windows.field(imu)[windows.used], axis=1) - strength)
 
 
 def _contradicted(fit: Fit, windows: FieldWindows, field: FieldStrength) -> bool:
@@ -589,7 +569,7 @@ def _undisturbed(
     return fit, windows, [note] if left.any() else []
 
 
-def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> NDArray[np.bool_]:
+def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> BoolArray:
     """Return in which of `whole` (n,) the field is another than in `windows`, by its strength or its angle to gravity.
 
     What is next to such a window is asked at a lower level, and what lies between two is one, too: a disturbance that
@@ -667,7 +647,7 @@ def _require_covered(fit: Fit, windows: FieldWindows, where: str) -> None:
         )
 
 
-def _open_words(names: Sequence[Name], wide: NDArray[np.bool_]) -> str:
+def _open_words(names: Sequence[Name], wide: BoolArray) -> str:
     """Name what is known no better than from the data sheet; where no number is by itself, their combinations."""
     axes: dict[str, list[str]] = {}
     for name, open_ in zip(names, wide, strict=True):
@@ -719,11 +699,11 @@ def _left_out(
             values = np.concatenate(parts)
             spreads[name] = float(np.std(values) / np.mean(values))
     off = {name: np.concatenate([np.zeros(0), *parts]) for name, parts in headings.items()}
-    turned = {name: float(np.degrees(np.sqrt(np.mean(errors**2)))) for name, errors in off.items() if len(errors)}
+    turned = {name: rms(np.degrees(errors)) for name, errors in off.items() if len(errors)}
     return spreads, turned or None
 
 
-def carried_headings(windows: FieldWindows, imu: Imu, rows: NDArray[np.int64]) -> FloatArray:
+def carried_headings(windows: FieldWindows, imu: Imu, rows: IntArray) -> FloatArray:
     """Return by how much (rad) the heading of each calm window leaves the one that the gyroscope carries.
 
     rows: windows in order. Less a straight line, for the gyroscope's bias, over each recording.
@@ -734,8 +714,7 @@ def carried_headings(windows: FieldWindows, imu: Imu, rows: NDArray[np.int64]) -
         up, calm = windows.up[part], (windows.used & windows.level & (windows.off < _CALM))[part]
         if not windows.turn.any() or calm.sum() < _FEWEST_HEADINGS:
             continue
-        east = np.cross(field[part], up)
-        east /= np.linalg.norm(east, axis=1, keepdims=True)
+        east = unit_vectors(np.cross(field[part], up))
         level = np.stack([east, np.cross(up, east), up], axis=1)
         carried, yaw = level[0], []
         for frame, row in zip(level, part, strict=True):
@@ -754,8 +733,7 @@ def carried_headings(windows: FieldWindows, imu: Imu, rows: NDArray[np.int64]) -
 
 def coverage(imu: Imu, windows: FieldWindows) -> float:
     """Return the share of all directions that the field had, in the magnetometer's axes, to within 15°."""
-    field = windows.field(imu)[windows.used]
-    field /= np.linalg.norm(field, axis=1, keepdims=True)
+    field = unit_vectors(windows.field(imu)[windows.used])
     return float(np.mean((spiral(400) @ field.T).max(axis=1) > _NEAR))
 
 
@@ -819,7 +797,7 @@ def _reactions(names: Sequence[Name], field: FloatArray, gain: FloatArray) -> Fl
     return np.linalg.inv(gain) @ change
 
 
-def next_directions(calibration: Calibration, measurement: MagneticField, dip: float, count: int = 6) -> dict[str, Any]:
+def next_directions(calibration: Calibration, measurement: MagneticField, dip: float, count: int = 6) -> Json:
     """Return where the field should be seen next, in the unit's axes, and what that buys a level heading.
 
     `calibration`: fitted to `measurement`; `dip`: rad. One after another the direction whose strength, measured as well
@@ -873,13 +851,13 @@ def _longest(direction: FloatArray) -> str:
     return "xyz"[int(np.argmax(np.abs(direction)))]
 
 
-def _data(logs: Sequence[MagneticLog], windows: FieldWindows) -> dict[str, Any]:
+def _data(logs: Sequence[MagneticLog], windows: FieldWindows) -> Json:
     recordings = [log.recording for log in logs if log.recording is not None]
     source = provenance(recordings) if recordings else {"file": logs[0].name}
     return source | {"windows": int(windows.used.sum())}
 
 
-def _gyroscope_bias(calibration: Calibration) -> dict[str, Any] | None:
+def _gyroscope_bias(calibration: Calibration) -> Json | None:
     """Return the gyroscope's bias (3), output units, that the carried field tells."""
     if not any(name.owner == "gyroscope" for name in calibration.names):
         return None

@@ -8,23 +8,20 @@ from dataclasses import replace
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration, concluded, provenance
-from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.refusals import require_determined
 from jaximu.data.poses import EXCESS_NAMES, PosesAndTurns, residual_rms
-from jaximu.estimation.fitting import Fit, Prior, fit
-from jaximu.estimation.problem import Loss, Name, names_of, without_equipment_or_effects
+from jaximu.estimation.fitting import Prior, fit
+from jaximu.estimation.problem import Loss, Name, axis_scales, names_of, without_equipment_or_effects
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
-from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
+from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import PoseMeans
 from jaximu.recordings.segmentation import observe_means
-
-__all__ = ["calibrate_means"]
 
 _SPARE = 3
 """Poses beyond the parameters, from whose misfit an unknown noise is taken."""
@@ -50,27 +47,28 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     Raises `NotPossibleError` where the poses do not span enough orientations or are fewer, or the fit does not
     converge.
     """
-    require_float64()
-    gravity = as_gravity(gravity)
-    recording = means.recording
-    where, poses = recording.name, len(recording.accelerometer)
-    observations = observe_means(means, gravity.value)
+    gravity, recording = as_gravity(gravity), means.recording
+    poses, observations = len(recording.accelerometer), observe_means(means, gravity.value)
     nominal, notes = nominal_imu(recording)
     method = "accelerometer" if recording.gyroscope is None else "joint"
     free = [name for name in names_of(nominal) if name.owner == "accelerometer" and without_equipment_or_effects(name)]
-    prior = None
     few = means.accelerometer_sigma is None and poses < len(free) + _SPARE
+    prior, measured, excess = None, observations, None
     if few or (poses >= _FACES and _open(means)):
-        fitted, prior = _with_few_poses(means, nominal, free, gravity.value, method, loss)
+        prior = _misalignments(nominal, free)
+        spare = poses - (len(free) - len(prior.names))
+        _require_axes(means, len(free), spare)
+        measured = observe_means(_as_written(means), gravity.value)
+        excess = None if spare >= _SPARE else np.zeros(len(EXCESS_NAMES))
         notes += (
             f"{poses} poses leave misalignments open: they were taken to be zero within ±{200 * _ACROSS:g} % (95 %), "
             "as data sheets state the cross-axis sensitivity."
             + few
             * " The means are taken to be as good as their digits.",
         )
-    else:
-        fitted = fit_hand_held(nominal, observations, method, loss)
-    require_determined(fitted, where, poses=poses)
+    at_rest = PosesAndTurns.of(measured, "norm" if method == "accelerometer" else "all")
+    fitted = fit(nominal, at_rest, prior=prior, loss=loss, excess=excess, estimate_excess=excess is None)
+    require_determined(fitted, recording.name, poses=poses)
     if method == "accelerometer":
         fitted = replace(fitted, imu=Imu(fitted.imu.accelerometer, None))
     stated = {"accelerometer": means.accelerometer_sigma is not None or few}
@@ -95,8 +93,7 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
         nominal=nominal,
         reading=recording.reading,
     )
-    known = {name: size for name, size in calibration.excess.items() if stated.get(name)}
-    return replace(calibration, excess=known)
+    return replace(calibration, excess={name: size for name, size in calibration.excess.items() if stated.get(name)})
 
 
 def _open(means: PoseMeans) -> bool:
@@ -109,6 +106,14 @@ def _open(means: PoseMeans) -> bool:
     return bool(np.sort(np.abs(upright), axis=1)[:, 1].max() < _UPRIGHT)
 
 
+def _as_written(means: PoseMeans) -> PoseMeans:
+    """Return the means as good as their digits, where they do not state how good they are."""
+    if means.accelerometer_sigma is not None:
+        return means
+    values = means.recording.accelerometer.values
+    return replace(means, accelerometer_sigma=np.full(values.shape, _step(values) / np.sqrt(12)))
+
+
 def _step(values: FloatArray) -> float:
     """Return the step (m/s²) of the digits in which a table is written, in m/s² or in g."""
     for digits in range(7):
@@ -119,22 +124,24 @@ def _step(values: FloatArray) -> float:
     return 1e-6
 
 
-def _with_few_poses(
-    means: PoseMeans, nominal: Imu, free: Sequence[Name], gravity: float, method: str, loss: Loss
-) -> tuple[Fit, Prior]:
-    """Fit with misalignments that are zero within what sensors have, and return what was known of them beforehand."""
-    across = [name for name in free if name.part == "gain" and name.axes[0] != name.axes[1]]
-    signal = means.recording.accelerometer
-    spare = len(signal) - (len(free) - len(across))
+def _misalignments(nominal: Imu, free: Sequence[Name]) -> Prior:
+    """Return what is known of the misalignments beforehand: they are zero within what sensors have."""
+    across = tuple(name for name in free if name.part == "gain" and name.axes[0] != name.axes[1])
+    scale = axis_scales(nominal.accelerometer)
+    sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
+    return Prior(across, np.zeros(len(across)), np.diag(1 / sigma))
+
+
+def _require_axes(means: PoseMeans, parameters: int, spare: int) -> None:
+    """Refuse poses that leave scale or bias of an axis open; `spare`: more poses than these numbers are."""
+    where, signal = means.recording.name, means.recording.accelerometer
     if spare < 0:
         raise NotPossibleError(
-            f"{means.recording.name}: {len(signal)} poses for {len(free)} parameters do not show how uncertain the "
+            f"{where}: {len(signal)} poses for {parameters} parameters do not show how uncertain the "
             f"means are: add {-spare} poses or more (each axis up and down once are six), or columns "
             "accel_sigma_x [m/s^2], … with the samples' standard deviations, and samples, their number."
         )
-    scale = np.linalg.norm(nominal.accelerometer.gain, axis=1)
-    sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
-    up = signal.si() / np.linalg.norm(signal.si(), axis=1, keepdims=True)
+    up = unit_vectors(signal.si())
     if np.linalg.svd(np.hstack([up**2, up]), compute_uv=False)[-1] < _SPANNED:
         lacks = [
             f"{axis} {way}"
@@ -143,15 +150,7 @@ def _with_few_poses(
             if part.max() < _ON
         ]
         raise NotPossibleError(
-            f"{means.recording.name}: the rows do not determine every axis' scale and bias: "
+            f"{where}: the rows do not determine every axis' scale and bias: "
             f"{f'none has {listed(lacks)}' if lacks else 'their directions are too much alike'}. "
             "Check the signs of the rows, and measure each axis up and down."
         )
-    prior = Prior(tuple(across), np.zeros(len(across)), np.diag(1 / sigma))
-    if means.accelerometer_sigma is None:
-        spread = np.full((len(signal), 3), _step(signal.values) / np.sqrt(12))  # of rounding
-        means = replace(means, accelerometer_sigma=spread)
-    observations = observe_means(means, gravity)
-    data = PosesAndTurns.of(observations, "norm" if method == "accelerometer" else "all")
-    excess = None if spare >= _SPARE else np.zeros(len(EXCESS_NAMES))
-    return fit(nominal, data, prior=prior, loss=loss, excess=excess, estimate_excess=excess is None), prior

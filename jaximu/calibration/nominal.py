@@ -8,12 +8,9 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.gravity import STANDARD
 from jaximu.model.sensor import Imu
-from jaximu.recordings.alignment import Turning, angle_of, rotation_of, signed_permutation, turning
+from jaximu.recordings.alignment import EXPLAINED, Turning, angle_of, rotation_of, signed_permutation, turning
 from jaximu.recordings.recording import Recording
 
-__all__ = ["as_stated", "nominal_imu"]
-
-_EXPLAINED = 0.5
 _KNOWN = 0.2
 """Standard deviation, of an entry, beyond which the gyroscope's matrix against gravity is not used."""
 _SAME = 0.2
@@ -51,7 +48,7 @@ def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
     motion = recording.turning
     if (factors != 1).any():
         motion = turning(accelerometer.time, accelerometer.si() / factors, gyroscope.time, gyroscope.si())
-    if motion is None or motion.explained < _EXPLAINED or not float(np.max(motion.sigma)) < _KNOWN:
+    if motion is None or motion.explained < EXPLAINED or not float(np.max(motion.sigma)) < _KNOWN:
         return imu, ()
     matrix, notes = _start(motion)
     if np.array_equal(matrix, np.eye(3)):

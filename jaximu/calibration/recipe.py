@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.bias_drift import knowing_drift
-from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, effect_named, provenance
+from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, effect_named, notes_of, provenance
 from jaximu.calibration.hand_held import Method, fit_hand_held
 from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
 from jaximu.calibration.nominal import nominal_imu
@@ -25,7 +24,7 @@ from jaximu.estimation.problem import Loss
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
-from jaximu.ground.tracing import first, lifted
+from jaximu.ground.tracing import first, lifted, on_host
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
@@ -36,14 +35,6 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, same_outputs
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, observed_poses, segment
-
-__all__ = [
-    "Choices",
-    "calibrate",
-    "calibrate_ready",
-    "errors_of",
-    "require_gravity",
-]
 
 _SAME = 1e-9
 """Share by which two statements of one gravity may differ."""
@@ -119,7 +110,7 @@ def calibrate(
         raise InputError("a start is for data of several kinds: recordings by hand begin at the data sheet's values.")
     with prepared(by_hand, repair, gyroscope=method != "accelerometer") as ready:
         calibration, unusual = calibrate_ready([one.recording for one in ready], choices, repair)
-    notes = [*(note for item in ready for note in item.notes), *(item.text for item in unusual)]
+    notes = [*notes_of(*ready), *(item.text for item in unusual)]
     calibration = replace(calibration, notes=tuple(dict.fromkeys((*notes, *calibration.notes))))
     return _with_drift(calibration, noise_of(static))
 
@@ -145,8 +136,8 @@ def _calibrated_jointly(
             parts = tuple(segment(one.recording, choices.segmentation) for one in ready)
             kinds = [RecordedByHand(parts, observed_poses(parts, choices.gravity.value, noise=noise)), *kinds]
     recorded = [recording for kind in kinds for recording in kind.recordings]
-    notes = [*(note for one in ready for note in one.notes), *(same_outputs(recorded) if recorded else ())]
-    notes += [note for part in (*recorded, *parts, *([] if noise is None else [noise])) for note in part.notes]
+    mixed = same_outputs(recorded) if recorded else ()
+    notes = [*notes_of(*ready), *mixed, *notes_of(*recorded, *parts, noise)]
     if noise is None and recorded:
         notes.append(f"{_NO_DRIFT}, unless data were observed with a noise model.")
     remarks: tuple[str, ...] = ()
@@ -158,7 +149,7 @@ def _calibrated_jointly(
     if unit.setup and sum(not one.no_fixture for one in data) > 1:
         raise InputError("the start has effects of one set-up, and two of the data have separate ones: fit them apart.")
     effects = {effect.name: effect for effect in (*map(effect_named, choices.effects), *unit.all_effects().values())}
-    unit = jax.tree.map(np.asarray, unit.with_effects(*effects.values()))
+    unit = on_host(unit.with_effects(*effects.values()))
     prior = Prior.of_effects(unit, choices.effect_sigmas)
     fitted = fit(unit, kinds, prior=prior, loss=choices.loss)
     where = ", ".join(recording.name for recording in recorded) or "these data"
@@ -277,7 +268,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     mixed = same_outputs(recordings)
     has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
     method = choices.method if has_gyroscope else "accelerometer"
-    chosen = [effect_named(effect) for effect in choices.effects]
+    chosen = list(map(effect_named, choices.effects))
     if chosen and method != "joint":
         raise InputError(
             f"{chosen[0].name} is fitted jointly with gain and bias of both sensors, which needs the joint method and "
@@ -312,17 +303,16 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
             chosen, sigmas = [*chosen, earth], sigmas | {earth.name: spread}
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
-        start = jax.tree.map(np.asarray, fitted.imu).with_effects(*chosen)
+        start = on_host(fitted.imu).with_effects(*chosen)
         prior = Prior.of_effects(start, sigmas)
         fitted = fit(start, measurement, prior=prior, loss=loss, excess=fitted.excess)
         require_determined(fitted, where, prior=prior)
         observations = measurement.along(fitted.imu, tuple(fitted.imu.all_effects().values())).observations
     notes = (
-        *(note for recording in recordings for note in recording.notes),
+        *notes_of(*recordings),
         *notes,
         *mixed,
-        *(() if noise is None else noise.notes),
-        *(note for part in segmentations for note in part.notes),
+        *notes_of(noise, *segmentations),
     )
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)

@@ -15,15 +15,6 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.quantities import Z95, number, sentence
 
-__all__ = [
-    "refuse_undetermined",
-    "relative_covariance",
-    "require_carried",
-    "require_determined",
-    "require_solved",
-    "require_spanning",
-]
-
 _LOST = 45.0
 """Degrees, rms, by which a gyroscope that turned with the accelerometer cannot lose gravity over turns."""
 

@@ -16,8 +16,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
 from jaximu.recordings.observations import Stations
 
-__all__ = ["Scheme", "describe_scheme"]
-
 _OPEN = 1e-6  # singular value, as a share of the largest, below which nothing is determined
 _FACES = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
 

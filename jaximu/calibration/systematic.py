@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
 
-import jax
 import numpy as np
 
 from jaximu.calibration.attitude import Mounted, mounted_on, reference_summary
-from jaximu.calibration.calibration import Calibration, concluded, effect_named
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, notes_of
 from jaximu.calibration.compensation import compensate
 from jaximu.calibration.filter_history import History
 from jaximu.calibration.recipe import Choices, calibrate_ready
@@ -36,10 +34,12 @@ from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, typi
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.uncertainty import label, pose_advice
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import sentence
+from jaximu.ground.tracing import on_host
 from jaximu.mistakes import prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
@@ -51,22 +51,6 @@ from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, find_stops, rest_statistics
-
-__all__ = [
-    "FIELD",
-    "NEIGHBOURS",
-    "calibrate_by_filter",
-    "disturbances",
-    "field_of",
-    "known_scale",
-    "noise_at_rest",
-    "places_of",
-    "plausible_sizes",
-    "require_gyroscope",
-    "seen_from_outside",
-    "state_advice",
-    "state_effect",
-]
 
 DRIFTS = 2
 """Gauss–Markov processes an axis that stand for all of a noise model's."""
@@ -139,9 +123,7 @@ def field_of(calibration: Calibration, recording: Recording) -> Signal:
         )
     if "magnetometer" not in calibration.triads():
         raise InputError("the calibration given for the magnetometer holds none: make one with `jaximu magnetometer`.")
-    field = compensate(calibration, recording).magnetometer
-    assert field is not None
-    return field
+    return compensate(calibration, recording).signals["magnetometer"]
 
 
 def require_gyroscope(recording: Recording) -> None:
@@ -215,7 +197,7 @@ def calibrate_by_filter(
         unknown = GyroEarthRotation.dormant(), np.full(3, EARTH_RATE)
         earth, spread = unknown if latitude is None else GyroEarthRotation.at(latitude)
         chosen = [effect for effect in chosen if effect.name != earth.name]
-        imu = jax.tree.map(np.asarray, start.imu.with_effects(earth, *chosen, *outside))
+        imu = on_host(start.imu.with_effects(earth, *chosen, *outside))
         stated = {**{effect.name: effect.known for effect in outside}, **(effect_sigmas or {}), earth.name: spread}
         known_before, prior = Prior.of_effects(imu, stated), Prior.of_effects(imu, plausible_sizes(imu) | stated)
         assert known_before is not None and prior is not None
@@ -225,7 +207,7 @@ def calibrate_by_filter(
             if mounted is None:  # else the attitude tells what poses and turns leave open
                 _require_enough_turned(fitted, start, recording.name)
             require_solved(fitted, recording.name)
-            imu = jax.tree.map(np.asarray, fitted.imu)
+            imu = on_host(fitted.imu)
             followed = _followed(measurement, imu, free, prior, gravity, start)
             matched = _matched(measurement, followed)
             if matched is None:
@@ -249,8 +231,7 @@ def calibrate_by_filter(
         known=known_before.names,
         data=start.data,
         notes=[
-            *ready.notes,
-            *(() if mounted is None else mounted.attitude.notes),
+            *notes_of(ready, mounted and mounted.attitude),
             *(finding.text for finding in findings),
             *start.notes,
             *notes,
@@ -276,7 +257,7 @@ def _summary(
     names: Sequence[Name],
     correlation_time: FloatArray,
     scale: Mapping[str, float],
-) -> dict[str, Any]:
+) -> Json:
     """Return the states of the filter, the scale of its noise, how large innovations were, and what it leaves open.
 
     Of effects, weak directions that are determined all the same are no open states.

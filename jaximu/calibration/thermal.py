@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
-import jax
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
@@ -31,24 +30,23 @@ from jaximu.calibration.thermal_triad import TriadFit, fit_triad
 from jaximu.data.rest import mean_terms, padded_count
 from jaximu.data.rest_blocks import RATE_BANDWIDTH, WAYS, RestBlocks, own_noise, rest_blocks
 from jaximu.estimation.fitting import effect_numbers
-from jaximu.estimation.problem import Name
+from jaximu.estimation.problem import Name, axis_scales
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import Document
+from jaximu.ground.document import Document, Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
+from jaximu.ground.tracing import on_host
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
 from jaximu.model.effects import Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, Signal
-
-__all__ = ["ThermalCalibration", "calibrate_thermal", "change", "steady", "steady_change"]
 
 SCHEMA = "jaximu.thermal/1"
 THERMAL = (*POWERS, *RATES, *HISTORY, *BESIDE, LEARNED, NETWORK, SCALE)
@@ -89,11 +87,11 @@ class ThermalCalibration(Result, Document, page="thermal"):
         value, sigma = change(self.calibration, triad, THERMAL, temperature, rate=rate)
         return value / scale, sigma / scale
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return everything as the JSON document of schema `jaximu.thermal/1`."""
         grid = np.linspace(*self.blocks.range, _GRID)
 
-        def triad(name: str, fit: TriadFit) -> dict[str, Any]:
+        def triad(name: str, fit: TriadFit) -> Json:
             value, sigma = self.bias(name, grid)
             return {
                 "unit": SENSOR_UNITS[name],
@@ -355,7 +353,7 @@ def _calibration(
     }
     ended = [fit.fit.failure() for fit in fits.values() if NETWORK not in fit.candidate.names]  # they are solved before
     return Calibration(
-        imu=jax.tree.map(np.asarray, replace(unit, **triads)),
+        imu=on_host(replace(unit, **triads)),
         names=tuple(names),
         covariance=scipy.linalg.block_diag(*covariances),
         gravity=STANDARD if base is None else base.gravity,
@@ -371,7 +369,7 @@ def _calibration(
     ), notes
 
 
-def _data(blocks: RestBlocks, base: Calibration | None) -> dict[str, Any]:
+def _data(blocks: RestBlocks, base: Calibration | None) -> Json:
     """Return where a calibration comes from, as `Calibration.data` has it."""
     signals = blocks.recordings[0].signals
     data = provenance(blocks.recordings) | {
@@ -427,7 +425,7 @@ def _numbers(fit: TriadFit, with_bias: bool, signal: Signal, levels: int) -> tup
 def steady_change(calibration: Calibration, name: str, celsius: FloatArray) -> FloatArray:
     """Return what steady temperatures (m,) °C add to a triad's bias, (m, 3), SI: the calibration's `bias` left out."""
     triad = calibration.triads()[name]
-    scale = np.linalg.norm(triad.gain, axis=1) if triad.output_unit == "count" else np.ones(3)
+    scale = axis_scales(triad) if triad.output_unit == "count" else np.ones(3)
     effects = [effect for effect in triad.effects if effect.plain in THERMAL]
     return steady(effects, celsius, 0.0, triad.temperature_reference)[0] / scale
 

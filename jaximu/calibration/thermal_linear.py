@@ -6,16 +6,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.calibration.thermal_terms import Model, ThermalTerm, net_of
 from jaximu.data.rest_blocks import RestBlocks
 from jaximu.estimation.leave_out import LeftOut, leave_out, off, orthonormal
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.model.noise_model import NoiseModel
-
-__all__ = ["Held", "Whitened"]
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,7 @@ class Whitened:
 
         return misfit
 
-    def held_out(self, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray) -> Held:
+    def held_out(self, model: Model, folds: Sequence[IntArray], scale: FloatArray) -> Held:
         """Predict each fold from all other blocks, noise that they share included; `scale` (3,): of its variance."""
         count, levels = len(self.blocks), self.blocks.levels
         likelihood, errors = np.zeros(3), np.full((3, count), np.nan)
@@ -114,8 +111,6 @@ class Whitened:
                 errors[:, inside] -= np.nanmean(errors[:, inside], axis=1)[:, None]
         return Held(np.sqrt(np.nanmean(errors**2, axis=1)), likelihood)
 
-    def left_out(
-        self, axis: int, terms: Sequence[ThermalTerm], folds: Sequence[NDArray[np.int64]]
-    ) -> Iterator[LeftOut]:
+    def left_out(self, axis: int, terms: Sequence[ThermalTerm], folds: Sequence[IntArray]) -> Iterator[LeftOut]:
         """Yield how all other blocks predict each fold; numbers: levels, then coefficients."""
         return leave_out(self.root[axis], self.design(axis, terms), self.target(axis, terms), folds)

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial.chebyshev import chebvander
-from numpy.typing import NDArray
 
 from jaximu.calibration.thermal_linear import Whitened
 from jaximu.calibration.thermal_selection import Candidate, candidate_of, parameters_of
@@ -29,11 +28,9 @@ from jaximu.data.rest import padded_count
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.solver import solve
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.model.effects.network import UNITS, WEIGHTS, network
-
-__all__ = ["patterned", "with_network"]
 
 _PRIORS = ((0.5, 3.0), (1.5, 1.5), (5.0, 0.7))
 """Standard deviations a priori that are tried, the stiffest last: of the output's weights, over the rms that
@@ -61,7 +58,7 @@ def patterned(data: Whitened, model: Model, scale: FloatArray) -> bool:
 
 
 def with_network(
-    data: Whitened, more: Sequence[str], rated: bool, folds: Sequence[NDArray[np.int64]], scales: FloatArray
+    data: Whitened, more: Sequence[str], rated: bool, folds: Sequence[IntArray], scales: FloatArray
 ) -> tuple[Candidate, FloatArray]:
     """Fit a network of temperature and, if `rated`, its rate, beside a straight line in temperature and `more`.
 
@@ -81,7 +78,7 @@ def with_network(
 
 
 def _about(plain: Sequence[ThermalTerm], net: Net) -> tuple[ThermalTerm, ...]:
-    return (*plain, *(ThermalTerm(NETWORK, (), k, net) for k in range(WEIGHTS)))
+    return (*plain, *(ThermalTerm(NETWORK, shape=k, net=net) for k in range(WEIGHTS)))
 
 
 def _functions(data: Whitened, axis: int, terms: Sequence[ThermalTerm]) -> FloatArray:

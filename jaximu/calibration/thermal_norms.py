@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -14,16 +12,15 @@ from jaximu.calibration.calibration import effect_named
 from jaximu.calibration.refusals import require_solved
 from jaximu.data.gravity_norm import gravity_norm_error
 from jaximu.estimation.covariance import Covariance
-from jaximu.estimation.data import About, Conditions, Data
+from jaximu.estimation.data import About, Conditions, OfOneUnit
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD
+from jaximu.ground.rotation import Number
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
-
-__all__ = ["calibrate_norms"]
 
 _NOISE = 1e-4
 """m/s², of a norm at an excess of zero: less than any window's, whose scatter is found."""
@@ -33,19 +30,15 @@ _BLIND = 1e-7  # share of the largest singular value below which a combination o
 class _Norms(Conditions):
     mean: Float[Array, "n 3"]
     celsius: Float[Array, " n"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of gravity's norm, m/s²."""
         force = imu.accelerometer.recover(self.mean, Stimulus(temperature=self.celsius))
         return gravity_norm_error(force, self.magnitude)
 
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> _Norms:
-        """Return the same with another gravity."""
-        return eqx.tree_at(lambda norms: norms.magnitude, self, magnitude)
 
-
-class _Windows(Data):
+class _Windows(OfOneUnit):
     effects_inside = True
     excess_names = ("accelerometer",)
     coarse = (1e6,)
@@ -53,11 +46,11 @@ class _Windows(Data):
     def __init__(self, conditions: _Norms):
         self.conditions = conditions
 
-    def about(self, imu: Imu) -> About:
-        """Return the norms about one unit, the leading axis."""
-        one = np.ones((1, len(self.conditions.celsius)))
-        covariance = Covariance(_NOISE**2 * one, (_NOISE * one,), one, np.zeros(one.shape, int))
-        return About(jax.tree.map(lambda leaf: leaf[None], self.conditions), covariance, np.zeros((*one.shape, 0)))
+    def about_one(self, imu: Imu) -> About:
+        """Return the norms, whatever the unit."""
+        one = np.ones(len(self.conditions.celsius))
+        covariance = Covariance(_NOISE**2 * one, (_NOISE * one,), one, np.zeros(len(one), int))
+        return About(self.conditions, covariance, np.zeros((len(one), 0)))
 
 
 def calibrate_norms(

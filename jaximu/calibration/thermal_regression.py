@@ -10,8 +10,7 @@ import numpy as np
 from jaximu.calibration.thermal_selection import exchanged
 from jaximu.estimation.leave_out import leave_out, off, orthonormal
 from jaximu.ground.array_types import FloatArray
-
-__all__ = ["multifactor"]
+from jaximu.ground.distributions import rms
 
 _FOLDS = 5
 
@@ -41,4 +40,4 @@ def multifactor(factors: Mapping[str, FloatArray], truth: FloatArray) -> tuple[l
 
     kept = exchanged(tuple(columns), criterion, stays)
     parts = leave_out(np.eye(count), matrix(kept), truth, np.array_split(np.arange(count), _FOLDS))
-    return kept, float(np.sqrt(np.mean(np.concatenate([part.errors for part in parts]) ** 2)))
+    return kept, rms(np.concatenate([part.errors for part in parts]))

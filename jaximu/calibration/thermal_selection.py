@@ -9,7 +9,6 @@ from math import comb, log
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration.identifiability import Identifiability
 from jaximu.calibration.thermal_linear import Held, Whitened
@@ -29,27 +28,9 @@ from jaximu.calibration.thermal_terms import (
     memories,
     net_of,
 )
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.units import PREFIXES
 from jaximu.model.effects.network import WEIGHTS
-
-__all__ = [
-    "CUBIC",
-    "PAYS",
-    "VAGUE",
-    "Candidate",
-    "best_by_axis",
-    "beyond_bias",
-    "candidate_of",
-    "completed",
-    "exchanged",
-    "families_of",
-    "parameters_of",
-    "richest",
-    "stepwise",
-    "terms_of",
-    "tuned",
-]
 
 T = TypeVar("T")
 CUBIC = "cubic"
@@ -180,7 +161,7 @@ def tuned(data: Whitened, model: Model, scale: FloatArray) -> Model:
         for term in best:
             name, bounds = term.name, data.shapes.grids[term.name][[0, -1]]
             around = np.geomspace(1 / spacing[name], spacing[name], GRID)
-            grids[name] = np.clip(term.inner[0][1] * around, *bounds)
+            grids[name] = np.clip(term.inner * around, *bounds)
             spacing[name] **= 2 / (GRID - 1)
     return at(best)
 
@@ -214,7 +195,7 @@ def terms_of(names: Sequence[str], shapes: ThermalShapes) -> tuple[ThermalTerm, 
     for name in names:
         leader = BESIDE.get(name, name)
         if name == LEARNED:
-            terms += [ThermalTerm(LEARNED, (), k) for k in range(SPLINES)]
+            terms += [ThermalTerm(LEARNED, shape=k) for k in range(SPLINES)]
         elif leader in HISTORY:
             terms.append(history(name, shapes.grids[leader][GRID // 2]))
         else:
@@ -276,9 +257,7 @@ def best_by_axis(candidates: Sequence[Candidate]) -> list[int]:
     return chosen
 
 
-def candidate_of(
-    data: Whitened, family: str, model: Model, folds: Sequence[NDArray[np.int64]], scale: FloatArray
-) -> Candidate:
+def candidate_of(data: Whitened, family: str, model: Model, folds: Sequence[IntArray], scale: FloatArray) -> Candidate:
     """Return a model with how it did where folds were left out; `scale` (3,): of the noise's variance."""
     numbers = np.array([parameters_of(terms) for terms in model])
     misfit = np.array([data.misfit(axis, terms) for axis, terms in enumerate(model)])

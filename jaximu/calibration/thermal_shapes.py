@@ -29,8 +29,6 @@ from jaximu.model.effects.learned import ZERO_CELSIUS, AccelLearnedTemperature
 from jaximu.model.effects.network import WEIGHTS
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["GRID", "ThermalShapes"]
-
 GRID = 12
 """Values of an inner parameter that are tried at once."""
 
@@ -66,7 +64,7 @@ class ThermalShapes:
         learned = AccelLearnedTemperature(np.zeros(3 * SPLINES), *curve[0])
         there = np.asarray(learned.shapes(np.asarray(reference + ZERO_CELSIUS)))
         for k, value in enumerate(there):  # a curve need not be zero at the reference
-            self._columns[ThermalTerm(LEARNED, (), k)] -= value
+            self._columns[ThermalTerm(LEARNED, shape=k)] -= value
         self.prepare(self.grids)
         celsius, rates = np.append(blocks.temperature, reference), np.append(blocks.rate, 0.0)
         inputs = np.stack([(2 * celsius - low - high) / (high - low), rates / max(fastest, 1e-12)], axis=1)
@@ -96,7 +94,7 @@ class ThermalShapes:
         if term.net is not None:
             return self.network(term.net)[1][:, :, term.shape]
         if term not in self._columns:
-            self.prepare({BESIDE.get(term.name, term.name): np.full(GRID, term.inner[0][1])})
+            self.prepare({BESIDE.get(term.name, term.name): np.full(GRID, term.inner)})
         return self._columns[term]
 
     def network(self, net: Net) -> tuple[FloatArray, FloatArray]:
@@ -113,7 +111,7 @@ class ThermalShapes:
 
     def smooth(self) -> FloatArray:
         """Return what a smooth function of temperature may be (n, 9)."""
-        return np.stack([self.column(ThermalTerm(LEARNED, (), k))[0] for k in range(SPLINES)], axis=1)
+        return np.stack([self.column(ThermalTerm(LEARNED, shape=k))[0] for k in range(SPLINES)], axis=1)
 
     def generous(self) -> FloatArray:
         """Return what temperature may plausibly do (n, 15), to tell noise from it.

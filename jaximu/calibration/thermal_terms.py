@@ -10,24 +10,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import SHAPES
 
-__all__ = [
-    "BESIDE",
-    "HISTORY",
-    "LEARNED",
-    "NETWORK",
-    "POWERS",
-    "RATES",
-    "SCALE",
-    "SPLINES",
-    "Model",
-    "Net",
-    "ThermalTerm",
-    "at_inner",
-    "history",
-    "memories",
-    "net_of",
-]
-
 POWERS = ("temperature", "temperature_squared", "temperature_cubed")
 RATES = ("temperature_rate", "temperature_rate_squared", "temperature_times_rate")
 HISTORY = {"thermal_lag": "time_constant", "thermal_hysteresis": "half_width"}
@@ -52,10 +34,10 @@ class Net:
 
 
 class ThermalTerm(NamedTuple):
-    """A column group of the fit: a catalogue effect without its prefix, inner parameters, and which of its shapes."""
+    """A column group of the fit: a catalogue effect without its prefix, inner parameter, and which of its shapes."""
 
     name: str
-    inner: tuple[tuple[str, float], ...] = ()
+    inner: float = 0.0  # of what has a memory
     shape: int = 0  # of an axis: of the learned curve, or the weight of the network
     net: Net | None = None  # about which the network is linear
 
@@ -66,7 +48,7 @@ Model = tuple[tuple[ThermalTerm, ...], ...]
 
 def history(name: str, value: float) -> ThermalTerm:
     """Return the term of an effect with memory at a value of its inner parameter."""
-    return ThermalTerm(name, ((HISTORY[BESIDE.get(name, name)], float(value)),))
+    return ThermalTerm(name, float(value))
 
 
 def memories(names: Iterable[str]) -> set[str]:

@@ -43,8 +43,6 @@ from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.network import UNITS
 from jaximu.model.sensor import Imu
 
-__all__ = ["TriadFit", "fit_triad"]
-
 
 @dataclass(frozen=True)
 class TriadFit:
@@ -177,7 +175,7 @@ def _fitted(data: Whitened, model: Model, scale: FloatArray) -> Fit:
             number = Name(name, "coefficients", (index,), order.index(term.name))
             used.add(number)
             values[term.name][index] = value * unit
-            inner[term.name] |= dict(term.inner)
+            inner[term.name] |= {key: term.inner for key in kinds[term.name].inner if key in HISTORY.values()}
             if term.net is not None:
                 known[number] = term.net.prior[axis, term.shape] * np.sqrt(scale[axis]) * unit
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
 
 from jaximu.calibration.bias_drift import knowing_drift
-from jaximu.calibration.calibration import Calibration, concluded, effect_named, provenance
+from jaximu.calibration.calibration import Calibration, concluded, effect_named, notes_of, provenance
 from jaximu.calibration.nominal import as_stated
 from jaximu.calibration.refusals import require_determined
 from jaximu.data.observe_stations import observe_stations
@@ -25,6 +24,8 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import counted
+from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.tracing import on_host
 from jaximu.mistakes import Prepared, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.earth_rotation import GyroEarthRotation
@@ -42,13 +43,6 @@ _RECORD = (
     "Rest for a second or more in at least six orientations, each axis up and down, and turn about each axis between "
     "rests."
 )
-
-__all__ = [
-    "calibrate_table_ready",
-    "calibrate_turntable",
-    "fit_turntable",
-    "free_on_table",
-]
 
 
 def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss: Loss = "linear") -> Fit:
@@ -68,17 +62,12 @@ def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss
 
     **Returns:** a `Fit` with the same leading axes. Look at `converged` and `finite`; nothing is raised.
     """
-    require_float64()
-    single = np.ndim(stations.gravity) == 0
-    lift = (lambda leaf: np.asarray(leaf)[None]) if single else np.asarray
-    start, stations = jax.tree.map(lift, (start, stations))
     on_table, force = free_on_table(start, free), bool(np.any(stations.accelerometer_used))
 
     def seen(name: Name) -> bool:
         return on_table(name) and (force or name.owner != "accelerometer" or name.effect is not None)
 
-    fitted = fit(start, KnownStations(stations), seen, loss=loss, follow=True)
-    return jax.tree.map(lambda leaf: leaf[0], fitted) if single else fitted
+    return fit(start, KnownStations(stations), seen, loss=loss, follow=True)
 
 
 def free_on_table(imu: Imu, free: Sequence[str] = ()) -> Callable[[Name], bool]:
@@ -150,7 +139,7 @@ def calibrate_table_ready(
     nominal = as_stated(recordings[0])
     if recordings[0].gyroscope is None:
         nominal = Imu(nominal.accelerometer, None)
-    chosen = [effect_named(effect) for effect in effects]
+    chosen = list(map(effect_named, effects))
     if latitude is not None:
         _require_headings(recordings, references)
         known = GyroEarthRotation.make(earth_rate(np.radians(latitude)))
@@ -162,7 +151,7 @@ def calibrate_table_ready(
                 f"{effect.name} needs to know how the unit was turned about the vertical in every pose: state headings "
                 "in the reference, or all turns between the poses."
             )
-    start = jax.tree.map(np.asarray, nominal.with_effects(*chosen))
+    start = on_host(nominal.with_effects(*chosen))
     fitted = fit_turntable(start, stations, free, loss)
     where = ", ".join(recording.name for recording in recordings)
     used = np.asarray(stations.accelerometer_used) | np.asarray(stations.gyroscope_used)
@@ -172,8 +161,7 @@ def calibrate_table_ready(
     fitted = _at_rest_where_open(fitted, start)
     notes = (
         *(note for recording in recordings for note in recording.remarks),
-        *(note for one in ready for note in one.notes),
-        *(() if noise is None else noise.notes),
+        *notes_of(*ready, noise),
         *remarks,
     )
     calibration = concluded(
@@ -212,7 +200,7 @@ def _turned_as_a_whole(calibration: Calibration) -> list[str]:
     notes = []
     for sensor in sorted({name.owner for name in calibration.names if name.part == "gain"} - open_gains):
         gain = np.asarray(calibration.triads()[sensor].gain)
-        rotation, _ = scipy.linalg.polar(gain / np.linalg.norm(gain, axis=1, keepdims=True))
+        rotation, _ = scipy.linalg.polar(unit_vectors(gain))
         vector = scipy.spatial.transform.Rotation.from_matrix(rotation).as_rotvec(degrees=True)
         if _TURNED < np.linalg.norm(vector) < _ARRANGED:
             about = ", ".join(f"{axis} {angle:+.2g}°" for axis, angle in zip("xyz", vector, strict=True))
@@ -234,7 +222,7 @@ def _at_rest_where_open(fitted: Fit, start: Imu) -> Fit:
     if not len(free):
         return fitted
     back = moved - free.T @ (free @ moved)
-    model = jax.tree.map(np.asarray, parameters.model(start, jnp.asarray(back)))
+    model = on_host(parameters.model(start, jnp.asarray(back)))
     return replace(fitted, imu=model, values=values + fitted.sizes * back)
 
 

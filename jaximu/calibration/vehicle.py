@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
-from numpy.typing import NDArray
+import scipy
 
 from jaximu.calibration.calibration import Calibration, provenance
 from jaximu.calibration.filter_history import History
@@ -22,16 +21,17 @@ from jaximu.data.drift import about_biases, estimated_drift
 from jaximu.estimation.data import OutputMeans
 from jaximu.estimation.information_filter import Knowledge, WhiteRows, advance, estimate
 from jaximu.estimation.problem import Name
-from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import student_isf
+from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.distributions import rms, student_isf
+from jaximu.ground.document import Json
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.quantities import Z95
+from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.tracing import on_host
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation, rest_statistics
-
-__all__ = ["calibrate_at_stops"]
 
 _SECONDS, _STRAIGHT = 4.0, np.radians(30.0)
 """Seconds after and before a stop whose speeds show where forward is, while the vehicle turns by less than this."""
@@ -46,6 +46,8 @@ _MOST = 200
 """Stops, the longest, of which the bias is estimated: more take minutes and show little more."""
 _SHORTEST = 1e-9
 """Share of a drift's size that a step drives it by at the least."""
+_STEP = 1e-5
+"""rad by which axes are turned to see how their angles follow."""
 _OPEN = (
     "Gyroscope scale and misalignment: a vehicle turns about the vertical, and nothing here measures how far.",
     "Accelerometer scale, misalignment and bias: all stops have one orientation. A bias tilts the mounting, by 0.6° "
@@ -67,7 +69,6 @@ class _Rate:
     change_sigma: FloatArray
     left: FloatArray
     excess: FloatArray
-    noise: NoiseModel
     notes: tuple[str, ...]
 
 
@@ -93,20 +94,18 @@ def calibrate_at_stops(
     longest = np.sort(np.argsort(-np.diff(stops.intervals)[:, 0])[:_MOST])
     rate, history = _rate(gyroscope, stops.intervals[longest], earth, known)
     scale = gyroscope.nominal_scale
-    covariance = rate.covariance + scale[:, None] * spread * scale
+    felt = scale[:, None] * spread * scale  # of the Earth's rotation, the same throughout
     nominal = as_stated(recording)
-    assert nominal.gyroscope is not None
-    unit = replace(nominal, gyroscope=replace(nominal.gyroscope, bias=rate.bias))
-    still = np.sqrt(np.mean(np.square(rate.left + (rate.bias - gyroscope.nominal_offset) / scale)))
-    steady = np.diag(scale[:, None] * spread * scale)
+    unit = replace(nominal, gyroscope=replace(nominal.triads()["gyroscope"], bias=rate.bias))
+    still = rms(rate.left + (rate.bias - gyroscope.nominal_offset) / scale)
     calibration = Calibration(
-        imu=jax.tree.map(np.asarray, unit),
+        imu=on_host(unit),
         names=history.names,
-        covariance=covariance,
+        covariance=rate.covariance + felt,
         gravity=gravity,
         method="filter",
         loss="linear",
-        rms={"static_gyroscope": (float(still), float(np.sqrt(np.mean(rate.left**2))), "rad/s")},
+        rms={"static_gyroscope": (still, rms(rate.left), "rad/s")},
         rank=3,
         weak=(),
         excess={"gyroscope": float(rate.excess[0])},
@@ -117,7 +116,7 @@ def calibrate_at_stops(
         nominal=nominal,
         absent=("accelerometer",),
         reading=recording.reading,
-        bias_sigma_recording={"gyroscope": np.sqrt(rate.sigma_recording**2 + steady)},
+        bias_sigma_recording={"gyroscope": np.sqrt(rate.sigma_recording**2 + np.diag(felt))},
     )
     vehicle = _mounted(stops, sites, force, up, (rate.bias - gyroscope.nominal_offset) / scale, gravity)
     vehicle["bias_change"] = _entry(rate.change, rate.change_sigma, "rad/s")
@@ -131,7 +130,7 @@ def calibrate_at_stops(
     return replace(calibration, filter=summary), history
 
 
-def _undetermined(vehicle: dict[str, Any]) -> list[str]:
+def _undetermined(vehicle: Json) -> list[str]:
     texts = []
     if vehicle["roll"]["sigma"] is None:
         texts.append(
@@ -193,7 +192,7 @@ def _rate(
         change, change_sigma = np.full((2, 3), np.nan)
     trend = np.square(scale) * np.maximum(change**2 - np.square(Z95 * change_sigma), 0.0)
     after = after + np.diag(np.nan_to_num(trend))  # what changed beyond chance may go on changing
-    rate = _Rate(bias, after, sigmas["gyroscope"], change, change_sigma, left, excess, noise, notes)
+    rate = _Rate(bias, after, sigmas["gyroscope"], change, change_sigma, left, excess, notes)
     return rate, _followed(names, start, stop, values.reshape(-1, 3), variance["gyroscope"], noise, scale)
 
 
@@ -252,56 +251,51 @@ def _followed(
 # --- the mounting -----------------------------------------------------------------------------------------------------
 
 
-def _sites(intervals: FloatArray) -> NDArray[np.int64]:
+def _sites(intervals: FloatArray) -> IntArray:
     """Return the site (P,) of each stop: after a few seconds of motion a vehicle stands on the same slope again."""
     return np.append(0, np.cumsum(intervals[1:, 0] - intervals[:-1, 1] > _ELSEWHERE))
 
 
-def _by_site(values: FloatArray, sites: NDArray[np.int64]) -> FloatArray:
+def _by_site(values: FloatArray, sites: IntArray) -> FloatArray:
     """Return the mean (S, k) over each site of values (P, k) at stops."""
     return np.array([values[sites == site].mean(axis=0) for site in range(sites[-1] + 1)])
 
 
 def _mean_direction(force: FloatArray) -> FloatArray:
     """Return the direction (3,) in which forces (P, 3) point on average."""
-    mean = np.mean(force / np.linalg.norm(force, axis=1, keepdims=True), axis=0)
-    return mean / np.linalg.norm(mean)
+    mean = np.mean(unit_vectors(force), axis=0)
+    return unit_vectors(mean)
 
 
 def _mounted(
     stops: Segmentation,
-    sites: NDArray[np.int64],
+    sites: IntArray,
     force: FloatArray,
     up: FloatArray,
     bias: FloatArray,
     gravity: LocalGravity,
-) -> dict[str, Any]:
+) -> Json:
     """Return how a unit is mounted in the vehicle, by the force (P, 3) at its stops and the speeds beside these.
 
     **Arguments:** `sites` (P,): of the stops; `bias` (3,): of the gyroscope, rad/s.
     """
     across = np.linalg.svd(up[None])[2][1:]
     across[1] = np.cross(up, across[0])
-    tilts = force / np.linalg.norm(force, axis=1, keepdims=True) @ across.T
+    tilts = unit_vectors(force) @ across.T
     different = _by_site(tilts, sites)
     covariance = _of_mean(different)
     sides, speeds = _speeds(stops, force, across, up, bias)
     forward, sigma, alike = _forward(sides, speeds)
-    determined = sigma is not None and Z95 * sigma < _WIDEST and alike > _ONE_WAY
+    determined = Z95 * sigma < _WIDEST and alike > _ONE_WAY
     ahead = forward @ across
-    axes = np.stack([ahead, np.cross(up, ahead), up])
-    angles = _angles(axes)
-    turns = np.vstack([across, up])
-    slopes = np.stack([_angles(axes @ _turned(turn)) - _angles(axes @ _turned(-turn)) for turn in turns], 1) / (
-        2 * _STEP
-    )
-    whole = np.zeros((3, 3))
-    if covariance is not None:
-        quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a turn about one direction moves up along the other
-        whole[:2, :2] = quarter @ covariance @ quarter.T
-    whole[2, 2] = 0.0 if sigma is None else sigma**2
+    axes = np.stack([ahead, np.cross(up, ahead), up])  # the vehicle's, in the unit: Rz(yaw) Ry(pitch) Rx(roll)
+    rotation = scipy.spatial.transform.Rotation
+    turns = rotation.from_rotvec(_STEP * np.vstack([np.zeros(3), across, up, -across, -up]))
+    angles, *moved = (rotation.from_matrix(axes) * turns).as_euler("ZYX")[:, ::-1]
+    slopes = (np.array(moved[:3]) - moved[3:]).T / (2 * _STEP)
+    quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a turn about one direction moves up along the other
+    whole = scipy.linalg.block_diag(quarter @ covariance @ quarter.T, np.nan_to_num(sigma) ** 2)
     sigmas = np.sqrt(np.diag(slopes @ whole @ slopes.T))
-    shown = [None if covariance is None else float(value) for value in sigmas]
     norm = np.linalg.norm(force, axis=1)
     scatter = _of_mean(norm[:, None])
     return {
@@ -312,49 +306,35 @@ def _mounted(
         "seconds": float(np.sum(np.diff(stops.intervals))),
         "up": up.tolist(),
         "forward": ahead.tolist() if determined else None,
-        "roll": _entry(angles[0], shown[0], "rad"),
-        "pitch": _entry(angles[1], shown[1], "rad"),
-        "yaw": _entry(angles[2], shown[2], "rad") if determined else None,
-        "slope": None if covariance is None else float(np.sqrt(np.sum(different.var(axis=0, ddof=1)))),
+        "roll": _entry(angles[0], sigmas[0], "rad"),
+        "pitch": _entry(angles[1], sigmas[1], "rad"),
+        "yaw": _entry(angles[2], sigmas[2], "rad") if determined else None,
+        "slope": None if len(different) < 2 else float(np.sqrt(np.sum(different.var(axis=0, ddof=1)))),
         "speeds": [
             {"stop": int(side), "along": float(along), "left": float(left)}
             for side, (along, left) in zip(sides, speeds @ across @ axes[:2].T, strict=True)
         ],
         "forward_share": (1 + alike) / 2 if determined else None,
         "norm_error": _entry(
-            float(norm.mean() - gravity.value),
-            None if scatter is None else float(np.hypot(np.sqrt(scatter[0, 0]), gravity.sigma)),
+            norm.mean() - gravity.value,
+            np.hypot(np.sqrt(scatter[0, 0]), gravity.sigma),
             "m/s^2",
         ),
     }
 
 
-_STEP = 1e-5
-
-
-def _turned(turn: FloatArray) -> FloatArray:
-    """Return the matrix that turns by a small step about a direction."""
-    return np.eye(3) + _STEP * np.cross(np.eye(3), -turn)
-
-
-def _angles(axes: FloatArray) -> FloatArray:
-    """Return roll, pitch and yaw (rad) of a unit from the vehicle's axes in it, as rows: Rz(yaw) Ry(pitch) Rx(roll)."""
-    (x, y, z) = axes
-    return np.array([np.arctan2(z[1], z[2]), -np.arcsin(np.clip(z[0], -1, 1)), np.arctan2(y[0], x[0])])
-
-
-def _of_mean(values: FloatArray) -> FloatArray | None:
-    """Return the covariance of the mean of values (n, k), widened so that 1.96 of its sigmas hold 95 %; None of one."""
-    count = len(values)
+def _of_mean(values: FloatArray) -> FloatArray:
+    """Return the covariance of the mean of values (n, k), widened so that 1.96 of its sigmas hold 95 %; NaN of one."""
+    count, size = values.shape
     if count < 2:
-        return None
+        return np.full((size, size), np.nan)
     widened = student_isf(0.025, count - 1) / Z95
     return widened**2 / count * np.atleast_2d(np.cov(values.T))
 
 
 def _speeds(
     stops: Segmentation, force: FloatArray, across: FloatArray, up: FloatArray, bias: FloatArray
-) -> tuple[NDArray[np.int64], FloatArray]:
+) -> tuple[IntArray, FloatArray]:
     """Return the stop beside each speed (n,), and speeds (n, 2), m/s, along `across` (2, 3), as if driven forwards.
 
     Speeds are gained after a stop and lost before one. The gyroscope carries the axes in which they add up, so that
@@ -383,14 +363,14 @@ def _speeds(
     return np.array(sides, int), np.array(speeds).reshape(-1, 2)
 
 
-def _forward(sides: NDArray[np.int64], speeds: FloatArray) -> tuple[FloatArray, float | None, float]:
-    """Return the direction (2,) along which speeds (n, 2) lie, its sigma (rad) if any, and how one-sided they are.
+def _forward(sides: IntArray, speeds: FloatArray) -> tuple[FloatArray, float, float]:
+    """Return the direction (2,) along which speeds (n, 2) lie, its sigma (rad) or NaN, and how one-sided they are.
 
     The last is the sum of squared speeds one way less that of those the other way, over that of all: backwards is
     slow. Speeds beside one stop share its slope, so the scatter that counts is that of stops.
     """
     if not len(speeds):
-        return np.array([1.0, 0.0]), None, 0.0
+        return np.array([1.0, 0.0]), np.nan, 0.0
     direction = np.linalg.svd(speeds, full_matrices=False)[2][0]
     direction = direction * (np.sign(speeds.sum(axis=0) @ direction) or 1.0)
     along, across = speeds @ direction, speeds @ np.array([-direction[1], direction[0]])
@@ -398,16 +378,15 @@ def _forward(sides: NDArray[np.int64], speeds: FloatArray) -> tuple[FloatArray, 
     pulls = np.bincount(sides, along * across)[np.unique(sides)]
     count = len(pulls)
     if count < _FEWEST_STOPS:
-        return direction, None, alike
+        return direction, np.nan, alike
     scatter = np.sqrt(np.sum(pulls**2) * count / (count - 1)) / np.sum(along**2)
     return direction, float(scatter * student_isf(0.025, count - 1) / Z95), alike
 
 
-def _entry(value: Any, sigma: Any, unit: str) -> dict[str, Any]:
+def _entry(value: Any, sigma: Any, unit: str) -> Json:
     """Return a number, or several, with what it is known to, as the JSON document has it; not finite ones are null."""
 
     def plain(number: Any) -> Any:
-        listed = np.asarray(number, float) if number is not None else None
-        return None if listed is None or not np.isfinite(listed).all() else listed.tolist()
+        return np.asarray(number, float).tolist() if np.isfinite(number).all() else None
 
     return {"value": plain(value), "sigma": plain(sigma), "unit": unit}

@@ -15,20 +15,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaximu.data.gravity_direction import across, unit_vectors
+from jaximu.data.gravity_direction import across
 from jaximu.data.poses import EXCESS_NAMES, HandHeldConditions, condense
 from jaximu.data.poses_covariance import turn_noise
 from jaximu.estimation.covariance import Covariance, mean_root
 from jaximu.estimation.data import About, Conditions, OfOneUnit
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate, rotation_matrix
-from jaximu.ground.tracing import first
+from jaximu.ground.rotation import (
+    Number,
+    conjugate,
+    exponential,
+    logarithm,
+    multiply,
+    rotate,
+    rotation_matrix,
+    unit_vectors,
+)
+from jaximu.ground.tracing import first, stacked
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
-
-__all__ = ["IN_COMMON", "SharedConditions", "UnitsOnOneBody"]
 
 IN_COMMON = "turns, in common"
 """The component of the excess that all units' turns share: what the body does between samples that all take alike."""
@@ -42,7 +49,7 @@ class SharedConditions(Conditions):
 
     separate: HandHeldConditions
     basis: Float[Array, "P 2 3"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return each unit's conditions, directions (rad), two a pose and other unit, and turns (rad), one each."""
@@ -68,7 +75,7 @@ class SharedConditions(Conditions):
 
 def _stacked(board: Board) -> Imu:
     """Return the units of a board along a leading axis, without effects."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(unit.with_effects() for unit in board.units()))
+    return stacked([unit.with_effects() for unit in board.units()])
 
 
 def _mountings(board: Board) -> Float[Array, "U-1 3"]:

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from jaximu.data.preintegration import linear_slope, preintegrate_samples, white_covariance
 from jaximu.estimation.covariance import Covariance
@@ -28,9 +27,10 @@ from jaximu.estimation.problem import Parameters
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import TRIADS, Track, added, stimuli
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.differences import interpolated, value_and_jacobian
+from jaximu.ground.array_types import Array, FloatArray, IntArray
+from jaximu.ground.differences import interpolated, midpoints, value_and_jacobian
 from jaximu.ground.rotation import (
+    Number,
     conjugate,
     exponential,
     inverse_matrix,
@@ -39,7 +39,7 @@ from jaximu.ground.rotation import (
     right_jacobian,
     rotate,
     rotation_matrix,
-    rotation_matrix_on_host,
+    unit_vectors,
 )
 from jaximu.model.effects import Effect
 from jaximu.model.effects.lever_arm import AccelLeverArm
@@ -50,19 +50,6 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, smoothed_slope
-from jaximu.recordings.reference import Integral
-
-__all__ = [
-    "EXCESS_NAMES",
-    "INTERVALS",
-    "WINDOW",
-    "AgainstAttitude",
-    "AttitudeConditions",
-    "Intervals",
-    "evaluated",
-    "reference_sigmas",
-    "shared_ends",
-]
 
 EXCESS_NAMES = ("gyroscope", "reference attitude", "gyroscope bias walk", "accelerometer", "reference velocity")
 _UNITS = (1e-4, 1e-3, 1e-5, 1e-3, 1e-2)
@@ -109,7 +96,7 @@ class AttitudeConditions(Conditions):
     gain: Float[Array, "W 3"]
     turn: Bool[Array, " T"]
     window: Bool[Array, " W"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the errors of the rotations (rad) and of the mean forces (m/s²)."""
@@ -177,7 +164,7 @@ class Intervals(eqx.Module):
     attitude: Float[Array, "T+1 4"]
     velocity: Float[Array, "T 3"]
     used: Bool[Array, " T"]
-    gravity: Float[Array, ""]
+    gravity: Number
 
 
 def _smoothed(imu: Imu, mounting: Mounting, data: Intervals, stamps: Float[Array, " k"]) -> Float[Array, "k 4"]:
@@ -307,7 +294,7 @@ class AgainstAttitude(OfOneUnit):
     def intervals(self) -> Intervals:
         """What was recorded, the reference thinned to some two hundred intervals."""
         attitude, (accelerometer, gyroscope) = self.attitude, map(self.recording.signals.__getitem__, TRIADS)
-        time, edges = gyroscope.time, Integral(gyroscope, gyroscope.values).edges
+        time, edges = gyroscope.time, gyroscope.edges
         stamps = attitude.time + self.offset
         knots, group = self._knots
         count = len(knots) - 1
@@ -327,7 +314,7 @@ class AgainstAttitude(OfOneUnit):
             gyroscope.values,
             slope,
             curve,
-            interpolated(accelerometer.time, accelerometer.values, time),
+            accelerometer.at(time),
             edges[:-1],
             edges[1:],
             stamps[knots],
@@ -338,7 +325,7 @@ class AgainstAttitude(OfOneUnit):
         )  # pyright: ignore
 
     @cached_property
-    def _knots(self) -> tuple[NDArray[np.int64], int]:
+    def _knots(self) -> tuple[IntArray, int]:
         """Rows of the reference between which the intervals lie, and how many intervals make a window of the force."""
         gyroscope, attitude = self.recording.signals["gyroscope"], self.attitude
         margin, stamps = 3 / gyroscope.rate, attitude.time + self.offset
@@ -352,7 +339,7 @@ class AgainstAttitude(OfOneUnit):
         """Intervals to a window of the specific force."""
         return self._knots[1]
 
-    def _places(self, mounting: Mounting) -> NDArray[np.int64]:
+    def _places(self, mounting: Mounting) -> IntArray:
         """Samples (T, S) of each interval, with some more on either side for the delay to move."""
         data = self.intervals
         stamps = mounting.on_log(data.stamp)
@@ -402,14 +389,14 @@ class AgainstAttitude(OfOneUnit):
         ends = stamps[::group]
         window = np.arange(len(ends) - 1)
         observation = np.repeat(np.concatenate([np.repeat(window, group), window]), 3)
-        middle = np.concatenate([(stamps[1:] + stamps[:-1]) / 2, (ends[1:] + ends[:-1]) / 2])
+        middle = np.concatenate([midpoints(stamps), midpoints(ends)])
         rotations = (np.arange(len(middle)) < len(used))[:, None]
         signals = self.recording.signals
         force, rate = (interpolated(signals[name].time, signals[name].si(), middle) for name in TRIADS)
         covariates = {TIME: middle} | by_axis("rate", "°/s", np.where(rotations, np.degrees(rate), np.nan))
         covariates |= by_axis("specific force", "m/s²", np.where(rotations, np.nan, force))
         if warmth := signals.get("temperature"):
-            covariates[TEMPERATURE] = np.interp(middle, warmth.time, warmth.values[:, 0])
+            covariates[TEMPERATURE] = warmth.at(middle)[:, 0]
         length = np.concatenate([np.where(used, np.diff(stamps), 1.0), np.ones(len(window))])
         return Rows(
             kinds=RESIDUALS,
@@ -524,7 +511,7 @@ class AgainstAttitude(OfOneUnit):
             return np.asarray(details.reactions.react(*both, windows))
 
         share = (np.asarray(stimulus.time) - stamps[0]) / np.ptp(stamps)
-        return Observed(react, share, up=force / np.linalg.norm(force, axis=1, keepdims=True))
+        return Observed(react, share, up=unit_vectors(force))
 
     def without(self, observation: int) -> AgainstAttitude:
         """Return the recording with a window of the force left out, and the rotations in it."""
@@ -559,7 +546,7 @@ class AgainstAttitude(OfOneUnit):
             whole[rows.ravel()] = factor
             return (whole.T * used).T
 
-        back = rotation_matrix_on_host(conditions.target).swapaxes(1, 2)
+        back = rotation_matrix(conditions.target).swapaxes(1, 2)
         ends = np.zeros((n, 3 * (turns + 1)))
         ends[rows.ravel()] = shared_ends(back)
         for interval in range(turns):
@@ -585,7 +572,7 @@ class AgainstAttitude(OfOneUnit):
         turn, window = conditions.turn, conditions.window
         rate = values[: 3 * len(turn)].reshape(-1, 3)[turn] / about.details.duration[turn, None]
         stamps = self.intervals.stamp
-        middle = (stamps[1:] + stamps[:-1]) / 2
+        middle = midpoints(stamps)
         forces = values[3 * len(turn) :].reshape(-1, 3)[window]
         return {
             "rotation": (middle[turn], np.degrees(rate), "deg/s"),

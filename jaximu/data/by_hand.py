@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-import jax
 import numpy as np
 
 from jaximu.data.drift import drift_components, mean_output_reactions, means_by_hand
@@ -29,8 +28,8 @@ from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.rotation import rotation_matrix_on_host
-from jaximu.ground.tracing import first
+from jaximu.ground.rotation import rotation_matrix, unit_vectors
+from jaximu.ground.tracing import first, on_host
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
@@ -38,8 +37,6 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observed_poses
-
-__all__ = ["RecordedByHand"]
 
 
 @dataclass
@@ -63,7 +60,7 @@ class RecordedByHand(OfOneUnit):
     advice = staticmethod(pose_advice)
 
     def __post_init__(self):
-        self.observations = jax.tree.map(np.asarray, self.observations)
+        self.observations = on_host(self.observations)
 
     @cached_property
     def data(self) -> PosesAndTurns:
@@ -82,7 +79,7 @@ class RecordedByHand(OfOneUnit):
 
     def along(self, imu: Imu, effects: tuple[Effect, ...]) -> Along:
         """Return the recordings about a unit with effects: the tracks, and the observations without what they add."""
-        along = jax.tree.map(np.asarray, self.data.along(imu, effects))
+        along = on_host(self.data.along(imu, effects))
         return along._replace(observations=as_observations(along.observations))
 
     def reactions(self, details: Along):
@@ -160,7 +157,7 @@ class RecordedByHand(OfOneUnit):
         return Observed(
             react,
             (time - time.min()) / max(np.ptp(time), 1e-9),
-            up=(force / np.linalg.norm(force, axis=1, keepdims=True))[real],
+            up=unit_vectors(force[real]),
             still=np.ones(len(real), bool),
             number=real,
             alone=real,
@@ -231,5 +228,5 @@ def _attitudes(tracks: Sequence[dict[str, Track]], poses: int) -> FloatArray:
         pose, row = np.unique(track.observation, return_index=True)
         inside = pose < poses
         attitude = np.asarray(track.stimulus.attitude)[row[inside]]
-        axes[pose[inside]] = rotation_matrix_on_host(attitude).reshape(-1, 9)
+        axes[pose[inside]] = rotation_matrix(attitude).reshape(-1, 9)
     return axes

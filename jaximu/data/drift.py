@@ -11,39 +11,20 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.data.poses_covariance import Sensitivities
-from jaximu.data.rest_blocks import RATIO, correlation_times
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import OutputMeans
 from jaximu.estimation.fitting import Fit, unwhitened
 from jaximu.estimation.leave_out import orthonormal
 from jaximu.estimation.problem import Name
 from jaximu.estimation.track import TRIADS
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.quantities import size
 from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.processes import RATIO, correlation_times
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.segmentation import Segmentation
-
-__all__ = [
-    "DRIFT_ESTIMATED",
-    "USUAL_DRIFT",
-    "EstimatedDrift",
-    "about_biases",
-    "drift_components",
-    "drifting",
-    "estimated_drift",
-    "mean_output_reactions",
-    "means_by_hand",
-    "power_on_text",
-    "restricted_likelihood",
-    "slow_units",
-    "with_drift",
-    "with_noise",
-    "with_usual_drift",
-]
 
 _POWER_ON = "power-on"
 USUAL_DRIFT = {"bias instability": (0.4, 1.2), "random walk": (0.1, 1.0), _POWER_ON: (5.0, 1.5)}
@@ -175,7 +156,7 @@ def estimated_drift(
     measured: FloatArray,
     excess: Sequence[FloatArray],
     means: OutputMeans,
-    used: NDArray[np.bool_] | slice = slice(None),
+    used: BoolArray | slice = slice(None),
 ) -> EstimatedDrift:
     """Return the drift of biases that conditions show, estimated together with the excess of their noise.
 
@@ -282,8 +263,8 @@ def means_by_hand(
         for name, rows in zip(TRIADS, mean_output_reactions(reaction), strict=True)
         if name in scales
     }
-    scatter = {"accelerometer": poses.accelerometer_covariance, "gyroscope": poses.gyroscope_covariance}
-    variances = {name: np.diagonal(np.asarray(scatter[name])[real], axis1=1, axis2=2) for name in reactions}
+    scatter = {name: np.asarray(getattr(poses, f"{name}_covariance"))[real] for name in reactions}
+    variances = {name: np.diagonal(covariance, axis1=1, axis2=2) for name, covariance in scatter.items()}
     start, stop = np.asarray(poses.start)[real], np.asarray(poses.stop)[real]
     return OutputMeans.of(start, stop, np.repeat(np.arange(len(counts)), counts)[real], reactions, scales, variances)
 

@@ -27,16 +27,13 @@ from jaximu.estimation.data import About, Conditions, OfOneUnit
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.estimation.track import Track, added
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.differences import interpolated
-from jaximu.ground.rotation import exponential, inverse_matrix, rotate
+from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
+from jaximu.ground.distributions import rms
+from jaximu.ground.rotation import Number, exponential, inverse_matrix, rotate, unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.reference import Integral
-
-__all__ = ["EXCESS_NAMES", "FieldConditions", "FieldSamples", "FieldWindows", "MagneticField", "windows_of"]
 
 EXCESS_NAMES = ("magnetometer", "carried field", "angle to gravity")
 RESIDUALS = (
@@ -77,8 +74,8 @@ class FieldConditions(Conditions):
     window: Bool[Array, " n"]
     turn: Bool[Array, " n"]
     level: Bool[Array, " n"]
-    magnitude: Float[Array, ""]
-    sine: Float[Array, ""]
+    magnitude: Number
+    sine: Number
     alone: bool = eqx.field(static=True, default=False)
 
     def field(self, imu: Imu) -> Float[Array, "n 3"]:
@@ -175,9 +172,9 @@ class FieldWindows:
     angle: FloatArray
     time: FloatArray
     count: FloatArray
-    used: NDArray[np.bool_]
-    turn: NDArray[np.bool_]
-    level: NDArray[np.bool_]
+    used: BoolArray
+    turn: BoolArray
+    level: BoolArray
     noise: float
     origin: FloatArray
     samples: FieldSamples
@@ -210,12 +207,12 @@ class FieldWindows:
 
     def bent(self, field: FloatArray) -> FloatArray:
         """Return how the sine (n,) of the angle from up to a field (n, 3) reacts to what `vertical` is of, (n, 12)."""
-        along = field / np.linalg.norm(field, axis=1, keepdims=True)
+        along = unit_vectors(field)
         across = along - np.sum(along * self.up, axis=1, keepdims=True) * self.up
         by_gain = np.einsum("ni,nj->nij", across, self.up).reshape(len(self), 9)
         return np.concatenate([by_gain, across], axis=1)
 
-    def without(self, left_out: NDArray[np.bool_]) -> FieldWindows:
+    def without(self, left_out: BoolArray) -> FieldWindows:
         """Return the same with some windows left out (n,)."""
         used = self.used & ~left_out
         following = np.append(used[1:], False)
@@ -226,7 +223,7 @@ class FieldWindows:
         """Return windows of several recordings of one unit as one."""
         names = ("output", "slope", "carried", "swept", "up", "off", "angle", "time", "count", "used", "turn", "level")
         together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        noise = float(np.sqrt(np.mean([part.noise**2 for part in parts])))
+        noise = rms([part.noise for part in parts])
         samples = FieldSamples.joined([part.samples for part in parts])
         return cls(**together, noise=noise, origin=parts[0].origin, samples=samples, vertical=parts[0].vertical)
 
@@ -237,7 +234,7 @@ def white_noise(signal: Signal) -> float:
     spread = 1.4826 * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / np.sqrt(20.0)
     levels = [np.unique(axis[:20000]).tolist() for axis in signal.values.T]
     rounding = [min(np.diff(values).tolist(), default=0.0) / np.sqrt(12.0) for values in levels]
-    return float(np.sqrt(np.mean(np.maximum(spread, rounding) ** 2)))
+    return rms(np.maximum(spread, rounding))
 
 
 def windows_of(
@@ -269,11 +266,11 @@ def windows_of(
     up, off = np.zeros((len(centre), 3)), np.ones(len(centre))
     if motion is not None:
         force = motion.accelerometer
-        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, interpolated(force.time, force.values, time[index]))
+        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, force.at(time[index]))
         length = np.linalg.norm(mean, axis=1)
         up, off = mean / length[:, None], np.abs(length / STANDARD_GRAVITY - 1)
     known = {} if motion is None else motion.signals
-    known = {name: interpolated(part.time, part.values, time[index]) for name, part in known.items()}
+    known = {name: part.at(time[index]) for name, part in known.items()}
     warm, flow = (known[name][..., 0] if name in known else None for name in ("temperature", "current"))
     stimulus = Stimulus(time=time[index], temperature=warm, current=flow, angular_rate=known.get("gyroscope"))  # pyright: ignore
     window = np.where(weight > 0, np.arange(len(count))[:, None], len(count))
@@ -323,7 +320,7 @@ def _frames(
     return turned, carried, swept, angle
 
 
-def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> NDArray[np.int64]:
+def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> IntArray:
     """Samples at which windows begin and end: equal lengths of the field's path, rests counting a little."""
     smooth = np.asarray(scipy.ndimage.uniform_filter1d(values, max(1, round(_SMOOTHED * rate)), axis=0))
     centred = smooth - (smooth.max(axis=0) + smooth.min(axis=0)) / 2
@@ -340,7 +337,7 @@ def _carried(gyroscope: Signal):
 
     Both against the frame in which the recording began.
     """
-    edges, count = Integral(gyroscope, gyroscope.values).edges, len(gyroscope)
+    edges, count = gyroscope.edges, len(gyroscope)
     padding = (0, (1 << count.bit_length()) - count)  # few shapes are compiled
     rates, held = np.pad(gyroscope.values, (padding, (0, 0))), np.pad(np.diff(edges), padding)
     running, sweep = (leaf[:count] for leaf in stored.call(turned_by_rates, "carried attitude", rates, held))
@@ -470,8 +467,7 @@ class MagneticField(OfOneUnit):
 
 def _across(field: FloatArray) -> FloatArray:
     """Two unit vectors (n, 2, 3) across each vector and each other."""
-    along = field / np.linalg.norm(field, axis=1, keepdims=True)
+    along = unit_vectors(field)
     other = np.eye(3)[np.argmin(np.abs(along), axis=1)]
-    first = np.cross(along, other)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    first = unit_vectors(np.cross(along, other))
     return np.stack([first, np.cross(along, first)], axis=1)

@@ -4,16 +4,14 @@ Tedaldi, Pretto, Menegatti, ICRA 2014, eq. 10: r = g0² − |f̂|², here over 2
 squared: to first order the error of the norm.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import Number
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Poses
-
-__all__ = ["gravity_norm", "gravity_norm_error", "recover_specific_force", "recovery_jacobian"]
 
 
 def recover_specific_force(imu: Imu, poses: Poses, stimulus: Stimulus | None = None) -> Float[Array, "P 3"]:
@@ -22,16 +20,7 @@ def recover_specific_force(imu: Imu, poses: Poses, stimulus: Stimulus | None = N
     return imu.accelerometer.recover(poses.accelerometer_mean, known)
 
 
-def recovery_jacobian(imu: Imu, poses: Poses) -> Float[Array, "P 3 3"]:
-    """Return ∂f̂/∂y of each pose: how noise in the mean output reaches the specific force."""
-
-    def recover(output, temperature):
-        return imu.accelerometer.recover(output, Stimulus(temperature=temperature))
-
-    return jax.vmap(jax.jacfwd(recover))(poses.accelerometer_mean, poses.temperature)
-
-
-def gravity_norm_error(force: Float[Array, "P 3"], gravity: Float[Array, ""]) -> Float[Array, " P"]:
+def gravity_norm_error(force: Float[Array, "P 3"], gravity: Number) -> Float[Array, " P"]:
     """Return (g0² − |f̂|²) / 2 g0 in m/s²."""
     return (gravity**2 - jnp.sum(force**2, axis=-1)) / (2 * gravity)
 

@@ -19,8 +19,6 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Observations, Turns
 from jaximu.recordings.segmentation import Segmentation
 
-__all__ = ["bend", "handling", "missed_by_sampling", "moved_by_hand", "sway"]
-
 _SHORT = 0.25  # s
 _SURE = 5.0
 """Standard deviations by which a pose must tilt to be called moving."""

@@ -35,7 +35,6 @@ import numpy as np
 import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 
 from jaximu.data.gravity_direction import level
 from jaximu.data.preintegration import preintegrate_samples, white_covariance
@@ -45,10 +44,21 @@ from jaximu.estimation.data import About, Conditions, OfOneUnit
 from jaximu.estimation.information_filter import Knowledge, WhiteRows, estimate, run, smooth, smoothed_variances
 from jaximu.estimation.problem import flatten
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.differences import interpolated, value_and_jacobian
+from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
+from jaximu.ground.differences import midpoints, value_and_jacobian
 from jaximu.ground.errors import NotPossibleError
-from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
+from jaximu.ground.rotation import (
+    Number,
+    Numbers,
+    Quaternion,
+    Vector,
+    conjugate,
+    exponential,
+    logarithm,
+    multiply,
+    rotate,
+    unit_vectors,
+)
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import NoiseModel
@@ -56,25 +66,6 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.reference import Integral
-
-__all__ = [
-    "FARTHEST_UNSEEN",
-    "LONGEST_MOTION",
-    "Disturbances",
-    "IntervalsOfMotion",
-    "MotionIntervals",
-    "MotionPath",
-    "carried",
-    "cut",
-    "first_field",
-    "first_knowledge",
-    "interval_rows",
-    "longest_rest",
-    "merged_drift",
-    "sees_earth",
-    "turned",
-]
 
 _LONGEST = 0.5
 """Seconds of an interval, at most."""
@@ -119,11 +110,11 @@ class MotionIntervals(eqx.Module):
     gyroscope: Float[Array, "... B+S 3"]
     length: Float[Array, "... S"]
     time: Float[Array, "... B+S"]
-    rest: Float[Array, " ..."]
-    arrival: Float[Array, " ..."]
-    restart: Float[Array, " ..."]
-    lost: Float[Array, " ..."]
-    real: Float[Array, " ..."]
+    rest: Numbers
+    arrival: Numbers
+    restart: Numbers
+    lost: Numbers
+    real: Numbers
     sightings: tuple[Sighting, ...] = ()
 
 
@@ -140,12 +131,12 @@ class Disturbances(eqx.Module):
     rest: Float[Array, 6]
     variance: Float[Array, "k 6"]
     correlation_time: Float[Array, " k"]
-    creep: Float[Array, ""]
-    arrival: Float[Array, ""]
+    creep: Number
+    arrival: Number
     lost: Float[Array, 6]
-    reference: Float[Array, ""] | float = 1.0
-    velocity: Float[Array, ""] | float = 1.0
-    field: Float[Array, ""] | float = 1.0
+    reference: Number | float = 1.0
+    velocity: Number | float = 1.0
+    field: Number | float = 1.0
 
     @property
     def states(self) -> int:
@@ -156,8 +147,8 @@ class Disturbances(eqx.Module):
 class MotionPath(eqx.Module):
     """Attitudes (N + 1, 4), body to level, and velocities (N + 1, 3), m/s, at the ends of N intervals."""
 
-    attitude: Float[Array, "... 4"]
-    velocity: Float[Array, "... 3"]
+    attitude: Quaternion
+    velocity: Vector
 
 
 def merged_drift(noise: NoiseModel, shortest: float, most: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -467,7 +458,7 @@ def _sighted(
 def interval_rows(
     like: Imu,
     numbers: Float[Array, " M"],
-    gravity: Float[Array, ""],
+    gravity: Number,
     part: MotionIntervals,
     errors: Disturbances,
     before: MotionPath,
@@ -484,7 +475,7 @@ def interval_rows(
 
 
 def carried(
-    like: Imu, numbers: Float[Array, " M"], gravity: Float[Array, ""], part: MotionIntervals, before: MotionPath
+    like: Imu, numbers: Float[Array, " M"], gravity: Number, part: MotionIntervals, before: MotionPath
 ) -> MotionPath:
     """Return the path's end after an interval, as a unit's numbers have it: the same attitude in a rest or restart."""
     samples, earth, _ = _samples(like, numbers, part)
@@ -553,10 +544,10 @@ class _Pieces:
     samples in the others.
     """
 
-    begin: NDArray[np.int64]
-    end: NDArray[np.int64]
-    rest: NDArray[np.bool_]
-    restart: NDArray[np.bool_]
+    begin: IntArray
+    end: IntArray
+    rest: BoolArray
+    restart: BoolArray
     skipped: float
     jumped: int
     bridged: float
@@ -567,7 +558,7 @@ class _Pieces:
         gyroscope: Signal,
         edges: FloatArray,
         lost: FloatArray,
-        rests: NDArray[np.int64],
+        rests: IntArray,
         marks: FloatArray,
         still: float,
     ) -> _Pieces:
@@ -633,11 +624,10 @@ def cut(
     """
     gyroscope, accelerometer = recording.signals["gyroscope"], recording.accelerometer
     time, period = gyroscope.time, 1 / gyroscope.rate
-    force = interpolated(accelerometer.time, accelerometer.values, time)
-    edges = Integral(gyroscope, gyroscope.values).edges
+    force, edges = accelerometer.at(time), gyroscope.edges
     step = np.diff(time, prepend=time[0] - period, append=time[-1] + period)
     missing = np.where(step > 2.5 * period, step - period, 0.0)
-    lost = (missing[1:] + missing[:-1]) / 2
+    lost = midpoints(missing)
     resting = np.searchsorted(time, rests + np.array([_SETTLING, -_SETTLING]))
     marks = np.zeros(0) if attitude is None else np.asarray((mounting or Mounting()).on_log(attitude.time))
     pieces = _Pieces.of(gyroscope, edges, lost, resting, marks, still)
@@ -687,7 +677,7 @@ def _padded(values, mode: Any = "constant") -> FloatArray:
     return np.pad(np.asarray(values, float), missing, mode=mode)
 
 
-def _mean_field(field: Signal, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _mean_field(field: Signal, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the mean (P, 3) of a field between times (P,), and whether there are samples (P,)."""
     first, last = np.searchsorted(field.time, (start, stop))
     means = [field.values[a:b].mean(axis=0) if b > a else np.zeros(3) for a, b in zip(first, last, strict=True)]
@@ -736,9 +726,9 @@ class _Triangular(Conditions):
     root: Float[Array, "m m"]
     right: Float[Array, " m"]
     numbers: Float[Array, " M"]
-    gravity: Float[Array, ""]
+    gravity: Number
     left: Float[Array, " k"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return root · change − right, and what is left."""
@@ -852,7 +842,7 @@ class IntervalsOfMotion(OfOneUnit):
         assert merged is not None
         return merged
 
-    def _part(self, rows: NDArray[np.int64]) -> MotionIntervals:
+    def _part(self, rows: IntArray) -> MotionIntervals:
         """Return some of the intervals, without the samples that none of them has."""
         part = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], self.intervals)
         before = part.time.shape[1] - part.length.shape[1]
@@ -927,7 +917,7 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
         now = reckoned(start, False)[k]
         placed = sighting.placed(now, Mounting.from_numbers(numbers))
         heading = multiply(placed, conjugate(now)) * jnp.array([1.0, 0.0, 0.0, 1.0])
-        start = multiply(heading / jnp.linalg.norm(heading), start)
+        start = multiply(unit_vectors(heading), start)
     attitudes = jnp.concatenate([start[None], reckoned(start, True)])
     return MotionPath(attitudes, jnp.zeros((len(attitudes), 3)))
 
@@ -956,7 +946,6 @@ def _moved(path: MotionPath, moved: Array) -> MotionPath:
     return MotionPath(turned(path.attitude, moved[:, :3]), path.velocity + moved[:, 3:])
 
 
-def turned(attitude: Float[Array, "... 4"], vector: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
+def turned(attitude: Quaternion, vector: Vector) -> Quaternion:
     """Return an attitude turned in the body frame by a rotation vector, of length one."""
-    attitude = multiply(attitude, exponential(vector))
-    return attitude / jnp.linalg.norm(attitude, axis=-1, keepdims=True)
+    return unit_vectors(multiply(attitude, exponential(vector)))

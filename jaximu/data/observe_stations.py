@@ -16,28 +16,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from jaximu.estimation.problem import axis_scales
 from jaximu.estimation.track import TRIADS
 from jaximu.ground import stored
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import unit_vectors
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.recordings.observations import POWER_ON, Stations
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.reference import Entry, Integral, match_reference, rest_rate
+from jaximu.recordings.reference import Entry, Integral, match_reference, means_over, rest_rate
 from jaximu.recordings.segmentation import noise_by_model, require_model, rest_statistics
 from jaximu.simulation.protocols import Environment, Protocol, attitude_of
 from jaximu.simulation.protocols.motion import smooth_course
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
-
-__all__ = ["NODES", "TYPICAL_NOISE", "attitudes", "observe_stations", "scheme_stations"]
 
 NODES = 32
 """Nodes of a station: a mean square rate over a turn that ramps is right to some 1e-3."""
@@ -134,18 +132,18 @@ def observe_stations(
         later = together & (owner > 0)
         measured[1] += later * np.square(POWER_ON["gyroscope"] * parts[0][0].gyroscope.nominal_scale)[:, None, None]
     stimulus = jax.tree.map(lambda *leaves: np.concatenate(leaves), *stimuli)
-    force = len(parts[0][0].accelerometer) > 0
-    return _assembled(stacked, measured, stimulus, span, turn, gravity, owner, force), tuple(dict.fromkeys(notes))
+    force = ~turn & (len(parts[0][0].accelerometer) > 0)
+    return assembled(stacked, measured, stimulus, span, turn, gravity, force, owner), tuple(dict.fromkeys(notes))
 
 
 def _means(signal: Signal, span: FloatArray) -> FloatArray:
     """Return the means (n, 3) of a signal over spans; zero where it has no samples."""
     if not len(signal):
         return np.zeros((len(span), 3))
-    return Integral(signal, signal.values).over(*span.T) / np.diff(span)
+    return means_over(signal, span)
 
 
-def _mean_covariance(signal: Signal, span: FloatArray, turn: NDArray[np.bool_], name: str) -> FloatArray:
+def _mean_covariance(signal: Signal, span: FloatArray, turn: BoolArray, name: str) -> FloatArray:
     """Covariance (3, n, n) of means as the scatter within the poses tells it; turns are as noisy as rests."""
     if not len(signal):
         return np.zeros((3, len(span), len(span)))
@@ -161,7 +159,7 @@ def _mean_covariance(signal: Signal, span: FloatArray, turn: NDArray[np.bool_], 
 
 
 def _known_covariance(
-    signal: Signal, noise: AxisNoise | None, name: str, span: FloatArray, together: NDArray[np.bool_]
+    signal: Signal, noise: AxisNoise | None, name: str, span: FloatArray, together: BoolArray
 ) -> FloatArray:
     """Covariance (3, n, n) of means by a noise model; slow noise ties those of one recording, `together` (n, n)."""
     if not len(signal):
@@ -189,13 +187,13 @@ def _recorded_stimulus(
         stimulus = _stimulus(entries, attitudes(entries), course, gravity)
     temperature = np.full(time.shape, temperature_reference)
     if recording.temperature is not None:
-        temperature = np.interp(time, recording.temperature.time, recording.temperature.values[:, 0])
+        temperature = recording.temperature.at(time)[..., 0]
     return replace(stimulus, time=time, temperature=temperature)
 
 
 def _along(attitude: Signal, nodes: FloatArray, gravity: float) -> Stimulus:
     """Force, rate and attitude (S, Q) where the reference tells the attitude at all times."""
-    quaternion = attitude.values / np.linalg.norm(attitude.values, axis=1, keepdims=True)
+    quaternion = unit_vectors(attitude.values)
     clipped = np.clip(nodes, attitude.time[0], attitude.time[-1])
 
     def rotation(array):
@@ -251,8 +249,8 @@ def scheme_stations(
         if axes is not None
     ]
     zero = np.zeros((len(entries), 3))
-    gravity, alone = float(motion.gravity), np.zeros(len(entries), np.int64)
-    stations = _assembled([zero, zero][: len(scale)], covariances, stimulus, span, turn, gravity, alone)
+    means, gravity = [zero, zero][: len(scale)], float(motion.gravity)
+    stations = assembled(means, covariances, stimulus, span, turn, gravity, ~turn)
     means = stored.call(_mean_outputs, "station means", imu, stations)
     means += [np.zeros_like(stations.gyroscope_mean)] * (2 - len(means))
     return replace(stations, accelerometer_mean=means[0], gyroscope_mean=means[1])
@@ -290,33 +288,40 @@ def _stimulus(
     return Stimulus(specific_force=gravity * up, angular_rate=rate, attitude=attitude if known else None)
 
 
-def _assembled(
+def assembled(
     means: Sequence[FloatArray],
     covariances: Sequence[FloatArray],
     stimulus: Stimulus,
     span: FloatArray,
-    turn: NDArray[np.bool_],
+    turn: BoolArray,
     gravity: float,
-    recording: NDArray[np.int64],
-    force: bool = True,
+    force: BoolArray,
+    recording: IntArray | None = None,
+    weight: FloatArray | None = None,
 ) -> Stations:
-    """Put stations together, padded to a bucket; without `force` the accelerometer is not used."""
-    count = len(turn)
+    """Put stations together, padded to a bucket.
+
+    **Arguments:** by triad, the gyroscope's left out where there is none, `means` (n, 3) and their `covariances` (3, n,
+    n); `span` (n, 2): s; `turn`, `force` (n,): which are turns, and in which the accelerometer is used; `recording`
+    (n,): that each is of, of one if None; `weight` (n, Q): of the nodes, alike if None.
+    """
+    count, nodes = len(turn), stimulus.angular_rate.shape[1]  # pyright: ignore[reportOptionalMemberAccess]
+    recording = np.zeros(count, np.int64) if recording is None else recording
+    weight = np.full((count, nodes), 1 / nodes) if weight is None else weight
     size = max(_FEWEST, 1 << (count - 1).bit_length())
     there = np.arange(size) < count
-    padded_turn = np.pad(turn, (0, size - count))
-    used = [there & ~padded_turn & force, there if len(means) > 1 else np.zeros(size, bool)]
+    missing = 0, size - count
+    used = [np.pad(force, missing), there if len(means) > 1 else np.zeros(size, bool)]
 
     def pad(array: FloatArray) -> FloatArray:
         return np.concatenate([array, np.repeat(array[:1], size - count, axis=0)])
 
-    def spread(matrix: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+    def spread(matrix: FloatArray, used: BoolArray) -> FloatArray:
         whole = np.zeros((3, size, size))
         whole[:, :count, :count] = matrix
         return np.where(used[:, None] & used, whole, np.eye(size))
 
     means, covariances = [*means, np.zeros((count, 3))][:2], [*covariances, np.zeros((3, count, count))][:2]
-    nodes = stimulus.angular_rate.shape[1]  # pyright: ignore[reportOptionalMemberAccess]
     start, stop = (np.where(there, pad(edge), 0.0) for edge in span.T)
     return Stations(
         accelerometer_mean=np.where(there[:, None], pad(means[0]), 0.0),
@@ -324,12 +329,12 @@ def _assembled(
         accelerometer_covariance=spread(covariances[0], used[0]),
         gyroscope_covariance=spread(covariances[1], used[1]),
         stimulus=jax.tree.map(pad, stimulus),
-        weight=np.full((size, nodes), 1 / nodes),
+        weight=pad(weight),
         start=start,
         stop=stop,
-        turn=padded_turn,
+        turn=np.pad(turn, missing),
         accelerometer_used=used[0],
         gyroscope_used=used[1],
         gravity=np.asarray(gravity),
-        recording=np.pad(recording, (0, size - count)),
+        recording=np.pad(recording, missing),
     )

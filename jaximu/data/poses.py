@@ -26,9 +26,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 
-from jaximu.data.gravity_direction import gravity_direction_error, unit_vectors
+from jaximu.data.gravity_direction import gravity_direction_error
 from jaximu.data.gravity_norm import gravity_norm_error
 from jaximu.data.poses_covariance import Sensitivities, condition_covariance, sensitivities, turned_by
 from jaximu.data.preintegration import Turned, linear_slope
@@ -40,10 +39,12 @@ from jaximu.estimation.problem import Name, axis_scales
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import Track, added, mean_outputs
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, FloatArray, IntArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.rotation import (
+    Number,
     apply_matrix,
     conjugate,
     exponential,
@@ -51,8 +52,9 @@ from jaximu.ground.rotation import (
     inverse_matrix,
     multiply,
     rotate,
+    unit_vectors,
 )
-from jaximu.ground.tracing import array_module, first, lifted, one_by_one, repeated
+from jaximu.ground.tracing import array_module, first, lifted, on_host, one_by_one, repeated, stacked
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import NoiseModel
@@ -60,28 +62,6 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import observed_poses, segment
-
-__all__ = [
-    "COARSE_EXCESS",
-    "EXCESS_NAMES",
-    "NO_FIXTURE",
-    "RESIDUALS",
-    "Condensed",
-    "HandHeldConditions",
-    "PosesAndTurns",
-    "as_observations",
-    "condense",
-    "condensed",
-    "felt_by_hand",
-    "forces_and_angles",
-    "observe",
-    "only",
-    "pose_rows",
-    "residual_rms",
-    "resized",
-    "stack",
-    "with_gyroscope",
-]
 
 EXCESS_NAMES = ("accelerometer", "turns", "gyroscope")
 NO_FIXTURE = "a hand-held recording has no set-up to compare with"
@@ -114,7 +94,7 @@ class HandHeldConditions(Conditions):
     rotation: Float[Array, "T 4"]
     slope: Float[Array, "T 3 3 4"]
     linear: Float[Array, "3 4"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
 
     def rotations(self, imu: Imu) -> Float[Array, "T 4"]:
         """Return the turns' rotations, quaternions from the last body frame to the first, at a unit close by."""
@@ -253,7 +233,7 @@ class PosesAndTurns(Observations, Data):
         owners = {"norm": ("accelerometer",), "turning": ("gyroscope",)}.get(self.conditions)
         return super().free(name) and (owners is None or name.owner in owners)
 
-    def take(self, lanes: NDArray[np.int64]) -> Self:
+    def take(self, lanes: IntArray) -> Self:
         """Return the data of some of the units."""
         return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self._by_unit())
 
@@ -418,7 +398,7 @@ def stack(data: Sequence[PosesAndTurns]) -> PosesAndTurns:
             "these units' data differ in kind (gyroscope, thermometer, slow noise, its intervals, samples, number of "
             "recordings): stack those alike."
         )
-    return jax.tree.map(lambda *leaves: array_module(leaves).stack(leaves), *wide)
+    return stacked(wide)
 
 
 def resized(leaf: Array, *lengths: int, numerics: Any = np) -> Array:
@@ -435,7 +415,7 @@ def resized(leaf: Array, *lengths: int, numerics: Any = np) -> Array:
 
 def pose_rows(imu: Imu, observations: Observations) -> Rows:
     """Return what each of the conditions of poses and turns is, by a unit close to this one."""
-    poses, turns = jax.tree.map(np.asarray, (observations.poses, observations.turns))
+    poses, turns = on_host((observations.poses, observations.turns))
     gyroscope = imu.triads()["gyroscope"]
     pose, turn = np.arange(len(poses.mask)), np.arange(len(turns.mask))
 
@@ -499,14 +479,14 @@ def residual_rms(
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
     force, angle = forces_and_angles(imu, observations) if known is None else known
     norm = np.linalg.norm(force[poses], axis=1) - float(observations.gravity)
-    sizes = {"gravity_norm": (_rms(norm), "m/s^2")}
+    sizes = {"gravity_norm": (rms(norm), "m/s^2")}
     if imu.gyroscope is None or not gyroscope:
         return sizes
     if turns.any():
-        sizes["gravity_direction"] = (_rms(np.degrees(angle)[turns]), "deg")
+        sizes["gravity_direction"] = (rms(np.degrees(angle)[turns]), "deg")
     rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
     scale = axis_scales(imu.gyroscope)
-    sizes["static_gyroscope"] = (_rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
+    sizes["static_gyroscope"] = (rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
     return sizes
 
 
@@ -524,7 +504,3 @@ def forces_and_angles(
 def with_gyroscope(imu: Imu) -> Imu:
     """Return the unit; where it has no gyroscope with one that puts out rad/s, as the conditions need one."""
     return imu if "gyroscope" in imu.triads() else Imu(imu.accelerometer, Imu.nominal().gyroscope)
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

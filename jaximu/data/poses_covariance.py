@@ -15,22 +15,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from jaximu.data.gravity_direction import unit_vectors
-from jaximu.data.gravity_norm import recover_specific_force, recovery_jacobian
 from jaximu.data.preintegration import Turned, turned_by_rates, white_covariance
 from jaximu.estimation.covariance import Chain, Covariance, following, in_order, mean_root
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import conjugate, inverse_matrix, rotate, rotation_matrix
+from jaximu.ground.rotation import conjugate, inverse_matrix, rotate, rotation_matrix, unit_vectors
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.observations import Observations, Turns
-
-__all__ = [
-    "Sensitivities",
-    "condition_covariance",
-    "sensitivities",
-    "turn_noise",
-    "turned_by",
-]
 
 
 class Sensitivities(eqx.Module):
@@ -55,15 +45,18 @@ def turn_noise(gyroscope: Triad, turns: Turns, whole: Turned) -> Float[Array, "T
 
 
 def _pose_sensitivities(imu: Imu, observations: Observations, rotations: Float[Array, "T 4"]):
-    """The norm's and the directions' reaction to mean accelerometer outputs, and each turn's carried direction."""
+    """The norm's and the directions' reaction to mean accelerometer outputs, and each turn's carried direction.
+
+    Effects are not looked at: ∂f/∂y is the inverse of the gain.
+    """
     poses, turns = observations.poses, observations.turns
-    force = recover_specific_force(imu, poses)
-    unit = unit_vectors(force)
-    jacobian = recovery_jacobian(imu, poses)  # ∂f/∂y
+    inverse = imu.accelerometer.inverse()
+    force = poses.accelerometer_mean @ inverse[:, :3].T + inverse[:, 3]
+    unit, jacobian = unit_vectors(force), inverse[:, :3]
     length = jnp.sqrt(jnp.sum(force**2, axis=-1))[:, None, None]
-    direction = (jacobian - unit[..., :, None] * jnp.einsum("pi,pij->pj", unit, jacobian)[:, None, :]) / length
+    direction = (jacobian - unit[:, :, None] * (unit @ jacobian)[:, None]) / length
     back = rotation_matrix(conjugate(rotations))
-    norm = -jnp.einsum("pi,pij->pj", force, jacobian) / observations.gravity
+    norm = -(force @ jacobian) / observations.gravity
     after = jnp.einsum("tai,tij->taj", turns.basis, direction[1:])
     before = -jnp.einsum("tai,tij,tjk->tak", turns.basis, back, direction[:-1])
     # A small rotation δ of the last frame moves the carried direction u by −δ × u = u × δ.

@@ -28,6 +28,11 @@ from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import (
+    Matrix,
+    Numbers,
+    Quaternion,
+    Vector,
+    Vectors,
     apply_matrix,
     conjugate,
     exponential,
@@ -41,21 +46,8 @@ from jaximu.ground.rotation import (
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 
-__all__ = [
-    "Preintegrated",
-    "Turned",
-    "increments",
-    "linear_slope",
-    "preintegrate",
-    "preintegrate_samples",
-    "turned_by_rates",
-    "white_covariance",
-]
 
-
-def increments(
-    rates: Float[Array, "... S 3"], forces: Float[Array, "... S 3"], intervals: Float[Array, "... S"]
-) -> tuple[Float[Array, "... S 3"], Float[Array, "... S 3"]]:
+def increments(rates: Vectors, forces: Vectors, intervals: Float[Array, "... S"]) -> tuple[Vectors, Vectors]:
     """Return each sample's rotation vector θ (rad) with coning, and its ∫f dt (m/s) with sculling, ν.
 
     Rotation and velocity together are a rigid motion whose twist is the dual number ω + ε f (ε² = 0), so what holds of
@@ -79,7 +71,7 @@ class Turned(NamedTuple):
     sweep: Float[Array, "... S 3 3"]
 
     @property
-    def rotation(self) -> Float[Array, "... 4"]:
+    def rotation(self) -> Quaternion:
         """From the last body frame to the first."""
         return self.running[..., -1, :]
 
@@ -89,19 +81,19 @@ class Turned(NamedTuple):
         return self.back[..., None, :, :] @ self.sweep
 
     @property
-    def back(self) -> Float[Array, "... 3 3"]:
+    def back(self) -> Matrix:
         """The matrix that takes vectors of the first frame to the last."""
         return rotation_matrix(conjugate(self.rotation))
 
 
-def turned_by_rates(rates: Float[Array, "... S 3"], intervals: Float[Array, "... S"]) -> Turned:
+def turned_by_rates(rates: Vectors, intervals: Float[Array, "... S"]) -> Turned:
     """Return the rotations of rates (rad/s) that hold over `intervals` (s; zero for padding)."""
     vectors = rotation_vectors(rates, intervals)
     running = running_rotations(vectors)
     return Turned(running, transport(running, vectors) * intervals[..., None, None])
 
 
-def linear_slope(reaction: Float[Array, "... S k 3"], output: Float[Array, "... S 3"]) -> Float[Array, "... k 3 4"]:
+def linear_slope(reaction: Float[Array, "... S k 3"], output: Vectors) -> Float[Array, "... k 3 4"]:
     """Return how sums react to (A | c), of samples A y + c, by their reaction to each sample and its output y."""
     with_one = jnp.concatenate([output, jnp.ones_like(output[..., :1])], axis=-1)
     sums = _flat(reaction).swapaxes(-1, -2) @ with_one
@@ -130,10 +122,10 @@ class Preintegrated(NamedTuple):
     that it fitted, `parameters[:, places] @ C @ parameters[:, places].T` is its part of the increments' covariance.
     """
 
-    rotation: Float[Array, "... 4"]
-    velocity: Float[Array, "... 3"]
-    displacement: Float[Array, "... 3"]
-    duration: Float[Array, " ..."]
+    rotation: Quaternion
+    velocity: Vector
+    displacement: Vector
+    duration: Numbers
     reaction: Float[Array, "... S 9 6"]
     parameters: Float[Array, "... 9 m"] | None = None
 
@@ -150,9 +142,7 @@ class Preintegrated(NamedTuple):
         )
 
 
-def preintegrate_samples(
-    rates: Float[Array, "... S 3"], forces: Float[Array, "... S 3"], intervals: Float[Array, "... S"]
-) -> Preintegrated:
+def preintegrate_samples(rates: Vectors, forces: Vectors, intervals: Float[Array, "... S"]) -> Preintegrated:
     """Return the increments of rates (rad/s) and specific forces (m/s²) that hold over `intervals` (s)."""
     vectors, gained = increments(rates, forces, intervals)
     left_jacobian = jnp.swapaxes(right_jacobian(vectors), -1, -2)

@@ -10,27 +10,24 @@ from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.data.observe_stations import observe_stations
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.data.stations import KnownStations, StationConditions, station_covariances, station_rms, station_rows
+from jaximu.data.twin_signal import twin_signal
 from jaximu.estimation.data import About, Observed, OfOneUnit, OutputMeans
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import TRIADS, Track, added, mean_outputs, stimuli
-from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.differences import interpolated
+from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
-from jaximu.ground.tracing import first, lifted
-from jaximu.model.noise import drawn_noise
+from jaximu.ground.tracing import first, lifted, on_host
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.reference import Entry, entries_of_columns
-
-__all__ = ["AtStations", "RecordedStations", "output_reaction", "station_means", "station_of"]
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,7 @@ class RecordedStations(OfOneUnit):
     coarse = KnownStations.coarse
 
     def __post_init__(self):
-        self.stations = jax.tree.map(np.asarray, self.stations)
+        self.stations = on_host(self.stations)
 
     @classmethod
     def of(
@@ -178,10 +175,8 @@ class RecordedStations(OfOneUnit):
         for number, (name, triad) in enumerate(imu.triads().items()):
             signal = self.recording.signals[name]
             true = np.asarray(getattr(path[name].stimulus, triad.quantity))[: len(signal)]
-            samples = drawn_noise(getattr(noise, name), len(signal), signal.rate, [seed, number])
-            drawn[name] = samples * signal.nominal_scale
-            outputs = true @ np.asarray(triad.gain).T + np.asarray(triad.bias) + drawn[name]
-            changed[name] = replace(signal, values=outputs)
+            changed[name] = twin_signal(signal, triad, true, getattr(noise, name), [seed, number])
+            drawn[name] = changed[name].values - true @ np.asarray(triad.gain).T - np.asarray(triad.bias)
         stations = self._without_outputs(conditions - self._means(path, drawn))
         return RecordedStations(replace(self.recording, **changed, notes=()), stations)
 
@@ -199,7 +194,7 @@ class RecordedStations(OfOneUnit):
         return np.asarray(mean_outputs(path, outputs, len(self.stations.turn)), np.float64).ravel()
 
 
-def output_reaction(triad: str, shape: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+def output_reaction(triad: str, shape: FloatArray, used: BoolArray) -> FloatArray:
     """Return the reaction (6 o, 3 k) of mean outputs, accelerometer and gyroscope of one observation after another.
 
     **Arguments:** `shape`: (o, k) of each axis alike; `used` (o,): observations in which the triad counts.
@@ -224,21 +219,21 @@ def station_means(stations: Stations, recordings: Sequence[Recording]) -> Output
     return OutputMeans.of(start, stop, which, reactions, scales, variances)
 
 
-def _used(stations: Stations) -> NDArray[np.bool_]:
+def _used(stations: Stations) -> BoolArray:
     return stations.accelerometer_used | stations.gyroscope_used
 
 
-def _spans(stations: Stations, chosen: NDArray[np.bool_]) -> FloatArray:
+def _spans(stations: Stations, chosen: BoolArray) -> FloatArray:
     return np.stack([stations.start[chosen], stations.stop[chosen]], axis=1)
 
 
-def _in_order(stations: Stations) -> NDArray[np.int64]:
+def _in_order(stations: Stations) -> IntArray:
     """Return the places of the stations that are used, in the order of time."""
     real = np.flatnonzero(_used(stations))
     return real[np.argsort(stations.start[real])]
 
 
-def station_of(time: FloatArray, stations: Stations) -> NDArray[np.int64]:
+def station_of(time: FloatArray, stations: Stations) -> IntArray:
     """Return the station (n,) that each stamp lies in, S where in none."""
     order = _in_order(stations)
     start, stop = stations.start[order], stations.stop[order]
@@ -256,7 +251,7 @@ def _path(recording: Recording, stations: Stations, imu: Imu) -> dict[str, Track
         signal = recording.signals[name]
         station = station_of(signal.time, stations)
         inside = station < count
-        nearest = np.clip(np.searchsorted((nodes.time[1:] + nodes.time[:-1]) / 2, signal.time), 0, len(nodes.time) - 1)
+        nearest = np.clip(np.searchsorted(midpoints(nodes.time), signal.time), 0, len(nodes.time) - 1)
         motion = {field: np.array(getattr(known, field)) for field in ("specific_force", "angular_rate")}
         for field, values in motion.items():
             values[inside] = interpolated(nodes.time, getattr(nodes, field), signal.time[inside])

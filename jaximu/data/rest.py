@@ -13,17 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, OfOneUnit, derivatives_by_numbers, free_columns
 from jaximu.estimation.track import Track
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, FloatArray, IntArray
+from jaximu.ground.rotation import Number
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.sensor import Imu
-
-__all__ = ["RestOverTemperature", "mean_terms", "over_blocks", "padded_count"]
 
 _ROWS = 256
 """Blocks are padded to a multiple of so many: few shapes to compile."""
@@ -37,13 +35,12 @@ class _WhiteOutputs(Conditions):
 
     output: Float[Array, " n"]
     bias: Float[Array, "n 3"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
     gyroscope: Int[Array, ""]
 
     def __call__(self, imu: Imu) -> Float[Array, " n"]:
         """Return the combinations, axis after axis."""
-        assert imu.gyroscope is not None
-        bias = jnp.where(self.gyroscope == 1, imu.gyroscope.bias, imu.accelerometer.bias)
+        bias = jnp.where(self.gyroscope == 1, imu.triads()["gyroscope"].bias, imu.accelerometer.bias)
         return self.output - self.bias @ bias
 
 
@@ -56,9 +53,7 @@ class RestOverTemperature(OfOneUnit):
 
     coarse = (0.0, 0.0, 0.0)
 
-    def __init__(
-        self, triad: str, output: FloatArray, weights: FloatArray, level: NDArray[np.int64], tracks: Sequence[Track]
-    ):
+    def __init__(self, triad: str, output: FloatArray, weights: FloatArray, level: IntArray, tracks: Sequence[Track]):
         self.triad, self.output, self.paths = triad, output, tracks
         member = np.eye(int(level.max()) + 1)[level]
         apart = member[:, 1:] - member[:, :1]  # levels that add up to nothing: their mean is the bias

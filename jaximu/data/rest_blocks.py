@@ -12,28 +12,16 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS, Track
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.differences import midpoints
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
 from jaximu.mistakes import prepared
 from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.processes import RATIO, correlation_times
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.columns.names import COUNTS_ADVICE
 from jaximu.recordings.recording import Recording, Signal, recordings_of, same_outputs, smoothed_slope
-
-__all__ = [
-    "LEAST_RANGE",
-    "RATE_BANDWIDTH",
-    "RATIO",
-    "WAYS",
-    "Leg",
-    "RestBlocks",
-    "correlation_times",
-    "folds_of",
-    "joined",
-    "rest_blocks",
-    "without_startup",
-]
 
 LEAST_RANGE = 3.0
 """K of change below which nothing is said about temperature."""
@@ -42,8 +30,6 @@ RATE_BANDWIDTH = 0.578 / TEMPERATURE_WINDOW
 3 (sin x − x cos x) / x³ with x = π f window."""
 WAYS = 4
 """Ways of the temperature from which on they are left out whole."""
-RATIO = 4.0
-"""Of neighbouring correlation times of the processes that make flicker noise."""
 _FOLDS = 8  # parts that are left out in turn, at most
 _MOST_BLOCKS = 600
 _FEWEST_BLOCKS = 30
@@ -75,7 +61,7 @@ class Leg:
     rates: K/s, between which four fifths of the way were gone.
     """
 
-    blocks: NDArray[np.int64]
+    blocks: IntArray
     begin: float
     end: float
     rate: float
@@ -108,9 +94,9 @@ class RestBlocks:
     recordings: tuple[Recording, ...]
     start: FloatArray
     stop: FloatArray
-    log: NDArray[np.int64]
-    rest: NDArray[np.int64]
-    level: NDArray[np.int64]
+    log: IntArray
+    rest: IntArray
+    level: IntArray
     temperature: FloatArray
     rate: FloatArray
     means: dict[str, FloatArray]
@@ -214,7 +200,7 @@ class RestBlocks:
                 )
         return legs
 
-    def only(self, keep: NDArray[np.bool_]) -> RestBlocks:
+    def only(self, keep: BoolArray) -> RestBlocks:
         """Return the blocks that are kept (n,), with the whole path of temperature."""
         numbers = np.full(len(self) + 1, int(keep.sum()))
         numbers[:-1][keep] = np.arange(keep.sum())
@@ -239,13 +225,13 @@ class RestBlocks:
         return replace(self, level=np.unique(level, return_inverse=True)[1])
 
 
-def _about(group: NDArray[np.int64], values: FloatArray) -> FloatArray:
+def _about(group: IntArray, values: FloatArray) -> FloatArray:
     """Return the mean of values (n, m) over the group of each, (n, m)."""
     member = np.eye(int(group.max(initial=-1)) + 1)[group]
     return member @ (member.T @ values / member.sum(axis=0)[:, None])
 
 
-def folds_of(legs: Sequence[Leg]) -> list[NDArray[np.int64]]:
+def folds_of(legs: Sequence[Leg]) -> list[IntArray]:
     """Return the blocks that are left out in turn: whole legs where there are enough, else stretches of them."""
     parts = [leg.blocks for leg in legs]
     if len(parts) < WAYS:
@@ -346,7 +332,7 @@ def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
     def whole(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    def counted(name: str, counts: Iterable[int]) -> NDArray[np.int64]:
+    def counted(name: str, counts: Iterable[int]) -> IntArray:
         """Return indices that each part counts from zero, counted on from part to part."""
         starts = np.cumsum([0, *counts])[:-1]
         return np.concatenate([getattr(part, name) + start for part, start in zip(parts, starts, strict=True)])
@@ -377,13 +363,12 @@ def joined(parts: Sequence[RestBlocks]) -> RestBlocks:
 
 def _cut(recording: Recording, block: float) -> RestBlocks:
     """Return block means of one recording, and its temperature's path."""
-    accelerometer, temperature = recording.accelerometer, recording.temperature
-    assert temperature is not None
+    accelerometer, temperature = recording.accelerometer, recording.signals["temperature"]
     half = 0.5 / accelerometer.rate  # a sample stands for the time about its stamp
     begin, end = float(accelerometer.time[0]) - half, float(accelerometer.time[-1]) + half
     nodes = max(int(np.ceil((end - begin) / block * _NODES)), 2)
     edges = begin + block / _NODES * np.arange(nodes + 1)
-    time = (edges[1:] + edges[:-1]) / 2
+    time = midpoints(edges)
     count = nodes // _NODES
     good, moved, means = np.ones(count, bool), np.zeros(count, bool), {}
     for name in TRIADS:
@@ -436,7 +421,7 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
 def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
     """Return means between edges of the line through a signal's samples, which goes on as it ends."""
     time, values = signal.time, signal.values[:, 0]
-    whole = np.concatenate([[0.0], np.cumsum(np.diff(time) * (values[1:] + values[:-1]) / 2)])
+    whole = np.concatenate([[0.0], np.cumsum(np.diff(time) * midpoints(values))])
     inside = np.clip(edges, time[0], time[-1])
     k = np.clip(np.searchsorted(time, inside, side="right") - 1, 0, len(time) - 2)
     integral = whole[k] + (inside - time[k]) * (values[k] + np.interp(inside, time, values)) / 2
@@ -518,12 +503,6 @@ def _startup(signal: Signal) -> int:
             break
         end = int(row) + 1
     return end
-
-
-def correlation_times(shortest: float, longest: float) -> FloatArray:
-    """Return the correlation times (s) of Gauss–Markov processes that together are flicker noise, `RATIO` apart."""
-    count = 1 + int(np.ceil(np.log(longest / shortest) / np.log(RATIO)))
-    return np.asarray(shortest * RATIO ** np.arange(count), np.float64)
 
 
 def own_noise(blocks: RestBlocks, smooth: FloatArray) -> NoiseModel:

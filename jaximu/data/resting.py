@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from jaximu.data.recorded_stations import output_reaction
 from jaximu.data.rest_blocks import WAYS, RestBlocks, folds_of
@@ -23,14 +22,12 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.estimation.track import TRIADS, Track, added, mean_outputs
 from jaximu.estimation.uncertainty import pose_advice
-from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.rotation import apply_matrix
+from jaximu.ground.array_types import Array, FloatArray, IntArray
+from jaximu.ground.rotation import Number, apply_matrix
 from jaximu.model.effects.base import Extent
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
-
-__all__ = ["Resting", "RestingConditions"]
 
 _FREE = (1.0, 0.1)  # m/s² and rad/s: how far a rest, or a smooth function of temperature, may lie off, as good as free
 _IN_POSES = ("accel.scale_temperature", "accel.misalignment_temperature")
@@ -49,7 +46,7 @@ class RestingConditions(Conditions):
 
     output: Float[Array, "n 6"]
     force: Float[Array, "n 3"]
-    magnitude: Float[Array, ""]
+    magnitude: Number
 
     def __call__(self, imu: Imu) -> Float[Array, " 6*n"]:
         """Return the errors of the mean outputs, accelerometer and gyroscope of one block after another."""
@@ -151,7 +148,7 @@ class Resting(OfOneUnit):
             return {}
         return dict.fromkeys(_IN_POSES, "in one pose it is a bias over temperature: poses tell them apart")
 
-    def parts(self, real: Rows, count: int) -> list[NDArray[np.int64]]:
+    def parts(self, real: Rows, count: int) -> list[IntArray]:
         """Return whole ways of the temperature, where there are enough."""
         legs = self.blocks.legs()
         return folds_of(legs) if len(legs) >= WAYS else super().parts(real, count)

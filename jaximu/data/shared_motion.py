@@ -8,21 +8,18 @@ and turns that are too quick to be followed by integration still count. NumPy, h
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu.data.observe_stations import assembled
 from jaximu.estimation.track import TRIADS
-from jaximu.ground.array_types import FloatArray
-from jaximu.ground.differences import interpolated
+from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.differences import midpoints
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.reference import Integral
-
-__all__ = ["shared_stations"]
+from jaximu.recordings.reference import means_over
 
 _MARGIN = 4
 """Samples of the first unit on either side of an interval, for the other's clock to move in."""
-_BUCKET = 32
 
 
 def shared_stations(
@@ -40,53 +37,31 @@ def shared_stations(
     s, on the recording's clock; `delay`: s by which the first's stamps are late; `density`: white noise of both units
     together (3, 3) of each sensor, output² s; `still`: the intervals are rests, in which means tell all.
 
-    **Returns:** stations padded to a multiple of 32.
+    **Returns:** padded stations.
     """
     accelerometer, gyroscope = (first.signals[name] for name in TRIADS)
     time, rate = gyroscope.time - delay, gyroscope.values
-    force = interpolated(accelerometer.time, accelerometer.values, gyroscope.time)
-    count, size = len(span), -(-len(span) // _BUCKET) * _BUCKET
-    used = np.arange(size) < count
-    span = np.concatenate([span, np.repeat(span[:1], size - count, axis=0)])
-    start, stop = span.T
-    length = np.diff(span)
+    force = accelerometer.at(gyroscope.time)
+    count, length, weight = len(span), np.diff(span)[:, 0], None
     if still:
-        means = (Integral(Signal(time, values, "1"), values).over(start, stop) / length for values in (force, rate))
+        means = (means_over(Signal(time, values, "1"), span) for values in (force, rate))
         force, rate = (np.repeat(mean[:, None], 2, axis=1) for mean in means)
         stimulus = Stimulus(force, rate, angular_acceleration=0 * rate, time=span)
-        weight = np.full(span.shape, 0.5)
     else:
         index, held = _held(time, span, gyroscope.rate)
         weight = held / held.sum(axis=1, keepdims=True)
         turning = np.gradient(rate, time, axis=0)
         stimulus = Stimulus(force[index], rate[index], angular_acceleration=turning[index], time=time[index])
-    force_mean, rate_mean = (
-        Integral(signal, signal.values).over(start, stop) / length
-        for signal in (recording.signals[name] for name in TRIADS)
-    )
-    variances = (np.where(used, np.diagonal(axes)[:, None] / length[:, 0], 1.0) for axes in density)
-    force_covariance, rate_covariance = (variance[:, :, None] * np.eye(size) for variance in variances)
-    return Stations(
-        force_mean,
-        rate_mean,
-        force_covariance,
-        rate_covariance,
-        stimulus,
-        weight,
-        start,
-        stop,
-        np.full(size, not still),
-        used,
-        used,
-        np.asarray(gravity),
-        np.zeros(size, np.int64),
-    )  # pyright: ignore
+    means = [means_over(recording.signals[name], span) for name in TRIADS]
+    covariances = [(np.diagonal(axes)[:, None] / length)[:, :, None] * np.eye(count) for axes in density]
+    turn, everywhere = np.full(count, not still), np.ones(count, bool)
+    return assembled(means, covariances, stimulus, span, turn, gravity, everywhere, weight=weight)
 
 
-def _held(time: FloatArray, span: FloatArray, rate: float) -> tuple[NDArray[np.int64], FloatArray]:
+def _held(time: FloatArray, span: FloatArray, rate: float) -> tuple[IntArray, FloatArray]:
     """Return which samples lie in each span, some beside it included, and how long each holds in it (S, Q), s."""
     edges = np.concatenate([[2 * time[0] - time[1]], time, [2 * time[-1] - time[-2]]])
-    edges = (edges[1:] + edges[:-1]) / 2
+    edges = midpoints(edges)
     begin = np.searchsorted(edges, span[:, 0], side="right") - 1 - _MARGIN
     nodes = int(np.ceil(np.max(np.diff(span)) * rate - 1e-6)) + 2 * _MARGIN + 1
     index = np.clip(begin, 0, len(time) - nodes)[:, None] + np.arange(nodes)

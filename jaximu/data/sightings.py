@@ -25,10 +25,8 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
+from jaximu.ground.rotation import Number, Numbers, conjugate, exponential, logarithm, multiply, rotate
 from jaximu.model.mounting import Mounting
-
-__all__ = ["SIZE", "AttitudeSeen", "FieldSeen", "Sighting", "Standing", "VelocitySeen"]
 
 SIZE = 9
 """Numbers of a `Standing` that follow from a unit's outputs: rate, specific force, angular acceleration."""
@@ -46,10 +44,10 @@ class Standing(NamedTuple):
     rate: Float[Array, 3]
     force: Float[Array, 3]
     acceleration: Float[Array, 3]
-    half: Float[Array, ""]
-    gravity: Float[Array, ""]
+    half: Number
+    gravity: Number
 
-    def after(self, ahead: Float[Array, ""]) -> Standing:
+    def after(self, ahead: Number) -> Standing:
         """Return where it is after some seconds, less than a sample."""
         pushed = rotate(self.attitude, self.force) - jnp.array([0.0, 0.0, 1.0]) * self.gravity
         turned = multiply(self.attitude, exponential(self.rate * ahead))
@@ -64,9 +62,9 @@ class Sighting(eqx.Module):
     standard deviation of each axis, and `absolute`: whether it is in a level frame of its own, whose heading counts.
     """
 
-    stamp: Float[Array, " ..."]
-    end: Float[Array, " ..."]
-    measured: Float[Array, " ..."]
+    stamp: Numbers
+    end: Numbers
+    measured: Numbers
     value: Float[Array, "... _"]
 
     noise: ClassVar[str]
@@ -80,7 +78,7 @@ class Sighting(eqx.Module):
         """Return the attitude that was measured, as far as it was, else the one given."""
         return attitude
 
-    def _ahead(self, mounting: Mounting) -> Float[Array, ""]:
+    def _ahead(self, mounting: Mounting) -> Number:
         return mounting.on_log(self.stamp) - self.end
 
 

@@ -12,8 +12,6 @@ from jaximu.ground.array_types import Array
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 
-__all__ = ["turntable_error"]
-
 
 def turntable_error(imu: Imu, stations: Stations) -> Float[Array, "6 S"]:
     """Return mean outputs less the model's (output units), accelerometer's three axes first; zero where not used."""

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from jaximu.data.station_error import turntable_error
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
@@ -17,25 +16,12 @@ from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.problem import axis_scales
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array
+from jaximu.ground.array_types import Array, IntArray
+from jaximu.ground.distributions import rms
+from jaximu.ground.rotation import Number
+from jaximu.ground.tracing import lifted, on_host
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
-
-__all__ = [
-    "RESIDUALS",
-    "KnownStations",
-    "StationConditions",
-    "StationErrors",
-    "station_covariance",
-    "station_covariances",
-    "station_errors",
-    "station_excess",
-    "station_rms",
-    "station_rows",
-    "station_weights",
-    "turntable",
-]
-
 
 RESIDUALS = (
     ResidualKind("accelerometer", "specific force in the poses", "m/s^2", 3),
@@ -58,7 +44,7 @@ class StationConditions(Conditions):
         """Return the errors, zero where a station is not used."""
         return turntable_error(imu, self.stations).T.reshape(-1)
 
-    def at_magnitude(self, magnitude: Float[Array, ""]) -> StationConditions:
+    def at_magnitude(self, magnitude: Number) -> StationConditions:
         """Return the same with another gravity: specific force is in proportion to it."""
         stations = self.stations
         force = stations.stimulus.specific_force * (magnitude / stations.gravity)
@@ -67,7 +53,7 @@ class StationConditions(Conditions):
 
 def station_rows(imu: Imu, stations: Stations) -> Rows:
     """Return what each error of a mean output is, by a unit close to this one."""
-    stations = jax.tree.map(np.asarray, stations)
+    stations = on_host(stations)
     count, turn, start, stop = len(stations.turn), stations.turn, stations.start, stations.stop
     station, stimulus = np.repeat(np.arange(count), 6), stations.stimulus
     kind = np.repeat(np.stack([np.zeros(count, np.int64), np.where(turn, 1, 2)], axis=1), 3, axis=1).ravel()
@@ -140,15 +126,15 @@ def station_covariance(stations: Stations) -> Covariance:
 
 
 class KnownStations(Data):
-    """Stations of units, one leading axis on every array."""
+    """Stations of a unit, or of units with a leading axis on every array."""
 
     effects_inside = True
     coarse = (0.0, 0.0, 0.0)
 
     def __init__(self, stations: Stations):
-        self.stations = stations
+        self.stations = lifted(stations) if np.ndim(stations.gravity) == 0 else stations
 
-    def take(self, lanes: NDArray[np.int64]) -> KnownStations:
+    def take(self, lanes: IntArray) -> KnownStations:
         """Return the measurement of some of the units."""
         return KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self.stations))
 
@@ -186,7 +172,7 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
         return turntable_error(imu, stations), jnp.sqrt(variance)
 
     error, sigma = map(np.asarray, stored.call(compute, "station errors", imu, stations, excess))
-    stations = jax.tree.map(np.asarray, stations)
+    stations = on_host(stations)
     scale = [axis_scales(triad)[:, None] for triad in imu.triads().values()]
     gyroscope, turn = stations.gyroscope_used, stations.turn
     degrees = np.degrees(stations.stop - stations.start)
@@ -207,7 +193,7 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
 def station_rms(imu: Imu, stations: Stations) -> dict[str, tuple[float, str]]:
     """Return the rms of each kind of error, as vectors, with its unit."""
     return {
-        kind.name: (float(np.sqrt(np.mean(np.sum(kind.error**2, axis=0)))), kind.unit)
+        kind.name: (rms(np.linalg.norm(kind.error, axis=0)), kind.unit)
         for kind in station_errors(imu, stations, np.zeros(len(KnownStations.coarse)))
         if len(kind.station)
     }

@@ -14,20 +14,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 
 from jaximu.data.gravity_direction import level
 from jaximu.estimation.track import TRIADS, Recorded, Track
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.rotation import multiply
 from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation
-
-__all__ = ["SamplesByHand", "during_turns", "pose_means", "rest_shifts", "samples_by_hand", "tracks_by_hand"]
 
 _NONE = np.iinfo(np.int64).max
 """Stands for the pose or the turn of a sample that is of none, and for a sample that there is not."""
@@ -167,7 +164,7 @@ def tracks_by_hand(imu: Imu, samples: SamplesByHand, running: Float[Array, "T S 
     return tracks
 
 
-def _pose_of(signal: Signal, intervals: FloatArray, first: int) -> NDArray[np.int64]:
+def _pose_of(signal: Signal, intervals: FloatArray, first: int) -> IntArray:
     """The pose each sample lies in."""
     pose = np.searchsorted(intervals[:, 0], signal.time, side="right") - 1
     inside = (pose >= 0) & (signal.time < intervals[np.maximum(pose, 0), 1])

@@ -11,13 +11,11 @@ from jaximu.data.poses import PosesAndTurns
 from jaximu.data.twin_signal import twin_signal
 from jaximu.estimation.track import Track
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.rotation import rotation_matrix_on_host
+from jaximu.ground.rotation import rotation_matrix, unit_vectors
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation
-
-__all__ = ["twin_recordings"]
 
 
 def twin_recordings(
@@ -49,7 +47,7 @@ def twin_recordings(
             for values in (track["accelerometer"].stimulus.specific_force, track["accelerometer"].observation)
         )
         at_rest = pose < count
-        force[at_rest] *= gravity / np.linalg.norm(force[at_rest], axis=1, keepdims=True)
+        force[at_rest] = gravity * unit_vectors(force[at_rest])
         rate, attitude = (
             np.array(getattr(track["gyroscope"].stimulus, name))[: len(signals["gyroscope"])]
             for name in ("angular_rate", "attitude")
@@ -74,7 +72,7 @@ def _correction(attitude: FloatArray, after: FloatArray, duration: float) -> Flo
     `attitude` (n, 4) is the body's after each sample, level at the start; to first order a rotation δ of the last frame
     is the sum of the rates' parts brought there.
     """
-    matrix = rotation_matrix_on_host(attitude)  # body to level
+    matrix = rotation_matrix(attitude)  # body to level
     lab = np.array([0.0, 0.0, 1.0])
     carried = matrix[-1].T @ lab
     delta = np.cross(after, carried)  # turning the frame by δ moves a fixed direction by −δ × u

@@ -13,8 +13,6 @@ from jaximu.model.noise_model import AxisNoise
 from jaximu.model.sensor import Triad
 from jaximu.recordings.recording import Signal
 
-__all__ = ["twin_signal"]
-
 
 def twin_signal(signal: Signal, triad: Triad, true: FloatArray, noise: AxisNoise, seed: Sequence[int]) -> Signal:
     """Return a signal as a triad without effects would put it out where it goes through `true` (n, 3), SI."""

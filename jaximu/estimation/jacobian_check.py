@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaximu.ground.rotation import compose_rotation_vectors, conjugate, rotate
+from jaximu.ground.rotation import conjugate, rotate, running_rotations
 from jaximu.model.conventions import first_order_inverse
 
 __all__ = [
@@ -159,7 +159,7 @@ def gravity_direction_hand(
     interval (s), without coning. The product is the library's own, so its derivative is checked along.
     """
     rates = (outputs - theta[9:]) @ theta[:9].reshape(3, 3).T
-    turned = compose_rotation_vectors(rates * intervals[..., None])
+    turned = running_rotations(rates * intervals[..., None])[..., -1, :]
     return (after - rotate(conjugate(turned), before)).reshape(-1)
 
 

@@ -10,9 +10,9 @@ if TYPE_CHECKING:
 
     from jax import Array as Computed
 
-__all__ = ["Array", "Computed", "FloatArray"]
+__all__ = ["Array", "BoolArray", "Computed", "FloatArray", "IntArray"]
 
-FloatArray = NDArray[np.float64]
+FloatArray, IntArray, BoolArray = NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]
 
 
 def __getattr__(name: str) -> Any:

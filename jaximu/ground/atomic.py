@@ -6,13 +6,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from jaximu.ground.errors import InputError
-
-__all__ = ["atomic_write", "write_files", "write_folder"]
+from jaximu.ground.errors import FilePath, InputError
 
 
 @contextmanager
-def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: FilePath) -> Iterator[Path]:
     """Gives a temporary path beside `path`, with the same suffix, to write to; renames it to `path` at the end.
 
     If the body raises, `path` is left as it was and the temporary file is removed. A link is followed.
@@ -33,7 +31,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def write_folder(folder: str | os.PathLike[str], contents: Mapping[str, bytes]) -> tuple[Path, ...]:
+def write_folder(folder: FilePath, contents: Mapping[str, bytes]) -> tuple[Path, ...]:
     """Write files by name into a folder, which is made if it is missing: all of them or none.
 
     **Returns:** their paths. Raises InputError where the folder cannot be made or written to.

@@ -6,9 +6,8 @@ from typing import Any
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import Numbers
 from jaximu.ground.tracing import array_module
-
-__all__ = ["interpolated", "slopes", "value_and_jacobian"]
 
 
 def slopes(values: Float[Array, "... n m"], time: Float[Array, "... n"]) -> Float[Array, "... n m"]:
@@ -30,9 +29,12 @@ def slopes(values: Float[Array, "... n m"], time: Float[Array, "... n"]) -> Floa
     return numerics.concatenate([chord[..., :1, :], inner, chord[..., -1:, :]], axis=-2)
 
 
-def interpolated(
-    time: Float[Array, " n"], values: Float[Array, "n k"], wanted: Float[Array, "..."]
-) -> Float[Array, "... k"]:
+def midpoints(values: Float[Array, "n ..."]) -> Float[Array, "n-1 ..."]:
+    """Return the means of neighbours along the first axis."""
+    return (values[1:] + values[:-1]) / 2
+
+
+def interpolated(time: Float[Array, " n"], values: Float[Array, "n k"], wanted: Numbers) -> Float[Array, "... k"]:
     """Return values at other times, along straight lines; the first and last value beyond the ends."""
     numerics = array_module(time, values, wanted)
     return numerics.stack([numerics.interp(wanted, time, column) for column in values.T], axis=-1)

@@ -1,22 +1,12 @@
-"""Tails of distributions by SciPy's special functions, which load when used: `scipy.stats` takes far longer to load."""
+"""Root mean squares; tails of distributions by SciPy's special functions: `scipy.stats` takes far longer to load."""
 
 import numpy as np
 import scipy
 
-__all__ = [
-    "chi2_isf",
-    "chi2_median",
-    "chi2_sf",
-    "f_tails",
-    "gamma_mean_sf",
-    "holm",
-    "kolmogorov_sf",
-    "noncentral_chi2_sf",
-    "normal_isf",
-    "normal_sf",
-    "student_cdf",
-    "student_isf",
-]
+
+def rms(values) -> float:
+    """Return the root mean square of numbers of any shape."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def chi2_sf(value, freedom):

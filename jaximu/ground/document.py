@@ -12,28 +12,28 @@ from typing import Any
 
 from jaximu._version import __version__
 from jaximu.ground.atomic import atomic_write
-from jaximu.ground.errors import InputError, NotPossibleError, name_of, readable
+from jaximu.ground.errors import FilePath, InputError, NotPossibleError, name_of, readable
 
-__all__ = ["SOFTWARE", "Document", "damage", "digest", "file_digest", "read_document", "read_toml"]
-
+Json = dict[str, Any]
+"""A JSON document, or a part of one, by its keys."""
 SOFTWARE = {"name": "jaximu", "version": __version__}
 """What a document says that it was written by."""
 
 
-def digest(document: dict[str, Any]) -> str:
+def digest(document: Json) -> str:
     """Return the SHA-256 of a document without its key `digest`, however its JSON is laid out."""
     content = {key: value for key, value in document.items() if key != "digest"}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def file_digest(path: str | os.PathLike[str]) -> str:
+def file_digest(path: FilePath) -> str:
     """Return the SHA-256 of a file. Raises `InputError` where it cannot be read."""
     with readable(path), open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_document(path: str | os.PathLike[str], schema: str | None, what: str) -> dict[str, Any]:
+def read_document(path: FilePath, schema: str | None, what: str) -> Json:
     """Read a JSON document of a schema, or of any schema of jaximu's.
 
     Raises `InputError` for a file that is none; `what` says what is expected, such as "a calibration.json".
@@ -50,7 +50,7 @@ def read_document(path: str | os.PathLike[str], schema: str | None, what: str) -
     return document
 
 
-def read_toml(path: str | os.PathLike[str], what: str = "a TOML file") -> dict[str, Any]:
+def read_toml(path: FilePath, what: str = "a TOML file") -> Json:
     """Read a TOML file. Raises `InputError` for a file that is none; `what` says what is expected."""
     try:
         with readable(path):
@@ -60,7 +60,7 @@ def read_toml(path: str | os.PathLike[str], what: str = "a TOML file") -> dict[s
 
 
 @contextmanager
-def damage(path: str | os.PathLike[str]) -> Iterator[None]:
+def damage(path: FilePath) -> Iterator[None]:
     """Turn what goes wrong while a document is taken apart into an `InputError` that names the file and the reason."""
     try:
         yield
@@ -73,7 +73,7 @@ class Document(ABC):
     """Something that is kept as one versioned JSON document."""
 
     @abstractmethod
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return what is kept, as JSON has it."""
 
     def __eq__(self, other: object) -> bool:
@@ -100,7 +100,7 @@ class Document(ABC):
                 f"the {kind} holds numbers that are not finite and is not kept ({error})."
             ) from error
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: FilePath) -> None:
         """Write the document, whole or not at all."""
         content = self.text()
         with atomic_write(path) as temporary:

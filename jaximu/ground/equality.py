@@ -3,8 +3,6 @@
 from dataclasses import fields, is_dataclass
 from typing import Any
 
-__all__ = ["Comparable"]
-
 
 class Comparable:
     """A dataclass with arrays in it, equal to another whose fields are all equal; a missing value (NaN) equals another.

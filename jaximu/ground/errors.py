@@ -11,19 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = [
-    "InputError",
-    "JaximuError",
-    "NotPossibleError",
-    "command_line",
-    "name_of",
-    "nearest",
-    "one_of",
-    "only",
-    "readable",
-    "worded",
-]
-
+FilePath = str | os.PathLike[str]
 _READING = "columns gyro-columns rate axes accel-scale accel-offset gyro-scale gyro-offset topic instance stamp".split()
 _ARGUMENTS = {
     "--gravity, or --latitude and --height": "gravity=, such as jaximu.wgs84_gravity(latitude, height)",
@@ -126,7 +114,7 @@ def name_of(path: object) -> str:
 
 
 @contextmanager
-def readable(path: str | os.PathLike[str]) -> Iterator[None]:
+def readable(path: FilePath) -> Iterator[None]:
     """Turn the system's refusal of a file into an `InputError` that names the file."""
     try:
         yield

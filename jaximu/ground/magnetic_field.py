@@ -8,8 +8,6 @@ from datetime import date
 
 from jaximu.ground.errors import InputError
 
-__all__ = ["HIGHEST", "LOWEST", "FieldStrength", "world_magnetic_model"]
-
 LOWEST, HIGHEST = 10.0, 100.0
 """µT between which the Earth's field lies, a building's iron included."""
 _SETS = (2010, 2015, 2020, 2025)

@@ -11,8 +11,6 @@ from jaximu.ground.reexport import later
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Code", "Items", "Matrices", "Page", "Part", "Picture", "Result", "Section", "Statement", "Table"]
-
 
 @dataclass(frozen=True)
 class Statement:
@@ -24,8 +22,20 @@ class Statement:
     caution: bool = False
 
 
-@dataclass(frozen=True)
-class Table:
+class Shown:
+    """A part that shows itself: printed as text, in a notebook as HTML."""
+
+    def __str__(self) -> str:
+        return later("report.terminal", "text")(self)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return later("report.html", "fragment")(self)
+
+
+@dataclass(frozen=True, repr=False)
+class Table(Shown):
     """Texts in rows under headers; without headers the first cell of a row is its name.
 
     caption: a sentence below it. marked: the rows that a reader should look at. brief: how many of the rows the first
@@ -38,14 +48,6 @@ class Table:
     caption: str = ""
     marked: Sequence[int] = ()
     brief: int | None = None
-
-    def __str__(self) -> str:
-        return later("report.terminal", "text")(self)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return later("report.html", "fragment")(self)
 
 
 @dataclass(frozen=True)
@@ -96,8 +98,8 @@ class Section:
 Part = str | Statement | Table | Picture | Items | Code | Matrices | Section
 
 
-@dataclass(frozen=True)
-class Page:
+@dataclass(frozen=True, repr=False)
+class Page(Shown):
     """A result in parts. Text between backticks is code.
 
     verdict: sentences. number, meaning: the one number, with its interval, and what it is of. first: what the first
@@ -135,14 +137,6 @@ class Page:
 
     def _headline(self) -> list[str]:
         return [*self.verdict, *([f"{self.number}: {self.meaning}"] if self.number else [])]
-
-    def __str__(self) -> str:
-        return later("report.terminal", "text")(self)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        return later("report.html", "fragment")(self)
 
 
 def _inside(part: Part, name: str) -> Part:

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     import pandas as pd  # pyright: ignore[reportMissingImports]
     import pyarrow as pa
 
-__all__ = ["Parameter", "ParameterTable", "data_frame"]
-
 
 @dataclass(frozen=True)
 class Parameter:

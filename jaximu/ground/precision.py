@@ -4,8 +4,6 @@ import jax
 
 from jaximu.ground.errors import InputError
 
-__all__ = ["require_float64"]
-
 
 def require_float64() -> None:
     """Raise `InputError` unless JAX computes in double precision."""

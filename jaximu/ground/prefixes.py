@@ -7,8 +7,6 @@ import jax.numpy as jnp
 
 from jaximu.ground.array_types import Array
 
-__all__ = ["running"]
-
 Elements = tuple[Array, ...]
 
 

@@ -7,24 +7,6 @@ import math
 import re
 from collections.abc import Collection, Sequence
 
-__all__ = [
-    "Z95",
-    "change",
-    "counted",
-    "joined",
-    "listed",
-    "number",
-    "plain",
-    "probability",
-    "raised",
-    "readable",
-    "sentence",
-    "size",
-    "unit_text",
-    "with_interval",
-    "with_intervals",
-]
-
 Z95 = 1.96
 """Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 _SYMBOLS = {

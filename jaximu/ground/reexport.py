@@ -4,8 +4,6 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
-__all__ = ["later", "lazily"]
-
 
 def later(module: str, name: str) -> Any:
     """Return what a method hands its object to: pictures and files of an object, which lie in layers above its own.

@@ -12,36 +12,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array
 from jaximu.ground.prefixes import running
+from jaximu.ground.tracing import array_module
 
-__all__ = [
-    "Matrix",
-    "Quaternion",
-    "Vector",
-    "apply_matrix",
-    "compose_rotation_vectors",
-    "conjugate",
-    "exponential",
-    "integrate_rates",
-    "inverse_matrix",
-    "logarithm",
-    "multiply",
-    "product",
-    "right_jacobian",
-    "right_jacobian_rows",
-    "rotate",
-    "rotation_matrix",
-    "rotation_matrix_on_host",
-    "rotation_rows",
-    "rotation_vectors",
-    "running_rotations",
-    "transport",
-]
-
+Number = Float[Array, ""]
+Numbers = Float[Array, "..."]
+"""One number, and numbers of any shape."""
 Vector = Float[Array, "... 3"]
 Vectors = Float[Array, "... S 3"]
 """Of S samples."""
@@ -65,6 +44,11 @@ def inverse_matrix(matrix: Matrix) -> Matrix:
     columns = [jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)]
     determinant = jnp.sum(a * columns[0], axis=-1)
     return jnp.stack(columns, axis=-1) / determinant[..., None, None]
+
+
+def unit_vectors(vectors: Float[Array, "... m"]) -> Float[Array, "... m"]:
+    """Return vectors scaled to length one, with NumPy or under a trace with JAX."""
+    return vectors / array_module(vectors).sqrt((vectors**2).sum(axis=-1, keepdims=True))
 
 
 def product(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
@@ -105,12 +89,8 @@ def rotation_rows(quaternion: Sequence[Any]) -> list[list[Any]]:
 
 def rotation_matrix(q: Quaternion) -> Matrix:
     """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`."""
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rotation_rows(_parts(q))], axis=-2)
-
-
-def rotation_matrix_on_host(q: FloatArray) -> FloatArray:
-    """Return rotation matrices (..., 3, 3) of unit quaternions (..., 4) in NumPy, where nothing is to be traced."""
-    return np.moveaxis(np.array(rotation_rows(_parts(q))), (0, 1), (-2, -1))
+    stack = array_module(q).stack
+    return stack([stack(row, axis=-1) for row in rotation_rows(_parts(q))], axis=-2)
 
 
 def rotate(q: Quaternion, vector: Vector) -> Vector:
@@ -174,21 +154,14 @@ def right_jacobian_rows(vector: Sequence[Any], first: Any, second: Any) -> list[
     ]
 
 
-def _normalised(parts):
-    length = jnp.sqrt(sum(part**2 for part in parts))
-    return tuple(part / length for part in parts)
-
-
-def _prefixes(rotation_vectors):
-    """Return exp(θ_1)…exp(θ_k) for every k as four (S, ...) arrays."""
-    cosine, sine = _half_angle(rotation_vectors)
-    parts = (cosine, *(sine * component for component in _parts(rotation_vectors)))
-    return _normalised(running(product, tuple(jnp.moveaxis(part, -1, 0) for part in parts)))
-
-
 def running_rotations(rotation_vectors: Vectors) -> Float[Array, "... S 4"]:
-    """Return exp(θ_1) ⊗ … ⊗ exp(θ_k) for every k: the attitude after each sample, relative to the first body frame."""
-    return jnp.moveaxis(jnp.stack(_prefixes(rotation_vectors)), (0, 1), (-1, -2))
+    """Return exp(θ_1) ⊗ … ⊗ exp(θ_k) for every k: the attitude after each sample, relative to the first body frame.
+
+    Exactly, of body rotation vectors (rad); a zero vector is the identity, so padding costs nothing but time.
+    """
+    whole = running(product, _parts(jnp.moveaxis(exponential(rotation_vectors), -2, 0)))
+    length = jnp.sqrt(sum(part**2 for part in whole))
+    return jnp.moveaxis(jnp.stack(whole) / length, (0, 1), (-1, -2))
 
 
 def transport(running: Float[Array, "... S 4"], rotation_vectors: Vectors) -> Float[Array, "... S 3 3"]:
@@ -203,29 +176,6 @@ def transport(running: Float[Array, "... S 4"], rotation_vectors: Vectors) -> Fl
     entries = [sum(r * j for r, j in zip(row, column, strict=True)) for row in rows for column in columns]
     by_component = jnp.moveaxis(jnp.stack(entries, axis=-2), -2, -1)
     return by_component.reshape(*rotation_vectors.shape, 3)
-
-
-@jax.custom_jvp
-def compose_rotation_vectors(rotation_vectors: Vectors) -> Quaternion:
-    """Return exp(θ_1) ⊗ … ⊗ exp(θ_S): the rotation of S successive body rotation vectors (rad), exactly.
-
-    A zero vector is the identity, so padded samples cost nothing but time. The derivative is not traced through the
-    product: with P_k the product up to k, a change δθ_k turns the final body frame by
-    R(P_S)ᵀ R(P_k) J_r(θ_k) δθ_k (the error-state recursion of strapdown navigation, summed), which costs one weighted
-    sum for each tangent instead of one more product.
-    """
-    return jnp.stack([part[-1] for part in _prefixes(rotation_vectors)], axis=-1)
-
-
-@compose_rotation_vectors.defjvp
-def _compose_rotation_vectors_jvp(primals, tangents):
-    (vectors,), (tangent,) = primals, tangents
-    running = running_rotations(vectors)
-    final = running[..., -1, :]
-    # Each sample's change is turned into the first body frame and summed there; one rotation takes the sum to the last.
-    local = rotate(conjugate(final), jnp.einsum("...sij,...sj->...i", transport(running, vectors), tangent))
-    half = jnp.concatenate([jnp.zeros_like(local[..., :1]), local / 2], axis=-1)
-    return final, multiply(final, half)
 
 
 def rotation_vectors(
@@ -268,24 +218,19 @@ def _integrate_rk4(rates, intervals):
     last = jnp.concatenate([jnp.where(followed, meeting, rates[..., :-1, :]), rates[..., -1:, :]], axis=-2)
 
     def derivative(q, rate):
-        return tuple(part / 2 for part in product(q, (jnp.zeros_like(rate[0]), *rate)))
-
-    def add(q, slope, step):
-        return tuple(a + step * b for a, b in zip(q, slope, strict=True))
+        return multiply(q, jnp.concatenate([jnp.zeros_like(rate[..., :1]), rate], axis=-1)) / 2
 
     def advance(q, sample):
         first, middle, last, step = sample
         k1 = derivative(q, first)
-        k2 = derivative(add(q, k1, step / 2), middle)
-        k3 = derivative(add(q, k2, step / 2), middle)
-        k4 = derivative(add(q, k3, step), last)
-        total = tuple((a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4, strict=True))
-        return _normalised(add(q, total, step)), None
+        k2 = derivative(q + k1 * step / 2, middle)
+        k3 = derivative(q + k2 * step / 2, middle)
+        k4 = derivative(q + k3 * step, last)
+        return unit_vectors(q + (k1 + 2 * k2 + 2 * k3 + k4) * step / 6), None
 
-    samples = (*(_parts(jnp.moveaxis(array, -2, 0)) for array in (first, rates, last)), jnp.moveaxis(intervals, -1, 0))
-    start = tuple(jnp.full(rates.shape[:-2], part, rates.dtype) for part in (1.0, 0.0, 0.0, 0.0))
-    final, _ = jax.lax.scan(advance, start, samples)
-    return jnp.stack(final, axis=-1)
+    samples = tuple(jnp.moveaxis(array, -2, 0) for array in (first, rates, last, intervals[..., None]))
+    start = jnp.zeros((*rates.shape[:-2], 4), rates.dtype).at[..., 0].set(1.0)
+    return jax.lax.scan(advance, start, samples)[0]
 
 
 def integrate_rates(rates: Vectors, intervals: Float[Array, "... S"], method: str = "exponential") -> Quaternion:
@@ -299,7 +244,7 @@ def integrate_rates(rates: Vectors, intervals: Float[Array, "... S"], method: st
       the quaternion Runge–Kutta of Tedaldi et al. (2014), with the rate linear between samples.
     """
     if method == "exponential":
-        return compose_rotation_vectors(rotation_vectors(rates, intervals))
+        return running_rotations(rotation_vectors(rates, intervals))[..., -1, :]
     if method == "rk4":
         return _integrate_rk4(rates, intervals)
     raise ValueError(f"unknown integration method {method!r}: use 'exponential' or 'rk4'")

@@ -21,10 +21,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.tracing import is_traced
-
-__all__ = ["cache", "call", "compiled", "compiling", "folder", "forget", "prepare_process", "tell_apart"]
 
 _folder: Path | None = None
 _at_first: Callable[[], None] | None = None
@@ -35,7 +33,7 @@ F = TypeVar("F", bound=Callable)
 Result = TypeVar("Result")
 
 
-def cache(folder: str | os.PathLike[str] | None, at_first: Callable[[], None] | None = None) -> None:
+def cache(folder: FilePath | None, at_first: Callable[[], None] | None = None) -> None:
     """Keep compiled programs in a folder, so that the next process need not compile them; None stops it.
 
     Of a folder that only you can write to: what lies there is run. `at_first` is called once, before a function is

@@ -1,10 +1,8 @@
 """One text for arrays on the host and for arrays that are being traced."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
-
-__all__ = ["array_module", "first", "is_traced", "lifted", "one_by_one", "repeated"]
 
 Result = TypeVar("Result")
 State = TypeVar("State")
@@ -43,6 +41,21 @@ def lifted(tree: Tree) -> Tree:
     return jax.tree.map(lambda leaf: array_module(leaf).asarray(leaf)[None], tree)
 
 
+def on_host(tree: Tree) -> Tree:
+    """Return every array as one of NumPy."""
+    import jax
+    import numpy
+
+    return jax.tree.map(numpy.asarray, tree)
+
+
+def stacked(trees: Sequence[Tree]) -> Tree:
+    """Return trees alike as one, every array with a leading axis."""
+    import jax
+
+    return jax.tree.map(lambda *leaves: array_module(leaves).stack(leaves), *trees)
+
+
 def repeated(step: Callable[[State], State], state: State, times: int, *others: Any) -> State:
     """Return a state after so many steps: one after the other, or where JAX traces it or `others`, in a loop of JAX.
 
@@ -66,4 +79,4 @@ def one_by_one(function: Callable[..., Result], *trees: Any) -> Result:
         return jax.lax.map(lambda entry: function(*entry), trees)
     count = len(jax.tree.leaves(trees)[0])
     results = [function(*jax.tree.map(lambda leaf, k=k: leaf[k], trees)) for k in range(count)]
-    return jax.tree.map(lambda *leaves: array_module().stack(leaves), *results)
+    return stacked(results)

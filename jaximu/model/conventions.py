@@ -25,21 +25,6 @@ from jax.core import Tracer
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import Matrix, Vector, inverse_matrix
 
-__all__ = [
-    "FrameChange",
-    "ImuTk",
-    "Kalibr",
-    "PartsPerMillion",
-    "ReciprocalScale",
-    "ScaleMisalignment",
-    "SimplifiedScaleMisalignment",
-    "Tedaldi",
-    "first_order_inverse",
-    "lower_triangular_frame",
-    "rotate_body_frame",
-    "upper_triangular_frame",
-]
-
 _PPM = 1e6
 _SINGULAR = 1e-9
 """Smallest singular value or diagonal of a matrix whose rows are scaled to unit length, and a rotation's departure."""
@@ -245,12 +230,10 @@ class Kalibr(eqx.Module):
             gyro_matrix=gyro_matrix,
             gyro_rotation=gyro_rotation,
             g_sensitivity=(
-                jnp.zeros_like(gyro_matrix)
-                if g_sensitivity is None
-                else jnp.matmul(jnp.matmul(g_sensitivity, rotation), jnp.matrix_transpose(gyro_rotation))
+                jnp.zeros_like(gyro_matrix) if g_sensitivity is None else g_sensitivity @ rotation @ gyro_rotation.mT
             ),
             gyro_bias=jnp.asarray(bias_gyro),
-            body_rotation=jnp.matrix_transpose(rotation),
+            body_rotation=rotation.mT,
         )
 
     def to_gains(self) -> tuple[Matrix, Vector, Matrix, Vector]:
@@ -260,13 +243,13 @@ class Kalibr(eqx.Module):
         """
         if not isinstance(self.g_sensitivity, Tracer) and np.any(np.asarray(self.g_sensitivity)):
             raise InputError("A gain and a bias cannot hold a g-sensitivity (A is not zero): give it as an effect.")
-        gain_accel = jnp.matmul(self.accel_matrix, self.body_rotation)
-        gain_gyro = jnp.matmul(jnp.matmul(self.gyro_matrix, self.gyro_rotation), self.body_rotation)
+        gain_accel = self.accel_matrix @ self.body_rotation
+        gain_gyro = self.gyro_matrix @ self.gyro_rotation @ self.body_rotation
         return gain_accel, self.accel_bias, gain_gyro, self.gyro_bias
 
     def to_g_sensitivity(self) -> Matrix:
         """Return G = A C Q of y_g = K_g ω + G f + b_g, in the frame that `from_gains` was given."""
-        return jnp.matmul(jnp.matmul(self.g_sensitivity, self.gyro_rotation), self.body_rotation)
+        return self.g_sensitivity @ self.gyro_rotation @ self.body_rotation
 
 
 class FrameChange(NamedTuple):
@@ -299,9 +282,7 @@ def lower_triangular_frame(gain_accel: Matrix, gain_gyro: Matrix) -> FrameChange
     """
     _refuse_improper(gain_accel, "accelerometer gain")
     triangular, rotation = _lower_times_rotation(gain_accel)
-    return FrameChange(
-        triangular, jnp.matmul(gain_gyro, jnp.matrix_transpose(rotation)), jnp.matrix_transpose(rotation)
-    )
+    return FrameChange(triangular, gain_gyro @ rotation.mT, rotation.mT)
 
 
 def upper_triangular_frame(gain_accel: Matrix, gain_gyro: Matrix) -> FrameChange:
@@ -313,8 +294,8 @@ def upper_triangular_frame(gain_accel: Matrix, gain_gyro: Matrix) -> FrameChange
     """
     _refuse_improper(gain_accel, "accelerometer gain")
     triangular, rotation = _lower_times_rotation(jnp.flip(jnp.asarray(gain_accel), (-2, -1)))
-    triangular, back = jnp.flip(triangular, (-2, -1)), jnp.matrix_transpose(jnp.flip(rotation, (-2, -1)))
-    return FrameChange(triangular, jnp.matmul(gain_gyro, back), back)
+    back = jnp.flip(rotation, (-2, -1)).mT
+    return FrameChange(jnp.flip(triangular, (-2, -1)), gain_gyro @ back, back)
 
 
 def first_order_inverse(gain: Matrix) -> Matrix:
@@ -334,11 +315,9 @@ def first_order_inverse(gain: Matrix) -> Matrix:
 
 def _lower_times_rotation(gain: Matrix) -> tuple[Matrix, Matrix]:
     """Factor K = L Q, L lower-triangular with a positive diagonal, Q orthogonal."""
-    orthogonal, upper = jnp.linalg.qr(jnp.matrix_transpose(gain))
+    orthogonal, upper = jnp.linalg.qr(jnp.asarray(gain).mT)
     sign = jnp.where(_diagonal(upper) < 0, -1.0, 1.0)
-    return jnp.tril(jnp.matrix_transpose(upper * sign[..., :, None])), jnp.matrix_transpose(
-        orthogonal * sign[..., None, :]
-    )
+    return jnp.tril((upper * sign[..., :, None]).mT), (orthogonal * sign[..., None, :]).mT
 
 
 def _diagonal(matrix: Matrix) -> Vector:

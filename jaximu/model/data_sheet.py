@@ -17,18 +17,6 @@ from numpy.typing import ArrayLike
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import DEGREE, STANDARD_GRAVITY
 
-__all__ = [
-    "DATASHEET_UNITS",
-    "NOISE_KINDS",
-    "SI_UNITS",
-    "TERM_NAMES",
-    "convert",
-    "from_discrete",
-    "parse_quantity",
-    "parse_unit",
-    "to_discrete",
-]
-
 SI_UNITS = {
     "angular_rate": {"Q": "rad", "N": "rad/s/sqrt(Hz)", "B": "rad/s", "K": "rad/s^2/sqrt(Hz)", "R": "rad/s^2"},
     "specific_force": {"Q": "m/s", "N": "m/s^2/sqrt(Hz)", "B": "m/s^2", "K": "m/s^3/sqrt(Hz)", "R": "m/s^3"},

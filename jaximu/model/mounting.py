@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float
 
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import Quaternion, conjugate, exponential, multiply
+from jaximu.ground.rotation import Number, Numbers, Quaternion, conjugate, exponential, multiply
 from jaximu.ground.stored import compiled
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.clock_scale import SetupClockScale
@@ -21,8 +21,6 @@ from jaximu.model.effects.reference_filter import SetupReferenceFilter
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.effects.table_tilt import SetupTableTilt
 from jaximu.model.sensor import Imu
-
-__all__ = ["MOUNTING_EFFECTS", "Mounting"]
 
 MOUNTING_EFFECTS = (
     SetupReferenceRotation,
@@ -43,11 +41,11 @@ class Mounting(NamedTuple):
     """How a reference is mounted on a unit; each field has the coefficients of one effect, and is zero without it."""
 
     rotation: Float[Array, 3] = np.zeros(3)  # rad: the unit's axes are the reference's turned by this rotation vector
-    delay: Float[Array, ""] = 0.0  # s, by which the reference's stamps are late
+    delay: Number = 0.0  # s, by which the reference's stamps are late
     tilt: Float[Array, 2] = np.zeros(2)  # rad, of the reference's level frame about its x and y axes
-    filter_variance: Float[Array, ""] = 0.0  # s², of the weights by which the reference is smoothed
+    filter_variance: Number = 0.0  # s², of the weights by which the reference is smoothed
     lever_arm: Float[Array, 3] = np.zeros(3)  # m, from the point that is tracked to the unit, in the unit's axes
-    clock_scale: Float[Array, ""] = 0.0  # by which the log's clock runs fast against the reference's
+    clock_scale: Number = 0.0  # by which the log's clock runs fast against the reference's
     field: Float[Array, 3] = np.zeros(3)  # µT, the magnetic field in the level frame
 
     @classmethod
@@ -68,11 +66,11 @@ class Mounting(NamedTuple):
         kinds = zip(Mounting._fields, MOUNTING_EFFECTS, strict=True)
         return tuple(kind.make(start[name]) for name, kind in kinds if name in start)
 
-    def on_log(self, stamps: Float[Array, " ..."]) -> Float[Array, " ..."]:
+    def on_log(self, stamps: Numbers) -> Numbers:
         """Return stamps of the reference on the log's clock."""
         return (stamps - self.delay) * (1 + self.clock_scale)
 
-    def on_reference(self, times: Float[Array, " ..."]) -> Float[Array, " ..."]:
+    def on_reference(self, times: Numbers) -> Numbers:
         """Return times of the log as the reference stamps them."""
         return times / (1 + self.clock_scale) + self.delay
 

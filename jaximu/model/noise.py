@@ -33,8 +33,6 @@ from jaximu.model.noise_model import AxisNoise
 from jaximu.model.processes import FirstOrderGaussMarkov, Process, White
 from jaximu.model.state_space import BLOCK, BlockSystem, LinearSystem, combine, linear_system, run
 
-__all__ = ["FIGURE_TERMS", "Noise", "NoiseStream", "drawn_noise"]
-
 Generators = list[np.random.Generator]
 """A stream of draws for every unit and axis, in their order."""
 

@@ -18,13 +18,11 @@ from functools import lru_cache
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.page import Result
 from jaximu.model.processes import RATIO
-
-__all__ = ["AxisNoise", "NoiseModel"]
 
 _LONGEST = 4.0
 """Longest correlation time, in lengths of the recording: slower than this looks like a random walk in it."""
@@ -57,7 +55,7 @@ class AxisNoise:
         """Return white noise of density N² (a number or (3,)) and nothing else."""
         return cls(np.broadcast_to(np.asarray(density, float), (3,)), np.zeros(3), np.zeros((3, 0)), np.zeros(0))
 
-    def integrated(self, duration: ArrayLike) -> NDArray[np.float64]:
+    def integrated(self, duration: ArrayLike) -> FloatArray:
         """Return G (..., 3): half the variance of the noise's integral over `duration` (...), s; even in it."""
         h = np.abs(np.asarray(duration, float))[..., None]
         x = h / self.correlation_time  # (..., M)
@@ -126,8 +124,8 @@ def fit_bank(values: FloatArray, rate: float) -> AxisNoise:
 def _fitted(
     expected: FloatArray,
     mean: FloatArray,
-    counts: NDArray[np.int64],
-    edges: NDArray[np.int64],
+    counts: IntArray,
+    edges: IntArray,
     duration: float,
     times: FloatArray,
 ) -> FloatArray:
@@ -149,7 +147,7 @@ def _fitted(
     return sizes
 
 
-def _non_negative(expected: FloatArray, mean: FloatArray, counts: NDArray[np.int64], times: FloatArray) -> FloatArray:
+def _non_negative(expected: FloatArray, mean: FloatArray, counts: IntArray, times: FloatArray) -> FloatArray:
     """Return sizes s ≥ 0 (terms,) for which the mean power of each bin (bins,) is like expected.T @ s.
 
     A mean of c ordinates of power S has the variance S²/c: Fisher scoring for their Gamma likelihood. Of processes so
@@ -183,7 +181,7 @@ def _non_negative(expected: FloatArray, mean: FloatArray, counts: NDArray[np.int
 
 
 @lru_cache(maxsize=4)
-def _expectations(samples: int, rate: float) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+def _expectations(samples: int, rate: float) -> tuple[IntArray, FloatArray, FloatArray]:
     """Edges of the bins of Fourier frequencies, correlation times (M,), and each term's expected power (2 + M, bins).
 
     The first frequencies are bins of their own, the others about 8 % wide.

@@ -24,19 +24,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.model.state_space import LinearSystem, linear_system
 
-__all__ = [
-    "BiasInstability",
-    "BiasRepeatability",
-    "FirstOrderGaussMarkov",
-    "Process",
-    "Quantisation",
-    "RandomConstant",
-    "RandomWalk",
-    "RateRamp",
-    "SecondOrderGaussMarkov",
-    "White",
-]
-
 
 @dataclass(frozen=True)
 class Process:
@@ -286,6 +273,12 @@ RATIO = 4.0
 2 / cosh(π² / ln 4) = 0.3 %."""
 
 
+def correlation_times(shortest: float, longest: float) -> FloatArray:
+    """Return the correlation times (s) of Gauss–Markov processes that together are flicker noise, `RATIO` apart."""
+    count = 1 + max(0, math.ceil(np.log(longest / shortest) / np.log(RATIO)))
+    return np.asarray(shortest * RATIO ** np.arange(count), np.float64)
+
+
 @dataclass(frozen=True)
 class BiasInstability(Process):
     """Flicker noise B: spectrum B²/(2π|f|), Allan deviation √(2 ln 2/π) B = 0.664 B at any averaging time.
@@ -309,9 +302,7 @@ class BiasInstability(Process):
 
     def bank(self, interval: float) -> FloatArray:
         """Return the correlation times (s)."""
-        shortest = 0.7 * interval
-        count = 1 + max(0, math.ceil(np.log(float(self.longest) / shortest) / np.log(RATIO)))
-        return np.asarray(shortest * RATIO ** np.arange(count), np.float64)
+        return correlation_times(0.7 * interval, float(self.longest))
 
     def system(self, interval):
         transition, gain, output, through, root = _innovations(tuple(self.bank(interval)), interval)

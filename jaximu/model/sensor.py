@@ -27,8 +27,6 @@ from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.effects.base import Effect, SetupEffect
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus, rate_of_change
 
-__all__ = ["Board", "Imu", "Triad"]
-
 _REFRESHED = 3
 """Rounds of `recover` in which a derivative of the input is taken again. More would amplify what it cannot resolve:
 a lag τ is undone up to (τ d/dt)³."""

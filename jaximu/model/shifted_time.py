@@ -6,8 +6,6 @@ from jaximu.ground.differences import slopes
 from jaximu.ground.errors import InputError
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["at_times"]
-
 
 def _look_up(time, values, at):
     """Cubic Hermite interpolation of (n, m) values: smooth, so that it has a derivative by `at` also at a sample.

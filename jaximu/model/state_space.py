@@ -13,8 +13,6 @@ from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
 
-__all__ = ["BLOCK", "BlockSystem", "LinearSystem", "combine", "linear_system", "run"]
-
 BLOCK = 64
 """Samples that are computed by one matrix product; between blocks the state is carried step by step."""
 

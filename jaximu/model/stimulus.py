@@ -9,11 +9,8 @@ from jaxtyping import Float
 from jaximu.ground.array_types import Array
 from jaximu.ground.differences import slopes
 from jaximu.ground.errors import InputError
-from jaximu.ground.rotation import Quaternion, Vector
+from jaximu.ground.rotation import Numbers, Quaternion, Vector
 
-__all__ = ["REFERENCE_TEMPERATURE", "Stimulus", "rate_of_change"]
-
-Numbers = Float[Array, " ..."]
 REFERENCE_TEMPERATURE = 25.0
 """°C at which gain and bias are stated, unless a triad says otherwise."""
 

@@ -16,7 +16,9 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import student_isf
 
 __all__ = [
+    "ARRANGEMENTS",
     "CORRELATED",
+    "EXPLAINED",
     "BlockMeans",
     "Carried",
     "Clocks",
@@ -53,6 +55,10 @@ _WELL = 0.8
 _SHEARS = [np.diag([1.0, -1.0, 0.0]), np.diag([0.0, 1.0, -1.0])]
 """A basis (5, 3, 3) of the symmetric matrices without a common scale."""
 _SHEARS += [np.eye(3)[[a]].T @ np.eye(3)[[b]] + np.eye(3)[[b]].T @ np.eye(3)[[a]] for a, b in ((0, 1), (0, 2), (1, 2))]
+
+
+EXPLAINED = 0.5
+"""Share of the turning of gravity that a gyroscope must explain for anything to be judged by it."""
 
 
 class Turning(NamedTuple):
@@ -236,7 +242,15 @@ _JUMP = 0.15
 """Share of the way from one rest's gravity to the next's that may lie before and behind a jump."""
 _FACTORS = 1.15 ** np.arange(-30, 31)
 """Factors by which rates as read may have to be multiplied."""
-_SIGNS = [np.array(signs)[:, None] for signs in product((1.0, -1.0), repeat=3)]
+ARRANGEMENTS = np.stack(
+    [
+        np.array(signs)[:, None] * np.eye(3)[list(order)]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+)
+ARRANGEMENTS = ARRANGEMENTS[np.linalg.det(ARRANGEMENTS) > 0]
+"""The rotations (24, 3, 3) that exchange axes and turn them round; the first turns nothing."""
 _MOST_TURNS, _ROUGH_ANGLE = 0.75, np.radians(3)
 """Share of the turns whose error counts; difference of such errors that distinguishes nothing."""
 
@@ -296,12 +310,8 @@ def carried(
     while turns.shape[1] > 1:
         turns = turns[:, ::2] @ turns[:, 1::2]
     back = turns[:, 0]
-    arranged = np.stack(
-        [np.array(signs) * np.eye(3)[list(order)] for order in permutations(range(3)) for signs in _SIGNS]
-    )
-    arranged = arranged[np.linalg.det(arranged) > 0]
     # f' = Q Rᵀ Qᵀ f, with Q from the gyroscope's axes to the accelerometer's
-    before, after = (np.einsum("qji,tj->qti", arranged, part) for part in (up[used], up[used + 1]))
+    before, after = (np.einsum("qji,tj->qti", ARRANGEMENTS, part) for part in (up[used], up[used + 1]))
     cosine = np.einsum("qti,stji,qtj->sqt", after, back, before)
     error = np.quantile(np.arccos(np.clip(cosine, -1.0, 1.0)), _MOST_TURNS, axis=2)
     # of factors that do as well the one nearest to none

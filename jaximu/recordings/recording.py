@@ -104,6 +104,10 @@ class Signal(Comparable):
         middle, half = (self.time[1:] + self.time[:-1]) / 2, 0.5 / self.rate
         return np.concatenate([[self.time[0] - half], middle, [self.time[-1] + half]])
 
+    def at(self, times: FloatArray) -> FloatArray:
+        """(..., m) the output at times (...), along straight lines; the first and last value beyond the ends."""
+        return np.stack([np.interp(times, self.time, axis) for axis in self.values.T], axis=-1)
+
     def samples(self, seconds: float) -> int:
         """Return how many samples so many seconds are; of a half, rounding of the rate does not decide."""
         return int(seconds * self.rate + 0.5 + 1e-9)

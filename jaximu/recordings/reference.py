@@ -21,7 +21,7 @@ from jaximu.recordings.attitude import UNIT_LENGTH
 from jaximu.recordings.readers.schedule import ScheduleEntry
 from jaximu.recordings.recording import Recording, Signal, runs_of
 
-__all__ = ["Entry", "Integral", "entries_of_columns", "match_reference", "rest_rate"]
+__all__ = ["Entry", "Integral", "entries_of_columns", "match_reference", "means_over", "rest_rate"]
 
 _MOVING = np.radians(2.0)  # rad/s, mean rate over a second that no pose has
 _OFF = 20.0  # degrees between a pose's "up" and what the accelerometer reads as its data sheet has it
@@ -67,6 +67,11 @@ class Integral:
         start, stop = np.asarray(start), np.asarray(stop)
         ends = [np.stack([np.interp(t, self.edges, axis) for axis in self.sums.T], axis=-1) for t in (start, stop)]
         return ends[1] - ends[0] + self.origin * (stop - start)[..., None]
+
+
+def means_over(signal: Signal, span: FloatArray) -> FloatArray:
+    """Return the means (n, m) of a signal between times (n, 2), in its unit."""
+    return Integral(signal, signal.values).over(*span.T) / np.diff(span)
 
 
 def rest_rate(integral: Integral, entries: Sequence[Entry]) -> FloatArray:

@@ -4,8 +4,6 @@ import jax.numpy as jnp
 
 from jaximu.model.effects.base import InputEffect, pair
 
-__all__ = ["EFFECTS", "AccelAsymmetry", "GyroAsymmetry"]
-
 
 class _Asymmetry(InputEffect):
     """c_i times the size of each axis's input: the gain is K + c for positive and K − c for negative input."""

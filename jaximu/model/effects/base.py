@@ -17,28 +17,14 @@ from jaxtyping import Float
 
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
-from jaximu.ground.rotation import Vector
+from jaximu.ground.rotation import Numbers, Vector
 from jaximu.ground.units import SENSORS
 from jaximu.model.stimulus import Stimulus
 
-__all__ = [
-    "BiasEffect",
-    "Effect",
-    "Extent",
-    "Inner",
-    "InputEffect",
-    "Place",
-    "Scalar",
-    "ScaleEffect",
-    "SetupEffect",
-    "inner_owners",
-    "on_triad",
-    "pair",
-]
-
 Place = TypeVar("Place", bound=Hashable)
-Scalar = Float[Array, "..."] | float
+Scalar = Numbers | float
 """An inner parameter."""
 
 _TRIADS = {
@@ -188,7 +174,7 @@ class Effect(eqx.Module):
         plain = output_unit if cls.unit == "output" or "/" not in output_unit else f"({output_unit})"
         return cls.unit.replace("output", plain)
 
-    def document(self, output_unit: str) -> dict[str, Any]:
+    def document(self, output_unit: str) -> Json:
         """Return the effect of a triad with this output unit as JSON documents have it."""
         return {
             "coefficients": np.asarray(self.coefficients).tolist(),
@@ -205,6 +191,10 @@ class Effect(eqx.Module):
         """Return plausible deviations of every number of this effect, for a triad of so many output units per SI."""
         size = self.typical * (scale if self.unit.startswith("output") else 1.0)
         return type(self)(np.ones(self.size) * size, **jax.tree.map(np.float64, self._typical_inner()))
+
+    def needed(self, stimulus: Stimulus) -> list[Array]:
+        """Return the fields of a stimulus that the effect needs, in their order. Raises `InputError` as `need` does."""
+        return [stimulus.need(field, self.name) for field in self.needs]
 
     def term(self, stimulus: Stimulus) -> Vector:
         """Return the term (..., 3), in output units or SI as `refers_to` says, of stimuli with any leading axes."""
@@ -229,9 +219,9 @@ class BiasEffect(Effect):
 
     scope = "device"
 
-    def factor(self, stimulus: Stimulus) -> Float[Array, " ..."]:
-        """Return the number (...) that each axis's coefficient multiplies."""
-        raise NotImplementedError
+    def factor(self, stimulus: Stimulus) -> Numbers:
+        """Return the number (...) that each axis's coefficient multiplies: what the effect needs first, as a rule."""
+        return stimulus.need(self.needs[0], self.name)
 
     def term(self, stimulus):
         return self.coefficients * self.factor(stimulus)[..., None]

@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.base import BiasEffect, pair
 
-__all__ = ["EFFECTS", "AccelBiasRamp", "GyroBiasRamp"]
-
 
 class _BiasRamp(BiasEffect):
     """A bias in proportion to time, counted from the reference time: the rate ramp R of an Allan deviation."""

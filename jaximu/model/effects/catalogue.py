@@ -8,8 +8,6 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSORS
 from jaximu.model.effects.base import Effect
 
-__all__ = ["CATALOGUE", "register", "registered"]
-
 _FILES = (
     "quadratic",
     "cubic",

@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.time_offset import ShiftedTime
 
-__all__ = ["EFFECTS", "SetupClockScale"]
-
 
 class SetupClockScale(ShiftedTime):
     """A sample stamped t was taken at t / (1 + c) of the reference's time: positive, and the logger's clock runs fast.

@@ -5,8 +5,6 @@ import jax.numpy as jnp
 from jaximu.ground.rotation import apply_matrix
 from jaximu.model.effects.base import InputEffect, pair
 
-__all__ = ["EFFECTS", "AccelCrossCoupling", "GyroCrossCoupling"]
-
 
 class _CrossCoupling(InputEffect):
     """Products of two components of the input in every output (not the linear gain from one axis to another).

@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.base import InputEffect, pair
 
-__all__ = ["EFFECTS", "AccelCubic", "GyroCubic"]
-
 
 class _Cubic(InputEffect):
     """c_i times the cube of each axis's input. With inputs of one size alone it cannot be told from scale."""

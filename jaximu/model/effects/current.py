@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.base import BiasEffect
 
-__all__ = ["EFFECTS", "MagCurrent"]
-
 
 class MagCurrent(BiasEffect):
     """An output in proportion to a current: by Biot and Savart's law the field of a wire at a fixed place."""
@@ -16,9 +14,6 @@ class MagCurrent(BiasEffect):
     look_alikes = ("mag.temperature", "mag.hard_iron_step")
     source = "Biot and Savart's law; the current compensation of PX4 (CAL_MAGn_xCOMP) and ArduPilot (COMPASS_MOT_x)"
     typical = 2.0
-
-    def factor(self, stimulus):
-        return stimulus.need("current", self.name)
 
 
 EFFECTS = (MagCurrent,)

@@ -4,8 +4,6 @@ import jax.numpy as jnp
 
 from jaximu.model.effects.base import Effect
 
-__all__ = ["EFFECTS", "GyroDeadBand"]
-
 
 class GyroDeadBand(Effect):
     """No output of an axis while |ω_i| < δ_i (lock-in, stiction of a digital threshold).

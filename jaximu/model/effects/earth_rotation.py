@@ -1,12 +1,10 @@
 """Earth rotation: what the gyroscope feels of it, where the motion is told against the ground."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.rotation import conjugate, rotate
 from jaximu.model.effects.base import Effect
-
-__all__ = ["EARTH_RATE", "EFFECTS", "GyroEarthRotation"]
 
 EARTH_RATE = 7.292115e-5
 """Rate of the Earth's rotation, rad/s (WGS 84)."""
@@ -35,7 +33,7 @@ class GyroEarthRotation(Effect):
     refers_to = "input"
 
     @classmethod
-    def at(cls, latitude: float) -> tuple[Effect, NDArray[np.float64]]:
+    def at(cls, latitude: float) -> tuple[Effect, FloatArray]:
         """Return it at a latitude (degrees) in a level frame of unknown heading, and its standard deviations (3,).
 
         Upwards it is known; the horizontal part lies in any direction.

@@ -7,8 +7,6 @@ import jax.numpy as jnp
 from jaximu.model.effects.base import Inner, Scalar
 from jaximu.model.effects.magnetic_field import FieldEffect
 
-__all__ = ["EFFECTS", "SetupFieldDisturbance"]
-
 
 class SetupFieldDisturbance(FieldEffect):
     """From the onset on, for the duration, the field of the place changes by c, in the level frame.

@@ -3,8 +3,6 @@
 from jaximu.ground.rotation import apply_matrix
 from jaximu.model.effects.base import Effect
 
-__all__ = ["EFFECTS", "GyroGSensitivity", "GyroGSquaredSensitivity"]
-
 
 class GyroGSensitivity(Effect):
     """G f: a gyroscope bias in proportion to specific force. Coefficients: G (3, 3), row by row."""

@@ -4,8 +4,6 @@ import jax.numpy as jnp
 
 from jaximu.model.effects.base import Effect
 
-__all__ = ["EFFECTS", "GyroLag", "MagLag"]
-
 
 class GyroLag(Effect):
     """−τ_i ω̇_i: each axis's output is late by τ_i, to first order in the delay; a positive τ is a delay.
@@ -52,8 +50,8 @@ class MagLag(Effect):
     refers_to = "input"
 
     def term(self, stimulus):
-        rate = stimulus.need("angular_rate", self.name)
-        return self.coefficients * jnp.cross(rate, stimulus.need("magnetic_field", self.name))
+        field, rate = self.needed(stimulus)
+        return self.coefficients * jnp.cross(rate, field)
 
 
 EFFECTS = (GyroLag, MagLag)

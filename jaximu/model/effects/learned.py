@@ -15,28 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import Number, Numbers
 from jaximu.model.effects.base import Effect, Inner, Scalar, pair
-
-__all__ = [
-    "EFFECTS",
-    "SHAPES",
-    "AccelLearnedForce",
-    "AccelLearnedForceX",
-    "AccelLearnedForceY",
-    "AccelLearnedForceZ",
-    "AccelLearnedTemperature",
-    "AccelLearnedTemperatureRate",
-    "AccelLearnedTime",
-    "GyroLearnedForce",
-    "GyroLearnedForceX",
-    "GyroLearnedForceY",
-    "GyroLearnedForceZ",
-    "GyroLearnedRate",
-    "GyroLearnedTemperature",
-    "GyroLearnedTemperatureRate",
-    "GyroLearnedTime",
-    "Learned",
-]
 
 ZERO_CELSIUS = 273.15
 SPLINES = 10
@@ -47,7 +27,7 @@ SHAPES *= np.where(SHAPES[-1] < 0, -1.0, 1.0)  # an eigenvector's sign is anybod
 SHAPES[:, 0], SHAPES[:, 1] = 1.0, (2 * np.arange(SPLINES) - SPLINES + 1) / (SPLINES - 3)
 
 
-def splines(share: Float[Array, " ..."]) -> Float[Array, "... 10"]:
+def splines(share: Numbers) -> Float[Array, "... 10"]:
     """Return the values of the uniform cubic B-splines at shares (...) of the range, from 0 to 1; they add up to one.
 
     b(s) = ((2 − |s|)₊³ − 4 (1 − |s|)₊³) / 6, s counted in knots from the middle of each spline.
@@ -77,11 +57,11 @@ class Learned(Effect):
         cls.__doc__ = Learned.__doc__
         super().__init_subclass__(**kwargs)
 
-    def covariate(self, stimulus) -> Float[Array, "..."]:
+    def covariate(self, stimulus) -> Numbers:
         """Return what the curve depends on: (..., 1) for all axes alike, or (..., 3), each axis its own."""
         raise NotImplementedError
 
-    def interval(self) -> tuple[Float[Array, ""] | float, Float[Array, ""] | float]:
+    def interval(self) -> tuple[Number | float, Number | float]:
         """Return the range that the curve was learned in, in the covariate's unit."""
         raise NotImplementedError
 
@@ -95,7 +75,7 @@ class Learned(Effect):
         """Return the sum of squared second differences of each shape (k,); a straight line is taken like the next."""
         return np.maximum(ROUGHNESS, ROUGHNESS[2])[cls.first :]
 
-    def shapes(self, value: Float[Array, " ..."]) -> Float[Array, "... k"]:
+    def shapes(self, value: Numbers) -> Float[Array, "... k"]:
         """Return the curves (..., k) that an axis's coefficients multiply, at values (...) of the covariate."""
         # the range is where the data was, and not for a fit to move
         low, high = jax.lax.stop_gradient(self.interval())

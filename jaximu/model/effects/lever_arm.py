@@ -4,8 +4,6 @@ import jax.numpy as jnp
 
 from jaximu.model.effects.base import Effect
 
-__all__ = ["EFFECTS", "LEVER_RECOVERY", "AccelLeverArm", "lever_acceleration"]
-
 LEVER_RECOVERY = (
     "exactly where ω̇ is known; else ω̇ is taken by central differences of the samples, which lose (2πfΔt)²/6 of its "
     "part at frequency f: 1 % at a twenty-fifth of the sample rate, 7 % at a tenth"
@@ -34,8 +32,7 @@ class AccelLeverArm(Effect):
     recovery = LEVER_RECOVERY
 
     def term(self, stimulus):
-        rate = stimulus.need("angular_rate", self.name)
-        return lever_acceleration(self.coefficients, rate, stimulus.need("angular_acceleration", self.name))
+        return lever_acceleration(self.coefficients, *self.needed(stimulus))
 
 
 EFFECTS = (AccelLeverArm,)

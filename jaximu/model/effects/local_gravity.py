@@ -7,8 +7,6 @@ import jax.numpy as jnp
 from jaximu.ground.rotation import conjugate, rotate
 from jaximu.model.effects.base import SetupEffect
 
-__all__ = ["EFFECTS", "SetupGravity"]
-
 
 class SetupGravity(SetupEffect):
     """Local gravity is greater by c than was said; at rest the specific force is, too.

@@ -5,8 +5,6 @@ from dataclasses import replace
 from jaximu.ground.rotation import conjugate, rotate
 from jaximu.model.effects.base import SetupEffect
 
-__all__ = ["EFFECTS", "FieldEffect", "SetupMagneticField"]
-
 
 class FieldEffect(SetupEffect):
     """The field is another than the set-up says."""

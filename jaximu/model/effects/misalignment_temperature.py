@@ -6,8 +6,6 @@ import jax.numpy as jnp
 
 from jaximu.model.effects.base import InputEffect, pair
 
-__all__ = ["EFFECTS", "AccelMisalignmentTemperature", "GyroMisalignmentTemperature"]
-
 
 class _MisalignmentTemperature(InputEffect):
     """Off-diagonal gains that change in proportion to temperature.

@@ -9,17 +9,16 @@ import numpy as np
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.rotation import Numbers, Vector
 from jaximu.model.effects.base import Effect, Inner, Scalar, pair
 from jaximu.model.effects.learned import ZERO_CELSIUS
-
-__all__ = ["EFFECTS", "UNITS", "WEIGHTS", "AccelLearnedNetwork", "GyroLearnedNetwork", "network"]
 
 UNITS = 4
 WEIGHTS = 4 * UNITS
 """Numbers of an axis: each unit's share of the output, its weights of T and of Ṫ, and its constant."""
 
 
-def network(weights: Float[Array, "... 16"], x: Float[Array, " ..."], r: Float[Array, " ..."]) -> Float[Array, " ..."]:
+def network(weights: Float[Array, "... 16"], x: Numbers, r: Numbers) -> Numbers:
     """Return the outputs of networks with one hidden layer of tanh units, without a constant, at inputs x and r."""
     out, of_x, of_r, constant = jnp.split(weights, 4, axis=-1)
     return jnp.sum(out * jnp.tanh(of_x * x[..., None] + of_r * r[..., None] + constant), axis=-1)
@@ -55,7 +54,7 @@ class _LearnedNetwork(Effect):
         }
     )
 
-    def value(self, temperature: Scalar, rate: Scalar) -> Float[Array, "... 3"]:
+    def value(self, temperature: Scalar, rate: Scalar) -> Vector:
         """Return the networks' outputs (..., 3) at absolute temperatures, K, and rates, K/s."""
         # the range is where the data was, and not for a fit to move
         low, high, largest = jax.lax.stop_gradient((self.low, self.high, self.reach))
@@ -69,9 +68,10 @@ class _LearnedNetwork(Effect):
         return replace(sizes, coefficients=np.where(of_output, sizes.coefficients, 1.0))
 
     def term(self, stimulus):
-        rate = stimulus.need("temperature_rate", self.name)
-        temperature = stimulus.need("temperature", self.name) + ZERO_CELSIUS
-        return self.value(temperature, rate) - self.value(stimulus.temperature_reference + ZERO_CELSIUS, 0.0)
+        temperature, rate = self.needed(stimulus)
+        return self.value(temperature + ZERO_CELSIUS, rate) - self.value(
+            stimulus.temperature_reference + ZERO_CELSIUS, 0.0
+        )
 
 
 EFFECTS = AccelLearnedNetwork, GyroLearnedNetwork = pair(

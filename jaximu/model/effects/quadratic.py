@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.base import InputEffect, pair
 
-__all__ = ["EFFECTS", "AccelQuadratic", "GyroQuadratic"]
-
 
 class _Quadratic(InputEffect):
     """c_i times the square of each axis's input: the gain grows with the input on one side, shrinks on the other."""

@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.time_offset import ShiftedTime
 
-__all__ = ["EFFECTS", "SetupReferenceDelay"]
-
 
 class SetupReferenceDelay(ShiftedTime):
     """What the reference says at t happened at t − δ, so at t the sensor is where the reference will be at t + δ.

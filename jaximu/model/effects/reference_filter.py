@@ -7,9 +7,6 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import conjugate, exponential, multiply, rotate
 from jaximu.model.effects.base import SetupEffect
 
-__all__ = ["EFFECTS", "SetupReferenceFilter", "behind"]
-
-
 _SHARP = 1e-5
 """s²; a variance around zero counts as of a lag of 3 ms in the third order, so that there is a derivative at zero."""
 
@@ -45,7 +42,7 @@ class SetupReferenceFilter(SetupEffect):
     cause = False
 
     def act(self, stimulus, quantity):
-        rate, acceleration, time = (stimulus.need(field, self.name) for field in self.needs)
+        rate, acceleration, time = self.needed(stimulus)
         if time.ndim == 0 or time.shape[-1] < 2:
             raise InputError(f"the effect {self.name} needs a path in time, not one instant.")
         vector = behind(self.coefficients[0], acceleration, slopes(acceleration, time))

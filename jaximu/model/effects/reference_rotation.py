@@ -3,8 +3,6 @@
 from jaximu.ground.rotation import conjugate, exponential, multiply, rotate
 from jaximu.model.effects.base import SetupEffect
 
-__all__ = ["EFFECTS", "SetupReferenceRotation"]
-
 
 class SetupReferenceRotation(SetupEffect):
     """The unit's axes are the reference's body axes turned by the rotation vector α, the same at all times.
@@ -24,8 +22,7 @@ class SetupReferenceRotation(SetupEffect):
     cause = False
 
     def act(self, stimulus, quantity):
-        for name in self.needs:
-            stimulus.need(name, self.name)
+        self.needed(stimulus)
         turn = exponential(self.coefficients)
         stimulus = stimulus.changed(lambda attitude: multiply(attitude, turn), "attitude")
         return stimulus.changed(

@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.base import ScaleEffect, pair
 
-__all__ = ["EFFECTS", "AccelScaleRamp", "GyroScaleRamp"]
-
 
 class _ScaleRamp(ScaleEffect):
     """A scale factor that changes in proportion to time, counted from the reference time (warming up, ageing)."""

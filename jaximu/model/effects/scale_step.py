@@ -5,8 +5,6 @@ from types import MappingProxyType
 from jaximu.model.effects.base import ScaleEffect, pair
 from jaximu.model.effects.step import OnsetEffect
 
-__all__ = ["EFFECTS", "AccelScaleStep", "GyroScaleStep"]
-
 
 class _ScaleStep(OnsetEffect, ScaleEffect):
     """A scale factor that changes by c at the onset and stays (another range or filter, a supply that switched).

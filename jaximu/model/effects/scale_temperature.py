@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.base import ScaleEffect, pair
 
-__all__ = ["EFFECTS", "AccelScaleTemperature", "GyroScaleTemperature"]
-
 
 class _ScaleTemperature(ScaleEffect):
     """A scale factor that changes in proportion to temperature, counted from the reference temperature."""

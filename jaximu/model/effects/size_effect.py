@@ -5,8 +5,6 @@ import jax.numpy as jnp
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.lever_arm import LEVER_RECOVERY, lever_acceleration
 
-__all__ = ["EFFECTS", "AccelSizeEffect"]
-
 
 class AccelSizeEffect(Effect):
     """Each axis senses the force at its own place r_i, given from the point that `specific_force` belongs to.
@@ -33,9 +31,8 @@ class AccelSizeEffect(Effect):
 
     def term(self, stimulus):
         arms = self.coefficients.reshape(3, 3)
-        rate = stimulus.need("angular_rate", self.name)
-        acceleration = stimulus.need("angular_acceleration", self.name)
-        return jnp.stack([lever_acceleration(arms[i], rate, acceleration)[..., i] for i in range(3)], axis=-1)
+        motion = self.needed(stimulus)
+        return jnp.stack([lever_acceleration(arms[i], *motion)[..., i] for i in range(3)], axis=-1)
 
 
 EFFECTS = (AccelSizeEffect,)

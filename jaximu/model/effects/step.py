@@ -6,8 +6,6 @@ import jax.numpy as jnp
 
 from jaximu.model.effects.base import BiasEffect, Inner, Scalar, pair
 
-__all__ = ["EFFECTS", "AccelStep", "GyroStep", "MagHardIronStep", "OnsetEffect"]
-
 
 class OnsetEffect(BiasEffect):
     """An error that begins at one instant and stays.

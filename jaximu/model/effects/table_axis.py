@@ -4,8 +4,6 @@ import jax.numpy as jnp
 
 from jaximu.model.effects.base import SetupEffect
 
-__all__ = ["EFFECTS", "SetupTableAxis"]
-
 
 class SetupTableAxis(SetupEffect):
     """The table's axes are turned by ε against the fixture's frame, to first order: ω = ω_said + ε × ω_said.

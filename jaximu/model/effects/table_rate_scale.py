@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.base import SetupEffect
 
-__all__ = ["EFFECTS", "SetupTableRateScale"]
-
 
 class SetupTableRateScale(SetupEffect):
     """True rates are (1 + c) times what the table says.

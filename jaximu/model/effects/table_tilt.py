@@ -7,8 +7,6 @@ import jax.numpy as jnp
 from jaximu.ground.rotation import conjugate, exponential, multiply, rotate
 from jaximu.model.effects.base import SetupEffect
 
-__all__ = ["EFFECTS", "SetupTableTilt"]
-
 
 class SetupTableTilt(SetupEffect):
     """The table is turned by (α_x, α_y) against the level frame, so its poses' "up" is not gravity's.
@@ -29,10 +27,9 @@ class SetupTableTilt(SetupEffect):
     known = 0.05
 
     def act(self, stimulus, quantity):
-        attitude = stimulus.need("attitude", self.name)
+        force, attitude = self.needed(stimulus)
         tilted = multiply(exponential(jnp.append(self.coefficients, 0.0)), attitude)
-        force = rotate(conjugate(tilted), rotate(attitude, stimulus.need("specific_force", self.name)))
-        return replace(stimulus, specific_force=force, attitude=tilted)
+        return replace(stimulus, specific_force=rotate(conjugate(tilted), rotate(attitude, force)), attitude=tilted)
 
 
 EFFECTS = (SetupTableTilt,)

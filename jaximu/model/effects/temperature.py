@@ -2,17 +2,6 @@
 
 from jaximu.model.effects.base import BiasEffect, on_triad, pair
 
-__all__ = [
-    "EFFECTS",
-    "AccelTemperature",
-    "AccelTemperatureCubed",
-    "AccelTemperatureSquared",
-    "GyroTemperature",
-    "GyroTemperatureCubed",
-    "GyroTemperatureSquared",
-    "MagTemperature",
-]
-
 
 class _Temperature(BiasEffect):
     """A bias in proportion to temperature, counted from the reference temperature."""

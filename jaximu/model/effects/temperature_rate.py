@@ -2,16 +2,6 @@
 
 from jaximu.model.effects.base import BiasEffect, pair
 
-__all__ = [
-    "EFFECTS",
-    "AccelTemperatureRate",
-    "AccelTemperatureRateSquared",
-    "AccelTemperatureTimesRate",
-    "GyroTemperatureRate",
-    "GyroTemperatureRateSquared",
-    "GyroTemperatureTimesRate",
-]
-
 
 class _TemperatureRate(BiasEffect):
     """A bias in proportion to how quickly the temperature changes."""
@@ -22,9 +12,6 @@ class _TemperatureRate(BiasEffect):
     needs = ("temperature_rate",)
     excited_by = "ramps of several rates, up and down"
     source = "IEEE Std 952-2020, bias temperature-ramp sensitivity"
-
-    def factor(self, stimulus):
-        return stimulus.need("temperature_rate", self.name)
 
 
 class _TemperatureRateSquared(_TemperatureRate):
@@ -50,7 +37,7 @@ class _TemperatureTimesRate(_TemperatureRate):
     source = "IEEE Std 952-2020, bias temperature-ramp sensitivity, its change over temperature"
 
     def factor(self, stimulus):
-        return stimulus.warmth(self.name) * super().factor(stimulus)
+        return stimulus.warmth(self.name) * stimulus.need("temperature_rate", self.name)
 
 
 AccelTemperatureRate, GyroTemperatureRate = pair(

@@ -7,8 +7,6 @@ import jax.numpy as jnp
 from jaximu.ground.prefixes import running
 from jaximu.model.effects.base import BiasEffect, Inner, Scalar, pair
 
-__all__ = ["EFFECTS", "AccelThermalHysteresis", "GyroThermalHysteresis"]
-
 
 class _ThermalHysteresis(BiasEffect):
     """A bias in proportion to a play of half-width w on T − T_ref: it moves only once the temperature has pushed it.

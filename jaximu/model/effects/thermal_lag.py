@@ -7,8 +7,6 @@ import jax.numpy as jnp
 from jaximu.ground.prefixes import running
 from jaximu.model.effects.base import BiasEffect, Inner, Scalar, pair
 
-__all__ = ["EFFECTS", "AccelThermalLag", "AccelThermalLagSquared", "GyroThermalLag", "GyroThermalLagSquared"]
-
 
 class _ThermalLag(BiasEffect):
     """A bias in proportion to T_lag, which follows T − T_ref with a time constant: τ dT_lag/dt = (T − T_ref) − T_lag.

@@ -3,8 +3,6 @@
 from jaximu.model.effects.base import SetupEffect
 from jaximu.model.shifted_time import at_times
 
-__all__ = ["EFFECTS", "SetupTimeOffset", "ShiftedTime"]
-
 
 class ShiftedTime(SetupEffect):
     """Samples that were taken at other times than the set-up's clock says."""

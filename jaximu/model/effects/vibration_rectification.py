@@ -2,8 +2,6 @@
 
 from jaximu.model.effects.base import BiasEffect, pair
 
-__all__ = ["EFFECTS", "AccelVibrationRectification", "GyroVibrationRectification"]
-
 
 class _VibrationRectification(BiasEffect):
     """A bias in proportion to the mean square of the vibration's acceleration, all directions together.
@@ -16,9 +14,6 @@ class _VibrationRectification(BiasEffect):
     needs = ("vibration_power",)
     excited_by = "vibration of several strengths"
     source = "IEEE Std 1293-2018, vibration rectification error"
-
-    def factor(self, stimulus):
-        return stimulus.need("vibration_power", self.name)
 
 
 EFFECTS = AccelVibrationRectification, GyroVibrationRectification = pair(

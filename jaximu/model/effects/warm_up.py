@@ -6,8 +6,6 @@ import jax.numpy as jnp
 
 from jaximu.model.effects.base import BiasEffect, Inner, Scalar, pair
 
-__all__ = ["EFFECTS", "AccelWarmUp", "GyroWarmUp"]
-
 
 class _WarmUp(BiasEffect):
     """A bias that dies away with a time constant, from c at the reference time, which is power-on."""
