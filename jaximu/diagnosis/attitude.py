@@ -13,8 +13,6 @@ from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording
 
-__all__ = ["diagnose_against_attitude"]
-
 
 def diagnose_against_attitude(
     recording: Recording,

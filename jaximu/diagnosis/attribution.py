@@ -40,18 +40,6 @@ from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.recording import Recording, recordings_of
 
-__all__ = [
-    "COMMON_DRIFT",
-    "Attributed",
-    "Attribution",
-    "BoardRecording",
-    "CommonDrift",
-    "Part",
-    "attribute",
-    "places_of",
-    "split",
-]
-
 COMMON_DRIFT = "session.common_drift"
 
 _WIDE = 8.0

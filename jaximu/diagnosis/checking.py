@@ -42,8 +42,6 @@ from jaximu.recordings.observations import POWER_ON
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import SegmentationOptions, observed_poses, segment
 
-__all__ = ["check"]
-
 _OTHER_UNIT = 0.05
 """Difference of gains, in scales, that no unit's calibration makes: it is another unit, or its axes or units are."""
 _FAR_OFF = (0.05 * STANDARD_GRAVITY, 0.2)

@@ -14,8 +14,6 @@ from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, holm, kolmogorov_sf
 
-__all__ = ["Check", "checks_of"]
-
 _KINDS = {
     "gravity_norm": ("gravity norm at rest", "the magnitude of the specific force in the poses"),
     "gravity_direction": ("gravity direction over turns", "the direction of gravity carried over the turns"),

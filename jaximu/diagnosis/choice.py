@@ -19,8 +19,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import normal_sf
 from jaximu.ground.quantities import Z95
 
-__all__ = ["open_choice", "with_open_choice"]
-
 _NEGLIGIBLE = 1e-4
 """Weight, relative to the likeliest model's, below which a model is left out."""
 

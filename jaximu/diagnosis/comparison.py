@@ -23,8 +23,6 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 
-__all__ = ["Explanation", "FollowedUnit", "Fresh", "Old", "Question", "Widened", "candidates", "scatter_about_a_fit"]
-
 _COMPARABLE = 0.1
 """Uncertainty, in typical sizes (10 % of a scale, 1 m/s²), beyond which a recording tells nothing of a parameter."""
 _FREE = 100.0

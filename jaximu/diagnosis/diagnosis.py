@@ -46,19 +46,6 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import SegmentationOptions
 
-__all__ = [
-    "Diagnosis",
-    "Examination",
-    "Named",
-    "diagnose",
-    "diagnose_data",
-    "examine",
-    "recorded_by_hand",
-    "same_device",
-    "twin_of",
-    "without_effects",
-]
-
 SCHEMA = "jaximu.diagnosis/1"
 _OTHER_UNIT = 0.005
 """Difference of gains, in scales, from which two recordings are hardly of one unit."""

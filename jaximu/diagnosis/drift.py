@@ -29,8 +29,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 
-__all__ = ["DRAWS", "DriftComponents", "drifted", "estimate_drift", "hands_of"]
-
 _USUAL = {**USUAL_DRIFT, "poses that move": (1.0, 0.5), "turns undersampled": (0.1, 1.0)}
 """Median of each kind's standard deviation and the spread of its logarithm. What hands do is relative to what the
 samples show, which for poses is all, and for turns holds at half the sample rate."""

@@ -22,8 +22,6 @@ from jaximu.estimation.leave_out import off
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
 
-__all__ = ["BLIND", "EffectBlock", "Evidence", "Scores", "detection_limit", "limit_noncentrality", "strength"]
-
 BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
 _LARGE = 20.0

@@ -30,8 +30,6 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
-__all__ = ["LEAST_WARMING", "Experiment", "State"]
-
 LEAST_WARMING = 0.2
 """K of change below which a recording shows nothing of temperature."""
 _PLAUSIBLE = 20.0

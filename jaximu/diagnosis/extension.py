@@ -17,8 +17,6 @@ from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.recordings.finding import Finding
 
-__all__ = ["Extension", "Found", "extend", "settled"]
-
 _DECISIVE = 5.0
 """Log-likelihood of another recording by which one of several causes must fall behind to be dropped: 150 to 1."""
 _MOST = 3

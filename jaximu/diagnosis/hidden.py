@@ -10,8 +10,6 @@ from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import State
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["Hidden", "hidden_causes", "shift_by"]
-
 _NOTHING = 0.05
 """Standard deviations below which a shift is not listed."""
 

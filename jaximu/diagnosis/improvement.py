@@ -22,8 +22,6 @@ from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import POWER_ON
 
-__all__ = ["Gain", "Prediction", "cross_validated", "on_held_out"]
-
 _FOLDS = 5
 _SIMILAR = 10.0
 """Difference of χ² up to which another inner parameter counts in a prediction: beyond, its weight is below 0.7 %."""

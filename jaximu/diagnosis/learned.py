@@ -26,8 +26,6 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import Learned as Curve
 
-__all__ = ["LearnedTerm", "curves", "learn", "left_out", "left_out_likelihood"]
-
 _STRENGTHS = 10.0 ** np.arange(7)
 """Prior variances tried, of what the data tells best, in variances that the data tells it with."""
 _PAYS = 10.0

@@ -17,8 +17,6 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Signal
 from jaximu.recordings.segmentation import Segmentation
 
-__all__ = ["MOVING_LINE", "MovingLine", "coincident", "line_findings", "moving_lines", "spectrum_at_rest", "swings_of"]
-
 MOVING_LINE = "data.moving_line"
 _NAMED = 3
 """Lines of an axis that are described; the others are counted."""

@@ -27,8 +27,6 @@ from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent
 
-__all__ = ["MagneticCause", "MagneticDiagnosis", "MagneticShift", "check_magnetometer", "diagnose_magnetometer"]
-
 _ONSETS = 40
 """Onsets at which a step is sought."""
 _FOLDS = 5

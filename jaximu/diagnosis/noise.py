@@ -27,8 +27,6 @@ from jaximu.ground.quantities import number, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
 
-__all__ = ["NOISE_NAMES", "NoiseFinding", "own_noise", "quick_noise", "slow_noise", "usual_noise"]
-
 NOISE_NAMES = ("noise.white", "noise.correlated", "noise.bias_instability", "noise.rate_random_walk")
 _SHARE = 0.1
 """Share of the level of all tests together that the noise model's tests may use."""

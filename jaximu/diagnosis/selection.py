@@ -9,19 +9,6 @@ import numpy as np
 
 from jaximu.diagnosis.evidence import FAMILY_LEVEL, EffectBlock, Evidence, Scores
 
-__all__ = [
-    "BESIDE",
-    "LEVEL",
-    "SelectedCause",
-    "Selection",
-    "causes_of",
-    "criterion",
-    "one_curve",
-    "select",
-    "shape_of",
-    "strength_needed",
-]
-
 LEVEL = FAMILY_LEVEL
 """Rate of false alarms over all tests together."""
 _TIE = 7.0

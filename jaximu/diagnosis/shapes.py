@@ -8,8 +8,6 @@ from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.estimation.data import Observed
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["harmonics", "imitated_shapes", "shapes_without_cause"]
-
 _SIZES = {"accelerometer": 0.01, "gyroscope": 1e-3}
 """Size of a shape, m/s² and rad/s."""
 _CYCLES = 2.0, 20.0

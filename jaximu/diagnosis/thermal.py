@@ -25,8 +25,6 @@ from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, recordings_of
 
-__all__ = ["diagnose_thermal"]
-
 _BLOCKS = 120
 _NAMED = 3  # effects that can be named one by one
 _CYCLE = (

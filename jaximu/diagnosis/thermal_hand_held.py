@@ -32,8 +32,6 @@ from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording, recordings_of
 from jaximu.recordings.segmentation import segment
 
-__all__ = ["HandHeldThermal", "calibrate_thermal_by_hand", "turned_by_hand"]
-
 SCHEMA = "jaximu.thermal/1"
 _PLAIN = ("temperature", "temperature_squared", "temperature_cubed", "scale_temperature", "misalignment_temperature")
 ASKED = tuple(f"{prefix}.{name}" for prefix in ("accel", "gyro") for name in _PLAIN)

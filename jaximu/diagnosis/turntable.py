@@ -16,8 +16,6 @@ from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.reference import Entry, entries_of_columns
 
-__all__ = ["diagnose_turntable"]
-
 
 def diagnose_turntable(
     recording: Recording,

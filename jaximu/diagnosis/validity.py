@@ -18,8 +18,6 @@ from jaximu.ground.page import Result
 from jaximu.ground.quantities import probability, size, with_interval
 from jaximu.mistakes.titles import effect_title
 
-__all__ = ["Cause", "OutputError", "Shift", "Validity"]
-
 SCHEMA = "jaximu.check/1"
 _TOGETHER = {
     "accelerometer.bias": "the accelerometer's biases",

@@ -22,21 +22,6 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import inverse_matrix
 from jaximu.ground.tracing import array_module
 
-__all__ = [
-    "BlockFactor",
-    "Chain",
-    "ChainWeights",
-    "Covariance",
-    "Weights",
-    "following",
-    "in_order",
-    "inverse_cholesky",
-    "mean_root",
-    "parts_of",
-    "scored",
-    "update_excess",
-]
-
 _SMALL = 6
 """Size of a matrix up to which it is factorised by plain operations."""
 

@@ -34,18 +34,6 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
-__all__ = [
-    "About",
-    "Conditions",
-    "Data",
-    "Handling",
-    "Observed",
-    "OfOneUnit",
-    "OutputMeans",
-    "derivatives_by_numbers",
-    "free_columns",
-]
-
 _GRID = 16
 """Inner parameters of an effect are asked for in multiples of so many."""
 

@@ -37,17 +37,6 @@ from jaximu.ground.tracing import array_module, first, is_traced, lifted
 from jaximu.model.effects.base import inner_owners
 from jaximu.model.sensor import Imu
 
-__all__ = [
-    "Fit",
-    "Linear",
-    "Prior",
-    "effect_numbers",
-    "fit",
-    "informed",
-    "linearise",
-    "unwhitened",
-]
-
 _CHUNK = 16
 """Units of a batch that a compiled pass takes: as many as make calling it cheap, and no more are fitted in vain."""
 _SPARE = (12, 36, 84)

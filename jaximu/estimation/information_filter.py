@@ -22,8 +22,6 @@ from scipy.linalg import solve_triangular
 
 from jaximu.ground.array_types import Array
 
-__all__ = ["Eliminated", "Knowledge", "WhiteRows", "advance", "estimate", "run", "smooth", "smoothed_variances"]
-
 
 class WhiteRows(NamedTuple):
     """White conditions of a step: before · x + after · x_next + shared · p − right has variance one; leading axes."""

@@ -16,18 +16,6 @@ from jaxtyping import Array, ArrayLike, Float
 from jaximu.ground.rotation import conjugate, rotate, running_rotations
 from jaximu.model.conventions import first_order_inverse
 
-__all__ = [
-    "GRAVITY_DIRECTION_NAMES",
-    "GRAVITY_NORM_NAMES",
-    "JacobianCheck",
-    "check_jacobian",
-    "first_order_inverse_error",
-    "gravity_direction_hand",
-    "gravity_norm_hand",
-    "hand_jacobian_gravity_direction",
-    "hand_jacobian_gravity_norm",
-]
-
 GRAVITY_NORM_NAMES = ("M_yx", "M_zx", "M_zy", "S'_x", "S'_y", "S'_z", "b_x", "b_y", "b_z")
 GRAVITY_DIRECTION_NAMES = (*(f"C_{row}{column}" for row in "xyz" for column in "xyz"), "b_x", "b_y", "b_z")
 

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["LeftOut", "leave_out", "off", "orthonormal"]
-
 _RANK = 1e-9
 """Share of the largest singular value below which a combination of columns is none."""
 _BLIND = 1e-7

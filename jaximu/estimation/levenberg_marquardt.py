@@ -3,8 +3,6 @@
 import equinox as eqx
 import optimistix as optx
 
-__all__ = ["LevenbergMarquardt"]
-
 
 class LevenbergMarquardt(optx.LevenbergMarquardt):
     """optimistix's Levenberg–Marquardt that also stops when the step it proposes is below tolerance.

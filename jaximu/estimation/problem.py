@@ -16,23 +16,6 @@ from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Board, Imu, Triad
 
-__all__ = [
-    "LOSSES",
-    "TOLERANCE",
-    "Loss",
-    "Name",
-    "Parameters",
-    "Problem",
-    "axis_scales",
-    "flatten",
-    "names_of",
-    "typical_sizes",
-    "unflatten",
-    "without_equipment",
-    "without_equipment_or_effects",
-]
-
-
 TOLERANCE = 5.0
 """How far, in typical sizes, a parameter may lie from the data sheet (one sigma). A scale may be off by half:
 recordings labelled with another range are common, and a tighter tolerance would hold such a fit half way."""

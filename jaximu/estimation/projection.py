@@ -23,8 +23,6 @@ from jaximu.ground.rotation import Vector
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["OutputUncertainty", "output_error", "output_uncertainty", "sensitivity"]
-
 
 @dataclass(frozen=True)
 class OutputUncertainty:

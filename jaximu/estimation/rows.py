@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["TEMPERATURE", "TIME", "ResidualKind", "Rows", "by_axis"]
-
 TIME, TEMPERATURE = "time [s]", "temperature [°C]"
 """The covariate that all conditions have, and the one that those with a thermometer have."""
 

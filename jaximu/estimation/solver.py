@@ -13,8 +13,6 @@ from jaximu.ground.array_types import Array, Computed
 from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.precision import require_float64
 
-__all__ = ["MAX_STEPS", "Failure", "Solution", "solve"]
-
 
 class Failure(enum.Enum):
     """How a solve can end other than well; the value tells the user what to do."""

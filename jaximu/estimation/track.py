@@ -24,8 +24,6 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, smoothed_slope
 
-__all__ = ["TEMPERATURE_WINDOW", "TRIADS", "Recorded", "Track", "added", "mean_outputs", "stimuli"]
-
 TRIADS = ("accelerometer", "gyroscope")
 TEMPERATURE_WINDOW = 20.0
 """Seconds of recorded temperature, whose steps are coarse, that a rate of temperature is taken over."""

@@ -13,19 +13,6 @@ from jaximu.ground.quantities import listed, number, size
 from jaximu.ground.units import SENSOR_UNITS, STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 
-__all__ = [
-    "WeakDirection",
-    "allowing_for_neighbours",
-    "describe",
-    "gains_open",
-    "label",
-    "pose_advice",
-    "spoken_amount",
-    "station_advice",
-    "weak_directions",
-]
-
-
 # Standard deviations along a direction, in typical sizes (10 % of a scale, 1 m/s², 0.1 rad/s).
 UNDETERMINED = 1.0  # the data say no more than the data sheet
 WEAK = 0.05
