@@ -11,7 +11,7 @@ __all__ = ["ArrayCommand"]
 
 
 @dataclass(frozen=True)
-class ArrayCommand:
+class ArrayCommand(options.Fits):
     """Calibrate several units on one rigid body: rotation, position and clock of each, and which one disturbs.
 
     One LOG per unit, recorded together: poses at rest with turns between them, and some quick turns for the positions.
@@ -26,12 +26,8 @@ class ArrayCommand:
     """
 
     logs: options.Logs
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     loss: options.LossChoice = "linear"
     repair: options.RepairFlag = False
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

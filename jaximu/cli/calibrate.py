@@ -20,7 +20,7 @@ __all__ = ["CalibrateCommand"]
 
 
 @dataclass(frozen=True)
-class CalibrateCommand:
+class CalibrateCommand(options.Fits):
     """Calibrate a unit from poses at rest and the turns between them, without equipment.
 
     Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
@@ -33,9 +33,6 @@ class CalibrateCommand:
     """
 
     logs: options.Logs
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     method: Annotated[
         Literal["joint", "two-step", "two-step-rk4", "accelerometer"],
         arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
@@ -48,7 +45,6 @@ class CalibrateCommand:
         False
     )
     traced: options.Traced = options.TRACED
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

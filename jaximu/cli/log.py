@@ -43,7 +43,7 @@ _RECORD = (
 
 
 @dataclass(frozen=True)
-class LogCommand:
+class LogCommand(options.Fits):
     """Run all that LOGs allow, in one report: calibration, diagnosis, noise, temperature and more.
 
     LOGs are files, a phone's folder or its ZIP archive: recordings of one unit. One of them at rest states the noise
@@ -59,10 +59,6 @@ class LogCommand:
 
     logs: options.Logs
     yes: Annotated[bool, arg(help="Ask nothing: take the default for what the logs leave open, and say so.")] = False
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

@@ -25,7 +25,7 @@ _NEAR_THE_EQUATOR = 20.0  # degrees of latitude within which the field may point
 
 
 @dataclass(frozen=True)
-class MagnetometerCommand:
+class MagnetometerCommand(options.Reads):
     """Calibrate a magnetometer while the unit is turned about: scale, hard and soft iron, alignment.
 
     Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
@@ -60,10 +60,7 @@ class MagnetometerCommand:
         UseAppendAction,
         option("NAME[:onset=S]", "Also fit this effect: mag.lag, mag.temperature … May be repeated."),
     ] = ()
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
     traced: options.Traced = options.TRACED
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

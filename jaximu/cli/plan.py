@@ -21,7 +21,7 @@ __all__ = ["PlanCommand"]
 
 
 @dataclass(frozen=True)
-class PlanCommand:
+class PlanCommand(options.Reads):
     """Plan which poses and turns to record next, to reduce the largest uncertainties.
 
     A LOG is calibrated first; of a SPEC, as for `jaximu simulate`, only the data sheet is known. DIR receives
@@ -37,8 +37,6 @@ class PlanCommand:
     """
 
     source: Annotated[Path, Positional, option("CALIBRATION|LOG|SPEC", "What is known about the unit.")]
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
     equipment: Annotated[
         Literal["hands", "table", "dividing-head", "robot"],
         arg(help="What turns the unit. robot: a robot, or anything whose attitude is tracked."),
@@ -66,7 +64,6 @@ class PlanCommand:
     ] = None
     step: Annotated[float | None, option("DEG", "Round angles to multiples of this.")] = None
     seed: Annotated[int, option("N", "Random seed of the search.")] = 0
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

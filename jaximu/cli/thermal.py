@@ -23,7 +23,7 @@ __all__ = ["ThermalCommand"]
 
 
 @dataclass(frozen=True)
-class ThermalCommand:
+class ThermalCommand(options.Fits):
     """Fit bias over temperature from LOGs of a unit at rest while its temperature changes.
 
     LOGs of poses and turns by hand while the temperature changes give bias, scale and misalignment over temperature.
@@ -37,9 +37,6 @@ class ThermalCommand:
     """
 
     logs: options.Logs
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     calibration: Annotated[
         Path | None, option("CALIBRATION", "Add the thermal part to this calibration of the unit.")
     ] = None
@@ -56,7 +53,6 @@ class ThermalCommand:
     ] = None
     accel_id: Annotated[int, option("ID", "PX4's device ID of the accelerometer.")] = 0
     gyro_id: Annotated[int, option("ID", "PX4's device ID of the gyroscope.")] = 0
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""
