@@ -166,8 +166,9 @@ def _number(analysis: NoiseAnalysis) -> tuple[str, str]:
         for term, estimate in [(term, mean.get(term)) for term in "NBK"]:
             if estimate is not None:
                 low, high = (_in_unit(end, quantity, term) for end in (estimate.low, estimate.high))
-                meaning = f"{TERM_NAMES[term]} of the {name} (mean of the axes), 95 % interval {low} … {high}"
-                return _in_unit(estimate.value, quantity, term), meaning
+                return _in_unit(
+                    estimate.value, quantity, term
+                ), f"{TERM_NAMES[term]} of the {name} (mean of the axes), 95 % interval {low} … {high}"
     return "", ""
 
 
@@ -445,8 +446,9 @@ def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
             "recording resolves four times as long averages."
         )
         triads.setdefault(text, []).append(name)
-    statements = [Statement(sentence(listed(names)), text) for text, names in triads.items()]
-    yield Section("What the length cannot resolve", statements)
+    yield Section(
+        "What the length cannot resolve", [Statement(sentence(listed(names)), text) for text, names in triads.items()]
+    )
     parts: list[Part] = [
         "One recording does not show how the bias changes from power-on to power-on, and the Allan deviation cannot "
         "see it. Give several recordings of the unit, lying alike: `jaximu allan LOG1 LOG2 LOG3 …`"
@@ -456,8 +458,10 @@ def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
             f"Standard deviation of the bias over {len(analysis.files)} recordings, with its 95 % interval. No Allan "
             "deviation sees it, and a filter needs it as the bias's standard deviation at the start."
         )
-        rows = [row.row(row.meaning) for row in _repeatability_rows(analysis)]
-        parts = [text, Table(("sensor", "unit", *_AXES[:3]), rows)]
+        parts = [
+            text,
+            Table(("sensor", "unit", *_AXES[:3]), [row.row(row.meaning) for row in _repeatability_rows(analysis)]),
+        ]
     yield Section("Repeatability", parts)
 
 
@@ -483,18 +487,26 @@ def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Par
     )
     yield Section("For Kalibr", ["The same, as `imu.yaml`:", Code(kalibr_text(analysis))])
     files = [(source.path, str(source.rows or ""), source.sha256) for source in sources]
-    facts = [
-        ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
-        (
-            "Method",
-            "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data supports "
-            "(jaximu.noise.identify); picture: overlapping Allan deviation at octaves",
-        ),
-        ("Software", f"jaximu {__version__}"),
-        ("Report written", written_now()),
-    ]
     tables = [Table(("file", "rows", "SHA-256"), files)] if files else []
-    yield Section("Where it comes from", [*tables, Table((), facts)])
+    yield Section(
+        "Where it comes from",
+        [
+            *tables,
+            Table(
+                (),
+                [
+                    ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
+                    (
+                        "Method",
+                        "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data "
+                        "supports (jaximu.noise.identify); picture: overlapping Allan deviation at octaves",
+                    ),
+                    ("Software", f"jaximu {__version__}"),
+                    ("Report written", written_now()),
+                ],
+            ),
+        ],
+    )
 
 
 def _discrete(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:

@@ -83,21 +83,27 @@ def share_words(calibration: Calibration) -> list[str]:
 
 def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
     """Return the page of a calibration against a measured attitude."""
-    findings = [
-        Statement("The reference", " ".join(mounting_words(calibration))),
-        Statement(
-            "What the misfit is made of",
-            f"{sentence('; '.join(share_words(calibration)))}. The intervals contain all of it.",
-        ),
-    ]
-    picture = Picture(
-        "residuals",
-        partial(_figure, calibration, measurement),
-        "Errors against the reference before and after",
-        "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
-    )
     trust, unknown = gravity_statements(calibration), partial(limits, calibration)
-    return calibration_page(calibration, [picture], trust, unknown, findings=findings)
+    return calibration_page(
+        calibration,
+        [
+            Picture(
+                "residuals",
+                partial(_figure, calibration, measurement),
+                "Errors against the reference before and after",
+                "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
+            )
+        ],
+        trust,
+        unknown,
+        findings=[
+            Statement("The reference", " ".join(mounting_words(calibration))),
+            Statement(
+                "What the misfit is made of",
+                f"{sentence('; '.join(share_words(calibration)))}. The intervals contain all of it.",
+            ),
+        ],
+    )
 
 
 def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:

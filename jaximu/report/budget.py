@@ -65,8 +65,10 @@ def _goals(budget: Budget) -> Iterator[Section]:
 
 
 def _sources(budget: Budget) -> Section:
-    headers = ("source", "size (1σ)", "mean share of the variances", "most of")
-    return Section("Sources, dominant first", [Table(headers, source_rows(budget))])
+    return Section(
+        "Sources, dominant first",
+        [Table(("source", "size (1σ)", "mean share of the variances", "most of"), source_rows(budget))],
+    )
 
 
 def _parameters(budget: Budget) -> Section:
@@ -76,12 +78,18 @@ def _parameters(budget: Budget) -> Section:
         (words, sigma, *([simulated] if drawn else []), made)
         for words, sigma, made, simulated in parameter_rows(budget)
     ]
-    caption = (
-        "Standard deviations; scale and misalignment relative to the scale of their axis. To first order, through the "
-        "whole fit."
+    return Section(
+        "Parameters",
+        [
+            Table(
+                ("parameter", "1σ", *drawn, "made of"),
+                rows,
+                "Standard deviations; scale and misalignment relative to the scale of their axis. To first order, "
+                "through the whole fit.",
+                [index for index, row in enumerate(rows) if not row[-1]],
+            )
+        ],
     )
-    marked = [index for index, row in enumerate(rows) if not row[-1]]
-    return Section("Parameters", [Table(("parameter", "1σ", *drawn, "made of"), rows, caption, marked)])
 
 
 def _limits(budget: Budget) -> Iterator[Section]:
@@ -146,8 +154,9 @@ def _number(budget: Budget) -> tuple[str, str]:
     shown = {goal.worst: goal for goal in budget.goals if budget.determined[budget.names.index(goal.worst)]}
     if shown:
         goal = max(shown.values(), key=lambda goal: _total(budget, goal) / goal.size)
-        meaning = f"standard deviation (1σ) of the {describe(goal.worst, budget.imu)}; its goal is {_wanted(goal)}"
-        return amount(_total(budget, goal), goal.unit), meaning
+        return amount(
+            _total(budget, goal), goal.unit
+        ), f"standard deviation (1σ) of the {describe(goal.worst, budget.imu)}; its goal is {_wanted(goal)}"
     known = budget.determined
     if not budget.sources or not known.any():
         return "not determined", "the scheme determines no parameter"

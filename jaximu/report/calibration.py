@@ -190,9 +190,19 @@ def _parameters(calibration: Calibration) -> Iterator[Part]:
     parts: list[Part] = []
     for name, triad in calibration.triads().items():
         rows = tables.rows(calibration, name, triad)
-        marked = [index for index, row in enumerate(rows) if "*" in row[1]]
         parts.append(
-            Section(sentence(name), [Table(("", "parameter", "± 95 %", "in other words"), rows, "", marked)], 3)
+            Section(
+                sentence(name),
+                [
+                    Table(
+                        ("", "parameter", "± 95 %", "in other words"),
+                        rows,
+                        "",
+                        [index for index, row in enumerate(rows) if "*" in row[1]],
+                    )
+                ],
+                3,
+            )
         )
     others = [one for one in calibration.parameters.values() if "effects" in one.name]
     if others:
@@ -246,8 +256,9 @@ def _correlation(calibration: Calibration) -> Picture:
     )
     if shared:
         caption += " The accelerometer's scales go together as far as they share the uncertainty of gravity."
-    draw = partial(figures.correlation_figure, calibration)
-    return Picture("correlation", draw, "Correlation of the fitted parameters", caption)
+    return Picture(
+        "correlation", partial(figures.correlation_figure, calibration), "Correlation of the fitted parameters", caption
+    )
 
 
 def _origin(calibration: Calibration) -> Iterator[Part]:

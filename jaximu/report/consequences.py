@@ -96,12 +96,20 @@ def _tracks(consequences: Consequences) -> Iterator[Part]:
 def _tables(consequences: Consequences) -> Iterator[Section]:
     """Return the position error by term, and all errors by direction, at the times that are shown."""
     times = _headers(consequences)
-    caption = (
-        "Position: root sum of squares of east, north and up. A term is what it makes by itself; correlated terms of "
-        "the calibration together are in the row “calibration, all together”. To first order along the path."
-    )
     budget = _budget_rows(consequences)
-    yield Section("Position error by term (1σ)", [Table(("", *times), budget, caption, brief=8)])
+    yield Section(
+        "Position error by term (1σ)",
+        [
+            Table(
+                ("", *times),
+                budget,
+                "Position: root sum of squares of east, north and up. A term is what it makes by itself; correlated "
+                "terms of the calibration together are in the row “calibration, all together”. To first order along "
+                "the path.",
+                brief=8,
+            )
+        ],
+    )
     yield Section("All errors, by direction (1σ)", [Table(("", *times), _total_rows(consequences))])
 
 
@@ -112,8 +120,9 @@ def _for_estimators(noise: Mapping[str, EstimatorNoise], files: Mapping[str, byt
         notes = [Items(page.notes)] if page.notes else []
         yield Section(f"Noise for estimators, {origin}", (*page.verdict, *page.first, *notes))
     if files:
-        parts = [Section(name, [Code(text.decode().rstrip())], 3) for name, text in files.items()]
-        yield Section("Files for estimators", parts)
+        yield Section(
+            "Files for estimators", [Section(name, [Code(text.decode().rstrip())], 3) for name, text in files.items()]
+        )
 
 
 # --- words ------------------------------------------------------------------------------------------------------------

@@ -252,8 +252,10 @@ def _mistake(diagnosis: Diagnosis, finding: Finding) -> Statement:
 
 def _effects_table(diagnosis: Diagnosis) -> Table:
     """Return each cause with what it is, what it adds to the output, its coefficients and its evidence."""
-    headers = ("effect", "adds up to", "coefficients ± 95 %", "evidence")
-    return Table(headers, [_effect_row(effect) for effect in diagnosis.effects])
+    return Table(
+        ("effect", "adds up to", "coefficients ± 95 %", "evidence"),
+        [_effect_row(effect) for effect in diagnosis.effects],
+    )
 
 
 def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
@@ -271,14 +273,19 @@ def _lines_part(diagnosis: Diagnosis) -> Iterator[Section]:
     """Return the spectral lines that move, over the spectrum that they were followed in."""
     if not diagnosis.lines:
         return
-    picture = Picture(
-        "lines",
-        partial(_lines_figure, diagnosis),
-        "Frequency over time, at rest",
-        "Dark: power over the noise beside it, in windows at rest. Coloured: the lines that move, as followed; a line "
-        "that reaches zero frequency or half the sample rate (the edges) goes on as its mirror image.",
+    yield Section(
+        "Lines that move",
+        [
+            Picture(
+                "lines",
+                partial(_lines_figure, diagnosis),
+                "Frequency over time, at rest",
+                "Dark: power over the noise beside it, in windows at rest. Coloured: the lines that move, as "
+                "followed; a line that reaches zero frequency or half the sample rate (the edges) goes on as its "
+                "mirror image.",
+            )
+        ],
     )
-    yield Section("Lines that move", [picture])
 
 
 def _lines_figure(diagnosis: Diagnosis) -> Figure:
@@ -305,19 +312,21 @@ def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
     learned = diagnosis.learned
     if learned is None:
         return
-    text = (
-        f"No known effect explains it, but the {learned.triad}'s misfit depends on {learned.covariate}: a smooth curve "
-        f"({learned.effect.name}) follows it, and the extended calibration contains the curve."
+    yield Section(
+        "What the misfit depends on",
+        [
+            f"No known effect explains it, but the {learned.triad}'s misfit depends on {learned.covariate}: a smooth "
+            f"curve ({learned.effect.name}) follows it, and the extended calibration contains the curve.",
+            Picture(
+                "learned",
+                partial(_learned, learned),
+                "The smooth curve that the misfit follows, with its band",
+                f"What the {learned.triad} puts out by {learned.covariate}, learned from the recording without a "
+                "cause, with its 95 % band; a constant is part of the bias. Beyond its ends the extended calibration "
+                "keeps the curve constant.",
+            ),
+        ],
     )
-    picture = Picture(
-        "learned",
-        partial(_learned, learned),
-        "The smooth curve that the misfit follows, with its band",
-        f"What the {learned.triad} puts out by {learned.covariate}, learned from the recording without a cause, with "
-        "its 95 % band; a constant is part of the bias. Beyond its ends the extended calibration keeps the curve "
-        "constant.",
-    )
-    yield Section("What the misfit depends on", [text, picture])
 
 
 def _gains(diagnosis: Diagnosis) -> Iterator[Section]:
@@ -334,12 +343,11 @@ def _gain_table(diagnosis: Diagnosis, what: str, gain: Gain) -> Table:
     """Return the errors of a model without and with an extension."""
     words = _kind_words(diagnosis)
     before, after = (part.chi_squared / part.count for part in (gain.before, gain.after))
-    caption = (
-        f"Measured on {gain.data}. χ² per condition {before:.2f} → {after:.2f} (1 is noise alone), log-likelihood "
-        f"{gain.log_likelihood:+.1f}."
-    )
     return Table(
-        ("error, rms", f"base model → {what}"), [(words[kind], gain.errors(kind)) for kind in gain.before.rms], caption
+        ("error, rms", f"base model → {what}"),
+        [(words[kind], gain.errors(kind)) for kind in gain.before.rms],
+        f"Measured on {gain.data}. χ² per condition {before:.2f} → {after:.2f} (1 is noise alone), log-likelihood "
+        f"{gain.log_likelihood:+.1f}.",
     )
 
 
@@ -376,8 +384,9 @@ def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
         yield Statement("What it costs without the extension", f"In this recording, {'; '.join(outputs)}.")
     elif diagnosis.verdict == "unexplained":
         cause = "A mistake in the recording" if _standing(diagnosis) else "An unmodelled effect"
-        text = f"{cause} may bias the parameters by more than their intervals show."
-        yield Statement("What it costs", text, caution=True)
+        yield Statement(
+            "What it costs", f"{cause} may bias the parameters by more than their intervals show.", caution=True
+        )
 
 
 def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
@@ -387,17 +396,19 @@ def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
         "that its test finds with 90 % power. It would shift the calibrated numbers by as much as the last column "
         "says, in their standard deviations (σ): the intervals do not include that."
     )
-    rows = [
-        (
-            effect_title(cause.name),
-            size(cause.limit, cause.unit, 2),
-            f"{number(_in_plausible_sizes(diagnosis, cause.name, cause.limit), 2)} ×",
-            _shift_words(diagnosis, cause),
-        )
-        for cause in diagnosis.hidden
-    ]
-    headers = ("effect", "detection limit", "compared with a plausible size", "would shift most")
-    yield Table(headers, rows, brief=6)
+    yield Table(
+        ("effect", "detection limit", "compared with a plausible size", "would shift most"),
+        [
+            (
+                effect_title(cause.name),
+                size(cause.limit, cause.unit, 2),
+                f"{number(_in_plausible_sizes(diagnosis, cause.name, cause.limit), 2)} ×",
+                _shift_words(diagnosis, cause),
+            )
+            for cause in diagnosis.hidden
+        ],
+        brief=6,
+    )
 
 
 def _shift_words(diagnosis: Diagnosis, cause: Hidden) -> str:
@@ -425,21 +436,24 @@ def _options(diagnosis: Diagnosis) -> Iterator[Part]:
     )
     first = diagnosis.options[0]
     lines = [("this recording", first.before), *((option.text, option.powers) for option in diagnosis.options)]
-    rows = [(text, *(f"{100 * power:.0f} %" for power in powers.values())) for text, powers in lines]
-    yield Table(("do this", *map(effect_title, first.powers)), rows)
+    yield Table(
+        ("do this", *map(effect_title, first.powers)),
+        [(text, *(f"{100 * power:.0f} %" for power in powers.values())) for text, powers in lines],
+    )
 
 
 def _checks_table(checks: list[Check]) -> Table:
     """Return checks of the base model, the most significant first."""
-    rows = [
-        (*check.text.rpartition(": ")[::2], probability(check.adjusted).removeprefix("= "))
-        for check in sorted(checks, key=lambda check: check.adjusted)
-    ]
-    caption = (
+    return Table(
+        ("check of the base model", "statistic", "p-value"),
+        [
+            (*check.text.rpartition(": ")[::2], probability(check.adjusted).removeprefix("= "))
+            for check in sorted(checks, key=lambda check: check.adjusted)
+        ],
         "p-values allow for all checks together: below 0.01 the model or its noise is wrong there; above, chance does "
-        "as much."
+        "as much.",
+        brief=6,
     )
-    return Table(("check of the base model", "statistic", "p-value"), rows, caption, brief=6)
 
 
 def _evidence(diagnosis: Diagnosis, twin: Twin) -> Iterator[Picture]:
@@ -465,11 +479,13 @@ def _evidence(diagnosis: Diagnosis, twin: Twin) -> Iterator[Picture]:
 def _blind_table(diagnosis: Diagnosis) -> Table:
     """Return each reason once, with the effects that it hides."""
     reasons = diagnosis.not_observable
-    rows = [
-        (sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))
-        for reason in dict.fromkeys(reasons.values())
-    ]
-    return Table(("reason", "effects that it hides"), rows)
+    return Table(
+        ("reason", "effects that it hides"),
+        [
+            (sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))
+            for reason in dict.fromkeys(reasons.values())
+        ],
+    )
 
 
 def _kind_words(diagnosis: Diagnosis) -> dict[str, str]:

@@ -123,16 +123,17 @@ def page_of(calibration: Calibration, history: History) -> Page:
     worst = np.degrees(Z95 * max(bias) / scale)
     minutes = (history.time[-1] - history.time[0]) / 60
     verdict = "diverged" if calibration.filter.get("diverged") else "followed the unit"
-    picture = Picture(
-        "residuals",
-        partial(_figure, calibration, history),
-        "States of the filter over time with 95 % bands",
-        "Lines: what the filter knew at each time from the recording so far; bands: 95 %. Grey: rests. Bottom: squared "
-        "innovations over what their uncertainty expects; noise gives about 1.",
-    )
     return calibration_page(
         calibration,
-        [picture],
+        [
+            Picture(
+                "residuals",
+                partial(_figure, calibration, history),
+                "States of the filter over time with 95 % bands",
+                "Lines: what the filter knew at each time from the recording so far; bands: 95 %. Grey: rests. "
+                "Bottom: squared innovations over what their uncertainty expects; noise gives about 1.",
+            )
+        ],
         gravity_statements(calibration),
         partial(_limits, calibration, calibration.filter["open"]),
         (f"The filter {verdict} through {minutes:.1f} min of rests and motion.",),

@@ -102,24 +102,34 @@ def _next(fleet: Fleet) -> str:
 def _outliers(fleet: Fleet, document: str) -> Iterator[Part]:
     if not fleet.strangers:
         return
-    rows = [
-        (
-            stranger.device,
-            "; ".join(
-                f"{describe(name)} ({z:+.1f}σ)".replace("-", "−") for name, _, z in stranger.parameters if abs(z) > 2
-            )
-            or "no single parameter, but their combination",
-            probability(stranger.p_value).removeprefix("= "),
-            Path(stranger.file).name,
-        )
-        for stranger in fleet.strangers[:MOST_ROWS]
-    ]
     more = len(fleet.strangers) - MOST_ROWS
     caption = "p: probability that a fleet of this size has a unit as far off as this one, if all belonged."
     if more > 0:
         caption += f" {more} more outliers are in `{document}`."
-    headers = ("device", "most unlike the others in", "p", "file")
-    yield Section("Outliers", [Table(headers, rows, caption, brief=10)])
+    yield Section(
+        "Outliers",
+        [
+            Table(
+                ("device", "most unlike the others in", "p", "file"),
+                [
+                    (
+                        stranger.device,
+                        "; ".join(
+                            f"{describe(name)} ({z:+.1f}σ)".replace("-", "−")
+                            for name, _, z in stranger.parameters
+                            if abs(z) > 2
+                        )
+                        or "no single parameter, but their combination",
+                        probability(stranger.p_value).removeprefix("= "),
+                        Path(stranger.file).name,
+                    )
+                    for stranger in fleet.strangers[:MOST_ROWS]
+                ],
+                caption,
+                brief=10,
+            )
+        ],
+    )
 
 
 def _differences(fleet: Fleet) -> Iterator[Part]:
@@ -130,8 +140,17 @@ def _differences(fleet: Fleet) -> Iterator[Part]:
         for difference in fleet.differences
     ]
     if rows:
-        caption = "± 95 %. p: probability of a difference at least as large by chance, all questions allowed for."
-        yield Section("Lots, dates, repeated recordings", [Table(("", "difference", "p"), rows, caption, brief=5)])
+        yield Section(
+            "Lots, dates, repeated recordings",
+            [
+                Table(
+                    ("", "difference", "p"),
+                    rows,
+                    "± 95 %. p: probability of a difference at least as large by chance, all questions allowed for.",
+                    brief=5,
+                )
+            ],
+        )
     elif fleet.population is not None:
         lots = len({lot for lot in fleet.lots if lot})
         yield (
@@ -165,8 +184,17 @@ def _failures(fleet: Fleet, document: str) -> Iterator[Part]:
     if others := [*fleet.failed.values()][most:]:
         rows.append((f"{len(others)} other reasons", str(sum(map(len, others))), ""))
     statuses = ", ".join(f"{count} {status}" for status, count in fleet.statuses.most_common())
-    caption = f"By status: {statuses}. All files are listed in `{document}`."
-    yield Section("Not calibrated", [Table(("reason", "recordings", "files"), rows, caption, brief=5)])
+    yield Section(
+        "Not calibrated",
+        [
+            Table(
+                ("reason", "recordings", "files"),
+                rows,
+                f"By status: {statuses}. All files are listed in `{document}`.",
+                brief=5,
+            )
+        ],
+    )
 
 
 def _diagnoses(fleet: Fleet) -> Iterator[Part]:
@@ -174,8 +202,11 @@ def _diagnoses(fleet: Fleet) -> Iterator[Part]:
     if fleet.verdicts:
         parts.append(f"Verdicts: {', '.join(f'{count} {name}' for name, count in fleet.verdicts.most_common())}.")
     if fleet.effects:
-        rows = [(effect_title(name), str(count)) for name, count in fleet.effects.most_common()]
-        parts.append(Table(("effect", "units"), rows))
+        parts.append(
+            Table(
+                ("effect", "units"), [(effect_title(name), str(count)) for name, count in fleet.effects.most_common()]
+            )
+        )
     if parts:
         yield Section("Diagnoses", parts)
 
@@ -207,9 +238,17 @@ def _population(fleet: Fleet) -> Iterator[Picture]:
 def _lots(fleet: Fleet) -> Iterator[Section]:
     lots = [difference for difference in fleet.differences if difference.kind == "lot"]
     if lots and fleet.population is not None:
-        caption = "The parameter that differs most, unit by unit in each lot; lots that differ are orange."
-        picture = Picture("lots", partial(lot_figure, fleet, lots[0]), "A parameter by lot", caption)
-        yield Section("Lots", [picture])
+        yield Section(
+            "Lots",
+            [
+                Picture(
+                    "lots",
+                    partial(lot_figure, fleet, lots[0]),
+                    "A parameter by lot",
+                    "The parameter that differs most, unit by unit in each lot; lots that differ are orange.",
+                )
+            ],
+        )
 
 
 def _prior(fleet: Fleet) -> Iterator[Section]:
@@ -223,19 +262,22 @@ def _prior(fleet: Fleet) -> Iterator[Section]:
         sizes = (mean, fleet.population.spread[k], alone[k], prior[k])
         rows.append((describe(name), *(amount(name, float(size)) for size in sizes)))
     helped = np.flatnonzero(prior < 0.8 * alone).tolist()
-    headers = (
-        "parameter",
-        "mean",
-        "spread between units (1σ)",
-        "a unit by itself (1σ)",
-        "with the fleet as prior (1σ)",
-    )
-    caption = (
-        "Scale and misalignment are relative to the data sheet's scale. The last two columns are the 90th percentile "
-        "of the units' uncertainties, without gravity's part, which all units share; marked where the prior "
-        "makes it a fifth smaller or more."
-    )
-    parts: list[Part] = [Table(headers, rows, caption, helped)]
+    parts: list[Part] = [
+        Table(
+            (
+                "parameter",
+                "mean",
+                "spread between units (1σ)",
+                "a unit by itself (1σ)",
+                "with the fleet as prior (1σ)",
+            ),
+            rows,
+            "Scale and misalignment are relative to the data sheet's scale. The last two columns are the 90th "
+            "percentile of the units' uncertainties, without gravity's part, which all units share; marked where the "
+            "prior makes it a fifth smaller or more.",
+            helped,
+        )
+    ]
     if helped:
         parts.insert(
             0,

@@ -113,11 +113,11 @@ def _number(history: UnitHistory) -> tuple[str, str]:
     if history.interval is not None:
         return _time(history.interval, history.per), "until the first limit's guard band is reached"
     for owner, change in history.output.items():
-        meaning = (
+        return (
+            with_interval(change.worst, change.sigma, change.unit),
             f"largest error of the {owner}, up to {size(change.over, change.unit)}, with the first calibration on the "
-            "unit as it is in the last, 95 % interval"
+            "unit as it is in the last, 95 % interval",
         )
-        return with_interval(change.worst, change.sigma, change.unit), meaning
     return f"p {probability(history.together['all'].p_value)}", "probability of differences as large if nothing moved"
 
 
@@ -162,13 +162,15 @@ def _rest(history: UnitHistory) -> Iterator[Part]:
             "The numbers that changed most surely, over the temperatures of their recordings",
             "The same numbers over the temperature of their recordings: what follows it has not aged.",
         )
-    headers = ("calibration", "date", f"time [{history.per}s]", "temperature")
     columns = zip(history.files, history.dates, history.times, history.temperatures, strict=True)
-    rows = [
-        (file, day.isoformat() if day else "", f"{time:.2f}".replace("-", "−"), "" if t is None else f"{t:.1f} °C")
-        for file, day, time, t in columns
-    ]
-    yield Table(headers, rows, "In the order of time, counted from the last.")
+    yield Table(
+        ("calibration", "date", f"time [{history.per}s]", "temperature"),
+        [
+            (file, day.isoformat() if day else "", f"{time:.2f}".replace("-", "−"), "" if t is None else f"{t:.1f} °C")
+            for file, day, time, t in columns
+        ],
+        "In the order of time, counted from the last.",
+    )
 
 
 def _numbers_table(history: UnitHistory) -> Table:
@@ -216,9 +218,10 @@ def _together_table(history: UnitHistory) -> Table:
         )
         for name, test in history.together.items()
     ]
-    caption = "Jointly, with all correlations: χ² of no change."
     marked = [len(rows) - 1] if history.together["all"].p_value < history.level / 2 else []
-    return Table(("together", "χ²", "degrees of freedom", "p"), rows, caption, marked)
+    return Table(
+        ("together", "χ²", "degrees of freedom", "p"), rows, "Jointly, with all correlations: χ² of no change.", marked
+    )
 
 
 def _limits_table(history: UnitHistory) -> Table:
@@ -233,12 +236,14 @@ def _limits_table(history: UnitHistory) -> Table:
         return spoken(reached.name), bounds, level, _drift(history, movement), after
 
     ordered = sorted(history.limits, key=lambda limit: np.inf if limit.after is None else limit.after)
-    headers = ("limit on", "bounds", "now ± 95 %", "drift ± 95 %", "guard band reached after")
-    caption = (
+    return Table(
+        ("limit on", "bounds", "now ± 95 %", "drift ± 95 %", "guard band reached after"),
+        [row(reached) for reached in ordered],
         "The time from the last calibration until the line, with its uncertainty and the guard band of the decision "
-        "rule, leaves the bounds: the calibration interval is the shortest. It assumes that the drift goes on."
+        "rule, leaves the bounds: the calibration interval is the shortest. It assumes that the drift goes on.",
+        [0] * bool(ordered),
+        brief=6,
     )
-    return Table(headers, [row(reached) for reached in ordered], caption, [0] * bool(ordered), brief=6)
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------

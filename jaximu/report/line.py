@@ -82,8 +82,9 @@ def _by_capability(line: Line) -> list[tuple[FollowedQuantity, float]]:
 def _number(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> tuple[str, str]:
     """Return the worst Cpk with its interval, else how many recordings pass, and what it is."""
     if able and (capability := able[0][0].capability) is not None:
-        meaning = f"Cpk of {spoken(able[0][0].name)}, the worst quantity (95 %); a capable line has {_CAPABLE} or more"
-        return _index(capability.cpk), meaning
+        return _index(
+            capability.cpk
+        ), f"Cpk of {spoken(able[0][0].name)}, the worst quantity (95 %); a capable line has {_CAPABLE} or more"
     if line.limits is not None:
         return f"{100 * line.counts[PASS] / line.table.total:.3g} %", "of the recordings pass"
     return "", ""
@@ -141,14 +142,19 @@ def _capability(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> I
         return
     judged = line.judged
     failed = {} if judged is None else dict(zip(judged.names, np.sum(judged.verdict == FAIL, axis=0), strict=True))
-    headers = ("quantity", "Cpk (95 %)", "Cp (95 %)", "mean ± standard deviation", "limits", "fail")
-    caption = (
-        "Of each device's first recording; the deviation is that of all units, drift between them included. Marked: "
-        f"Cpk below {_CAPABLE}. Fail: recordings of all."
+    yield Section(
+        "Capability",
+        [
+            Table(
+                ("quantity", "Cpk (95 %)", "Cp (95 %)", "mean ± standard deviation", "limits", "fail"),
+                [_capability_row(quantity, failed.get(quantity.name, 0)) for quantity, _ in able],
+                "Of each device's first recording; the deviation is that of all units, drift between them included. "
+                f"Marked: Cpk below {_CAPABLE}. Fail: recordings of all.",
+                [row for row, (_, cpk) in enumerate(able) if cpk < _CAPABLE],
+                brief=6,
+            )
+        ],
     )
-    rows = [_capability_row(quantity, failed.get(quantity.name, 0)) for quantity, _ in able]
-    marked = [row for row, (_, cpk) in enumerate(able) if cpk < _CAPABLE]
-    yield Section("Capability", [Table(headers, rows, caption, marked, brief=6)])
 
 
 def _capability_row(quantity: FollowedQuantity, failed: int) -> tuple[str, ...]:
@@ -198,9 +204,17 @@ def _not_passed(line: Line) -> Iterator[Section]:
     rows = [(device, *(item_row(item)[cell] for cell in cells)) for device, item in line.items(MOST_ROWS)]
     more = sum(len(line.missed(row)) for row in range(len(line.table.rows))) - len(rows)
     if rows:
-        headers = ("device", "quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict")
         caption = f"And {more} more; the table's column `not_passed` has all." if more else ""
-        yield Section("What does not pass", [Table(headers, rows, caption)])
+        yield Section(
+            "What does not pass",
+            [
+                Table(
+                    ("device", "quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"),
+                    rows,
+                    caption,
+                )
+            ],
+        )
 
 
 def _gauge(line: Line) -> Iterator[Section]:
@@ -223,14 +237,27 @@ def _gauge(line: Line) -> Iterator[Section]:
         )
         rows.append(row)
     if rows:
-        headers = ("quantity", "repeatability (95 %)", "between stations", "between units", "ndc", "observed / stated")
-        caption = (
-            "Standard deviations by analysis of variance. ndc: groups of units that the measurement can distinguish; "
-            "marked below 5 (AIAG). Observed / stated: scatter of a unit's repeated recordings, in multiples of the "
-            "uncertainty that each states; 1 is expected, and * marks what chance does not explain (p < 1 %, all "
-            "quantities allowed for)."
+        yield Section(
+            "Gauge: repeated recordings",
+            [
+                Table(
+                    (
+                        "quantity",
+                        "repeatability (95 %)",
+                        "between stations",
+                        "between units",
+                        "ndc",
+                        "observed / stated",
+                    ),
+                    rows,
+                    "Standard deviations by analysis of variance. ndc: groups of units that the measurement can "
+                    "distinguish; marked below 5 (AIAG). Observed / stated: scatter of a unit's repeated recordings, "
+                    "in multiples of the uncertainty that each states; 1 is expected, and * marks what chance does "
+                    "not explain (p < 1 %, all quantities allowed for).",
+                    marked,
+                )
+            ],
         )
-        yield Section("Gauge: repeated recordings", [Table(headers, rows, caption, marked)])
 
 
 # --- charts -----------------------------------------------------------------------------------------------------------

@@ -138,24 +138,31 @@ def _poses(proposal: Proposal) -> Table:
     """Return each pose's number, words and, where each turn leads from one pose to the next, the turn to it."""
     chained = proposal.equipment.chained
     turns = ["", *(turn.words for turn in proposal.turns)] if proposal.turns else [""] * len(proposal.poses)
-    rows = [
-        (str(index + 1), pose.words, *([turns[index]] if chained else [])) for index, pose in enumerate(proposal.poses)
-    ]
     legend = "The top is the face that +z leaves, the bottom the one opposite."
     if any(" corner " in pose.words for pose in proposal.poses):
         legend += " A corner lies halfway, at 45°, between the two sides."
-    return Table(("", "pose", *(["turn to it"] if chained else [])), rows, legend)
+    return Table(
+        ("", "pose", *(["turn to it"] if chained else [])),
+        [
+            (str(index + 1), pose.words, *([turns[index]] if chained else []))
+            for index, pose in enumerate(proposal.poses)
+        ],
+        legend,
+    )
 
 
 def _turns(proposal: Proposal) -> Iterator[Section]:
     """Return the turns of a table; by hand, on a robot and in a sequence they stand beside the poses."""
     if proposal.turns and not proposal.equipment.chained:
         rows = [(str(index), turn.words) for index, turn in enumerate(proposal.turns, 1)]
-        words = (
-            "About the vertical axis of the table, the unit mounted as the turn says. schedule.csv holds poses and "
-            "turns in this order; correct its times once they are done."
+        yield Section(
+            f"{len(rows)} turns",
+            [
+                "About the vertical axis of the table, the unit mounted as the turn says. schedule.csv holds poses and "
+                "turns in this order; correct its times once they are done.",
+                Table(("", "turn"), rows),
+            ],
         )
-        yield Section(f"{len(rows)} turns", [words, Table(("", "turn"), rows)])
 
 
 def _parameters(proposal: Proposal) -> Table:
@@ -166,23 +173,29 @@ def _parameters(proposal: Proposal) -> Table:
 
     first = _parameter(proposal)
     sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
-    rows = [
-        (describe(name, proposal.imu), interval(name, before), interval(name, after), f"{_times(before / after)}×")
-        for name, before, after in sorted(sigmas, key=lambda row: (row[0] != first, -row[1] / row[2]))
-    ]
-    headers = ("parameter", "known", "after these poses", "times smaller")
     caption = "A prediction from the noise, to first order, without errors of the set-up; ± is 95 %."
-    return Table(headers, rows, f"{_criterion(proposal)} {caption}", [0] if first else [], brief=8)
+    return Table(
+        ("parameter", "known", "after these poses", "times smaller"),
+        [
+            (describe(name, proposal.imu), interval(name, before), interval(name, after), f"{_times(before / after)}×")
+            for name, before, after in sorted(sigmas, key=lambda row: (row[0] != first, -row[1] / row[2]))
+        ],
+        f"{_criterion(proposal)} {caption}",
+        [0] if first else [],
+        brief=8,
+    )
 
 
 def _open(proposal: Proposal) -> Iterator[Section]:
     """Return what stays open, in words."""
     if proposal.open:
-        statements = [
-            Statement("Weak" if weak.determined else "Not determined", weak.text, caution=True)
-            for weak in proposal.open
-        ]
-        yield Section("What stays open", statements)
+        yield Section(
+            "What stays open",
+            [
+                Statement("Weak" if weak.determined else "Not determined", weak.text, caution=True)
+                for weak in proposal.open
+            ],
+        )
 
 
 # --- the picture ------------------------------------------------------------------------------------------------------
@@ -197,8 +210,7 @@ def _picture(proposal: Proposal) -> Picture:
         view = "Seen a little from above; headings are counted from an arbitrary zero."
     else:
         view = "Seen a little from above; the heading on the table does not matter."
-    caption = f"{view} {AXES_WORDS}"
-    return Picture("poses", partial(_poses_figure, proposal), "The unit drawn in each pose", caption)
+    return Picture("poses", partial(_poses_figure, proposal), "The unit drawn in each pose", f"{view} {AXES_WORDS}")
 
 
 def _map(proposal: Proposal) -> Iterator[Picture]:

@@ -21,10 +21,15 @@ def page_of(recording: Recording) -> Page:
     """Return which sensors are in a recording, how they were sampled, and what reading it had to assume."""
     names = [source.path for source in recording.sources]
     signals = {name: signal_facts(signal) for name, signal in recording.signals.items()}
-    picture = Picture("signals", recording.plot, "All signals against time", "As recorded, in SI units.")
     after = f"`jaximu info {shlex.quote(names[0])}` shows what it can be used for." if names else ""
     title = ", ".join(Path(name).name for name in names) or "recording"
-    return _page(title, signals, (picture, _table(signals)), recording.notes, after)
+    return _page(
+        title,
+        signals,
+        (Picture("signals", recording.plot, "All signals against time", "As recorded, in SI units."), _table(signals)),
+        recording.notes,
+        after,
+    )
 
 
 def log_page(document: Mapping[str, Any], commands: Sequence[str]) -> Page:
@@ -32,13 +37,16 @@ def log_page(document: Mapping[str, Any], commands: Sequence[str]) -> Page:
     uses: list[Part] = []
     for use, command in zip(document["uses"] if commands else (), commands, strict=True):
         uses += [f"{sentence(use['why'])}:", Code(command)]
-    parts = [
-        _table(document["signals"]),
-        *_guess(document.get("guess")),
-        Section("What was noticed", [Items([*map(sentence, document["findings"])])]),
-        *([Section("What it can be used for", uses)] if uses else []),
-    ]
-    return _page(document["file"], document["signals"], parts)
+    return _page(
+        document["file"],
+        document["signals"],
+        [
+            _table(document["signals"]),
+            *_guess(document.get("guess")),
+            Section("What was noticed", [Items([*map(sentence, document["findings"])])]),
+            *([Section("What it can be used for", uses)] if uses else []),
+        ],
+    )
 
 
 def signal_facts(signal: Signal, used: Signal | None = None) -> dict[str, Any]:
@@ -81,19 +89,6 @@ def _page(
 
 def _table(signals: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return a row a signal: how it was sampled, and between which values it lies."""
-    rows = [
-        (
-            name.replace("_", " "),
-            unit_text(facts["unit"]),
-            str(facts["samples"]),
-            f"{facts['rate']:.5g}",
-            number(round(1e3 * facts["jitter"], 6)),
-            f"{facts['longest_gap']:.3g}",
-            f"{facts['duration']:.5g}",
-            *(" ".join(f"{value:.4g}" for value in facts[key]).replace("-", "−") for key in ("minimum", "maximum")),
-        )
-        for name, facts in signals.items()
-    ]
     return Table(
         (
             "signal",
@@ -106,7 +101,19 @@ def _table(signals: Mapping[str, Mapping[str, Any]]) -> Table:
             "minimum",
             "maximum",
         ),
-        rows,
+        [
+            (
+                name.replace("_", " "),
+                unit_text(facts["unit"]),
+                str(facts["samples"]),
+                f"{facts['rate']:.5g}",
+                number(round(1e3 * facts["jitter"], 6)),
+                f"{facts['longest_gap']:.3g}",
+                f"{facts['duration']:.5g}",
+                *(" ".join(f"{value:.4g}" for value in facts[key]).replace("-", "−") for key in ("minimum", "maximum")),
+            )
+            for name, facts in signals.items()
+        ],
     )
 
 

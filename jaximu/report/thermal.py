@@ -201,8 +201,13 @@ def candidate_table(thermal: ThermalCalibration, name: str) -> Table:
             (chosen + title, effects or "none", _size(name, candidate.held.rms), f"{gap:+.1f}".replace("-", "−"))
         )
     chosen_rows = range(len({*fit.families}))
-    headers = ("model", "effects kept by the information criterion", "left out, rms", "score, nats")
-    return Table(headers, rows, "", chosen_rows, brief=max(3, len(chosen_rows)))
+    return Table(
+        ("model", "effects kept by the information criterion", "left out, rms", "score, nats"),
+        rows,
+        "",
+        chosen_rows,
+        brief=max(3, len(chosen_rows)),
+    )
 
 
 def effect_table(calibration: Calibration) -> Table:
@@ -264,37 +269,47 @@ def _export(export: AutopilotParameters, thermal: ThermalCalibration) -> Section
 
 def _rest(thermal: ThermalCalibration) -> Iterator[Part]:
     """Return the temperatures covered, each sensor's surface and residuals, and how it was done."""
-    covered = Picture(
-        "covered",
-        partial(covered_figure, thermal),
-        "Temperatures and rates covered",
-        "Each dot is a block of the recording. Where dots lie on one line only, temperature and its rate go together, "
-        "and their effects cannot be separated.",
+    yield Section(
+        "Temperatures covered",
+        [
+            Picture(
+                "covered",
+                partial(covered_figure, thermal),
+                "Temperatures and rates covered",
+                "Each dot is a block of the recording. Where dots lie on one line only, temperature and its rate go "
+                "together, and their effects cannot be separated.",
+            )
+        ],
     )
-    yield Section("Temperatures covered", [covered])
     for name in thermal.fits:
-        surface = Picture(
-            f"surface_{name}",
-            partial(surface_figure, thermal, name),
-            f"Bias of the {name} over temperature and its rate",
-            f"The {name}'s bias, counted from {thermal.reference:g} °C: the model as a surface, as far as the data go, "
-            "and the data as dots, less the level of each rest.",
+        yield Section(
+            f"The {name}",
+            [
+                Picture(
+                    f"surface_{name}",
+                    partial(surface_figure, thermal, name),
+                    f"Bias of the {name} over temperature and its rate",
+                    f"The {name}'s bias, counted from {thermal.reference:g} °C: the model as a surface, as far as the "
+                    "data go, and the data as dots, less the level of each rest.",
+                ),
+                Picture(
+                    f"residual_{name}",
+                    partial(residual_figure, thermal, name),
+                    f"Residuals of the {name}",
+                    "Residuals of the model, less the level of each rest, jumps included; a slope, a curve or two "
+                    "colours apart would be something it misses.",
+                ),
+            ],
         )
-        residual = Picture(
-            f"residual_{name}",
-            partial(residual_figure, thermal, name),
-            f"Residuals of the {name}",
-            "Residuals of the model, less the level of each rest, jumps included; a slope, a curve or two colours "
-            "apart would be something it misses.",
-        )
-        yield Section(f"The {name}", [surface, residual])
-    text = (
-        f"{len(thermal.blocks)} blocks of {thermal.blocks.duration:.3g} s. The rate of temperature is the slope of a "
-        f"line through {TEMPERATURE_WINDOW:g} s (attenuates {RATE_BANDWIDTH:.2g} Hz by 29 %). Least squares with the "
-        "covariance of the noise, which ties blocks to each other: a long soak counts for no more than it contains, "
-        f"and slow bias does not pass for temperature. jaximu {thermal.software['version']}."
+    yield Section(
+        "How it was done",
+        [
+            f"{len(thermal.blocks)} blocks of {thermal.blocks.duration:.3g} s. The rate of temperature is the slope "
+            f"of a line through {TEMPERATURE_WINDOW:g} s (attenuates {RATE_BANDWIDTH:.2g} Hz by 29 %). Least squares "
+            "with the covariance of the noise, which ties blocks to each other: a long soak counts for no more than "
+            f"it contains, and slow bias does not pass for temperature. jaximu {thermal.software['version']}."
+        ],
     )
-    yield Section("How it was done", [text])
 
 
 def _ways(thermal: ThermalCalibration) -> list[Part]:
@@ -306,13 +321,19 @@ def _ways(thermal: ThermalCalibration) -> list[Part]:
     then = options[0].parts
     if all(then[name].apart < _WORTH * now[name].apart for name in weak):
         return []
-    text = (
-        f"{sentence(options[0].text)}, with a soak at each end ({options[0].duration / 60:.0f} min), and give both "
-        "recordings to `jaximu thermal`: of the ramps tried it separates best what looks alike now."
+    shares = Table(
+        ("effect", "share that no other can imitate, now", "with that ramp"),
+        [(name.replace("_", " "), *(_share(parts[name].apart) for parts in (now, then))) for name in weak],
     )
-    rows = [(name.replace("_", " "), *(_share(parts[name].apart) for parts in (now, then))) for name in weak]
-    shares = Table(("effect", "share that no other can imitate, now", "with that ramp"), rows)
-    return [Statement("What to record next", text, True), shares]
+    return [
+        Statement(
+            "What to record next",
+            f"{sentence(options[0].text)}, with a soak at each end ({options[0].duration / 60:.0f} min), and give both "
+            "recordings to `jaximu thermal`: of the ramps tried it separates best what looks alike now.",
+            True,
+        ),
+        shares,
+    ]
 
 
 def _share(share: float) -> str:
@@ -338,11 +359,11 @@ def _ambient(thermal: ThermalCalibration) -> Iterator[Statement]:
         added = blocks.means[name] - fit.level.T[blocks.level]
         fits = [multifactor(factors, values) for values in added.T]
         held, kept = np.array([rms for _, rms in fits]), max(len(terms) for terms, _ in fits)
-        text = (
+        yield Statement(
+            f"Regression of the {name} on sensor and ambient temperature and their rates",
             f"At most {kept} of 15 terms kept: {_size(name, held)} rms on fifths left out, against "
-            f"{_size(name, fit.candidate.held.rms)} of the model above on {_parts(thermal)} left out."
+            f"{_size(name, fit.candidate.held.rms)} of the model above on {_parts(thermal)} left out.",
         )
-        yield Statement(f"Regression of the {name} on sensor and ambient temperature and their rates", text)
 
 
 def loss_words(parameters: AutopilotParameters, thermal: ThermalCalibration) -> str:

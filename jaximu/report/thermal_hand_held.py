@@ -93,8 +93,10 @@ def _first(thermal: HandHeldThermal) -> Iterator[Part]:
         "from its direction, and what the gyroscope shows at rest. What goes with temperature the model lacks.",
     )
     if thermal.steps:
-        rows = [(sentence(words), changed(before, after, unit)) for words, before, after, unit in _sizes(thermal)]
-        yield Table(("error, rms", "one bias and scale → with the effects"), rows)
+        yield Table(
+            ("error, rms", "one bias and scale → with the effects"),
+            [(sentence(words), changed(before, after, unit)) for words, before, after, unit in _sizes(thermal)],
+        )
         yield Section("Effects", [effect_table(thermal.calibration)])
     yield Section("What may still hide", [*_limits(thermal)])
 
@@ -194,9 +196,17 @@ def _error_figure(thermal: HandHeldThermal) -> Figure:
 def _rest(thermal: HandHeldThermal) -> Iterator[Part]:
     """Return what each effect gained."""
     if thermal.steps:
-        rows = [(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in thermal.steps]
-        caption = (
-            "In the order in which they were taken in: χ² of the score test when tested, and log-likelihood gained on "
-            "parts left out."
+        yield Section(
+            "What each effect gained",
+            [
+                Table(
+                    ("effect", "χ²", "gain, nats"),
+                    [
+                        (effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}")
+                        for name, statistic, gain in thermal.steps
+                    ],
+                    "In the order in which they were taken in: χ² of the score test when tested, and log-likelihood "
+                    "gained on parts left out.",
+                )
+            ],
         )
-        yield Section("What each effect gained", [Table(("effect", "χ²", "gain, nats"), rows, caption)])

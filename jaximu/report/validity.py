@@ -84,12 +84,17 @@ def _shifts(validity: Validity) -> Iterator[Part]:
 
 def _shifts_table(validity: Validity) -> Table:
     """Return each parameter's old value, its shift, and that in the output, the most significant first."""
-    headers = ("parameter", "old", "shift ± 95 %", "in the output ± 95 %", "σ", "p-value, all allowed for")
     statistic, freedom, p_value = validity.difference
     together = f"All {freedom} together: χ² {statistic:.1f}, p {probability(p_value)}." if freedom else ""
     shifts = sorted(validity.shifts, key=_rank)
     moved = range(len(validity.moved))
-    return Table(headers, [_shift_row(shift) for shift in shifts], together, moved, brief=max(3, len(moved)))
+    return Table(
+        ("parameter", "old", "shift ± 95 %", "in the output ± 95 %", "σ", "p-value, all allowed for"),
+        [_shift_row(shift) for shift in shifts],
+        together,
+        moved,
+        brief=max(3, len(moved)),
+    )
 
 
 def _rank(shift: Shift) -> tuple[bool, float]:
@@ -129,9 +134,11 @@ def _statements(validity: Validity) -> Iterator[Statement]:
 def _errors_table(validity: Validity) -> Iterator[Table]:
     if validity.experiment is not None:
         words = {kind.name: kind.words for kind in validity.experiment.real.kinds}
-        rows = [(words[name], change(*sizes)) for name, sizes in validity.errors.items()]
         counts = f"{validity.data['poses']} poses, {validity.data['turns']} turns"
-        yield Table((f"error, rms ({counts})", "old calibration → fresh calibration"), rows)
+        yield Table(
+            (f"error, rms ({counts})", "old calibration → fresh calibration"),
+            [(words[name], change(*sizes)) for name, sizes in validity.errors.items()],
+        )
 
 
 def _picture(validity: Validity) -> Picture:

@@ -33,17 +33,19 @@ def vehicle_page(calibration: Calibration, history: History) -> Page:
     vehicle = calibration.filter["vehicle"]
     scale = np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)
     worst = float(np.max(Z95 * calibration.bias_sigma_recording["gyroscope"] / scale))
-    picture = Picture(
-        "vehicle",
-        partial(_figure, calibration, history),
-        "Gyroscope bias and tilt at each stop, and the speeds gained and lost beside stops",
-        "Top: the bias as a filter knew it after each stop, with 95 % bands. Middle: how much more than on average the "
-        "vehicle tilts at each stop, which is the slope of the road. Bottom: speeds gained in the seconds after a stop "
-        "and lost in those before one, along the vehicle and to its left; backwards they are negative.",
-    )
     page = calibration_page(
         calibration,
-        [picture],
+        [
+            Picture(
+                "vehicle",
+                partial(_figure, calibration, history),
+                "Gyroscope bias and tilt at each stop, and the speeds gained and lost beside stops",
+                "Top: the bias as a filter knew it after each stop, with 95 % bands. Middle: how much more than on "
+                "average the vehicle tilts at each stop, which is the slope of the road. Bottom: speeds gained in the "
+                "seconds after a stop and lost in those before one, along the vehicle and to its left; backwards they "
+                "are negative.",
+            )
+        ],
         [],
         partial(limits, calibration),
         (f"The vehicle stood still at {counted(len(vehicle['stops']), 'stop')}, {vehicle['seconds']:.0f} s in all.",),

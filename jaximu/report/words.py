@@ -118,11 +118,15 @@ def scatter_statements(calibration: Calibration) -> list[Statement]:
             why = "there is a little more than noise, and the intervals include it."
         entries.append(Statement(about, f"{sentence(subject)} scatter {how} their measured noise: {why}", large))
     if any(entry.caution for entry in entries):
-        text = (
-            "The intervals below include it as if it were random. A cause that repeats may have shifted the parameters "
-            "by more than they say, and will act again when the calibration is used. Run `jaximu diagnose` to find it."
+        entries.append(
+            Statement(
+                "What scatter beyond noise means",
+                "The intervals below include it as if it were random. A cause that repeats may have shifted the "
+                "parameters by more than they say, and will act again when the calibration is used. Run `jaximu "
+                "diagnose` to find it.",
+                True,
+            )
         )
-        entries.append(Statement("What scatter beyond noise means", text, True))
     return entries
 
 

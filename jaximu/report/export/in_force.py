@@ -119,20 +119,26 @@ class Composition:
 
     def section(self) -> Section:
         """Return the changes as a page has them."""
-        rows = [
+        return Section(
+            "What changes:",
             (
-                change["parameter"],
-                plain(change["in_force"]),
-                with_interval(change["new"], change["half_width"] / Z95)
-                if change["half_width"]
-                else f"{plain(change['new'])} (not determined)",
-                _words(change["at_rest"]),
-            )
-            for change in self.changes()
-        ]
-        caption = f"Offsets in m/s² and rad/s. All together, at most at rest: {_words(self.at_rest())}."
-        headers = ("Parameter", "In force", "New (± 95 %)", "Changes at rest")
-        return Section("What changes:", (Table(headers, rows, caption),))
+                Table(
+                    ("Parameter", "In force", "New (± 95 %)", "Changes at rest"),
+                    [
+                        (
+                            change["parameter"],
+                            plain(change["in_force"]),
+                            with_interval(change["new"], change["half_width"] / Z95)
+                            if change["half_width"]
+                            else f"{plain(change['new'])} (not determined)",
+                            _words(change["at_rest"]),
+                        )
+                        for change in self.changes()
+                    ],
+                    f"Offsets in m/s² and rad/s. All together, at most at rest: {_words(self.at_rest())}.",
+                ),
+            ),
+        )
 
     def document(self) -> dict[str, Any]:
         """Return the changes as JSON has them."""
