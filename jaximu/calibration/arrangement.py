@@ -142,7 +142,7 @@ def _mapped(option: str) -> Callable[[Recording], Recording]:
 
 def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
     """Name scales that are a whole factor off the data sheet's, or off by more than sensors are."""
-    sizes = np.linalg.norm(np.asarray(triad.gain), axis=1) / scale
+    sizes = triad.scales / scale
     option = "--accel-scale" if name == "accelerometer" else "--gyro-scale"
     findings = []
     whole = np.zeros(3)

@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +32,7 @@ from jaximu.recordings.readers.kalibr import kalibr_yaml
 from jaximu.recordings.recording import Source
 from jaximu.report.figures import AXES, dressed, new_figure
 from jaximu.report.tables import written_now
+from jaximu.report.words import file_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -351,7 +351,6 @@ def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
 
 def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
     """Return the page of a noise analysis; `sources`: the files with their SHA-256 and rows, where they are known."""
-    names = ", ".join(Path(path).name for path in analysis.files) or "a recording"
     log = shlex.quote(analysis.files[0]) if analysis.files else "REST"
     terms = _by_triad(
         analysis,
@@ -365,7 +364,7 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
         analysis, "For a Kalman filter", "Of the mean of the axes, in SI; Δt is one over the sample rate.", _filter
     )
     return Page(
-        f"Noise at rest: {names}",
+        f"Noise at rest: {file_names(analysis.files)}",
         [*_verdict(analysis)],
         *_number(analysis),
         (_picture(analysis), *_cautions(analysis), terms, numbers, *_limits(analysis)),

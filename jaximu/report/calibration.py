@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -102,7 +100,7 @@ def calibration_page(
     before those on the errors; `number`: the one number and what it is, the first error after calibration if None;
     `findings`: what else was found, for the first screen.
     """
-    known, trust = calibration.triads(), [*trust, *words.weak_statements(calibration.weak)]
+    trust = [*trust, *words.weak_statements(calibration.weak)]
     cautions = [statement for statement in trust if statement.caution]
     warnings = [Section("Before you rely on it", cautions)] if cautions else []
     settled = [statement for statement in trust if not statement.caution]
@@ -117,29 +115,25 @@ def calibration_page(
         yield _correlation(calibration)
         yield from _origin(calibration)
 
-    files = [str(file["file"]) for file in calibration.data.get("files", ())]
     value, meaning = number or _number(calibration)
     return Page(
-        _title(calibration, files),
+        _title(calibration),
         (*verdict, *_errors(calibration), *_determined(calibration)),
         value,
         meaning,
         (*pictures, *findings, *warnings, *_parameters(calibration)),
         rest,
         [sentence(note) for note in calibration.notes],
-        f"`jaximu compensate CALIBRATION {shlex.quote(files[0]) if files else 'LOG'} -o CORRECTED.csv` applies it."
-        if "accelerometer" in known
-        else "",
+        words.compensation(calibration.files, "applies it") if "accelerometer" in calibration.triads() else "",
     )
 
 
-def _title(calibration: Calibration, files: Sequence[str]) -> str:
+def _title(calibration: Calibration) -> str:
     data = calibration.data
     counts = [
         counted(data[kind + "s"], kind) for kind in ("pose", "turn", "interval", "window") if data.get(kind + "s")
     ]
-    names = ", ".join(Path(file).name for file in files) or "a recording"
-    return f"Calibration of {names}: {', '.join([*counts, f'{calibration.method} fit'])}"
+    return f"Calibration of {words.file_names(calibration.files)}: {', '.join([*counts, f'{calibration.method} fit'])}"
 
 
 def _error_words(name: str) -> str:
@@ -223,7 +217,7 @@ def _biases_of_the_recording(calibration: Calibration) -> str:
     means = []
     for name, sigma in calibration.bias_sigma_recording.items():
         triad = calibration.triads()[name]
-        scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
+        scale = triad.scales
         means.append(f"± {size(Z95 * float(np.max(sigma / scale)), SENSOR_UNITS[name], 2)} ({name})")
     return (
         "The biases, and their intervals, are for use after the recording, for as long again as it took and without "

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterator
 from functools import cache, partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +29,7 @@ from jaximu.noise.deviations import deviation
 from jaximu.recordings.finding import Finding
 from jaximu.report import figures
 from jaximu.report.figures import band, dressed, legend, zero_line
+from jaximu.report.words import compensation, file_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,8 +55,6 @@ _SCOPES = {"device": "unit", "session": "recording", "fixture": "set-up"}
 
 def page_of(diagnosis: Diagnosis) -> Page:
     """Return what is wrong, how sure that is, what it costs, what the extension gains, and what to do next."""
-    files = [str(file["file"]) for file in diagnosis.calibration.data.get("files", ())]
-    names = ", ".join(Path(file).name for file in files) or "a recording"
 
     @cache
     def twin() -> tuple[Experiment, State]:
@@ -65,13 +63,13 @@ def page_of(diagnosis: Diagnosis) -> Page:
         return simulated, simulated.fit(asking=())
 
     return Page(
-        f"Diagnosis of {names}: {diagnosis.verdict}",
+        f"Diagnosis of {file_names(diagnosis.calibration.files)}: {diagnosis.verdict}",
         [*filter(None, (*_what_is_wrong(diagnosis), _gained(diagnosis)))],
         *_number(diagnosis),
         [*_first(diagnosis, twin)],
         rest=partial(_rest, diagnosis, twin),
         notes=[sentence(note) for note in diagnosis.notes],
-        next=_next(diagnosis, [shlex.quote(file) for file in files] or ["LOG"]),
+        next=_next(diagnosis),
     )
 
 
@@ -223,8 +221,9 @@ def _number(diagnosis: Diagnosis) -> tuple[str, str]:
     return size(measured, shown.unit, 2), meaning
 
 
-def _next(diagnosis: Diagnosis, files: list[str]) -> str:
+def _next(diagnosis: Diagnosis) -> str:
     """Return what to record or run next."""
+    files = [*map(shlex.quote, diagnosis.calibration.files)] or ["LOG"]
     repairs = dict.fromkeys(finding.repair for finding in _standing(diagnosis) if finding.repair)
     by_hand = diagnosis.experiment.data.by_hand  # else the command has more arguments
     if repairs and by_hand:
@@ -235,7 +234,7 @@ def _next(diagnosis: Diagnosis, files: list[str]) -> str:
         recorded = by_hand and " record" in diagnosis.suggestion and not _standing(diagnosis)
         return diagnosis.suggestion + f" {together}" * recorded
     what = "extended calibration" if diagnosis.extended.effects else "calibration"
-    return f"`jaximu compensate CALIBRATION {files[0]} -o CORRECTED.csv` applies the {what}."
+    return compensation(diagnosis.calibration.files, f"applies the {what}")
 
 
 def _mistake(diagnosis: Diagnosis, finding: Finding) -> Statement:
@@ -424,7 +423,7 @@ def _in_plausible_sizes(diagnosis: Diagnosis, name: str, limit: float) -> float:
     """Return an effect's detection limit in multiples of a plausible size."""
     kind, imu = CATALOGUE[name], diagnosis.base.imu
     triad = imu.triads().get(kind.owner, imu.accelerometer)
-    scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
+    scale = float(np.mean(triad.scales))
     return limit / (kind.typical * (scale if kind.unit.startswith("output") else 1.0))
 
 

@@ -119,7 +119,7 @@ def page_of(calibration: Calibration, history: History) -> Page:
     if "vehicle" in calibration.filter:
         return vehicle_page(calibration, history)
     bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
-    scale = np.mean(np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1))
+    scale = np.mean(calibration.triads()["gyroscope"].scales)
     worst = np.degrees(Z95 * max(bias) / scale)
     minutes = (history.time[-1] - history.time[0]) / 60
     verdict = "diverged" if calibration.filter.get("diverged") else "followed the unit"
@@ -160,7 +160,7 @@ _Line = tuple[FloatArray, FloatArray, str, str]
 def _triads(calibration: Calibration, history: History) -> Iterator[tuple[str, list[_Line]]]:
     """Yield the title of each panel of biases and scales, and its lines, less their last values."""
     for owner, part, title, factor in _PANELS:
-        gain, lines = np.linalg.norm(np.asarray(getattr(calibration.imu, owner).gain), axis=1), []
+        gain, lines = getattr(calibration.imu, owner).scales, []
         for state in _places(history, owner, part):
             axes = history.names[state].axes
             if len(set(axes)) == 1:

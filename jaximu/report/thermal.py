@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +24,7 @@ from jaximu.mistakes.titles import effect_title
 from jaximu.planning.ramps import next_ramps
 from jaximu.recordings.recording import Recording, smoothed_slope
 from jaximu.report.figures import dressed, legend, new_figure, zero_line
-from jaximu.report.words import how_much_smaller
+from jaximu.report.words import compensation, file_names, how_much_smaller
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,9 +76,7 @@ def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] 
 def files_and_next(recordings: Sequence[Recording]) -> tuple[str, str]:
     """Return the names of the recordings' files, and the sentence on what to run next."""
     files = [str(source.path) for recording in recordings for source in recording.sources]
-    log = shlex.quote(files[0]) if files else "LOG"
-    names = ", ".join(Path(file).name for file in files) or "a recording"
-    return names, f"`jaximu compensate CALIBRATION {log} -o CORRECTED.csv` applies it at the logged temperatures."
+    return file_names(files), compensation(files, "applies it at the logged temperatures")
 
 
 def _size(name: str, axes: FloatArray) -> str:
@@ -254,7 +250,7 @@ def _largest_change(calibration: Calibration, owner: str, plain: str) -> tuple[s
     """Return the largest change of steady bias that an effect makes over the range, ± 95 %, by axis, and the unit."""
     low, high = calibration.data["temperature_range"]
     temperature = np.linspace(low, high, 101)
-    scale = np.linalg.norm(np.asarray(calibration.triads()[owner].gain), axis=1)
+    scale = calibration.triads()[owner].scales
     value, sigma = (values / scale for values in change(calibration, owner, (plain,), temperature))
     rows = np.argmax(np.abs(value), axis=0), np.arange(3)
     factor, unit = readable(SENSOR_UNITS[owner], np.max(np.abs(value)))

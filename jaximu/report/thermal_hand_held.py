@@ -127,7 +127,7 @@ def _limit_rows(thermal: HandHeldThermal) -> list[tuple[str, ...]]:
     for name, (value, unit) in thermal.limits.items():
         kind = CATALOGUE[name]
         triad = thermal.calibration.triads()[kind.owner]
-        scale = np.mean(np.linalg.norm(np.asarray(triad.gain), axis=1))
+        scale = np.mean(triad.scales)
         most = value * extent ** _POWER.get(kind.plain, 1) / scale
         shown = size(most, SENSOR_UNITS[kind.owner], 2) if kind.plain in POWERS else size(100 * most, "%", 2)
         rows.append((kind.title, size(value, unit, 2), shown))
@@ -150,7 +150,7 @@ def _change_figure(thermal: HandHeldThermal) -> Figure:
     temperature, calibration = np.linspace(*thermal.range, 101), thermal.calibration
     drawn = []
     for owner, word, names, force in _changed(thermal):
-        scale = np.linalg.norm(np.asarray(calibration.triads()[owner].gain), axis=1)
+        scale = calibration.triads()[owner].scales
         value, sigma = (values / scale for values in change(calibration, owner, names, temperature, force=force))
         most = np.max(np.abs(value))
         factor, unit = readable(SENSOR_UNITS[owner], most) if word == "bias" else (100.0, "%")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -16,7 +15,7 @@ from jaximu.ground.quantities import Z95, counted, listed, size, with_interval, 
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.report.calibration import calibration_page
 from jaximu.report.figures import AXES, band, dressed, legend, new_figure, zero_line
-from jaximu.report.words import limits
+from jaximu.report.words import compensation, limits
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,7 +30,7 @@ def vehicle_page(calibration: Calibration, history: History) -> Page:
     """Return the page of a gyroscope that was calibrated by the stops of a vehicle."""
     assert calibration.filter is not None
     vehicle = calibration.filter["vehicle"]
-    scale = np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)
+    scale = calibration.triads()["gyroscope"].scales
     worst = float(np.max(Z95 * calibration.bias_sigma_recording["gyroscope"] / scale))
     page = calibration_page(
         calibration,
@@ -52,9 +51,7 @@ def vehicle_page(calibration: Calibration, history: History) -> Page:
         (f"±{size(worst, 'rad/s', 2)}", "how well the gyroscope's bias over the drive is known (95 %, the worst axis)"),
         [*_statements(calibration, vehicle), Section("What stays open", [Items(calibration.filter["open"])], 3)],
     )
-    files = calibration.data.get("files", ())
-    log = shlex.quote(str(files[0]["file"])) if files else "LOG"
-    return replace(page, next=f"`jaximu compensate CALIBRATION {log} -o CORRECTED.csv` takes the gyroscope's bias off.")
+    return replace(page, next=compensation(calibration.files, "takes the gyroscope's bias off"))
 
 
 def _statements(calibration: Calibration, vehicle: Mapping[str, Any]) -> Iterator[Part]:
@@ -118,7 +115,7 @@ def _earth(calibration: Calibration) -> str:
 def _figure(calibration: Calibration, history: History) -> Figure:
     assert calibration.filter is not None
     vehicle = calibration.filter["vehicle"]
-    scale = np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)
+    scale = calibration.triads()["gyroscope"].scales
     figure = new_figure(7.5)
     bias, tilt, speed = figure.subplots(3, 1)
     for row, (axis, color) in enumerate(AXES.items()):

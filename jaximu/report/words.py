@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -16,8 +18,10 @@ from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
 __all__ = [
     "BEYOND",
+    "compensation",
     "counts",
     "direction_words",
+    "file_names",
     "gravity_statements",
     "how_much_smaller",
     "limits",
@@ -29,6 +33,16 @@ __all__ = [
 BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
 _CHANCE = 0.01
 """Share of recordings in which noise alone scatters more than a scatter that is called noise."""
+
+
+def file_names(paths: Sequence[str]) -> str:
+    """Return the names of recordings' files, without their folders."""
+    return ", ".join(Path(path).name for path in paths) or "a recording"
+
+
+def compensation(paths: Sequence[str], does: str) -> str:
+    """Return the command that applies a calibration to the first recording, and what it does."""
+    return f"`jaximu compensate CALIBRATION {shlex.quote(paths[0]) if paths else 'LOG'} -o CORRECTED.csv` {does}."
 
 
 def counts(calibration: Calibration) -> tuple[int, int]:

@@ -277,7 +277,6 @@ def yaml_matrices(named: Mapping[str, FloatArray], indent: int, rows: int) -> li
 def comments(parameters: ExportedUnit, sign: str = "#") -> str:
     """Where the numbers come from and what axes they are for, for the head of a file."""
     calibration = parameters.calibration
-    files = [str(file["file"]) for file in calibration.data.get("files", ())]
-    safe = "".join(letter if letter.isprintable() else "?" for letter in ", ".join(files) or "a recording")
+    safe = "".join(letter if letter.isprintable() else "?" for letter in ", ".join(calibration.files) or "a recording")
     version = calibration.software.get("version", "")
     return f"{sign} Calibrated by jaximu {version} from {safe}. {parameters.axes}"
