@@ -170,8 +170,7 @@ def _drift_figure(attribution: Attribution) -> Figure:
     """Draw the common time course of each session, and each axis scaled by its part in it."""
     drifts: Sequence[CommonDrift] = attribution.drifts
     factor, unit = readable("rad/s", max(drift.size for drift in drifts))
-    figure = figures.new_figure(1.0 + 2.0 * len(drifts))
-    grid = figure.subplots(len(drifts), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+    figure, grid = figures.stacked(len(drifts), 2.0, 1.0, sharex=True, sharey=True)
     for axes, drift in zip(grid, drifts, strict=True):
         for line in drift.axes:
             axes.plot(drift.times, factor * line, color=figures.BEFORE, linewidth=0.6, alpha=0.5)

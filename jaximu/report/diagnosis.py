@@ -291,8 +291,7 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
     """Draw the spectrum over time of the axes with lines that move, those that cross zero frequency first."""
     parts = diagnosis.calibration.segmentations
     axes_of = list(dict.fromkeys((one.recording, one.triad, one.line.axis) for one in diagnosis.lines))[:_PANELS]
-    figure = figures.new_figure(0.6 + 2.4 * len(axes_of))
-    grid = figure.subplots(len(axes_of), 1, squeeze=False)[:, 0]
+    figure, grid = figures.stacked(len(axes_of), 2.4, 0.6)
     for axes, key in zip(grid, axes_of, strict=True):
         mine = [one for one in diagnosis.lines if (one.recording, one.triad, one.line.axis) == key]
         times, power = spectrum_at_rest(parts[key[0]], key[1], key[2])

@@ -17,7 +17,7 @@ from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.report.attitude import mounting_words
 from jaximu.report.calibration import calibration_page
-from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, new_figure, zero_line
+from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, stacked, zero_line
 from jaximu.report.vehicle import vehicle_page
 from jaximu.report.words import BEYOND, gravity_statements, limits
 
@@ -186,8 +186,7 @@ def _effects(calibration: Calibration, history: History) -> Iterable[tuple[str, 
 
 def _figure(calibration: Calibration, history: History) -> Figure:
     drawn = [*_triads(calibration, history), *_effects(calibration, history)]
-    figure = new_figure(2.4 * (len(drawn) + 1))
-    panels = figure.subplots(len(drawn) + 1, 1, sharex=True)
+    figure, panels = stacked(len(drawn) + 1, 2.4, sharex=True)
     time = history.time
     middle = np.searchsorted(time, (time[0] + time[-1]) / 2)
     for panel, (title, lines) in zip(panels, drawn, strict=False):

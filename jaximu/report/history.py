@@ -287,11 +287,6 @@ def _surest(history: UnitHistory) -> list[Movement]:
     return sorted(history.movements, key=lambda movement: (not movement.tested, movement.p_value))[:_DRAWN]
 
 
-def _panels(movements: list[Movement]) -> tuple[Figure, list[Axes]]:
-    figure = figures.new_figure(0.8 + 1.7 * len(movements))
-    return figure, figure.subplots(len(movements), 1, sharex=True, squeeze=False)[:, 0].tolist()
-
-
 def _points(panel: Axes, movement: Movement, at: NDArray[Any]) -> tuple[float, str]:
     """Draw a number's values with their intervals; return the factor to its unit, and the unit."""
     shown, factor = in_shown_unit(movement.unit)
@@ -304,7 +299,7 @@ def _points(panel: Axes, movement: Movement, at: NDArray[Any]) -> tuple[float, s
 
 def _history_figure(history: UnitHistory) -> Figure:
     movements = _surest(history)
-    figure, panels = _panels(movements)
+    figure, panels = figures.stacked(len(movements), 1.7, 0.8, sharex=True)
     dated = history.per == "year"
     at = np.array(history.dates, "datetime64[D]") if dated else history.times
     for panel, movement in zip(panels, movements, strict=True):
@@ -322,7 +317,7 @@ def _history_figure(history: UnitHistory) -> Figure:
 
 def _temperature_figure(history: UnitHistory) -> Figure:
     movements = _surest(history)
-    figure, panels = _panels(movements)
+    figure, panels = figures.stacked(len(movements), 1.7, 0.8, sharex=True)
     for panel, movement in zip(panels, movements, strict=True):
         _points(panel, movement, np.array(history.temperatures, float))
     panels[-1].set_xlabel("temperature [°C]")

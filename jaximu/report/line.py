@@ -278,8 +278,7 @@ def _to_draw(line: Line) -> list[tuple[FollowedQuantity, str]]:
 
 def _chart_figure(line: Line, drawn: list[tuple[FollowedQuantity, str]]) -> Figure:
     """Draw control charts: values, moving average and limits above, moving ranges below."""
-    drawing = figures.new_figure(0.6 + 3.0 * len(drawn))
-    rows = drawing.subplots(2 * len(drawn), 1, height_ratios=[2.2, 1] * len(drawn), squeeze=False)[:, 0]
+    drawing, rows = figures.stacked(2 * len(drawn), 1.5, 0.6, height_ratios=[2.2, 1] * len(drawn))
     for (quantity, station), above, below in zip(drawn, rows[::2], rows[1::2], strict=True):
         chart, places = quantity.charts[station]
         unit, factor = in_shown_unit(si_unit(quantity.name), quantity.limit.stated if quantity.limit else "")

@@ -189,8 +189,7 @@ def _map_points() -> tuple[NDArray[np.bool_], FloatArray]:
 
 
 def _curves_figure(panels: list) -> Figure:
-    figure = figures.new_figure(2.6 * len(panels), 6.4)
-    grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    figure, grid = figures.stacked(len(panels), 2.6, width=6.4)
     for axes, (title, across, up, lines, heights) in zip(grid, panels, strict=True):
         for (name, values), height in zip(lines.items(), heights, strict=True):
             axes.plot(

@@ -14,7 +14,7 @@ from jaximu.ground.page import Items, Page, Part, Picture, Section, Statement
 from jaximu.ground.quantities import Z95, counted, listed, size, with_interval, with_intervals
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.report.calibration import calibration_page
-from jaximu.report.figures import AXES, band, dressed, legend, new_figure, zero_line
+from jaximu.report.figures import AXES, band, dressed, legend, stacked, zero_line
 from jaximu.report.words import compensation, limits
 
 if TYPE_CHECKING:
@@ -116,8 +116,7 @@ def _figure(calibration: Calibration, history: History) -> Figure:
     assert calibration.filter is not None
     vehicle = calibration.filter["vehicle"]
     scale = calibration.triads()["gyroscope"].scales
-    figure = new_figure(7.5)
-    bias, tilt, speed = figure.subplots(3, 1)
+    figure, (bias, tilt, speed) = stacked(3, 2.5)
     for row, (axis, color) in enumerate(AXES.items()):
         values, sigmas = (
             np.degrees(history.values[:, row] / scale[row]),
