@@ -61,7 +61,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Items:
-    """A list of sentences."""
+    """A list of sentences, each shown with a capital at its start."""
 
     kind: ClassVar[str] = "items"
     texts: Sequence[str]

@@ -369,7 +369,7 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
         *_number(analysis),
         (_picture(analysis), *_cautions(analysis), terms, numbers, *_limits(analysis)),
         partial(_details, analysis, sources or [Source(path, "", 0) for path in analysis.files]),
-        [*map(sentence, filter(None, analysis.notes))],
+        [*filter(None, analysis.notes)],
         f"`jaximu calibrate LOG --static {log} -o RESULTS` calibrates the unit with this noise."
         if "accelerometer" in analysis.axes
         else "",

@@ -13,7 +13,7 @@ import scipy
 
 from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.ground.page import Page, Picture, Statement, Table
-from jaximu.ground.quantities import number, sentence, with_interval
+from jaximu.ground.quantities import number, with_interval
 from jaximu.report.figures import AXES, dressed, new_figure
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def page_of(array: Array) -> Page:
             _table(array),
             *_noise(array),
         ),
-        notes=[sentence(note) for note in array.notes],
+        notes=array.notes,
         next=_next(array),
     )
 

@@ -32,7 +32,7 @@ def page_of(attribution: Attribution) -> Page:
         f"{explained} of {len(parts)}",
         "recordings whose model is adequate, or whose effects explain them",
         [*_first(attribution)],
-        notes=[sentence(note) for note in attribution.notes],
+        notes=attribution.notes,
         next=attribution.suggestion,
         caution=explained < len(parts),
     )

@@ -38,7 +38,7 @@ def page_of(budget: Budget) -> Page:
         number,
         meaning,
         (_picture(budget), *_goals(budget), _sources(budget), _parameters(budget), *_limits(budget)),
-        notes=[sentence(note) for note in budget.notes],
+        notes=budget.notes,
         next=_next(budget),
     )
 

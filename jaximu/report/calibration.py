@@ -122,7 +122,7 @@ def calibration_page(
         meaning,
         (*pictures, *findings, *warnings, *_parameters(calibration)),
         rest,
-        [sentence(note) for note in calibration.notes],
+        calibration.notes,
         words.compensation(calibration.files, "applies it") if "accelerometer" in calibration.triads() else "",
     )
 

@@ -39,7 +39,7 @@ def page_of(acceptance: Acceptance) -> Page:
         + f" of {counted(len(items), 'item')}",
         (Section("Results", [_results(items), *_remarks(items), *_rule(acceptance)]),),
         lambda: [_uncertainty(items)],
-        [sentence(note) for note in acceptance.notes],
+        acceptance.notes,
         _next(acceptance),
         caution=acceptance.verdict != PASS,
     )

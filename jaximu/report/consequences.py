@@ -48,7 +48,7 @@ def page_of(
             *_for_estimators(noise, files),
         ),
         partial(_tracks, consequences),
-        [sentence(note) for note in consequences.notes],
+        consequences.notes,
         _next(consequences),
     )
 

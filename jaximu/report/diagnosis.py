@@ -68,7 +68,7 @@ def page_of(diagnosis: Diagnosis) -> Page:
         *_number(diagnosis),
         [*_first(diagnosis, twin)],
         rest=partial(_rest, diagnosis, twin),
-        notes=[sentence(note) for note in diagnosis.notes],
+        notes=diagnosis.notes,
         next=_next(diagnosis),
     )
 

@@ -30,7 +30,7 @@ def page_of(noise: EstimatorNoise) -> Page:
         f"{number(triad.applied[at])} (95 %: {number(triad.low[at])} to {number(triad.high[at])})",
         f"times the {name}'s white noise N",
         (*statements(noise), _table(noise)),
-        notes=[sentence(note) for note in noise.notes],
+        notes=noise.notes,
     )
 
 

@@ -60,7 +60,7 @@ def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
             *([Section("Magnetometers", [Items(magnetometers)])] if magnetometers else []),
         ),
         rest,
-        [sentence(note) for note in fleet.notes],
+        fleet.notes,
         _next(fleet),
         caution=not done,
     )

@@ -37,7 +37,7 @@ def page_of(history: UnitHistory) -> Page:
         meaning,
         tuple(_first(history)),
         partial(_rest, history),
-        [sentence(note) for note in (*history.notes, *history.left_out)],
+        (*history.notes, *history.left_out),
         _next(history),
         caution=history.verdict == "moved",
     )

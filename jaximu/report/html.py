@@ -18,6 +18,7 @@ from markupsafe import Markup, escape
 from jaximu.ground.atomic import write_files, write_folder
 from jaximu.ground.errors import worded
 from jaximu.ground.page import Page, Part, Picture, Result, Section
+from jaximu.ground.quantities import sentence
 
 if TYPE_CHECKING:
     import jinja2
@@ -139,7 +140,7 @@ def environment() -> jinja2.Environment:
         "script": script,
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     }
-    made.filters |= {"inline": _inline, "kind_of_cell": _kind_of_cell, "anchor": _anchor}
+    made.filters |= {"inline": _inline, "sentence": sentence, "kind_of_cell": _kind_of_cell, "anchor": _anchor}
     return made
 
 

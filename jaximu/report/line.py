@@ -64,7 +64,7 @@ def page_of(line: Line) -> Page:
         meaning,
         (*(pictures if charts else []), *_capability(line, able), *_alarms(line)),
         lambda: [*_not_passed(line), *_worst_lots(able), *_gauge(line)],
-        [sentence(note) for note in line.notes],
+        line.notes,
         _next(line),
         caution=bool(line.counts[FAIL] or (able and able[0][1] < _CAPABLE)),
     )

@@ -44,7 +44,7 @@ def page_of(
 
 
 def _assumed(texts: Sequence[str]) -> Iterator[Part]:
-    yield Section("What was assumed", [Items([*map(sentence, texts)])])
+    yield Section("What was assumed", [Items(texts)])
 
 
 def _refused(texts: Mapping[str, str]) -> Iterator[Part]:

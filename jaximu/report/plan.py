@@ -15,7 +15,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.projection import output_uncertainty
 from jaximu.estimation.uncertainty import describe, spoken_amount
 from jaximu.ground.page import Page, Picture, Section, Statement, Table
-from jaximu.ground.quantities import Z95, number, plain, sentence
+from jaximu.ground.quantities import Z95, number, plain
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.planning import Proposal
 from jaximu.report import figures
@@ -50,7 +50,7 @@ def page_of(proposal: Proposal) -> Page:
             Section("What they are expected to gain", [_parameters(proposal)]),
             *_open(proposal),
         ),
-        notes=[sentence(note) for note in proposal.notes],
+        notes=proposal.notes,
         next=_next(proposal),
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ def log_page(document: Mapping[str, Any], commands: Sequence[str]) -> Page:
         [
             _table(document["signals"]),
             *_guess(document.get("guess")),
-            Section("What was noticed", [Items([*map(sentence, document["findings"])])]),
+            Section("What was noticed", [Items(document["findings"])]),
             *([Section("What it can be used for", uses)] if uses else []),
         ],
     )
@@ -73,7 +73,7 @@ def _page(
     title: str,
     signals: Mapping[str, Mapping[str, Any]],
     parts: Sequence[Part],
-    notes: Iterable[str] = (),
+    notes: Sequence[str] = (),
     after: str = "",
 ) -> Page:
     """Return the page of signals that are described by their facts: which sensors, at what rate, and for how long."""
@@ -84,7 +84,7 @@ def _page(
         rate, duration = f" at {longest['rate']:.5g} Hz", f"{longest['duration']:.5g} s"
         meaning = f"from the first to the last of {longest['samples']} samples"
     text = sentence(f"{listed(sensors)}{rate}.")
-    return Page(title, (text,), duration, meaning, parts, notes=[*map(sentence, notes)], next=after)
+    return Page(title, (text,), duration, meaning, parts, notes=notes, next=after)
 
 
 def _table(signals: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -125,7 +125,7 @@ def _guess(guess: Mapping[str, Any] | None) -> Iterator[Part]:
     parts: list[Part] = [
         f"The file does not say all of this. Check it{blanks}, then paste:",
         Code(guess["line"]),
-        Items([sentence(text) for text in (*guess["reasons"], *guess["questions"])]),
+        Items((*guess["reasons"], *guess["questions"])),
     ]
     if guess["rows"]:
         columns = list(zip(*guess["rows"], strict=True))

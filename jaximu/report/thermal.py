@@ -68,7 +68,7 @@ def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] 
             *(_export(export, thermal) for export in exports),
         ),
         partial(_rest, thermal),
-        [sentence(note) for note in thermal.notes],
+        thermal.notes,
         command,
     )
 
@@ -260,7 +260,7 @@ def _largest_change(calibration: Calibration, owner: str, plain: str) -> tuple[s
 
 def _export(export: AutopilotParameters, thermal: ThermalCalibration) -> Section:
     """Say what an autopilot's parameters lose, and how to use them."""
-    return Section(f"{export.name} parameters", [loss_words(export, thermal), Items([*map(sentence, export.notes)])])
+    return Section(f"{export.name} parameters", [loss_words(export, thermal), Items(export.notes)])
 
 
 def _rest(thermal: ThermalCalibration) -> Iterator[Part]:

@@ -41,7 +41,7 @@ def page_of(thermal: HandHeldThermal) -> Page:
         meaning,
         (*_first(thermal),),
         partial(_rest, thermal),
-        [*map(sentence, thermal.notes), f"Written by jaximu {thermal.software['version']}."],
+        (*thermal.notes, f"Written by jaximu {thermal.software['version']}."),
         command,
     )
 

@@ -51,7 +51,7 @@ def page_of(validity: Validity) -> Page:
         meaning,
         (*_shifts(validity), *_statements(validity), *_errors_table(validity)),
         rest=lambda: [_picture(validity)],
-        notes=[sentence(note) for note in validity.notes],
+        notes=validity.notes,
         next=following[validity.verdict].replace("LOG", shlex.quote(log)),
     )
 
