@@ -76,7 +76,9 @@ def verbs(monkeypatch):
             arguments = vars(command)
             calls.append((verb, arguments.get("logs") or arguments["log_path"], arguments))
             names = ("diagnosis", "calibration") if verb == "diagnose" else ("calibration",)
-            command.results.present(lambda: Page(f"About {verb}", ["It is done."]), **{name: Document() for name in names})
+            command.results.present(
+                lambda: Page(f"About {verb}", ["It is done."]), **{name: Document() for name in names}
+            )
 
         return run
 

@@ -1,4 +1,7 @@
-"""A result in parts, before anyone has decided how to show it: on the terminal, as an HTML file, in a notebook."""
+"""A result in parts, before anyone has decided how to show it: on the terminal, as an HTML file, in a notebook.
+
+A part that holds nothing is false, and no renderer shows it: a section of nothing needs no condition where it is made.
+"""
 
 from __future__ import annotations
 
@@ -39,6 +42,9 @@ class Table:
     marked: Sequence[int] = ()
     brief: int | None = None
 
+    def __bool__(self) -> bool:
+        return bool(self.rows)
+
     def __str__(self) -> str:
         return later("report.terminal", "text")(self)
 
@@ -66,6 +72,9 @@ class Items:
     kind: ClassVar[str] = "items"
     texts: Sequence[str]
 
+    def __bool__(self) -> bool:
+        return bool(self.texts)
+
 
 @dataclass(frozen=True)
 class Code:
@@ -91,6 +100,9 @@ class Section:
     title: str
     parts: Sequence[Part]
     level: int = 2
+
+    def __bool__(self) -> bool:
+        return any(self.parts)
 
 
 Part = str | Statement | Table | Picture | Items | Code | Matrices | Section
@@ -121,16 +133,15 @@ class Page:
 
     def section(self) -> Section:
         """Return the first screen as one section."""
-        notes = [Items(self.notes)] if self.notes else []
-        return Section(self.title, (*self._headline(), *self.first, *notes), 4)
+        return Section(self.title, (*self._headline(), *self.first, Items(self.notes)), 4)
 
     def chapter(self, name: str, whole: bool) -> Section:
         """Return the page as a section of another, its pictures kept as NAME_….png.
 
         whole: with all that the HTML file shows, not the first screen alone.
         """
-        notes = [Section("Notes", [Items(self.notes)])] if self.notes else []
-        parts = (*self._headline(), *self.first, *(self.rest() if whole else ()), *notes)
+        rest = self.rest() if whole else ()
+        parts = (*self._headline(), *self.first, *rest, Section("Notes", [Items(self.notes)]))
         return Section(self.title, [_inside(part, name) for part in parts])
 
     def _headline(self) -> list[str]:

@@ -367,7 +367,7 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
         f"Noise at rest: {file_names(analysis.files)}",
         [*_verdict(analysis)],
         *_number(analysis),
-        (_picture(analysis), *_cautions(analysis), terms, numbers, *_limits(analysis)),
+        (_picture(analysis), _cautions(analysis), terms, numbers, *_limits(analysis)),
         partial(_details, analysis, sources or [Source(path, "", 0) for path in analysis.files]),
         [*filter(None, analysis.notes)],
         f"`jaximu calibrate LOG --static {log} -o RESULTS` calibrates the unit with this noise."
@@ -389,7 +389,7 @@ def _picture(analysis: NoiseAnalysis) -> Picture:
     )
 
 
-def _cautions(analysis: NoiseAnalysis) -> Iterator[Section]:
+def _cautions(analysis: NoiseAnalysis) -> Section:
     """Say where the terms are not the whole noise, and which sensor is missing."""
     poor = [name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)]
     missing = [name for name in INERTIAL_QUANTITIES if name not in analysis.axes]
@@ -399,23 +399,28 @@ def _cautions(analysis: NoiseAnalysis) -> Iterator[Section]:
         cautions.append(Statement("More than the five terms", f"{text}the notes.", True))
     if missing:
         cautions.append(Statement("Not recorded", f"The recording has no {listed(missing, 'and no')}.", True))
-    if cautions:
-        yield Section("Before you rely on it", cautions)
+    return Section("Before you rely on it", cautions)
 
 
 def _by_triad(analysis: NoiseAnalysis, title: str, text: str, content: _Content) -> Section:
     """Return a section with a part for each triad."""
-    parts: list[Part] = [text] if text else []
-    for name in analysis.axes:
-        parts.append(Section(f"{sentence(name)}, {analysis.rates[name]:.6g} Hz", [*content(analysis, name)], 3))
-    return Section(title, parts)
+    return Section(
+        title,
+        [
+            text,
+            *(
+                Section(f"{sentence(name)}, {analysis.rates[name]:.6g} Hz", [*content(analysis, name)], 3)
+                for name in analysis.axes
+            ),
+        ],
+    )
 
 
 def _terms(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
     """Yield a triad's terms with their intervals, in both units, what is not seen, and the lowest point."""
     axes, quantity = analysis.axes[name], SENSOR_QUANTITIES[name]
-    if rows := [row.row(f"{row.term} {row.meaning}", row.first) for row in term_rows(axes, quantity)]:
-        yield Table(("term", "unit", *_AXES), rows)
+    rows = [row.row(f"{row.term} {row.meaning}", row.first) for row in term_rows(axes, quantity)]
+    yield Table(("term", "unit", *_AXES), rows)
     yield from unseen_notes(axes, quantity)
     at, size = _lowest(axes)
     yield f"Lowest point of the mean's curve: {_in_unit(size, quantity, 'B', 2)} at {_hours(at)}."
@@ -426,13 +431,13 @@ def _terms_in_si(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
     quantity = SENSOR_QUANTITIES[name]
     rows = [row for row in term_rows(analysis.axes[name], quantity) if row.unit == SI_UNITS[quantity][row.term]]
     named = [replace(row, first=True).row(f"{row.term} {row.meaning}") for row in rows]
-    yield Table(("term", "unit", *_AXES), named) if named else _NONE
+    yield Table(("term", "unit", *_AXES), named) or _NONE
 
 
 def _filter(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
     """Yield the numbers that a filter takes of the mean of a triad's axes."""
     rows = [row for row in _filter_rows(filter_numbers(analysis, name)[1]) if row[2]]
-    yield Table(("formula", "number", "value", "unit"), rows) if rows else _NONE
+    yield Table(("formula", "number", "value", "unit"), rows) or _NONE
 
 
 def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
@@ -486,11 +491,10 @@ def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Par
     )
     yield Section("For Kalibr", ["The same, as `imu.yaml`:", Code(kalibr_text(analysis))])
     files = [(source.path, str(source.rows or ""), source.sha256) for source in sources]
-    tables = [Table(("file", "rows", "SHA-256"), files)] if files else []
     yield Section(
         "Where it comes from",
         [
-            *tables,
+            Table(("file", "rows", "SHA-256"), files),
             Table(
                 (),
                 [
@@ -520,7 +524,7 @@ def _discrete(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
             cells = ["–" if one is None else number(factor * one, 4) for one in sizes]
             rows.append((words, unit_text(unit), *cells))
             words = ""
-    yield Table(("", "unit", *_AXES), rows) if rows else "The data supports neither N nor K."
+    yield Table(("", "unit", *_AXES), rows) or "The data supports neither N nor K."
 
 
 def _filter_by_axis(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
@@ -531,7 +535,7 @@ def _filter_by_axis(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
         for row in zip(*map(_filter_rows, per_axis), strict=True)
         if any(text for _, _, text, _ in row)
     ]
-    yield Table(("formula", "unit", *_AXES[:3]), rows) if rows else _NONE
+    yield Table(("formula", "unit", *_AXES[:3]), rows) or _NONE
     if mean.flat is not None:
         left, right = (_hours(end) for end in sorted(mean.flat))
         yield (

@@ -89,8 +89,7 @@ def _first(attribution: Attribution) -> Iterator[Part]:
             "Coloured: the common time course of each session, in a usual axis. Grey: each axis that has a part in it, "
             "less what follows orientation, divided by its part; where grey follows the line, the course is common.",
         )
-    if attribution.findings:
-        yield _findings_table(attribution)
+    yield _findings_table(attribution)
     yield _verdicts_table(attribution)
     if attribution.common:
         yield Statement(

@@ -37,7 +37,7 @@ def page_of(budget: Budget) -> Page:
         tuple(_verdict(budget)),
         number,
         meaning,
-        (_picture(budget), *_goals(budget), _sources(budget), _parameters(budget), *_limits(budget)),
+        (_picture(budget), _goals(budget), _sources(budget), _parameters(budget), _limits(budget)),
         notes=budget.notes,
         next=_next(budget),
     )
@@ -54,14 +54,15 @@ def _picture(budget: Budget) -> Picture:
     )
 
 
-def _goals(budget: Budget) -> Iterator[Section]:
+def _goals(budget: Budget) -> Section:
     """Return each goal with the sizes that would reach it."""
-    statements = [
-        Statement(f"{goal.name} to {_wanted(goal)}", sentence(goal_words(budget, goal)), not goal.reached)
-        for goal in budget.goals
-    ]
-    if statements:
-        yield Section("Goals", statements)
+    return Section(
+        "Goals",
+        [
+            Statement(f"{goal.name} to {_wanted(goal)}", sentence(goal_words(budget, goal)), not goal.reached)
+            for goal in budget.goals
+        ],
+    )
 
 
 def _sources(budget: Budget) -> Section:
@@ -92,14 +93,13 @@ def _parameters(budget: Budget) -> Section:
     )
 
 
-def _limits(budget: Budget) -> Iterator[Section]:
+def _limits(budget: Budget) -> Section:
     """Return where the first order is not enough, how it compares with simulated sessions, and what stays open."""
     parts: list[Part] = [Statement("Not linear", text, caution=True) for text in nonlinear_words(budget)]
     if budget.check is not None:
         parts.append(Statement("Against simulated sessions", check_words(budget, budget.check)))
     parts += [Statement("Weak or open", text, caution=True) for text in budget.open]
-    if parts:
-        yield Section("How far it holds", parts)
+    return Section("How far it holds", parts)
 
 
 # --- words ------------------------------------------------------------------------------------------------------------

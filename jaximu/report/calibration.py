@@ -101,14 +101,11 @@ def calibration_page(
     """
     trust = [*trust, *words.weak_statements(calibration.weak)]
     cautions = [statement for statement in trust if statement.caution]
-    warnings = [Section("Before you rely on it", cautions)] if cautions else []
     settled = [statement for statement in trust if not statement.caution]
 
     def rest() -> Iterator[Part]:
-        if settled:
-            yield Section("What to trust", settled)
-        if uncertain := [*uncertainty_parts(calibration)]:
-            yield Section("What is still uncertain", uncertain)
+        yield Section("What to trust", settled)
+        yield Section("What is still uncertain", [*uncertainty_parts(calibration)])
         yield Section("What the data cannot show", [*limits()])
         yield from _equations(calibration)
         yield _correlation(calibration)
@@ -120,7 +117,7 @@ def calibration_page(
         (*verdict, *_errors(calibration), *_determined(calibration)),
         value,
         meaning,
-        (*pictures, *findings, *warnings, *_parameters(calibration)),
+        (*pictures, *findings, Section("Before you rely on it", cautions), *_parameters(calibration)),
         rest,
         calibration.notes,
         words.compensation(calibration.files, "applies it") if "accelerometer" in calibration.triads() else "",
@@ -197,10 +194,8 @@ def _parameters(calibration: Calibration) -> Iterator[Part]:
                 3,
             )
         )
-    others = [one for one in calibration.parameters.values() if "effects" in one.name]
-    if others:
-        parts.append(Section("Effects", [Table(("number", "± 95 %"), [*map(_effect_row, others)])], 3))
-    yield Section("Parameters", [*parts])
+    others = [_effect_row(one) for one in calibration.parameters.values() if "effects" in one.name]
+    yield Section("Parameters", [*parts, Section("Effects", [Table(("number", "± 95 %"), others)], 3)])
     yield (
         "Gain K = S·(1 + M): scales S on the diagonal, misalignments M beside it (1 mrad is 0.1 % of the input); "
         "“misalignment y from x” is how much of the input along x appears on output y."

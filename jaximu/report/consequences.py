@@ -117,12 +117,10 @@ def _for_estimators(noise: Mapping[str, EstimatorNoise], files: Mapping[str, byt
     """Return the noise for estimators, by where it is from, and the files that carry it."""
     for origin, one in noise.items():
         page = one.summary()
-        notes = [Items(page.notes)] if page.notes else []
-        yield Section(f"Noise for estimators, {origin}", (*page.verdict, *page.first, *notes))
-    if files:
-        yield Section(
-            "Files for estimators", [Section(name, [Code(text.decode().rstrip())], 3) for name, text in files.items()]
-        )
+        yield Section(f"Noise for estimators, {origin}", (*page.verdict, *page.first, Items(page.notes)))
+    yield Section(
+        "Files for estimators", [Section(name, [Code(text.decode().rstrip())], 3) for name, text in files.items()]
+    )
 
 
 # --- words ------------------------------------------------------------------------------------------------------------

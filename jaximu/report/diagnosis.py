@@ -85,19 +85,15 @@ def _first(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
     )
     yield from _certainty(diagnosis)
     yield from _cost(diagnosis)
-    mistakes = [_mistake(diagnosis, finding) for finding in diagnosis.preflight]
-    if mistakes:
-        yield Section("The recording itself", mistakes)
-    if diagnosis.effects:
-        yield Section("What is missing in the model", [_effects_table(diagnosis)])
+    yield Section("The recording itself", [_mistake(diagnosis, finding) for finding in diagnosis.preflight])
+    yield Section("What is missing in the model", [_effects_table(diagnosis)])
     yield from _lines_part(diagnosis)
     yield from _learned_part(diagnosis)
-    yield from _gains(diagnosis)
+    yield Section("What the extension gains on data that was not fitted", [*_gains(diagnosis)])
     if diagnosis.verdict == "adequate":
         yield Section("What could still hide in this recording", [*_limits(diagnosis)])
     wrong = [check for check in diagnosis.checks if check.adjusted < _DOUBT]
-    if wrong:
-        yield Section("What the fitted model gets wrong", [_checks_table(wrong)])
+    yield Section("What the fitted model gets wrong", [_checks_table(wrong)])
 
 
 def _rest(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
@@ -108,8 +104,7 @@ def _rest(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
     yield Section("What the fitted model gets right", [_checks_table(right), *_evidence(diagnosis, twin)])
     if diagnosis.verdict != "adequate":
         yield Section("What could still hide in this recording", [*_limits(diagnosis)])
-    if diagnosis.not_observable:
-        yield Section("Not observable here", [_blind_table(diagnosis)])
+    yield Section("Not observable here", [_blind_table(diagnosis)])
 
 
 def _what_is_wrong(diagnosis: Diagnosis) -> Iterator[str]:
@@ -327,14 +322,12 @@ def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
     )
 
 
-def _gains(diagnosis: Diagnosis) -> Iterator[Section]:
-    """Return the errors on data that was not fitted, with what was added to the model."""
-    gains = [("extended model", diagnosis.gain)]
+def _gains(diagnosis: Diagnosis) -> Iterator[Table]:
+    """Yield the errors on data that was not fitted, with what was added to the model."""
+    if diagnosis.gain is not None:
+        yield _gain_table(diagnosis, "extended model", diagnosis.gain)
     if diagnosis.learned is not None:
-        gains.append(("with the smooth curve", diagnosis.learned.gain))
-    tables = [_gain_table(diagnosis, what, gain) for what, gain in gains if gain is not None]
-    if tables:
-        yield Section("What the extension gains on data that was not fitted", tables)
+        yield _gain_table(diagnosis, "with the smooth curve", diagnosis.learned.gain)
 
 
 def _gain_table(diagnosis: Diagnosis, what: str, gain: Gain) -> Table:

@@ -90,7 +90,7 @@ def new_figure(height: float, width: float = _WIDTH) -> Figure:
 
 def stacked(
     count: int, each: float, more: float = 0.0, width: float = _WIDTH, **shared: Any
-) -> tuple[Figure, list[Axes]]:
+) -> tuple[Figure, list[Any]]:
     """Return a figure with so many panels below each other, `each` inches high, and `more` for what is beside them."""
     figure = new_figure(more + each * count, width)
     return figure, figure.subplots(count, 1, squeeze=False, **shared)[:, 0].tolist()

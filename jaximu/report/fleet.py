@@ -45,7 +45,7 @@ def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
     def rest() -> Iterator[Part]:
         yield from _lots(fleet)
         yield from _prior(fleet)
-        yield from _diagnoses(fleet)
+        yield _diagnoses(fleet)
 
     return Page(
         f"Fleet of {counted(fleet.recordings, 'recording')}, {Path(fleet.table).name}",
@@ -54,10 +54,10 @@ def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
         "recordings calibrated",
         (
             *_population(fleet),
-            *_outliers(fleet, document),
+            _outliers(fleet, document),
             *_differences(fleet),
-            *_failures(fleet, document),
-            *([Section("Magnetometers", [Items(magnetometers)])] if magnetometers else []),
+            _failures(fleet, document),
+            Section("Magnetometers", [Items(magnetometers)]),
         ),
         rest,
         fleet.notes,
@@ -99,14 +99,12 @@ def _next(fleet: Fleet) -> str:
     return f"`jaximu accept {table} --limits LIMITS.toml -o LINE` holds every unit to limits and follows the line."
 
 
-def _outliers(fleet: Fleet, document: str) -> Iterator[Part]:
-    if not fleet.strangers:
-        return
+def _outliers(fleet: Fleet, document: str) -> Section:
     more = len(fleet.strangers) - MOST_ROWS
     caption = "p: probability that a fleet of this size has a unit as far off as this one, if all belonged."
     if more > 0:
         caption += f" {more} more outliers are in `{document}`."
-    yield Section(
+    return Section(
         "Outliers",
         [
             Table(
@@ -172,10 +170,8 @@ def difference_words(difference: Difference) -> str:
     return sentence(difference.text + (f": {', '.join(parts)}" if parts else ""))
 
 
-def _failures(fleet: Fleet, document: str) -> Iterator[Part]:
-    """Yield the commonest reasons why recordings were not calibrated, with files; what is left out is counted."""
-    if not fleet.failed:
-        return
+def _failures(fleet: Fleet, document: str) -> Section:
+    """Return the commonest reasons why recordings were not calibrated, with files; what is left out is counted."""
     most = 20
     rows = [
         (sentence(reason), str(len(files)), _first([Path(file).name for file in files], 5))
@@ -184,7 +180,7 @@ def _failures(fleet: Fleet, document: str) -> Iterator[Part]:
     if others := [*fleet.failed.values()][most:]:
         rows.append((f"{len(others)} other reasons", str(sum(map(len, others))), ""))
     statuses = ", ".join(f"{count} {status}" for status, count in fleet.statuses.most_common())
-    yield Section(
+    return Section(
         "Not calibrated",
         [
             Table(
@@ -197,18 +193,10 @@ def _failures(fleet: Fleet, document: str) -> Iterator[Part]:
     )
 
 
-def _diagnoses(fleet: Fleet) -> Iterator[Part]:
-    parts: list[Part] = []
-    if fleet.verdicts:
-        parts.append(f"Verdicts: {', '.join(f'{count} {name}' for name, count in fleet.verdicts.most_common())}.")
-    if fleet.effects:
-        parts.append(
-            Table(
-                ("effect", "units"), [(effect_title(name), str(count)) for name, count in fleet.effects.most_common()]
-            )
-        )
-    if parts:
-        yield Section("Diagnoses", parts)
+def _diagnoses(fleet: Fleet) -> Section:
+    verdicts = ", ".join(f"{count} {name}" for name, count in fleet.verdicts.most_common())
+    rows = [(effect_title(name), str(count)) for name, count in fleet.effects.most_common()]
+    return Section("Diagnoses", [verdicts and f"Verdicts: {verdicts}.", Table(("effect", "units"), rows)])
 
 
 def amount(name: Name, value: float, sigma: float = 0.0) -> str:

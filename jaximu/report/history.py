@@ -147,8 +147,7 @@ def _first(history: UnitHistory) -> Iterator[Part]:
             f"{size(change.rms, change.unit)} rms over all directions, at {size(change.over, change.unit)}{zeroed}. "
             f"The uncertainty of both calibrations alone makes {size(change.expected, change.unit)} rms.",
         )
-    if history.limits:
-        yield _limits_table(history)
+    yield _limits_table(history)
 
 
 def _rest(history: UnitHistory) -> Iterator[Part]:

@@ -62,8 +62,12 @@ def page_of(line: Line) -> Page:
         tuple(_verdict(line, able)),
         value,
         meaning,
-        (*(pictures if charts else []), *_capability(line, able), *_alarms(line)),
-        lambda: [*_not_passed(line), *_worst_lots(able), *_gauge(line)],
+        (
+            *(pictures if charts else []),
+            _capability(line, able),
+            Section("Alarms", [Table(("alarm", "what it shows"), _alarm_rows(line), brief=8)]),
+        ),
+        lambda: [_not_passed(line), _worst_lots(able), _gauge(line)],
         line.notes,
         _next(line),
         caution=bool(line.counts[FAIL] or (able and able[0][1] < _CAPABLE)),
@@ -137,12 +141,10 @@ def _next(line: Line) -> str:
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
-def _capability(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> Iterator[Section]:
-    if not able:
-        return
+def _capability(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> Section:
     judged = line.judged
     failed = {} if judged is None else dict(zip(judged.names, np.sum(judged.verdict == FAIL, axis=0), strict=True))
-    yield Section(
+    return Section(
         "Capability",
         [
             Table(
@@ -172,14 +174,13 @@ def _capability_row(quantity: FollowedQuantity, failed: int) -> tuple[str, ...]:
     )
 
 
-def _worst_lots(able: Sequence[tuple[FollowedQuantity, float]]) -> Iterator[Section]:
+def _worst_lots(able: Sequence[tuple[FollowedQuantity, float]]) -> Section:
     rows = []
     for quantity, _ in able:
         if quantity.lots:
             worst = min(quantity.lots, key=lambda lot: quantity.lots[lot].cpk[0])
             rows.append((spoken(quantity.name), worst, _index(quantity.lots[worst].cpk)))
-    if rows:
-        yield Section("Worst lots", [Table(("quantity", "lot", "Cpk of the lot (95 %)"), rows)])
+    return Section("Worst lots", [Table(("quantity", "lot", "Cpk of the lot (95 %)"), rows)])
 
 
 def _index(ends: tuple[float, float, float]) -> str:
@@ -194,30 +195,24 @@ def _alarm_rows(line: Line) -> list[tuple[str, str]]:
     return [(_TITLES[alarm.kind], f"{sentence(alarm.words(stated.get(alarm.name, '')))}.") for alarm in ordered]
 
 
-def _alarms(line: Line) -> Iterator[Section]:
-    if line.alarms:
-        yield Section("Alarms", [Table(("alarm", "what it shows"), _alarm_rows(line), brief=8)])
-
-
-def _not_passed(line: Line) -> Iterator[Section]:
+def _not_passed(line: Line) -> Section:
     cells = ("name", "value", "limits", "probability", "verdict")
     rows = [(device, *(item_row(item)[cell] for cell in cells)) for device, item in line.items(MOST_ROWS)]
     more = sum(len(line.missed(row)) for row in range(len(line.table.rows))) - len(rows)
-    if rows:
-        caption = f"And {more} more; the table's column `not_passed` has all." if more else ""
-        yield Section(
-            "What does not pass",
-            [
-                Table(
-                    ("device", "quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"),
-                    rows,
-                    caption,
-                )
-            ],
-        )
+    caption = f"And {more} more; the table's column `not_passed` has all." if more else ""
+    return Section(
+        "What does not pass",
+        [
+            Table(
+                ("device", "quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"),
+                rows,
+                caption,
+            )
+        ],
+    )
 
 
-def _gauge(line: Line) -> Iterator[Section]:
+def _gauge(line: Line) -> Section:
     questions, rows, marked = max(1, len(line.followed)), [], []
     for quantity in line.followed:
         gauge, unit, stated = quantity.gauge, si_unit(quantity.name), quantity.limit.stated if quantity.limit else ""
@@ -236,28 +231,27 @@ def _gauge(line: Line) -> Iterator[Section]:
             f"{gauge.explained:.2f}{' *' if gauge.p_value * questions < _LEVEL else ''}",
         )
         rows.append(row)
-    if rows:
-        yield Section(
-            "Gauge: repeated recordings",
-            [
-                Table(
-                    (
-                        "quantity",
-                        "repeatability (95 %)",
-                        "between stations",
-                        "between units",
-                        "ndc",
-                        "observed / stated",
-                    ),
-                    rows,
-                    "Standard deviations by analysis of variance. ndc: groups of units that the measurement can "
-                    "distinguish; marked below 5 (AIAG). Observed / stated: scatter of a unit's repeated recordings, "
-                    "in multiples of the uncertainty that each states; 1 is expected, and * marks what chance does "
-                    "not explain (p < 1 %, all quantities allowed for).",
-                    marked,
-                )
-            ],
-        )
+    return Section(
+        "Gauge: repeated recordings",
+        [
+            Table(
+                (
+                    "quantity",
+                    "repeatability (95 %)",
+                    "between stations",
+                    "between units",
+                    "ndc",
+                    "observed / stated",
+                ),
+                rows,
+                "Standard deviations by analysis of variance. ndc: groups of units that the measurement can "
+                "distinguish; marked below 5 (AIAG). Observed / stated: scatter of a unit's repeated recordings, "
+                "in multiples of the uncertainty that each states; 1 is expected, and * marks what chance does "
+                "not explain (p < 1 %, all quantities allowed for).",
+                marked,
+            )
+        ],
+    )
 
 
 # --- charts -----------------------------------------------------------------------------------------------------------

@@ -48,7 +48,10 @@ def page_of(proposal: Proposal) -> Page:
             Section("The poses", [_picture(proposal), *_map(proposal), *_instructions(proposal), _poses(proposal)]),
             *_turns(proposal),
             Section("What they are expected to gain", [_parameters(proposal)]),
-            *_open(proposal),
+            Section(
+                "What stays open",
+                [Statement("Weak" if one.determined else "Not determined", one.text, True) for one in proposal.open],
+            ),
         ),
         notes=proposal.notes,
         next=_next(proposal),
@@ -184,18 +187,6 @@ def _parameters(proposal: Proposal) -> Table:
         [0] if first else [],
         brief=8,
     )
-
-
-def _open(proposal: Proposal) -> Iterator[Section]:
-    """Return what stays open, in words."""
-    if proposal.open:
-        yield Section(
-            "What stays open",
-            [
-                Statement("Weak" if weak.determined else "Not determined", weak.text, caution=True)
-                for weak in proposal.open
-            ],
-        )
 
 
 # --- the picture ------------------------------------------------------------------------------------------------------

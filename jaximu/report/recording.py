@@ -44,7 +44,7 @@ def log_page(document: Mapping[str, Any], commands: Sequence[str]) -> Page:
             _table(document["signals"]),
             *_guess(document.get("guess")),
             Section("What was noticed", [Items(document["findings"])]),
-            *([Section("What it can be used for", uses)] if uses else []),
+            Section("What it can be used for", uses),
         ],
     )
 

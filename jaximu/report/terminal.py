@@ -64,15 +64,13 @@ def show(content: Page | Part, screen: Console | None = None) -> None:
                 show(verdict, screen)
             if content.number:
                 screen.print(f"{content.number}  {content.meaning}")
-            _print_parts(content.first, screen)
-            if content.notes:
-                show(Section("Notes", (Items(content.notes),)), screen)
+            _print_parts((*content.first, Section("Notes", (Items(content.notes),))), screen)
             if content.next:
                 show(f"\nNext: {content.next}", screen)
 
 
 def _print_parts(parts: Sequence[Part], screen: Console) -> None:
-    for part in parts:
+    for part in filter(None, parts):
         show(part, screen)
 
 

@@ -52,7 +52,6 @@ def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] 
     """Return what temperature did to each sensor, what remains of it, by which model, and what an autopilot loses."""
     files, command = files_and_next(thermal.blocks.recordings)
     value, meaning = _number(thermal)
-    effects = effect_table(thermal.calibration)
     return Page(
         f"Bias over temperature of {files}",
         (*_verdict(thermal),),
@@ -63,7 +62,7 @@ def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] 
             _remainder(thermal),
             *(_model(thermal, name) for name in thermal.fits),
             Section("What these recordings can separate", [*thermal.identifiability.words, *_ways(thermal)]),
-            *([Section("Effects", [effects])] if effects.rows else []),
+            Section("Effects", [effect_table(thermal.calibration)]),
             Section("Models that were tried", [*_candidates(thermal)]),
             *(_export(export, thermal) for export in exports),
         ),

@@ -103,12 +103,11 @@ def _first(thermal: HandHeldThermal) -> Iterator[Part]:
 
 def _limits(thermal: HandHeldThermal) -> Iterator[Part]:
     """Return the smallest effects that would have been found, and those that the recordings do not determine."""
-    if thermal.limits:
-        yield Table(
-            ("effect", "size that could hide", "at the end of the range"),
-            _limit_rows(thermal),
-            "Effects that were tested and are not needed. Larger ones would have been found nine times in ten.",
-        )
+    yield Table(
+        ("effect", "size that could hide", "at the end of the range"),
+        _limit_rows(thermal),
+        "Effects that were tested and are not needed. Larger ones would have been found nine times in ten.",
+    )
     for name, why in thermal.undetermined.items():
         yield Statement(sentence(effect_title(name)), f"Not determined: {why}.", True)
     yield (
@@ -126,8 +125,7 @@ def _limit_rows(thermal: HandHeldThermal) -> list[tuple[str, ...]]:
     extent = max(abs(end - thermal.calibration.imu.accelerometer.temperature_reference) for end in thermal.range)
     for name, (value, unit) in thermal.limits.items():
         kind = CATALOGUE[name]
-        triad = thermal.calibration.triads()[kind.owner]
-        scale = np.mean(triad.scales)
+        scale = float(np.mean(thermal.calibration.triads()[kind.owner].scales))
         most = value * extent ** _POWER.get(kind.plain, 1) / scale
         shown = size(most, SENSOR_UNITS[kind.owner], 2) if kind.plain in POWERS else size(100 * most, "%", 2)
         rows.append((kind.title, size(value, unit, 2), shown))
@@ -193,20 +191,11 @@ def _error_figure(thermal: HandHeldThermal) -> Figure:
     return figure
 
 
-def _rest(thermal: HandHeldThermal) -> Iterator[Part]:
+def _rest(thermal: HandHeldThermal) -> list[Section]:
     """Return what each effect gained."""
-    if thermal.steps:
-        yield Section(
-            "What each effect gained",
-            [
-                Table(
-                    ("effect", "χ²", "gain, nats"),
-                    [
-                        (effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}")
-                        for name, statistic, gain in thermal.steps
-                    ],
-                    "In the order in which they were taken in: χ² of the score test when tested, and log-likelihood "
-                    "gained on parts left out.",
-                )
-            ],
-        )
+    rows = [(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in thermal.steps]
+    caption = (
+        "In the order in which they were taken in: χ² of the score test when tested, and log-likelihood gained on "
+        "parts left out."
+    )
+    return [Section("What each effect gained", [Table(("effect", "χ²", "gain, nats"), rows, caption)])]

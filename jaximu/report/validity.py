@@ -78,8 +78,7 @@ def _shifts(validity: Validity) -> Iterator[Part]:
             "(gains at 1 g and 1 rad/s), with the 95 % interval of the difference. Coloured: moved, with all "
             "parameters allowed for.",
         )
-    if validity.shifts:
-        yield _shifts_table(validity)
+    yield _shifts_table(validity)
 
 
 def _shifts_table(validity: Validity) -> Table:
