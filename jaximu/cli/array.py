@@ -39,5 +39,6 @@ class ArrayCommand(options.Fits):
         with progress("calibrating"):
             array = calibrate_array(recordings, gravity, static=known, loss=self.loss, repair=self.repair)
         units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(array.units, 1)}
-        names = "array.json, report.html and the calibrations"
-        self.results.present(array.summary, names, {}, array.text, array=array, **units)
+        self.results.present(
+            array.summary, "array.json, report.html and the calibrations", {}, array.text, array=array, **units
+        )

@@ -83,8 +83,11 @@ class ConsequencesCommand(options.Reads):
         other = None if self.against is None else load_calibration(self.against)
         noise = None if self.noise_file is None else options.stated_noise(self.noise_file)
         _require_densities(targets, noise or {})
-        gravity = model.gravity if self.local == options.LOCAL else self.local.value()
-        site = Place(_LATITUDE if self.local.latitude is None else self.local.latitude, self.local.height, gravity)
+        site = Place(
+            _LATITUDE if self.local.latitude is None else self.local.latitude,
+            self.local.height,
+            model.gravity if self.local == options.LOCAL else self.local.value(),
+        )
         limits = _limits({"accelerometer": self.accel_range, "gyroscope": self.gyro_range})
         measured = self._measured(model, site)
         trajectory, stated = self._trajectory(model, site, measured)
@@ -165,8 +168,12 @@ class ConsequencesCommand(options.Reads):
         from jaximu.recordings.readers import read_attitude
 
         with progress("comparing with the reference"):
-            recording = self.log.alike(model).read(self.path, site.gravity)
-            return MeasuredErrors.of(model.inertial().imu, recording, read_attitude(self.reference), site.gravity)
+            return MeasuredErrors.of(
+                model.inertial().imu,
+                self.log.alike(model).read(self.path, site.gravity),
+                read_attitude(self.reference),
+                site.gravity,
+            )
 
     def _trajectory(
         self, model: Calibration, site: Place, measured: MeasuredErrors | None

@@ -86,8 +86,13 @@ class DiagnoseCommand(options.Fits):
         elif measured:
             from jaximu.cli.reference import read_reference
 
-            attitude = read_reference(self.reference, self.logs[0], recordings[0])
-            work = partial(diagnose_against_attitude, recordings[0], attitude, gravity, repair=self.repair)
+            work = partial(
+                diagnose_against_attitude,
+                recordings[0],
+                read_reference(self.reference, self.logs[0], recordings[0]),
+                gravity,
+                repair=self.repair,
+            )
         else:
             from jaximu.cli.turntable import references_of
 

@@ -75,8 +75,15 @@ class LogCommand(options.Fits):
             outcomes, refused = _run_all(_commands(contents, references, self.local, self.noise))
         if not outcomes:
             raise NotPossibleError(f"{_names(self.logs)}: {' '.join(_reasons(contents, refused))} {_RECORD}")
-        stated = "".join(map(options.typed, (self.log, self.local, self.noise)))
-        report = _Report(self.logs, contents, outcomes, refused, asker.assumed, stated, self.results)
+        report = _Report(
+            self.logs,
+            contents,
+            outcomes,
+            refused,
+            asker.assumed,
+            "".join(map(options.typed, (self.log, self.local, self.noise))),
+            self.results,
+        )
         report.give()
 
 

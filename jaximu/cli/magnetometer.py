@@ -114,8 +114,7 @@ def _strength(
             raise InputError("--longitude needs --latitude and --date, such as --date 2026-03-04: the field changes.")
         from jaximu.ground.magnetic_field import world_magnetic_model
 
-        day = date.fromisoformat((trace or {})["date"])
-        return world_magnetic_model(local.latitude, longitude, day, local.height)
+        return world_magnetic_model(local.latitude, longitude, date.fromisoformat((trace or {})["date"]), local.height)
     return options.field_strength(text)
 
 
@@ -153,8 +152,7 @@ def _read(log: options.LogOptions, path: Path, mag_log: Path | None, mag_columns
         reason = str(error).removeprefix(f"{path}: ").partition(";")[0]
         notes = (f"the magnetometer stands alone: {reason}.".replace("..", "."),)
         axes = log.axes if log.axes is not None or log.like is None else log.like.axes
-        read_as = Reading(axes=axes, units={"magnetometer": signal.unit})
-        return MagneticLog(signal, None, str(path), notes, read_as)
+        return MagneticLog(signal, None, str(path), notes, Reading(axes=axes, units={"magnetometer": signal.unit}))
     return MagneticLog(signal if recording.magnetometer is None else recording.magnetometer, recording, str(path))
 
 

@@ -486,8 +486,10 @@ class Results:
         texts = {f"{name}.json": document.text() for name, document in documents.items()}
         for name, text in texts.items():
             self._require_kept(folder / name, json.loads(text))
-        encoded = {name: (text + "\n").encode() for name, text in texts.items()}
-        return [*write_folder(folder, encoded | dict(files)), *draw(lambda: write(folder), folder / "report.html")]
+        return [
+            *write_folder(folder, {name: (text + "\n").encode() for name, text in texts.items()} | dict(files)),
+            *draw(lambda: write(folder), folder / "report.html"),
+        ]
 
 
 def typed(group: LogOptions | GravityOptions | NoiseOptions) -> str:

@@ -104,16 +104,25 @@ class PlanCommand(options.Reads):
             return
         with progress("planning") as report:
             if filtered:
-                effects = options.effects_of(self.effect)["effects"]
                 proposal = propose_sequence(
-                    known, chosen, count, self.criterion, self.parameter, effects, report=report
+                    known,
+                    chosen,
+                    count,
+                    self.criterion,
+                    self.parameter,
+                    options.effects_of(self.effect)["effects"],
+                    report=report,
                 )
             else:
                 proposal = propose(known, chosen, count, self.criterion, self.parameter, self.turns, self.seed, report)
         if magnetometer is not None:
             proposal = replace(proposal, notes=(*proposal.notes, magnetometer))
-        files = {} if chosen.by_hand else {"schedule.csv": proposal.schedule.encode()}
-        self.results.present(proposal.summary, "plan.json, report.html and the poses drawn", files, plan=proposal)
+        self.results.present(
+            proposal.summary,
+            "plan.json, report.html and the poses drawn",
+            {} if chosen.by_hand else {"schedule.csv": proposal.schedule.encode()},
+            plan=proposal,
+        )
 
 
 def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[Known | None, str | None]:

@@ -299,8 +299,16 @@ def _letter(
     if end < 12 or end > len(tau) - 12:  # on a line that leaves at the side
         spot, align = (8, "left") if end < 12 else (len(tau) - 8, "right")
     box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-    text = f" {term}  {TERM_NAMES[term]} "
-    panel.annotate(text, (tau[spot], line[spot]), fontsize=8.5, color="0.15", zorder=5, ha=align, va="center", bbox=box)
+    panel.annotate(
+        f" {term}  {TERM_NAMES[term]} ",
+        (tau[spot], line[spot]),
+        fontsize=8.5,
+        color="0.15",
+        zorder=5,
+        ha=align,
+        va="center",
+        bbox=box,
+    )
 
 
 def _headline(name: str, axes: Sequence[Identified]) -> str:
@@ -367,25 +375,27 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
         f"Noise at rest: {file_names(analysis.files)}",
         [*_verdict(analysis)],
         *_number(analysis),
-        (_picture(analysis), _cautions(analysis), terms, numbers, *_limits(analysis)),
+        (
+            Picture(
+                "allan",
+                partial(allan_figure, analysis),
+                "Allan deviation against averaging time for " + " and ".join(analysis.axes),
+                "How to read it: average the output over τ seconds, and the difference between one average and the "
+                "next is typically √2 times the height of the curve. On the left, averaging helps: white noise falls "
+                "by √10 for ten times the time. Where the curve is flat (bias instability) or rises (random walk, "
+                "ramp), the bias itself wanders and longer averages no longer help. The squares of the dashed lines "
+                "add up to that of a solid one.",
+            ),
+            _cautions(analysis),
+            terms,
+            numbers,
+            *_limits(analysis),
+        ),
         partial(_details, analysis, sources or [Source(path, "", 0) for path in analysis.files]),
         [*filter(None, analysis.notes)],
         f"`jaximu calibrate LOG --static {log} -o RESULTS` calibrates the unit with this noise."
         if "accelerometer" in analysis.axes
         else "",
-    )
-
-
-def _picture(analysis: NoiseAnalysis) -> Picture:
-    """Return the Allan deviation of all sensors with how to read it."""
-    return Picture(
-        "allan",
-        partial(allan_figure, analysis),
-        "Allan deviation against averaging time for " + " and ".join(analysis.axes),
-        "How to read it: average the output over τ seconds, and the difference between one average and the next is "
-        "typically √2 times the height of the curve. On the left, averaging helps: white noise falls by √10 for ten "
-        "times the time. Where the curve is flat (bias instability) or rises (random walk, ramp), the bias itself "
-        "wanders and longer averages no longer help. The squares of the dashed lines add up to that of a solid one.",
     )
 
 
@@ -521,8 +531,7 @@ def _discrete(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
         sizes = [None if one is None else float(to_discrete(term, one.value, rate)) for one in estimates]
         for unit in _DISCRETE_UNITS[quantity] if any(sizes) else ():
             factor = _factor(quantity, "B", unit)
-            cells = ["–" if one is None else number(factor * one, 4) for one in sizes]
-            rows.append((words, unit_text(unit), *cells))
+            rows.append((words, unit_text(unit), *["–" if one is None else number(factor * one, 4) for one in sizes]))
             words = ""
     yield Table(("", "unit", *_AXES), rows) or "The data supports neither N nor K."
 

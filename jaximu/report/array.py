@@ -25,11 +25,13 @@ __all__ = ["page_of"]
 def page_of(array: Array) -> Page:
     """Return what averaging gains, which unit disturbs, and where each unit is."""
     rate, force = (noise[0] / noise[1] for noise in (array.averaged.rate, array.averaged.force))
-    suspects = dict.fromkeys(unit.name for unit, *_ in array.suspects())
     return Page(
         f"An array of {len(array.units)} units",
         (
-            *(f"{Path(name).name} disturbs the array." for name in suspects),
+            *(
+                f"{Path(name).name} disturbs the array."
+                for name in dict.fromkeys(unit.name for unit, *_ in array.suspects())
+            ),
             f"At rest the weighted mean of all {len(array.units)} units has {rate:.2g} times less gyroscope noise and "
             f"{force:.2g} times less accelerometer noise than a typical unit.",
         ),
@@ -106,12 +108,11 @@ def _row(unit: ArrayUnit, first: bool) -> tuple[str, ...]:
         with_interval(1e3 * value, 1e3 * sigma) for value, sigma in zip(unit.position, unit.position_sigma, strict=True)
     )
     angle = np.degrees(2 * np.arccos(min(1.0, abs(unit.rotation[0]))))
-    delay = with_interval(1e3 * unit.time_offset, 1e3 * unit.time_offset_sigma)
     return (
         Path(unit.name).name,
         "the first" if first else with_interval(angle, np.degrees(np.max(unit.rotation_sigma))),
         "0" if first else position,
-        "0" if first else delay,
+        "0" if first else with_interval(1e3 * unit.time_offset, 1e3 * unit.time_offset_sigma),
         _scatter(unit.rate_scatter, np.degrees(1.0)),
         _scatter(unit.force_scatter, 1.0),
     )

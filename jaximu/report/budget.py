@@ -37,20 +37,22 @@ def page_of(budget: Budget) -> Page:
         tuple(_verdict(budget)),
         number,
         meaning,
-        (_picture(budget), _goals(budget), _sources(budget), _parameters(budget), _limits(budget)),
+        (
+            Picture(
+                "budget",
+                partial(_figure, budget),
+                "Shares of each source in each parameter's variance",
+                "A bar is the variance of one parameter, divided among its sources; the figure beside it is its "
+                "standard deviation (1σ). Independent errors add by their squares, so halving a source removes three "
+                "quarters of its part.",
+            ),
+            _goals(budget),
+            _sources(budget),
+            _parameters(budget),
+            _limits(budget),
+        ),
         notes=budget.notes,
         next=_next(budget),
-    )
-
-
-def _picture(budget: Budget) -> Picture:
-    return Picture(
-        "budget",
-        partial(_figure, budget),
-        "Shares of each source in each parameter's variance",
-        "A bar is the variance of one parameter, divided among its sources; the figure beside it is its standard "
-        "deviation (1σ). Independent errors add by their squares, so halving a source removes three quarters of its "
-        "part.",
     )
 
 
@@ -139,8 +141,7 @@ def _verdict(budget: Budget) -> Iterator[str]:
     if not len(known):
         yield "The scheme determines no parameter."
         return
-    largest = np.argmax(shares(budget)[:, known], axis=0)
-    count = np.bincount(largest, minlength=len(budget.sources))
+    count = np.bincount(np.argmax(shares(budget)[:, known], axis=0), minlength=len(budget.sources))
     order = [int(row) for row in np.argsort(-count, kind="stable") if count[row]]
     parts = [f"{budget.sources[row].words} for {count[row]}" for row in order]
     parts[0] = f"{parts[0]} of {counted(len(known), 'parameter')}"
@@ -235,11 +236,10 @@ def nonlinear_words(budget: Budget) -> Iterator[str]:
     for row, index in budget.nonlinear():
         source, unit = budget.sources[row], budget.units[index]
         linear, actual = budget.sigma[row, index], budget.actual[row, index]
-        change = 100 * budget.off[row, index]
         yield (
             f"{describe(budget.names[index], budget.imu)}: {source.words} reaches it with "
             f"{amount(actual, unit)} in the whole fit, {amount(linear, unit)} to first order; its total of "
-            f"{amount(budget.total[index], unit)} is {_wrong(change)}."
+            f"{amount(budget.total[index], unit)} is {_wrong(100 * budget.off[row, index])}."
         )
 
 

@@ -210,8 +210,7 @@ def _biases_of_the_recording(calibration: Calibration) -> str:
     """Say what the biases are good for, and how well their means over the recording are known."""
     means = []
     for name, sigma in calibration.bias_sigma_recording.items():
-        triad = calibration.triads()[name]
-        scale = triad.scales
+        scale = calibration.triads()[name].scales
         means.append(f"± {size(Z95 * float(np.max(sigma / scale)), SENSOR_UNITS[name], 2)} ({name})")
     return (
         "The biases, and their intervals, are for use after the recording, for as long again as it took and without "

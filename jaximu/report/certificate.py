@@ -91,22 +91,24 @@ def _next(acceptance: Acceptance) -> str:
 
 
 def _results(items: Sequence[Item]) -> Table:
-    rows = [item_row(item) for item in items]
     return Table(
         ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"),
-        [tuple(row[column] for column in _COLUMNS[:5]) for row in rows],
+        [tuple(row[column] for column in _COLUMNS[:5]) for row in map(item_row, items)],
         marked=[index for index, item in enumerate(items) if item.verdict != PASS],
     )
 
 
 def _uncertainty(items: Sequence[Item]) -> Section:
-    rows = [item_row(item) for item in items if item.sigma is not None]
     return Section(
         "Uncertainty",
         [
             Table(
                 ("quantity", "U covers", "degrees of freedom", "U from the recording", "U from gravity"),
-                [(row["name"], *(row[column] for column in _COLUMNS[5:])) for row in rows],
+                [
+                    (row["name"], *(row[column] for column in _COLUMNS[5:]))
+                    for row in map(item_row, items)
+                    if row["coverage"]
+                ],
                 "U is the expanded uncertainty, k = 2 times the standard uncertainty; how probably it covers follows "
                 "from the effective degrees of freedom. The last two columns are its budget: the recording (noise, "
                 "drift and scatter) and the local gravity; they add by their squares.",
@@ -134,8 +136,11 @@ def _rule(acceptance: Acceptance) -> Iterator[Statement]:
 def item_row(item: Item) -> dict[str, str]:
     """Return an item's cells, in the unit of its limits; value and U to the second digit of U."""
     shown, factor = in_shown_unit(item.unit, item.stated)
-    limits = between(item.low, item.high, item.unit, item.stated)
-    row = {"name": spoken(item.name), "limits": limits, "verdict": item.verdict}
+    row = {
+        "name": spoken(item.name),
+        "limits": between(item.low, item.high, item.unit, item.stated),
+        "verdict": item.verdict,
+    }
     if item.value is None or item.sigma is None:
         return dict.fromkeys(_COLUMNS, "") | {"value": "not determined"} | row
     expanded = 2 * factor * item.sigma

@@ -40,7 +40,13 @@ def page_of(
         _metres(_at_end(consequences.total)),
         f"error of position after {_end(consequences)} (1σ)",
         (
-            _budget_picture(consequences),
+            Picture(
+                "budget",
+                partial(_budget_figure, consequences),
+                "Position error over time, and the share of each term",
+                "Above: the error of position in space (1σ) and its largest terms. Below: how the squares of the "
+                "terms share the sum.",
+            ),
             f"Path: {consequences.trajectory.words}. Position, velocity and attitude at the start are taken as known "
             "exactly.",
             *_statements(consequences),
@@ -72,16 +78,6 @@ def _next(consequences: Consequences) -> str:
     return f"`jaximu plan {file} -o plan` plans the poses and turns that improve the calibration most."
 
 
-def _budget_picture(consequences: Consequences) -> Picture:
-    return Picture(
-        "budget",
-        partial(_budget_figure, consequences),
-        "Position error over time, and the share of each term",
-        "Above: the error of position in space (1σ) and its largest terms. Below: how the squares of the terms share "
-        "the sum.",
-    )
-
-
 def _tracks(consequences: Consequences) -> Iterator[Part]:
     if consequences.check is not None:
         yield Picture(
@@ -96,13 +92,12 @@ def _tracks(consequences: Consequences) -> Iterator[Part]:
 def _tables(consequences: Consequences) -> Iterator[Section]:
     """Return the position error by term, and all errors by direction, at the times that are shown."""
     times = _headers(consequences)
-    budget = _budget_rows(consequences)
     yield Section(
         "Position error by term (1σ)",
         [
             Table(
                 ("", *times),
-                budget,
+                _budget_rows(consequences),
                 "Position: root sum of squares of east, north and up. A term is what it makes by itself; correlated "
                 "terms of the calibration together are in the row “calibration, all together”. To first order along "
                 "the path.",
@@ -183,8 +178,10 @@ def _total_rows(consequences: Consequences) -> list[tuple[str, ...]]:
     shown = []
     for part, what in enumerate(("position", "velocity", "attitude")):
         for axis, direction in enumerate(("east", "north", "up")):
-            values = sigma[rows, 3 * part + axis]
-            words = [f"{number(np.degrees(value), 2)}°" if part == 2 else _metres(value) for value in values]
+            words = [
+                f"{number(np.degrees(value), 2)}°" if part == 2 else _metres(value)
+                for value in sigma[rows, 3 * part + axis]
+            ]
             about = "about " if part == 2 else ""
             shown.append((f"{what}, {about}{direction}", *(f"{word}/s" if part == 1 else word for word in words)))
     return shown
@@ -305,7 +302,11 @@ def _tracks_figure(consequences: Consequences) -> Figure:
     plane.set_aspect("equal", "datalim")
     for side in (-1, 1):
         height.plot(consequences.times, side * sigma, color=figures.FLAGGED, linewidth=1.6)
-    title = f"{min(100, len(check.errors))} draws over {_end(consequences)}"
-    dressed(plane, title, xlabel="error east (m)", ylabel="error north (m)")
+    dressed(
+        plane,
+        f"{min(100, len(check.errors))} draws over {_end(consequences)}",
+        xlabel="error east (m)",
+        ylabel="error north (m)",
+    )
     dressed(height, "and their heights", xlabel="time (s)", ylabel="error up (m)")
     return figure

@@ -290,11 +290,23 @@ def _lines_figure(diagnosis: Diagnosis) -> Figure:
     for axes, key in zip(grid, axes_of, strict=True):
         mine = [one for one in diagnosis.lines if (one.recording, one.triad, one.line.axis) == key]
         times, power = spectrum_at_rest(parts[key[0]], key[1], key[2])
-        edges = np.linspace(0, mine[0].line.rate / 2, power.shape[1])
-        axes.pcolormesh(times, edges, np.log10(power.T), cmap="Greys", vmin=0.0, vmax=2.0, rasterized=True)
+        axes.pcolormesh(
+            times,
+            np.linspace(0, mine[0].line.rate / 2, power.shape[1]),
+            np.log10(power.T),
+            cmap="Greys",
+            vmin=0.0,
+            vmax=2.0,
+            rasterized=True,
+        )
         for index, one in enumerate(mine):
-            color = figures.PALETTE[index % len(figures.PALETTE)]
-            axes.plot(one.line.times, one.line.recorded, color=color, linewidth=1.2, alpha=0.8)
+            axes.plot(
+                one.line.times,
+                one.line.recorded,
+                color=figures.PALETTE[index % len(figures.PALETTE)],
+                linewidth=1.2,
+                alpha=0.8,
+            )
         dressed(axes, mine[0].axis, ylabel="frequency (Hz)")
     grid[-1].set_xlabel("time (s)")
     return figure
@@ -531,8 +543,11 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
     order = sorted(best, key=lambda name: (best[name], name not in named))[:_SHOWN][::-1]
     rivals = {name for effect in diagnosis.effects for name in effect.rivals}
     colours = [_EXTENDED if n in named else ("#56B4E9" if n in rivals else "#C4C4C4") for n in order]
-    labels = [effect_title(name).replace(" (", "\n(") for name in order]
-    panel.barh(labels, [-np.log10(best[name]) for name in order], color=colours)
+    panel.barh(
+        [effect_title(name).replace(" (", "\n(") for name in order],
+        [-np.log10(best[name]) for name in order],
+        color=colours,
+    )
     panel.axvline(-np.log10(evidence.critical(0.05)), color="black", linestyle="--", linewidth=1)
     dressed(panel, "each effect, tested alone", xlabel="evidence: −log₁₀ of the p-value")
     panel.tick_params(axis="y", labelsize=7)
@@ -613,8 +628,7 @@ def _noise(diagnosis: Diagnosis, twin: Twin) -> Figure:
 def _allan(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Averaging times (k,), s, Allan deviation of a triad over its longest pose, root mean square of axes; interval."""
     parts, rate = experiment.still_parts(name)
-    longest = max(parts, key=len)
-    curve = deviation(longest.T, rate)
+    curve = deviation(max(parts, key=len).T, rate)
     value = np.sqrt(np.mean(curve.value**2, axis=0))
     # three axes, taken as independent and alike, know their mean √3 times as well as each its own
     known = (curve.value > 0).all(axis=0)  # output may not change at all

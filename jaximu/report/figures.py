@@ -170,8 +170,9 @@ def envelope(time: FloatArray, values: FloatArray, most: int = _MOST_POINTS) -> 
     starts = np.linspace(0, count, stretches, endpoint=False).astype(int)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     ends = np.append(starts[1:], count) - 1
-    thinned = np.stack([low, high], axis=1).reshape(-1, values.shape[1])
-    return np.stack([time[starts], time[ends]], axis=1).reshape(-1), thinned
+    return np.stack([time[starts], time[ends]], axis=1).reshape(-1), np.stack([low, high], axis=1).reshape(
+        -1, values.shape[1]
+    )
 
 
 def _traces(axes: Axes, signal: Signal, offset: float = 0.0, named: bool = True) -> None:

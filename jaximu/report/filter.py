@@ -38,6 +38,8 @@ _HOUR = np.degrees(3600.0)
 def statements(calibration: Calibration, history: History) -> Iterator[Statement]:
     """Say whether the innovations are noise, when each kind of number was known, and what the Earth's rotation is."""
     assert calibration.filter is not None
+    if calibration.reference:
+        yield Statement("The reference", " ".join(mounting_words(calibration)))
     if (text := calibration.filter.get("diverged")) is not None:
         yield Statement("Diverged", sentence(text), True)
     nis = calibration.filter["nis"]
@@ -138,13 +140,8 @@ def page_of(calibration: Calibration, history: History) -> Page:
         partial(_limits, calibration, calibration.filter["open"]),
         (f"The filter {verdict} through {minutes:.1f} min of rests and motion.",),
         (f"±{number(worst, 2)} °/s", "how well the gyroscope's bias is known at the end (95 %, the worst axis)"),
-        [*_mounting(calibration), *statements(calibration, history)],
+        statements(calibration, history),
     )
-
-
-def _mounting(calibration: Calibration) -> Iterator[Statement]:
-    if calibration.reference:
-        yield Statement("The reference", " ".join(mounting_words(calibration)))
 
 
 def _limits(calibration: Calibration, left_open: Sequence[str]) -> Iterator[Statement]:
@@ -179,8 +176,9 @@ def _effects(calibration: Calibration, history: History) -> Iterable[tuple[str, 
         if effect is not None and state not in history.earth:
             title = f"{sentence(effect.english)} [{effect.coefficient_unit(units.get(name.owner, ''))}]"
             lines = groups.setdefault(title, [])
-            text = label(name, calibration.imu)
-            lines.append((history.values[:, state], history.sigmas[:, state], f"C{len(lines)}", text))
+            lines.append(
+                (history.values[:, state], history.sigmas[:, state], f"C{len(lines)}", label(name, calibration.imu))
+            )
     return groups.items()
 
 

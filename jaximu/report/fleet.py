@@ -377,8 +377,15 @@ def lot_figure(fleet: Fleet, difference: Difference) -> Figure:
     axes = figure.add_subplot()
     for column, lot in enumerate(names):
         points = values[lots == lot]
-        color = _STRANGER if lot in different else _UNIT
-        axes.plot(_beside(column, len(points)), points, ".", color=color, alpha=0.5, ms=5, mew=0)
+        axes.plot(
+            _beside(column, len(points)),
+            points,
+            ".",
+            color=_STRANGER if lot in different else _UNIT,
+            alpha=0.5,
+            ms=5,
+            mew=0,
+        )
         axes.plot([column - 0.3, column + 0.3], [np.median(points)] * 2, color="black", linewidth=2)
     dressed(axes, ylabel=f"off the mean [{kind[4]}]")
     axes.set_xticks(range(len(names)), names, rotation=0 if len(names) < 15 else 90, fontsize=8)

@@ -49,8 +49,7 @@ def page_of(history: UnitHistory) -> Page:
 def _amount(movement: Movement, value: float, sigma: float, sign: bool = True) -> str:
     """Return an amount of a number with its 95 % interval, in the unit in which its kind is shown."""
     shown, factor = in_shown_unit(movement.unit)
-    unit = movement.unit if factor == 1.0 else shown  # an effect's is read with the prefix that suits it
-    return with_interval(factor * value, factor * sigma, unit, sign)
+    return with_interval(factor * value, factor * sigma, movement.unit if factor == 1.0 else shown, sign)
 
 
 def _drift(history: UnitHistory, movement: Movement) -> str:
@@ -135,7 +134,17 @@ def _next(history: UnitHistory) -> str:
 
 
 def _first(history: UnitHistory) -> Iterator[Part]:
-    yield _pictured_over_time(history) if len(history.files) > 2 else _pictured_changes(history)
+    yield (
+        Picture(
+            "history",
+            partial(_history_figure, history),
+            "The numbers that changed most surely, over time, with their drift",
+            "The numbers whose change is surest, with their 95 % intervals, without an error of gravity that all "
+            "share. The line is the drift, with its 95 % band.",
+        )
+        if len(history.files) > 2
+        else _pictured_changes(history)
+    )
     yield _numbers_table(history)
     yield _together_table(history)
     for owner, change in history.output.items():
@@ -231,8 +240,13 @@ def _limits_table(history: UnitHistory) -> Table:
         movement, limit = movements[reached.name], reached.limit
         after = "never, at this drift" if reached.after is None else _duration(history, reached.after)
         level = _amount(movement, movement.line.level, float(np.sqrt(movement.line.covariance[0, 0])))
-        bounds = between(limit.low, limit.high, limit.unit, limit.stated)
-        return spoken(reached.name), bounds, level, _drift(history, movement), after
+        return (
+            spoken(reached.name),
+            between(limit.low, limit.high, limit.unit, limit.stated),
+            level,
+            _drift(history, movement),
+            after,
+        )
 
     ordered = sorted(history.limits, key=lambda limit: np.inf if limit.after is None else limit.after)
     return Table(
@@ -258,16 +272,6 @@ def _pictured_changes(history: UnitHistory) -> Picture:
     )
 
 
-def _pictured_over_time(history: UnitHistory) -> Picture:
-    return Picture(
-        "history",
-        partial(_history_figure, history),
-        "The numbers that changed most surely, over time, with their drift",
-        "The numbers whose change is surest, with their 95 % intervals, without an error of gravity that all share. "
-        "The line is the drift, with its 95 % band.",
-    )
-
-
 def _changes_figure(history: UnitHistory) -> Figure:
     rows = history.movements[::-1]
     figure = figures.new_figure(1.0 + 0.17 * len(rows))
@@ -289,8 +293,15 @@ def _surest(history: UnitHistory) -> list[Movement]:
 def _points(panel: Axes, movement: Movement, at: NDArray[Any]) -> tuple[float, str]:
     """Draw a number's values with their intervals; return the factor to its unit, and the unit."""
     shown, factor = in_shown_unit(movement.unit)
-    half = factor * Z95 * np.array(movement.apart)
-    panel.errorbar(at, factor * np.array(movement.values), half, fmt="o", color=figures.FLAGGED, markersize=4, zorder=3)
+    panel.errorbar(
+        at,
+        factor * np.array(movement.values),
+        factor * Z95 * np.array(movement.apart),
+        fmt="o",
+        color=figures.FLAGGED,
+        markersize=4,
+        zorder=3,
+    )
     figures.dressed(panel, spoken(movement.name))
     panel.set_ylabel(shown)
     return factor, shown

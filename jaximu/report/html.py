@@ -54,8 +54,9 @@ def encoded(page: Page) -> tuple[bytes, dict[str, bytes]]:
             drawings[picture.name], pictures[f"{picture.name}.png"] = _drawn(picture.draw(), picture.name)
         except Exception as error:
             drawings[picture.name] = failure(f"The figure “{picture.name}”", error)
-    template = environment().get_template("page.html.jinja")
-    text = _FOLDERS.sub("", template.render(page=page, first=first, rest=rest, drawings=drawings))
+    text = _FOLDERS.sub(
+        "", environment().get_template("page.html.jinja").render(page=page, first=first, rest=rest, drawings=drawings)
+    )
     return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
 
 

@@ -133,7 +133,6 @@ def page_of(
     if heading is not None:
         caption += " Right: how good a heading is, one standard deviation, by where the unit points."
     verdict, number, meaning = _lead(calibration)
-    findings = statements(calibration)
     return calibration_page(
         calibration,
         [Picture("residuals", partial(_figure, calibration, measurement, heading), "Directions and headings", caption)],
@@ -141,7 +140,7 @@ def page_of(
         tuple,
         (verdict, *remarks),
         (number, meaning),
-        findings,
+        statements(calibration),
     )
 
 

@@ -22,9 +22,8 @@ def page_of(recording: Recording) -> Page:
     names = [source.path for source in recording.sources]
     signals = {name: signal_facts(signal) for name, signal in recording.signals.items()}
     after = f"`jaximu info {shlex.quote(names[0])}` shows what it can be used for." if names else ""
-    title = ", ".join(Path(name).name for name in names) or "recording"
     return _page(
-        title,
+        ", ".join(Path(name).name for name in names) or "recording",
         signals,
         (Picture("signals", recording.plot, "All signals against time", "As recorded, in SI units."), _table(signals)),
         recording.notes,
@@ -83,8 +82,7 @@ def _page(
     if longest["samples"] > 1:
         rate, duration = f" at {longest['rate']:.5g} Hz", f"{longest['duration']:.5g} s"
         meaning = f"from the first to the last of {longest['samples']} samples"
-    text = sentence(f"{listed(sensors)}{rate}.")
-    return Page(title, (text,), duration, meaning, parts, notes=notes, next=after)
+    return Page(title, (sentence(f"{listed(sensors)}{rate}."),), duration, meaning, parts, notes=notes, next=after)
 
 
 def _table(signals: Mapping[str, Mapping[str, Any]]) -> Table:

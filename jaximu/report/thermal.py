@@ -93,15 +93,12 @@ def _parts(thermal: ThermalCalibration) -> str:
     return "ramps" if len(thermal.identifiability.legs) > 3 else "stretches"
 
 
-def _span(thermal: ThermalCalibration) -> str:
-    return "{:.0f} and {:.0f} °C".format(*thermal.blocks.range).replace("-", "−")
-
-
 def _verdict(thermal: ThermalCalibration) -> Iterator[str]:
     """Say what temperature did to each sensor and what remains, and whether the recordings show more than one way."""
     jumps = ", jumps included" * bool(thermal.jumps)
+    span = "{:.0f} and {:.0f} °C".format(*thermal.blocks.range).replace("-", "−")
     for name, fit in thermal.fits.items():
-        moves = f"{_size(name, fit.before)} (rms) between {_span(thermal)}"
+        moves = f"{_size(name, fit.before)} (rms) between {span}"
         if fit.candidate.names:
             after = f"with the model {_size(name, fit.after)} remain{jumps}"
             yield f"The {name}'s output at rest moves by {moves}; {after}."

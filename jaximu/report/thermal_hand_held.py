@@ -62,8 +62,9 @@ def _verdict(thermal: HandHeldThermal) -> list[str]:
 def _sizes(thermal: HandHeldThermal) -> list[tuple[str, float, float, str]]:
     """Return each kind of error in words, its rms without and with the effects, and the unit."""
     before, after = (thermal.experiment.real.rms(state.conditions) for state in (thermal.base, thermal.state))
-    kinds = thermal.experiment.real.kinds
-    return [(kind.words, before[kind.name][0], after[kind.name][0], kind.unit) for kind in kinds]
+    return [
+        (kind.words, before[kind.name][0], after[kind.name][0], kind.unit) for kind in thermal.experiment.real.kinds
+    ]
 
 
 def _number(thermal: HandHeldThermal) -> tuple[str, str]:
@@ -150,8 +151,7 @@ def _change_figure(thermal: HandHeldThermal) -> Figure:
     for owner, word, names, force in _changed(thermal):
         scale = calibration.triads()[owner].scales
         value, sigma = (values / scale for values in change(calibration, owner, names, temperature, force=force))
-        most = np.max(np.abs(value))
-        factor, unit = readable(SENSOR_UNITS[owner], most) if word == "bias" else (100.0, "%")
+        factor, unit = readable(SENSOR_UNITS[owner], np.max(np.abs(value))) if word == "bias" else (100.0, "%")
         drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * value, factor * sigma))
     rows = -(-len(drawn) // 2)
     figure = new_figure(2.9 * rows)

@@ -171,8 +171,14 @@ def _shifts_figure(validity: Validity) -> Figure:
         shown = [shift for shift in validity.shifts if shift.parameter.owner == triad and _drawn(shift)][::-1]
         for row, shift in enumerate(shown):
             assert shift.in_si is not None and shift.sigma_in_si is not None
-            colour = figures.FLAGGED if shift.moved else figures.BEFORE
-            panel.errorbar(1e3 * shift.in_si, row, xerr=1.96e3 * shift.sigma_in_si, fmt="o", color=colour, markersize=5)
+            panel.errorbar(
+                1e3 * shift.in_si,
+                row,
+                xerr=1.96e3 * shift.sigma_in_si,
+                fmt="o",
+                color=figures.FLAGGED if shift.moved else figures.BEFORE,
+                markersize=5,
+            )
         panel.axvline(0.0, color="0.5", linewidth=0.8)
         figures.dressed(panel, triad, xlabel=f"shift [{unit}]")
         panel.set_yticks(range(len(shown)), [short_name(shift.parameter) for shift in shown], fontsize=8)
@@ -188,11 +194,13 @@ def _errors(validity: Validity, experiment: Experiment) -> Figure:
     times = real.covariates[TIME][norms], real.covariates[TIME][turns][::2]
     extended = [cause.title for cause in validity.causes if cause.scope != "parameter"]
     fresh = " with ".join(["fresh calibration", *([", ".join(extended)] if extended else [])])
-    labels = (("old calibration", figures.FLAGGED), (fresh, figures.AFTER))
-    for (label, colour), conditions in zip(labels, validity.conditions, strict=True):
+    for (label, colour), conditions in zip(
+        (("old calibration", figures.FLAGGED), (fresh, figures.AFTER)), validity.conditions, strict=True
+    ):
         norm = 1e3 * conditions[norms]
-        angle = np.degrees(np.linalg.norm(conditions[turns].reshape(-1, 2), axis=1))
-        for panel, time, values in zip(panels, times, (norm, angle), strict=True):
+        for panel, time, values in zip(
+            panels, times, (norm, np.degrees(np.linalg.norm(conditions[turns].reshape(-1, 2), axis=1))), strict=True
+        ):
             panel.plot(time, values, "o", color=colour, markersize=4, label=label)
     for panel, title, unit in zip(
         panels, ("gravity norm at rest", "gravity carried over a turn"), ("mm/s²", "°"), strict=True

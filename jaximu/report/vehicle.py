@@ -74,9 +74,11 @@ def _statements(calibration: Calibration, vehicle: Mapping[str, Any]) -> Iterato
         texts = with_intervals(change["value"], change["sigma"], "rad/s")
         moved = np.max(np.abs(change["value"]) / np.array(change["sigma"])) > _SURE
         advice = " Use it for this drive, and let the unit warm up before the next." * bool(moved)
-        axes = [f"{axis} {text}" for axis, text in zip("xyz", texts, strict=True)]
         yield Statement(
-            "Bias over the drive", f"From the first stop to the last it changed by {listed(axes)}.{advice}", bool(moved)
+            "Bias over the drive",
+            "From the first stop to the last it changed by "
+            f"{listed([f'{axis} {text}' for axis, text in zip('xyz', texts, strict=True)])}.{advice}",
+            bool(moved),
         )
     yield Statement("Earth's rotation", _earth(calibration))
 
@@ -105,10 +107,10 @@ def _earth(calibration: Calibration) -> str:
             f"Up to {size(EARTH_RATE, 'rad/s', 2)} of it are in the bias, and its interval allows for that. With "
             "--latitude its vertical part is taken off."
         )
-    level = EARTH_RATE * np.cos(np.radians(latitude))
     return (
-        f"Its vertical part was taken off. Of the horizontal part up to {size(level, 'rad/s', 2)} are in the bias, as "
-        "the heading is unknown, and its interval allows for that."
+        "Its vertical part was taken off. Of the horizontal part up to "
+        f"{size(EARTH_RATE * np.cos(np.radians(latitude)), 'rad/s', 2)} are in the bias, as the heading is unknown, "
+        "and its interval allows for that."
     )
 
 

@@ -82,8 +82,11 @@ class Logged:
 
     def correction(self, correction: Correction) -> Correction:
         """What a correction of the sensor's output makes of the log's values, in the log's axes."""
-        offset = np.linalg.solve(self.matrix, correction.offset - self.offset)
-        return replace(correction, matrix=self.frame.T @ correction.matrix @ self.matrix, offset=offset)
+        return replace(
+            correction,
+            matrix=self.frame.T @ correction.matrix @ self.matrix,
+            offset=np.linalg.solve(self.matrix, correction.offset - self.offset),
+        )
 
 
 @dataclass(frozen=True)
@@ -158,8 +161,9 @@ class ExportedUnit:
             words += ", if it was read without --axes, which this calibration does not say"
         if shared and "accelerometer" in calibration.triads() and not np.array_equal(maps["accelerometer"], first):
             words += "; the log's accelerometer has minus specific force, and the answer is specific force"
-        frames = dict.fromkeys(maps, first if shared else np.eye(3))
-        return cls(calibration, {}, {}, {}, "", noise or {}, instance, device)._in(maps, frames, f"Axes: {words}.")
+        return cls(calibration, {}, {}, {}, "", noise or {}, instance, device)._in(
+            maps, dict.fromkeys(maps, first if shared else np.eye(3)), f"Axes: {words}."
+        )
 
     def _in(self, maps: Mapping[str, FloatArray], frames: Mapping[str, FloatArray], axes: str) -> ExportedUnit:
         """Make them for outputs and answers in these axes: y = Aᵀ y_body and u = Fᵀ u_body, so the gain is AᵀKF."""

@@ -192,8 +192,13 @@ def noise_files(
             made.file: kalibr_yaml({key: (value, "") for key, value in values.items()}, rate, comments=head).encode()
         }
     rows = [made.row.format(key=key.name, value=values[key.name], unit=key.unit) for key in made.keys]
-    tail = made.tail.format(rate=rate, gravity=gravity)
-    lines = [made.opening, *(f"# {text}" for text in head), made.head, *rows, tail]
+    lines = [
+        made.opening,
+        *(f"# {text}" for text in head),
+        made.head,
+        *rows,
+        made.tail.format(rate=rate, gravity=gravity),
+    ]
     return {made.file: ("\n".join(filter(None, lines)) + "\n").encode()}
 
 
