@@ -145,30 +145,31 @@ def _hours(seconds: float) -> str:
     return f"{seconds / 60:.3g} min" if seconds < 7200 else f"{seconds / 3600:.3g} h"
 
 
+def _shown(analysis: NoiseAnalysis) -> Iterator[tuple[str, str, dict[str, Term]]]:
+    """Yield each triad, the most important first, its quantity, and which of N, B and K show, means of the axes."""
+    for name in [name for name in _ORDER if name in analysis.axes]:
+        mean = mean_terms(analysis.axes[name])
+        yield name, SENSOR_QUANTITIES[name], {term: one for term in "NBK" if (one := mean.get(term)) is not None}
+
+
 def _verdict(analysis: NoiseAnalysis) -> Iterator[str]:
     """Say of each triad what a person should keep."""
     start = f"In {_hours(recorded_seconds(next(iter(analysis.axes.values()))[0]))} at rest, the"
-    for name in [name for name in _ORDER if name in analysis.axes]:
-        quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
-        sizes = [
-            f"{TERM_NAMES[term]} of {_in_unit(estimate.value, quantity, term)}"
-            for term in "NBK"
-            if (estimate := mean.get(term)) is not None
-        ]
+    for name, quantity, terms in _shown(analysis):
+        sizes = [f"{TERM_NAMES[term]} of {_in_unit(mean.value, quantity, term)}" for term, mean in terms.items()]
         yield f"{start} {name} has {listed(sizes) if sizes else 'none of N, B and K'} (mean of the axes)."
         start = "The"
 
 
 def _number(analysis: NoiseAnalysis) -> tuple[str, str]:
     """Return the first term of the most important triad that shows one, and what it is."""
-    for name in [name for name in _ORDER if name in analysis.axes]:
-        quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
-        for term, estimate in [(term, mean.get(term)) for term in "NBK"]:
-            if estimate is not None:
-                low, high = (_in_unit(end, quantity, term) for end in (estimate.low, estimate.high))
-                return _in_unit(
-                    estimate.value, quantity, term
-                ), f"{TERM_NAMES[term]} of the {name} (mean of the axes), 95 % interval {low} … {high}"
+    for name, quantity, terms in _shown(analysis):
+        for term, mean in terms.items():
+            low, high = (_in_unit(end, quantity, term) for end in (mean.low, mean.high))
+            return (
+                _in_unit(mean.value, quantity, term),
+                f"{TERM_NAMES[term]} of the {name} (mean of the axes), 95 % interval {low} … {high}",
+            )
     return "", ""
 
 

@@ -31,12 +31,10 @@ _GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": 
 
 def page_of(budget: Budget) -> Page:
     """Return which goals are reached, which source dominates, and what each parameter's uncertainty is made of."""
-    number, meaning = _number(budget)
     return Page(
         f"Error budget of {Path(budget.source).name}",
         tuple(_verdict(budget)),
-        number,
-        meaning,
+        *_number(budget),
         (
             Picture(
                 "budget",

@@ -111,12 +111,10 @@ def calibration_page(
         yield _correlation(calibration)
         yield from _origin(calibration)
 
-    value, meaning = number or _number(calibration)
     return Page(
         _title(calibration),
         (*verdict, *_errors(calibration), *_determined(calibration)),
-        value,
-        meaning,
+        *(number or _number(calibration)),
         (*pictures, *findings, Section("Before you rely on it", cautions), *_parameters(calibration)),
         rest,
         calibration.notes,

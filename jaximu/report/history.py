@@ -29,12 +29,10 @@ _DRAWN = 4
 
 def page_of(history: UnitHistory) -> Page:
     """Return what moved, in uncertainties and in the output, each number's drift, and when limits are reached."""
-    value, meaning = _number(history)
     return Page(
         f"What moved over {counted(len(history.files), 'calibration')} of a unit?",
         tuple(_verdict(history)),
-        value,
-        meaning,
+        *_number(history),
         tuple(_first(history)),
         partial(_rest, history),
         (*history.notes, *history.left_out),

@@ -56,12 +56,10 @@ def page_of(line: Line) -> Page:
             "differences from the unit before.",
         )
     ]
-    value, meaning = _number(line, able)
     return Page(
         f"Production line, {Path(line.table.file).name}",
         tuple(_verdict(line, able)),
-        value,
-        meaning,
+        *_number(line, able),
         (
             *(pictures if charts else []),
             _capability(line, able),

@@ -51,12 +51,10 @@ _BESIDE_DATA = 0.04  # of the range of temperatures and of rates, about the bloc
 def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] = ()) -> Page:
     """Return what temperature did to each sensor, what remains of it, by which model, and what an autopilot loses."""
     files, command = files_and_next(thermal.blocks.recordings)
-    value, meaning = _number(thermal)
     return Page(
         f"Bias over temperature of {files}",
         (*_verdict(thermal),),
-        value,
-        meaning,
+        *_number(thermal),
         (
             *(_band_picture(thermal, name) for name in thermal.fits),
             _remainder(thermal),

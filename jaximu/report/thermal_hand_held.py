@@ -33,12 +33,10 @@ _POWER = {name: power for power, name in enumerate(POWERS, 1)}
 def page_of(thermal: HandHeldThermal) -> Page:
     """Return which effects of temperature are needed, the errors without and with them, and what may still hide."""
     files, command = files_and_next(thermal.experiment.recordings)
-    value, meaning = _number(thermal)
     return Page(
         f"Bias and scale over temperature of {files}",
         _verdict(thermal),
-        value,
-        meaning,
+        *_number(thermal),
         (*_first(thermal),),
         partial(_rest, thermal),
         (*thermal.notes, f"Written by jaximu {thermal.software['version']}."),

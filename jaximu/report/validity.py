@@ -36,7 +36,6 @@ _OUTPUTS = {
 def page_of(validity: Validity) -> Page:
     """Return what moved, what explains it, what using the old calibration would cost, and the errors under both."""
     log = str(validity.data.get("file", "LOG"))
-    number, meaning = _number(validity)
     following = {
         "valid": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
         "session": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
@@ -47,8 +46,7 @@ def page_of(validity: Validity) -> Page:
     return Page(
         f"Is the calibration still valid for {Path(log).name}?",
         (f"{sentence(validity.verdict)}: {validity.headline()}",),
-        number,
-        meaning,
+        *_number(validity),
         (*_shifts(validity), *_statements(validity), *_errors_table(validity)),
         rest=lambda: [_picture(validity)],
         notes=validity.notes,
