@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import UseAppendAction, arg
 
@@ -13,11 +13,6 @@ from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
-
-if TYPE_CHECKING:
-    from jaximu.ground.gravity import LocalGravity
-    from jaximu.model.noise_model import NoiseModel
-    from jaximu.recordings.recording import Recording
 
 __all__ = ["ThermalCommand"]
 
@@ -62,7 +57,7 @@ class ThermalCommand(options.Fits):
         self.results.prepare(*options.INERTIAL)
         options.require_files(self.calibration)
         from jaximu.calibration import calibrate_thermal, load_calibration
-        from jaximu.diagnosis.thermal_hand_held import turned_by_hand
+        from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
         from jaximu.recordings.flags import without_flagged
         from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
 
@@ -73,7 +68,9 @@ class ThermalCommand(options.Fits):
         if all(by_hand):
             if base is not None or self.block is not None or self.to:
                 raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
-            _give_by_hand(recordings, known, gravity, self.results)
+            with progress("fitting"):
+                turned = calibrate_thermal_by_hand(recordings, known, gravity)
+            self.results.present(turned.summary, text=turned.text, calibration=turned.calibration, thermal=turned)
             return
         if any(by_hand):
             first = str(self.logs[by_hand.index(True)])
@@ -94,14 +91,3 @@ class ThermalCommand(options.Fits):
             calibration=thermal.calibration,
             thermal=thermal,
         )
-
-
-def _give_by_hand(
-    recordings: list[Recording], known: Recording | NoiseModel | None, gravity: LocalGravity, results: options.Results
-) -> None:
-    """Fit poses and turns by hand over temperature, print the result and write it where asked."""
-    from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand
-
-    with progress("fitting"):
-        thermal = calibrate_thermal_by_hand(recordings, known, gravity)
-    results.present(thermal.summary, text=thermal.text, calibration=thermal.calibration, thermal=thermal)
