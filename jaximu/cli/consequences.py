@@ -83,11 +83,8 @@ class ConsequencesCommand(options.Reads):
         other = None if self.against is None else load_calibration(self.against)
         noise = None if self.noise_file is None else options.stated_noise(self.noise_file)
         _require_densities(targets, noise or {})
-        site = Place(
-            _LATITUDE if self.local.latitude is None else self.local.latitude,
-            self.local.height,
-            model.gravity if self.local == options.LOCAL else self.local.value(),
-        )
+        gravity = model.gravity if self.local == options.LOCAL else self.local.value()
+        site = Place(_LATITUDE if self.local.latitude is None else self.local.latitude, self.local.height, gravity)
         limits = _limits({"accelerometer": self.accel_range, "gyroscope": self.gyro_range})
         measured = self._measured(model, site)
         trajectory, stated = self._trajectory(model, site, measured)

@@ -109,7 +109,7 @@ def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
 def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
     assert calibration.nominal is not None
     nominal = calibration.nominal.with_effects(*calibration.imu.setup)
-    figure, panels = stacked(2, 2.6, sharex=True)
+    figure, panels = stacked(2, 2.2, sharex=True)
     before_after = [measurement.errors(imu) for imu in (nominal, calibration.imu)]
     for panel, (name, title) in zip(panels, _PANELS.items(), strict=True):
         for errors, colour, label in zip(before_after, (BEFORE, AFTER), ("before", "calibrated"), strict=True):

@@ -247,7 +247,7 @@ def _budget_figure(consequences: Consequences) -> Figure:
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
     visible = [name for name in _order(consequences) if np.max(variances[name] / whole) >= LEAST_SHARE]
     drawn, end = visible[: len(PALETTE)], f"after {_end(consequences)}"
-    figure, (above, below) = figures.stacked(2, 3.6, sharex=True)
+    figure, (above, below) = figures.stacked(2, 3.2, sharex=True)
     for name, color in zip(drawn, PALETTE, strict=False):
         above.plot(consequences.times, np.sqrt(variances[name]), color=color, linewidth=1.4)
     above.plot(

@@ -89,10 +89,10 @@ def new_figure(height: float, width: float = _WIDTH) -> Figure:
 
 
 def stacked(
-    count: int, each: float, more: float = 0.0, width: float = _WIDTH, **shared: Any
+    count: int, height: float = 1.7, more: float = 0.8, width: float = _WIDTH, **shared: Any
 ) -> tuple[Figure, list[Any]]:
-    """Return a figure with so many panels below each other, `each` inches high, and `more` for what is beside them."""
-    figure = new_figure(more + each * count, width)
+    """Return a figure with so many panels below each other, each so many inches high, and `more` for what is beside."""
+    figure = new_figure(more + height * count, width)
     return figure, figure.subplots(count, 1, squeeze=False, **shared)[:, 0].tolist()
 
 
@@ -186,7 +186,7 @@ def _traces(axes: Axes, signal: Signal, offset: float = 0.0, named: bool = True)
 def signals_figure(recording: Recording) -> Figure:
     """Draw all signals of a recording against time, in SI units."""
     signals = recording.signals
-    figure, grid = stacked(len(signals), 1.7, 0.8, sharex=True)
+    figure, grid = stacked(len(signals), sharex=True)
     for axes, (name, signal) in zip(grid, signals.items(), strict=True):
         _traces(axes, signal)
         unit = unit_text(SENSOR_UNITS.get(name, signal.unit))
@@ -277,7 +277,7 @@ def _rms(values: FloatArray) -> float:
 def residual_figure(errors: PoseAndTurnErrors) -> Figure:
     """Draw the errors by pose and by turn, before and after, with what the noise explains."""
     rows = 3 if len(errors.turn) else 2
-    figure, grid = stacked(rows, 2.35, sharex=True, height_ratios=(0.7, 1, 1)[:rows])
+    figure, grid = stacked(rows, 2.35, 0.0, sharex=True, height_ratios=(0.7, 1, 1)[:rows])
     pose, turn = np.arange(1, len(errors.norm_after) + 1), errors.turn + 1.5  # a turn lies between its two poses
 
     before, after = _rms(errors.norm_before), _rms(errors.norm_after)

@@ -184,7 +184,7 @@ def _effects(calibration: Calibration, history: History) -> Iterable[tuple[str, 
 
 def _figure(calibration: Calibration, history: History) -> Figure:
     drawn = [*_triads(calibration, history), *_effects(calibration, history)]
-    figure, panels = stacked(len(drawn) + 1, 2.4, sharex=True)
+    figure, panels = stacked(len(drawn) + 1, 2.4, 0.0, sharex=True)
     time = history.time
     middle = np.searchsorted(time, (time[0] + time[-1]) / 2)
     for panel, (title, lines) in zip(panels, drawn, strict=False):

@@ -307,7 +307,7 @@ def _points(panel: Axes, movement: Movement, at: NDArray[Any]) -> tuple[float, s
 
 def _history_figure(history: UnitHistory) -> Figure:
     movements = _surest(history)
-    figure, panels = figures.stacked(len(movements), 1.7, 0.8, sharex=True)
+    figure, panels = figures.stacked(len(movements), sharex=True)
     dated = history.per == "year"
     at = np.array(history.dates, "datetime64[D]") if dated else history.times
     for panel, movement in zip(panels, movements, strict=True):
@@ -325,7 +325,7 @@ def _history_figure(history: UnitHistory) -> Figure:
 
 def _temperature_figure(history: UnitHistory) -> Figure:
     movements = _surest(history)
-    figure, panels = figures.stacked(len(movements), 1.7, 0.8, sharex=True)
+    figure, panels = figures.stacked(len(movements), sharex=True)
     for panel, movement in zip(panels, movements, strict=True):
         _points(panel, movement, np.array(history.temperatures, float))
     panels[-1].set_xlabel("temperature [°C]")

@@ -188,7 +188,7 @@ def _map_points() -> tuple[NDArray[np.bool_], FloatArray]:
 
 
 def _curves_figure(panels: list) -> Figure:
-    figure, grid = figures.stacked(len(panels), 2.6, width=6.4)
+    figure, grid = figures.stacked(len(panels), 2.6, 0.0, width=6.4)
     for axes, (title, across, up, lines, heights) in zip(grid, panels, strict=True):
         for (name, values), height in zip(lines.items(), heights, strict=True):
             axes.plot(

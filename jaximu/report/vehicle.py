@@ -118,7 +118,7 @@ def _figure(calibration: Calibration, history: History) -> Figure:
     assert calibration.filter is not None
     vehicle = calibration.filter["vehicle"]
     scale = calibration.triads()["gyroscope"].scales
-    figure, (bias, tilt, speed) = stacked(3, 2.5)
+    figure, (bias, tilt, speed) = stacked(3, 2.5, 0.0)
     for row, (axis, color) in enumerate(AXES.items()):
         values, sigmas = (
             np.degrees(history.values[:, row] / scale[row]),
