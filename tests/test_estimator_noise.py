@@ -329,7 +329,7 @@ def test_the_command_writes_the_estimators_files(tmp_path, capsys):
     assert document["schema"] == "jaximu.consequences/1"
     for wrong, status, said in (
         ([*line, "--noise-for", "gtsam"], 2, "--noise"),
-        ([*path, "--noise-for", "gtsma"], 2, "did you mean gtsam"),
+        ([*path, "--noise-for", "gtsma"], 2, "did you mean 'gtsam'"),
         ([*path, "--noise-for", " , "], 2, "names no estimator"),
         ([*path, "--noise-for", "px4", "--noise-interval", "20"], 1, "too short|states are 20 s apart"),
         ([*path, "--reference", str(tmp_path / "imu.yaml")], 2, "--reference goes with --path LOG"),

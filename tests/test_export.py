@@ -406,7 +406,7 @@ def test_tools_that_never_see_counts(to):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--to", "kaliber"], "did you mean kalibr"),
+        (["--to", "kaliber"], "did you mean 'kalibr'"),
         (["--to", "px4", "--temperature-range", "50,10"], "lowest first"),
         (["--to", "px4", "--temperature-range", "warm"], "LOW,HIGH"),
         (["--to", "px4", "--rate-range", "-1"], "--rate-range"),

@@ -73,10 +73,12 @@ def verbs(monkeypatch):
 
     def stand_in(verb):
         def run(command):
-            (logs, *_), results, arguments = vars(command).values(), command.results, vars(command)
-            calls.append((verb, logs, arguments))
+            arguments = vars(command)
+            calls.append((verb, arguments.get("logs") or arguments["log_path"], arguments))
             names = ("diagnosis", "calibration") if verb == "diagnose" else ("calibration",)
-            results.present(lambda: Page(f"About {verb}", ["It is done."]), **{name: Document() for name in names})
+            command.results.present(
+                lambda: Page(f"About {verb}", ["It is done."]), **{name: Document() for name in names}
+            )
 
         return run
 

@@ -141,7 +141,7 @@ def _described(matrix: FloatArray) -> str:
 
 def _factors(name: str, scale: FloatArray, triad: Triad) -> list[Finding]:
     """Name scales that are a whole factor off the data sheet's, or off by more than sensors are."""
-    sizes = np.linalg.norm(np.asarray(triad.gain), axis=1) / scale
+    sizes = triad.scales / scale
     logarithm = np.log(sizes)
     usual, odd = float(np.exp(np.mean(logarithm))), np.abs(logarithm) > _ODD
     option = "--accel-scale" if name == "accelerometer" else "--gyro-scale"

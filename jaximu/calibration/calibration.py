@@ -134,6 +134,11 @@ class Calibration(Result, Document, page="calibration"):
         return triad
 
     @property
+    def files(self) -> list[str]:
+        """The paths of the recordings that it was made from."""
+        return [str(file["file"]) for file in self.data.get("files", ())]
+
+    @property
     def exact(self) -> tuple[str, ...]:
         """The kinds of residual that the fit passes through exactly: no degrees of freedom are left of them."""
         return tuple(name for name, (before, after, _) in self.rms.items() if after < EXACT * before)

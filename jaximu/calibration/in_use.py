@@ -37,7 +37,7 @@ from jaximu.data.motion import (
 )
 from jaximu.data.sightings import AttitudeSeen, FieldSeen, Sighting, VelocitySeen
 from jaximu.estimation.information_filter import Knowledge, WhiteRows, advance, estimate
-from jaximu.estimation.problem import Parameters, axis_scales, flatten, unflatten
+from jaximu.estimation.problem import Parameters, flatten, unflatten
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
@@ -288,7 +288,7 @@ class FilterInUse:
     def _rests(self, rate: FloatArray, force: FloatArray, lost: float) -> tuple[bool, bool, bool, float]:
         """Return whether the unit rests in an interval, arrives at a rest, begins one; and its mean speed, rad/s."""
         triads = self.imu.triads()
-        outputs = np.hstack([rate / axis_scales(triads["gyroscope"]), force / axis_scales(triads["accelerometer"])])
+        outputs = np.hstack([rate / triads["gyroscope"].scales, force / triads["accelerometer"].scales])
         mean = outputs.mean(axis=0)
         scatter, floor = (values.reshape(2, 3).sum(axis=1) for values in (outputs.var(axis=0, ddof=1), self._floor))
         self._least = np.minimum(self._least, scatter)

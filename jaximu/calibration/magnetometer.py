@@ -16,7 +16,7 @@ from jaximu.calibration.recipe import Choices, calibrate_ready
 from jaximu.calibration.refusals import relative_covariance, require_determined
 from jaximu.data.field import EXCESS_NAMES, FieldWindows, MagneticField, windows_of
 from jaximu.estimation.fitting import Fit, Prior, fit, informed
-from jaximu.estimation.problem import Name, axis_scales
+from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import UNDETERMINED, allowing_for_neighbours
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.distributions import rms
@@ -520,7 +520,7 @@ def _magnetometer(imu: Imu) -> Triad:
 
 def _scale_of(imu: Imu) -> float:
     """Output units of the magnetometer to a µT."""
-    return float(np.mean(axis_scales(_magnetometer(imu))))
+    return float(np.mean(_magnetometer(imu).scales))
 
 
 def _strengths(imu: Imu, output: FloatArray) -> FloatArray:

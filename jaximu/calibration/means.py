@@ -12,7 +12,7 @@ from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.refusals import require_determined
 from jaximu.data.poses import EXCESS_NAMES, PosesAndTurns, residual_rms
 from jaximu.estimation.fitting import Prior, fit
-from jaximu.estimation.problem import Loss, Name, axis_scales, names_of, without_equipment_or_effects
+from jaximu.estimation.problem import Loss, Name, names_of, without_equipment_or_effects
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -127,7 +127,7 @@ def _step(values: FloatArray) -> float:
 def _misalignments(nominal: Imu, free: Sequence[Name]) -> Prior:
     """Return what is known of the misalignments beforehand: they are zero within what sensors have."""
     across = tuple(name for name in free if name.part == "gain" and name.axes[0] != name.axes[1])
-    scale = axis_scales(nominal.accelerometer)
+    scale = nominal.accelerometer.scales
     sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
     return Prior(across, np.zeros(len(across)), np.diag(1 / sigma))
 

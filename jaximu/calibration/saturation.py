@@ -13,7 +13,6 @@ import numpy as np
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.calibration.hand_held import fit_hand_held
-from jaximu.estimation.problem import axis_scales
 from jaximu.recordings.finding import Finding
 
 _LIMITS = 1.01, 1.03, 1.08, 1.2, 1.4
@@ -32,7 +31,7 @@ def saturation(calibration: Calibration) -> list[Finding]:
     if variance < _COARSE:
         return []
     # the limit is the output's: the fitted gain is wrong by what it bends
-    scale = axis_scales(nominal.triads()["gyroscope"])
+    scale = nominal.triads()["gyroscope"].scales
     bias, inside = calibration.imu.triads()["gyroscope"].bias, turns.interval > 0
     rate = np.where(inside[..., None], (turns.output - bias) / scale, 0.0)
     greatest = float(np.max(np.abs(rate)))

@@ -30,7 +30,7 @@ from jaximu.calibration.thermal_triad import TriadFit, fit_triad
 from jaximu.data.rest import mean_terms, padded_count
 from jaximu.data.rest_blocks import RATE_BANDWIDTH, WAYS, RestBlocks, own_noise, rest_blocks
 from jaximu.estimation.fitting import effect_numbers
-from jaximu.estimation.problem import Name, axis_scales
+from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
 from jaximu.ground.array_types import FloatArray
@@ -425,7 +425,7 @@ def _numbers(fit: TriadFit, with_bias: bool, signal: Signal, levels: int) -> tup
 def steady_change(calibration: Calibration, name: str, celsius: FloatArray) -> FloatArray:
     """Return what steady temperatures (m,) °C add to a triad's bias, (m, 3), SI: the calibration's `bias` left out."""
     triad = calibration.triads()[name]
-    scale = axis_scales(triad) if triad.output_unit == "count" else np.ones(3)
+    scale = triad.scales if triad.output_unit == "count" else np.ones(3)
     effects = [effect for effect in triad.effects if effect.plain in THERMAL]
     return steady(effects, celsius, 0.0, triad.temperature_reference)[0] / scale
 

@@ -96,34 +96,76 @@ class AcceptCommand:
         tables = [path for path in self.calibrations if path.suffix.lower() == ".parquet"]
         if tables and len(self.calibrations) > 1:
             raise InputError(f"{tables[0]} is a fleet's table: give one table alone, or calibrations.")
-        if tables:
-            unusable = [name for name, value in (("--noise", self.noise), ("--trace", self.trace)) if value is not None]
-            if unusable:
-                raise InputError(f"{unusable[0]} belongs to single calibrations, not to a fleet's table.")
-            verdict = _line(
-                tables[0],
-                limits_of(self.limits, self.rule, self.risk) if self.limits else None,
-                self.golden,
-                self.measurements,
-                self.results,
-            )
-        else:
-            if self.limits is None:
-                raise InputError("name the limits: --limits LIMITS.toml; --explain shows such a file.")
-            if self.golden:
-                raise InputError("--golden names a device of a fleet's table; these are calibrations.")
-            verdict = _units(
-                self.calibrations,
-                limits_of(self.limits, self.rule, self.risk),
-                self.noise,
-                self.trace,
-                self.measurements,
-                self.results,
-                not self.without_certificate,
-            )
+        verdict = self._line(tables[0]) if tables else self._units()
         ends = {"undecided": ("fail", "undecided"), "fail": ("fail",), "never": ()}[self.fail_on]
         if verdict in ends:
             raise SystemExit(_STATUS[verdict])
+
+    def _units(self) -> str:
+        """Hold single units to limits; return the worst verdict."""
+        if self.limits is None:
+            raise InputError("name the limits: --limits LIMITS.toml; --explain shows such a file.")
+        if self.golden:
+            raise InputError("--golden names a device of a fleet's table; these are calibrations.")
+        limits = limits_of(self.limits, self.rule, self.risk)
+        from jaximu.acceptance import accept
+        from jaximu.acceptance.decision import worst
+        from jaximu.noise.analysis import read_analysis
+
+        known = None if self.noise is None else read_analysis(self.noise)
+        loaded = [_loaded(path, self.trace) for path in self.calibrations]
+        _refuse_doubled(loaded, self.calibrations)
+        self.results.prepare()
+        with progress("deciding"):
+            pairs = zip(loaded, self.calibrations, strict=True)
+            acceptances = [accept(calibration, limits, known, path) for calibration, path in pairs]
+        certificate = not self.without_certificate
+        if self.results.output is not None and certificate:
+            acceptances = [_with_what_is_missing(acceptance) for acceptance in acceptances]
+        verdict = worst([acceptance.verdict for acceptance in acceptances])
+        self.results.give(
+            lambda: _show(*acceptances),
+            partial(_write, acceptances, loaded if certificate else ()),
+            "acceptance.json and certificate.html",
+            {
+                f"{stem}acceptance.json": (acceptance.text() + "\n").encode()
+                for stem, acceptance in _stems(acceptances).items()
+            },
+            acceptances[0].text
+            if len(acceptances) == 1
+            else partial(json.dumps, _together(acceptances, verdict), indent=1),
+        )
+        self._measurements(acceptances)
+        return verdict
+
+    def _line(self, path: Path) -> str:
+        """Follow the line that a fleet's table is of; return its verdict."""
+        for name, value in (("--noise", self.noise), ("--trace", self.trace)):
+            if value is not None:
+                raise InputError(f"{name} belongs to single calibrations, not to a fleet's table.")
+        limits, output = self.limits and limits_of(self.limits, self.rule, self.risk), self.results.output
+        from jaximu.acceptance.line import follow, read_table
+
+        if output is not None and (output / path.name).resolve() == path.resolve():
+            raise InputError(f"-o {output}: the table {path.name} lies there; name another folder.")
+        self.results.prepare()
+        with progress("following the line"):
+            line = follow(read_table(path), limits, self.golden)
+        self.results.give(
+            lambda: _show(line),
+            lambda folder: write_line(line, folder / "report.html", folder / path.name),
+            "acceptance.json, report.html and the table with verdicts",
+            acceptance=line,
+        )
+        self._measurements(line)
+        return "pass" if limits is None else line.verdict
+
+    def _measurements(self, judged: Sequence[Acceptance] | Line) -> None:
+        if self.measurements is not None:
+            from jaximu.acceptance.interchange import write_measurements
+
+            write_measurements(judged, self.measurements)
+            say(f"Written: {self.measurements}")
 
 
 def _explain() -> None:
@@ -148,51 +190,6 @@ def limits_of(path: Path, rule: str | None, risk: float | None) -> Limits:
 
 
 # --- single units -----------------------------------------------------------------------------------------------------
-
-
-def _units(
-    paths: Sequence[Path],
-    limits: Limits,
-    noise: Path | None,
-    trace: Path | None,
-    measurements: Path | None,
-    results: options.Results,
-    certificate: bool,
-) -> str:
-    from jaximu.acceptance import accept
-    from jaximu.acceptance.decision import worst
-    from jaximu.noise.analysis import read_analysis
-
-    known = None if noise is None else read_analysis(noise)
-    loaded = [_loaded(path, trace) for path in paths]
-    _refuse_doubled(loaded, paths)
-    results.prepare()
-    with progress("deciding"):
-        acceptances = [
-            accept(calibration, limits, known, path) for calibration, path in zip(loaded, paths, strict=True)
-        ]
-    if results.output is not None and certificate:
-        acceptances = [_with_what_is_missing(acceptance) for acceptance in acceptances]
-    verdict = worst([acceptance.verdict for acceptance in acceptances])
-    text = (
-        acceptances[0].text if len(acceptances) == 1 else partial(json.dumps, _together(acceptances, verdict), indent=1)
-    )
-    write, names = partial(_write, acceptances, loaded, certificate), "acceptance.json and certificate.html"
-    files = {
-        f"{stem}acceptance.json": (acceptance.text() + "\n").encode()
-        for stem, acceptance in _stems(acceptances).items()
-    }
-    results.give(lambda: _show(*acceptances), write, names, files, text)
-    _measurements(acceptances, measurements)
-    return verdict
-
-
-def _measurements(judged: Sequence[Acceptance] | Line, path: Path | None) -> None:
-    if path is not None:
-        from jaximu.acceptance.interchange import write_measurements
-
-        write_measurements(judged, path)
-        say(f"Written: {path}")
 
 
 def _loaded(path: Path, trace: Path | None) -> Calibration:
@@ -262,21 +259,20 @@ def _stems(acceptances: Sequence[Acceptance]) -> dict[str, Acceptance]:
     }
 
 
-def _write(
-    acceptances: Sequence[Acceptance], loaded: Sequence[Calibration], certificate: bool, output: Path
-) -> tuple[Path, ...]:
+def _write(acceptances: Sequence[Acceptance], loaded: Sequence[Calibration], output: Path) -> tuple[Path, ...]:
+    """Write the certificates of units of which nothing is missing; none where no calibrations are given."""
     from jaximu.ground.atomic import write_files
     from jaximu.recordings.trace import missing
     from jaximu.report.certificate import certificate_of
     from jaximu.report.html import encoded
 
-    units = zip(_stems(acceptances).items(), loaded, strict=True)
-    pages = {
-        output / f"{stem}certificate.html": encoded(certificate_of(acceptance, calibration))[0]
-        for (stem, acceptance), calibration in units
-        if certificate and not missing(acceptance.trace)
-    }
-    return write_files(pages)
+    return write_files(
+        {
+            output / f"{stem}certificate.html": encoded(certificate_of(acceptance, calibration))[0]
+            for (stem, acceptance), calibration in zip(_stems(acceptances).items(), loaded, strict=False)
+            if not missing(acceptance.trace)
+        }
+    )
 
 
 def _show(*results: Acceptance | Line) -> None:
@@ -287,25 +283,6 @@ def _show(*results: Acceptance | Line) -> None:
 
 
 # --- a fleet's table --------------------------------------------------------------------------------------------------
-
-
-def _line(path: Path, limits: Limits | None, golden: str, measurements: Path | None, results: options.Results) -> str:
-    from jaximu.acceptance.line import follow, read_table
-
-    output = results.output
-    if output is not None and (output / path.name).resolve() == path.resolve():
-        raise InputError(f"-o {output}: the table {path.name} lies there; name another folder.")
-    results.prepare()
-    with progress("following the line"):
-        line = follow(read_table(path), limits, golden)
-    results.give(
-        lambda: _show(line),
-        lambda folder: write_line(line, folder / "report.html", folder / path.name),
-        "acceptance.json, report.html and the table with verdicts",
-        acceptance=line,
-    )
-    _measurements(line, measurements)
-    return "pass" if limits is None else line.verdict
 
 
 def write_line(line: Line, page: Path, table: Path) -> tuple[Path, ...]:

@@ -11,7 +11,7 @@ __all__ = ["ArrayCommand"]
 
 
 @dataclass(frozen=True)
-class ArrayCommand:
+class ArrayCommand(options.Fits):
     """Calibrate several units on one rigid body: rotation, position and clock of each, and which one disturbs.
 
     One LOG per unit, recorded together: poses at rest with turns between them, and some quick turns for the positions.
@@ -26,12 +26,8 @@ class ArrayCommand:
     """
 
     logs: options.Logs
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     loss: options.LossChoice = "linear"
     repair: options.RepairFlag = False
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""
@@ -43,5 +39,6 @@ class ArrayCommand:
         with progress("calibrating"):
             array = calibrate_array(recordings, gravity, static=known, loss=self.loss, repair=self.repair)
         units = {f"calibration_{number}": unit.calibration for number, unit in enumerate(array.units, 1)}
-        names = "array.json, report.html and the calibrations"
-        self.results.present(array.summary, names, {}, array.text, array=array, **units)
+        self.results.present(
+            array.summary, "array.json, report.html and the calibrations", {}, array.text, array=array, **units
+        )

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.calibration import Calibration
-    from jaximu.estimation.problem import Loss
     from jaximu.ground.gravity import LocalGravity
 
 __all__ = ["CalibrateCommand"]
 
 
 @dataclass(frozen=True)
-class CalibrateCommand:
+class CalibrateCommand(options.Fits):
     """Calibrate a unit from poses at rest and the turns between them, without equipment.
 
     Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
@@ -33,9 +32,6 @@ class CalibrateCommand:
     """
 
     logs: options.Logs
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     method: Annotated[
         Literal["joint", "two-step", "two-step-rk4", "accelerometer"],
         arg(help="Fit both sensors together, one after the other, or the accelerometer alone."),
@@ -48,7 +44,6 @@ class CalibrateCommand:
         False
     )
     traced: options.Traced = options.TRACED
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""
@@ -65,7 +60,7 @@ class CalibrateCommand:
                 f"--method {self.method}": self.method.startswith("two-step"),
             }
             unusable = [name for name, stated in meant.items() if stated]
-            calibration = _calibrated_means(self.logs, self.log, gravity, self.loss, unusable)
+            calibration = self._of_means(gravity, unusable)
         else:
             recordings, known = self.log.read_unit(self.logs, gravity, self.noise)
             choices = {
@@ -82,20 +77,15 @@ class CalibrateCommand:
         calibration = replace(calibration, trace=trace)
         self.results.present(calibration.summary, calibration=calibration)
 
+    def _of_means(self, gravity: LocalGravity, unusable: list[str]) -> Calibration:
+        """Calibrate from a table of pose means."""
+        if len(self.logs) != 1:
+            raise InputError(f"--means takes one table, found {len(self.logs)} files.")
+        if unusable:
+            raise InputError(f"{unusable[0]} needs a recording's samples, which a table of means (--means) has not.")
+        options.require_files(*self.logs)
+        from jaximu.calibration import calibrate_means
+        from jaximu.recordings.readers import read_means
 
-def _calibrated_means(
-    logs: tuple[Path, ...], log: options.LogOptions, gravity: LocalGravity, loss: Loss, unusable: list[str]
-) -> Calibration:
-    """Calibrate from a table of pose means."""
-    from jaximu.ground.errors import InputError
-
-    if len(logs) != 1:
-        raise InputError(f"--means takes one table, found {len(logs)} files.")
-    if unusable:
-        raise InputError(f"{unusable[0]} needs a recording's samples, which a table of means (--means) has not.")
-    options.require_files(*logs)
-    from jaximu.calibration import calibrate_means
-    from jaximu.recordings.readers import read_means
-
-    with progress("calibrating"):
-        return calibrate_means(read_means(logs[0], log.reading(gravity)), gravity, loss)
+        with progress("calibrating"):
+            return calibrate_means(read_means(self.logs[0], self.log.reading(gravity)), gravity, self.loss)

@@ -14,7 +14,7 @@ __all__ = ["CheckCommand"]
 
 
 @dataclass(frozen=True)
-class CheckCommand:
+class CheckCommand(options.Fits):
     """Check whether an old calibration is still valid for a new recording, and which parameters moved.
 
     Without poses, the calibrated unit is followed through LOG by a filter from its first rest, whose innovations
@@ -27,15 +27,11 @@ class CheckCommand:
 
     calibration: options.CalibrationFile
     logs: options.Logs
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     poses: options.Poses = options.POSES
     fail_on: Annotated[
         Literal["never", "invalid"],
         arg(help="Whether a calibration that is no longer valid ends with exit status 1, for scripts."),
     ] = "never"
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

@@ -27,7 +27,7 @@ _LIMITS = {"accelerometer": ("--accel-range", "specific_force"), "gyroscope": ("
 
 
 @dataclass(frozen=True)
-class ConsequencesCommand:
+class ConsequencesCommand(options.Reads):
     """Show how far off position, velocity and attitude get by calibration errors and noise, and which dominates.
 
     DIR receives consequences.json, report.html, budget.png and tracks.png; with --noise-for estimator_noise.json and
@@ -70,9 +70,6 @@ class ConsequencesCommand:
         Path | None,
         option("REF", "Attitude (and velocity or position) measured along LOG: noise from the errors seen."),
     ] = None
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""
@@ -168,8 +165,12 @@ class ConsequencesCommand:
         from jaximu.recordings.readers import read_attitude
 
         with progress("comparing with the reference"):
-            recording = self.log.alike(model).read(self.path, site.gravity)
-            return MeasuredErrors.of(model.inertial().imu, recording, read_attitude(self.reference), site.gravity)
+            return MeasuredErrors.of(
+                model.inertial().imu,
+                self.log.alike(model).read(self.path, site.gravity),
+                read_attitude(self.reference),
+                site.gravity,
+            )
 
     def _trajectory(
         self, model: Calibration, site: Place, measured: MeasuredErrors | None

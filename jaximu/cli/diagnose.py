@@ -22,7 +22,7 @@ __all__ = ["DiagnoseCommand", "give_diagnosis"]
 
 
 @dataclass(frozen=True)
-class DiagnoseCommand:
+class DiagnoseCommand(options.Fits):
     """Find what the model misses: name the effect, add it to the model and measure the gain on data not fitted.
 
     Several LOGs are several recordings of one unit, each with its own biases: what the unit does in all of them shows
@@ -40,9 +40,6 @@ class DiagnoseCommand:
     """
 
     logs: options.Logs
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     heldout: Annotated[Path | None, option("LOG", "Another recording of the unit, to measure the gain on.")] = None
     reference: Annotated[
         Path | None,
@@ -70,7 +67,6 @@ class DiagnoseCommand:
         Literal["never", "unexplained", "effects"],
         arg(help="Verdicts that end with exit status 1, for scripts: none, unexplained alone, or both."),
     ] = "never"
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""
@@ -90,8 +86,13 @@ class DiagnoseCommand:
         elif measured:
             from jaximu.cli.reference import read_reference
 
-            attitude = read_reference(self.reference, self.logs[0], recordings[0])
-            work = partial(diagnose_against_attitude, recordings[0], attitude, gravity, repair=self.repair)
+            work = partial(
+                diagnose_against_attitude,
+                recordings[0],
+                read_reference(self.reference, self.logs[0], recordings[0]),
+                gravity,
+                repair=self.repair,
+            )
         else:
             from jaximu.cli.turntable import references_of
 

@@ -83,8 +83,15 @@ def _catalogue(kinds: list[type[Effect]]) -> Page:
     for kind in kinds:
         inner = "".join(f" + {name.replace('_', ' ')}" for name in kind.inner)
         alike = f"; easily taken for {', '.join(kind.look_alikes)}" if kind.look_alikes else ""
-        text = f"{kind.size}{inner}, {unit_text(kind.unit)}; {kind.scope}; excited by {kind.excited_by}{alike}"
-        parts.append(Section(kind.title, (kind.formula, text)))
+        parts.append(
+            Section(
+                kind.title,
+                (
+                    kind.formula,
+                    f"{kind.size}{inner}, {unit_text(kind.unit)}; {kind.scope}; excited by {kind.excited_by}{alike}",
+                ),
+            )
+        )
     return Page(f"{len(kinds)} effects", ("`jaximu effects NAME` shows one in full.",), first=parts)
 
 

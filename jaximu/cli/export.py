@@ -112,8 +112,7 @@ class ExportCommand:
         parts: list[Part] = [f"Convention: {written.convention}", Section("Apply:", (Code(written.equation),))]
         if composition is not None:
             parts.append(composition.section())
-        if costs:
-            parts.append(Section(f"Not in the file, and what that costs over {extent.text()}:", (Items(costs),)))
+        parts.append(Section(f"Not in the file, and what that costs over {extent.text()}:", (Items(costs),)))
         later("report.terminal", "show")(Page(f"Calibration for {self.to}", (axes_words,), first=parts))
         say(f"Written: {', '.join(map(str, paths))}")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import Positional
 
@@ -15,14 +15,11 @@ from jaximu.cli.reference import read_reference
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 
-if TYPE_CHECKING:
-    pass
-
 __all__ = ["FilterCommand"]
 
 
 @dataclass(frozen=True)
-class FilterCommand:
+class FilterCommand(options.Fits):
     """Calibrate from all of a recording, motion included, by a Kalman filter; or follow a calibrated unit in use.
 
     For good units and sequences of positions; for a consumer unit turned by hand use `jaximu calibrate`. Of a vehicle
@@ -66,12 +63,8 @@ class FilterCommand:
             "measurement, which shows the heading of every rest.",
         ),
     ] = None
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     effect: options.EffectNames = ()
     repair: options.RepairFlag = False
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

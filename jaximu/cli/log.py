@@ -43,7 +43,7 @@ _RECORD = (
 
 
 @dataclass(frozen=True)
-class LogCommand:
+class LogCommand(options.Fits):
     """Run all that LOGs allow, in one report: calibration, diagnosis, noise, temperature and more.
 
     LOGs are files, a phone's folder or its ZIP archive: recordings of one unit. One of them at rest states the noise
@@ -59,10 +59,6 @@ class LogCommand:
 
     logs: options.Logs
     yes: Annotated[bool, arg(help="Ask nothing: take the default for what the logs leave open, and say so.")] = False
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""
@@ -76,11 +72,18 @@ class LogCommand:
 
         with tables_kept():
             contents, references = _contents_of(self.logs, self.log, asker)
-            outcomes, refused = _run_all(_jobs(contents, references, {"local": self.local, "noise": self.noise}))
+            outcomes, refused = _run_all(_commands(contents, references, self.local, self.noise))
         if not outcomes:
             raise NotPossibleError(f"{_names(self.logs)}: {' '.join(_reasons(contents, refused))} {_RECORD}")
-        stated = "".join(map(options.typed, (self.log, self.local, self.noise)))
-        report = _Report(self.logs, contents, outcomes, refused, asker.assumed, stated, self.results)
+        report = _Report(
+            self.logs,
+            contents,
+            outcomes,
+            refused,
+            asker.assumed,
+            "".join(map(options.typed, (self.log, self.local, self.noise))),
+            self.results,
+        )
         report.give()
 
 
@@ -276,15 +279,6 @@ def _holds_attitude(path: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class _Job:
-    """A verb, the logs that it takes, and what else its function may take by name."""
-
-    verb: str
-    paths: tuple[Path, ...]
-    arguments: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
 class _Outcome:
     """What a verb gave: its page, files and documents, and the document that it prints."""
 
@@ -313,38 +307,44 @@ class _Collected(options.Results):
         self.outcomes.append(_Outcome(cache(page), text or next(iter(documents.values())).text, files, documents))
 
 
-def _jobs(contents: Sequence[_Content], references: Sequence[Path], arguments: Mapping[str, Any]) -> Iterator[_Job]:
-    """Yield what the logs allow, each verb with all the logs that allow it and are read alike."""
+def _commands(
+    contents: Sequence[_Content], references: Sequence[Path], local: options.GravityOptions, noise: options.NoiseOptions
+) -> dict[str, Any]:
+    """Return what the logs allow, ready to run: each verb with all the logs that allow it and are read alike."""
     by_hand = [content for content in contents if content.allows("diagnose")]
     rests = [content.path for content in contents if content not in by_hand and content.allows("allan")]
-    noise = arguments["noise"]
     if by_hand and rests and noise == options.NOISE:
         say(f"{rests[0]} is at rest: it states the noise of the others.")
         noise = replace(noise, static=rests[0])
+    commands = {}
     for verb in _ORDER:
         logs = [content for content in contents if content.allows(verb)]
-        more: dict[str, Any] = {}
+        stated: dict[str, Any] = {"local": local, "noise": noise}
         if verb == "reference" and references and not logs:
             logs = [content for content in contents if "gyroscope" in content.document["signals"]]
-            more = {"reference": references[0]}
+            stated["reference"] = references[0]
         if logs:
-            alike = tuple(content.path for content in logs if content.log == logs[0].log)
-            yield _Job(verb, alike, {**arguments, "noise": noise, "log": logs[0].log, **more})
+            command, stated["log"] = command_of(verb), logs[0].log
+            accepted = {part.name for part in fields(command)}
+            paths = tuple(content.path for content in logs if content.log == logs[0].log)
+            stated = {name: value for name, value in stated.items() if name in accepted}
+            commands[verb] = command(paths if "logs" in accepted else paths[0], results=_Collected(), **stated)
+    return commands
 
 
-def _run_all(jobs: Iterator[_Job]) -> tuple[dict[str, _Outcome], dict[str, str]]:
+def _run_all(commands: Mapping[str, Any]) -> tuple[dict[str, _Outcome], dict[str, str]]:
     """Run verbs by their functions; return what they gave, and why others gave nothing, by verb."""
-    waiting = {job.verb: job for job in jobs}
     outcomes: dict[str, _Outcome] = {}
     refused: dict[str, str] = {}
-    for verb in sorted(waiting, key=lambda verb: verb in _HELD):
+    for verb in sorted(commands, key=lambda verb: verb in _HELD):
         holder, name = _HELD.get(verb, ("", ""))
         if holder in outcomes:
             document: Any = outcomes[holder].documents[name]
             outcomes[verb] = _Outcome(cache(document.summary), document.text)
             continue
         try:
-            outcomes[verb] = _outcome(waiting[verb])
+            commands[verb].run()
+            (outcomes[verb],) = commands[verb].results.outcomes
         except JaximuError as error:
             refused[verb] = str(error)
     return _ordered(outcomes), _ordered(refused)
@@ -352,16 +352,6 @@ def _run_all(jobs: Iterator[_Job]) -> tuple[dict[str, _Outcome], dict[str, str]]
 
 def _ordered(by_verb: Mapping[str, Any]) -> dict[str, Any]:
     return {verb: by_verb[verb] for verb in _ORDER if verb in by_verb}
-
-
-def _outcome(job: _Job) -> _Outcome:
-    command = command_of(job.verb)
-    accepted = {part.name for part in fields(command)}
-    collected = _Collected()
-    arguments = {**job.arguments, "results": collected}
-    log = job.paths if "logs" in accepted else job.paths[0]
-    command(log, **{name: value for name, value in arguments.items() if name in accepted}).run()
-    return collected.outcomes[0]
 
 
 def _reasons(contents: Sequence[_Content], refused: Mapping[str, str]) -> list[str]:

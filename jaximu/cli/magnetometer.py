@@ -25,7 +25,7 @@ _NEAR_THE_EQUATOR = 20.0  # degrees of latitude within which the field may point
 
 
 @dataclass(frozen=True)
-class MagnetometerCommand:
+class MagnetometerCommand(options.Reads):
     """Calibrate a magnetometer while the unit is turned about: scale, hard and soft iron, alignment.
 
     Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
@@ -60,10 +60,7 @@ class MagnetometerCommand:
         UseAppendAction,
         option("NAME[:onset=S]", "Also fit this effect: mag.lag, mag.temperature … May be repeated."),
     ] = ()
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
     traced: options.Traced = options.TRACED
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""
@@ -117,8 +114,7 @@ def _strength(
             raise InputError("--longitude needs --latitude and --date, such as --date 2026-03-04: the field changes.")
         from jaximu.ground.magnetic_field import world_magnetic_model
 
-        day = date.fromisoformat((trace or {})["date"])
-        return world_magnetic_model(local.latitude, longitude, day, local.height)
+        return world_magnetic_model(local.latitude, longitude, date.fromisoformat((trace or {})["date"]), local.height)
     return options.field_strength(text)
 
 
@@ -156,8 +152,7 @@ def _read(log: options.LogOptions, path: Path, mag_log: Path | None, mag_columns
         reason = str(error).removeprefix(f"{path}: ").partition(";")[0]
         notes = (f"the magnetometer stands alone: {reason}.".replace("..", "."),)
         axes = log.axes if log.axes is not None or log.like is None else log.like.axes
-        read_as = Reading(axes=axes, units={"magnetometer": signal.unit})
-        return MagneticLog(signal, None, str(path), notes, read_as)
+        return MagneticLog(signal, None, str(path), notes, Reading(axes=axes, units={"magnetometer": signal.unit}))
     return MagneticLog(signal if recording.magnetometer is None else recording.magnetometer, recording, str(path))
 
 

@@ -45,6 +45,7 @@ __all__ = [
     "CalibrationFile",
     "EffectNames",
     "FieldText",
+    "Fits",
     "ForceFlag",
     "JsonFlag",
     "Local",
@@ -57,6 +58,7 @@ __all__ = [
     "Output",
     "Poses",
     "Reading",
+    "Reads",
     "RepairFlag",
     "Results",
     "Traced",
@@ -484,8 +486,10 @@ class Results:
         texts = {f"{name}.json": document.text() for name, document in documents.items()}
         for name, text in texts.items():
             self._require_kept(folder / name, json.loads(text))
-        encoded = {name: (text + "\n").encode() for name, text in texts.items()}
-        return [*write_folder(folder, encoded | dict(files)), *draw(lambda: write(folder), folder / "report.html")]
+        return [
+            *write_folder(folder, {name: (text + "\n").encode() for name, text in texts.items()} | dict(files)),
+            *draw(lambda: write(folder), folder / "report.html"),
+        ]
 
 
 def typed(group: LogOptions | GravityOptions | NoiseOptions) -> str:
@@ -535,6 +539,22 @@ Traced = Annotated[TraceOptions, arg(name="")]
 Output = Annotated[Results, arg(name="")]
 READING, LOCAL, NOISE = LogOptions(), GravityOptions(), NoiseOptions()
 POSES, TRACED, RESULTS = PoseOptions(), TraceOptions(), Results()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reads:
+    """The options of every verb that reads logs: how, where on Earth they were recorded, and where results go."""
+
+    log: Reading = READING
+    local: Local = LOCAL
+    results: Output = RESULTS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fits(Reads):
+    """The options of every verb that fits a unit to logs."""
+
+    noise: Noise = NOISE
 
 
 def require_files(*paths: Path | None) -> None:

@@ -21,7 +21,7 @@ __all__ = ["PlanCommand"]
 
 
 @dataclass(frozen=True)
-class PlanCommand:
+class PlanCommand(options.Reads):
     """Plan which poses and turns to record next, to reduce the largest uncertainties.
 
     A LOG is calibrated first; of a SPEC, as for `jaximu simulate`, only the data sheet is known. DIR receives
@@ -37,8 +37,6 @@ class PlanCommand:
     """
 
     source: Annotated[Path, Positional, option("CALIBRATION|LOG|SPEC", "What is known about the unit.")]
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
     equipment: Annotated[
         Literal["hands", "table", "dividing-head", "robot"],
         arg(help="What turns the unit. robot: a robot, or anything whose attitude is tracked."),
@@ -66,7 +64,6 @@ class PlanCommand:
     ] = None
     step: Annotated[float | None, option("DEG", "Round angles to multiples of this.")] = None
     seed: Annotated[int, option("N", "Random seed of the search.")] = 0
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""
@@ -107,16 +104,25 @@ class PlanCommand:
             return
         with progress("planning") as report:
             if filtered:
-                effects = options.effects_of(self.effect)["effects"]
                 proposal = propose_sequence(
-                    known, chosen, count, self.criterion, self.parameter, effects, report=report
+                    known,
+                    chosen,
+                    count,
+                    self.criterion,
+                    self.parameter,
+                    options.effects_of(self.effect)["effects"],
+                    report=report,
                 )
             else:
                 proposal = propose(known, chosen, count, self.criterion, self.parameter, self.turns, self.seed, report)
         if magnetometer is not None:
             proposal = replace(proposal, notes=(*proposal.notes, magnetometer))
-        files = {} if chosen.by_hand else {"schedule.csv": proposal.schedule.encode()}
-        self.results.present(proposal.summary, "plan.json, report.html and the poses drawn", files, plan=proposal)
+        self.results.present(
+            proposal.summary,
+            "plan.json, report.html and the poses drawn",
+            {} if chosen.by_hand else {"schedule.csv": proposal.schedule.encode()},
+            plan=proposal,
+        )
 
 
 def _known(path: Path, log: options.LogOptions, local: options.Local) -> tuple[Known | None, str | None]:

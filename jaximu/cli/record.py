@@ -31,7 +31,7 @@ _LOG = "log.csv"
 
 
 @dataclass(frozen=True)
-class RecordCommand:
+class RecordCommand(options.Reads):
     """Record with guidance: which way to hold the unit next, which poses count, and when it is enough.
 
     Lines are CSV with a header, or described by --columns. DIR receives log.csv line by line, then calibration.json and
@@ -69,10 +69,7 @@ class RecordCommand:
         False
     )
     page_port: Annotated[int, option("N", "Port of the page, on this machine alone (default: one that is free).")] = 0
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
     traced: options.Traced = options.TRACED
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

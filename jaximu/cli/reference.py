@@ -21,7 +21,7 @@ __all__ = ["ReferenceCommand", "read_reference"]
 
 
 @dataclass(frozen=True)
-class ReferenceCommand:
+class ReferenceCommand(options.Fits):
     """Calibrate a unit against a measured attitude (optics, an inertial system, a robot) that has its own clock.
 
     DIR receives calibration.json, report.html and pictures.
@@ -42,13 +42,9 @@ class ReferenceCommand:
             "left out. Clocks, mounting and sense are found from the data.",
         ),
     ] = None
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     effect: options.EffectNames = ()
     loss: options.LossChoice = "linear"
     repair: options.RepairFlag = False
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

@@ -94,9 +94,16 @@ def _protocols() -> Page:
 
     parts = []
     for kind, protocol in PROTOCOLS.items():
-        text = [" ".join(paragraph.split()) for paragraph in (inspect.getdoc(protocol) or "").split("\n\n")]
         keys = [key.name + ("" if key.default is MISSING else f" = {_toml(key.default)}") for key in fields(protocol)]
-        parts.append(Section(kind, (*text, Code("\n".join(keys)))))
+        parts.append(
+            Section(
+                kind,
+                (
+                    *[" ".join(paragraph.split()) for paragraph in (inspect.getdoc(protocol) or "").split("\n\n")],
+                    Code("\n".join(keys)),
+                ),
+            )
+        )
     return Page("Protocols and their keys", (), first=parts)
 
 

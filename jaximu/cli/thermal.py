@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import UseAppendAction, arg
 
@@ -14,16 +14,11 @@ from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 
-if TYPE_CHECKING:
-    from jaximu.ground.gravity import LocalGravity
-    from jaximu.model.noise_model import NoiseModel
-    from jaximu.recordings.recording import Recording
-
 __all__ = ["ThermalCommand"]
 
 
 @dataclass(frozen=True)
-class ThermalCommand:
+class ThermalCommand(options.Fits):
     """Fit bias over temperature from LOGs of a unit at rest while its temperature changes.
 
     LOGs of poses and turns by hand while the temperature changes give bias, scale and misalignment over temperature.
@@ -37,9 +32,6 @@ class ThermalCommand:
     """
 
     logs: options.Logs
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     calibration: Annotated[
         Path | None, option("CALIBRATION", "Add the thermal part to this calibration of the unit.")
     ] = None
@@ -56,7 +48,6 @@ class ThermalCommand:
     ] = None
     accel_id: Annotated[int, option("ID", "PX4's device ID of the accelerometer.")] = 0
     gyro_id: Annotated[int, option("ID", "PX4's device ID of the gyroscope.")] = 0
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""
@@ -66,7 +57,7 @@ class ThermalCommand:
         self.results.prepare(*options.INERTIAL)
         options.require_files(self.calibration)
         from jaximu.calibration import calibrate_thermal, load_calibration
-        from jaximu.diagnosis.thermal_hand_held import turned_by_hand
+        from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand, turned_by_hand
         from jaximu.recordings.flags import without_flagged
         from jaximu.report.export.thermal_autopilot import ardupilot_parameters, px4_parameters
 
@@ -77,7 +68,9 @@ class ThermalCommand:
         if all(by_hand):
             if base is not None or self.block is not None or self.to:
                 raise InputError("these are poses by hand: --calibration, --block and --to are for a unit at rest.")
-            _give_by_hand(recordings, known, gravity, self.results)
+            with progress("fitting"):
+                turned = calibrate_thermal_by_hand(recordings, known, gravity)
+            self.results.present(turned.summary, text=turned.text, calibration=turned.calibration, thermal=turned)
             return
         if any(by_hand):
             first = str(self.logs[by_hand.index(True)])
@@ -98,14 +91,3 @@ class ThermalCommand:
             calibration=thermal.calibration,
             thermal=thermal,
         )
-
-
-def _give_by_hand(
-    recordings: list[Recording], known: Recording | NoiseModel | None, gravity: LocalGravity, results: options.Results
-) -> None:
-    """Fit poses and turns by hand over temperature, print the result and write it where asked."""
-    from jaximu.diagnosis.thermal_hand_held import calibrate_thermal_by_hand
-
-    with progress("fitting"):
-        thermal = calibrate_thermal_by_hand(recordings, known, gravity)
-    results.present(thermal.summary, text=thermal.text, calibration=thermal.calibration, thermal=thermal)

@@ -22,7 +22,7 @@ __all__ = ["TurntableCommand", "references_of"]
 
 
 @dataclass(frozen=True)
-class TurntableCommand:
+class TurntableCommand(options.Fits):
     """Calibrate a unit on a rate table, a dividing head or in known positions.
 
     Several LOGs are several recordings of one unit. DIR receives calibration.json, report.html and pictures.
@@ -44,9 +44,6 @@ class TurntableCommand:
             "reference columns; once for each LOG. Without it the log's own reference columns are used.",
         ),
     ] = ()
-    log: options.Reading = options.READING
-    local: options.Local = options.LOCAL
-    noise: options.Noise = options.NOISE
     fit: Annotated[
         tuple[str, ...],
         UseAppendAction,
@@ -62,7 +59,6 @@ class TurntableCommand:
     loss: options.LossChoice = "linear"
     repair: options.RepairFlag = False
     traced: options.Traced = options.TRACED
-    results: options.Output = options.RESULTS
 
     def run(self) -> None:
         """Do what the command line says."""

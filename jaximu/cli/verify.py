@@ -48,9 +48,11 @@ class VerifyCommand:
         if self.as_json:
             options.print_json({"verdict": verdict, "files": [vars(link) for link in links]})
         else:
-            rows = [(link.state, link.what, link.file) for link in links]
-            marked = [index for index, link in enumerate(links) if link.state == CHANGED]
-            table = Table(("state", "what", "file"), rows, marked=marked)
+            table = Table(
+                ("state", "what", "file"),
+                [(link.state, link.what, link.file) for link in links],
+                marked=[index for index, link in enumerate(links) if link.state == CHANGED],
+            )
             titles = {
                 "changed": "Changed: at least one file is not what it was when the result was written.",
                 "intact": "Intact: every file is what it was.",

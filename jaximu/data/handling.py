@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaximu.estimation.data import Handling
-from jaximu.estimation.problem import axis_scales
 from jaximu.ground.array_types import FloatArray
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu, Triad
@@ -51,7 +50,7 @@ def handling(
     off = excess / 2 * ((poses.stop - poses.start) / 2) ** 2
     gyroscope = imu.triads()["gyroscope"]
     assert noise.gyroscope is not None
-    scale = axis_scales(gyroscope)
+    scale = gyroscope.scales
     rest = (excess / 2)[:, None] * scale**2
     moving = np.concatenate([np.zeros(count), np.repeat(off[:-1] + off[1:], 2), rest.ravel()])
 
@@ -117,7 +116,7 @@ def moved_by_hand(
     poses = observations.poses
     start, stop = poses.start, poses.stop
     variance = poses.gyroscope_covariance.diagonal(axis1=1, axis2=2)
-    scale = axis_scales(imu.triads()["gyroscope"])
+    scale = imu.triads()["gyroscope"].scales
     noise = np.sqrt(np.mean(variance / scale**2, axis=1))
     moving = np.flatnonzero(poses.mask & (hands.tilting > _SURE * hands.noise) & (hands.tilting > noise))
     if len(moving):

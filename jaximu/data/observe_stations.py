@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from jaximu.estimation.problem import axis_scales
 from jaximu.estimation.track import TRIADS
 from jaximu.ground import stored
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
@@ -239,7 +238,7 @@ def scheme_stations(
     stimulus = _stimulus(entries, begin, course, float(motion.gravity))
     stimulus = replace(stimulus, time=time, temperature=np.interp(time, motion.temperature_time, motion.temperature))
     turn = np.array([entry.kind == "turn" for entry in entries])
-    scale = [axis_scales(triad) for triad in imu.triads().values()]
+    scale = [triad.scales for triad in imu.triads().values()]
     known = [noise.accelerometer, noise.gyroscope][: len(scale)]
     if known[-1] is None:
         raise NotPossibleError("the noise model has no gyroscope, but the unit has one: record both at rest.")

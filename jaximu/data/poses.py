@@ -35,7 +35,7 @@ from jaximu.data.tracks_by_hand import SamplesByHand, during_turns, pose_means, 
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import effect_numbers
-from jaximu.estimation.problem import Name, axis_scales
+from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.estimation.track import Track, added, mean_outputs
 from jaximu.ground import stored
@@ -438,7 +438,7 @@ def pose_rows(imu: Imu, observations: Observations) -> Rows:
         kind=np.repeat([0, 1, 2], [len(pose), 2 * len(turn), 3 * len(pose)]),
         first=placed(pose, turn),
         last=placed(pose, turn + 1),
-        to_si=np.concatenate([np.ones(len(pose) + 2 * len(turn)), np.tile(1 / axis_scales(gyroscope), len(pose))]),
+        to_si=np.concatenate([np.ones(len(pose) + 2 * len(turn)), np.tile(1 / gyroscope.scales, len(pose))]),
         used=placed(poses.mask, turns.mask).astype(bool),
         covariates=covariates,
         spans=np.stack([poses.start, poses.stop], axis=1),
@@ -485,7 +485,7 @@ def residual_rms(
     if turns.any():
         sizes["gravity_direction"] = (rms(np.degrees(angle)[turns]), "deg")
     rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
-    scale = axis_scales(imu.gyroscope)
+    scale = imu.gyroscope.scales
     sizes["static_gyroscope"] = (rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
     return sizes
 

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from jaximu.data.station_error import turntable_error
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.data import About, Conditions, Data
-from jaximu.estimation.problem import axis_scales
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, IntArray
@@ -67,7 +66,7 @@ def station_rows(imu: Imu, stations: Stations) -> Rows:
     turning = (kind == 1)[:, None]
     covariates |= by_axis("specific force", "m/s²", np.where(turning, np.nan, force))
     covariates |= by_axis("rate", "°/s", np.where(turning, np.degrees(rate), np.nan))
-    scale = [axis_scales(triad) for triad in imu.triads().values()]
+    scale = [triad.scales for triad in imu.triads().values()]
     used = np.stack([stations.accelerometer_used, stations.gyroscope_used], axis=1)
     return Rows(
         kinds=RESIDUALS,
@@ -173,7 +172,7 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
 
     error, sigma = map(np.asarray, stored.call(compute, "station errors", imu, stations, excess))
     stations = on_host(stations)
-    scale = [axis_scales(triad)[:, None] for triad in imu.triads().values()]
+    scale = [triad.scales[:, None] for triad in imu.triads().values()]
     gyroscope, turn = stations.gyroscope_used, stations.turn
     degrees = np.degrees(stations.stop - stations.start)
     kinds = [("specific_force", "m/s^2", stations.accelerometer_used, slice(3), 1.0)]

@@ -280,7 +280,7 @@ class Experiment(Data):
         most = dict.fromkeys(triads, 0.0)
         for tracks in self.data.tracks(state.linear.details):
             for name, outputs in added(state.imu.with_effects(effect), tracks).items():
-                scale = np.linalg.norm(np.asarray(triads[name].gain), axis=1)
+                scale = triads[name].scales
                 values = np.abs(np.asarray(outputs)[tracks[name].inside()] / scale)
                 most[name] = max(most[name], float(np.max(values)))
         return most
@@ -453,6 +453,6 @@ def _limits(evidence: Evidence, imu: Imu) -> dict[str, tuple[float, str]]:
 def _sizes(kind: type[Effect], imu: Imu) -> FloatArray:
     """Typical sizes of an effect's coefficients, to scale columns by."""
     triad = imu.triads().get(kind.owner, imu.accelerometer)
-    scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
+    scale = float(np.mean(triad.scales))
     typical = {name: parameter.typical for name, parameter in kind.inner.items()}
     return np.asarray(kind(np.zeros(kind.size), **typical).typical_sizes(scale).coefficients)

@@ -89,7 +89,7 @@ def _predict(held: Experiment, state: State) -> Prediction:
     spread = np.array(state.covariance[np.ix_(places, places)])
     for name, size in POWER_ON.items():
         if bias := _biases(names, name):
-            spread[bias, bias] += (size * np.linalg.norm(np.asarray(imu.triads()[name].gain), axis=1)) ** 2
+            spread[bias, bias] += (size * imu.triads()[name].scales) ** 2
     chi_squared, likelihood = _beside_open(conditions, covariance, columns, spread)
     return Prediction(held.real.rms(conditions), chi_squared, len(conditions), likelihood)
 

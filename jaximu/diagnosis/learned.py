@@ -231,7 +231,7 @@ def _curve(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the covariate (101,), the curve (101, 3), SI, and half the width of its 95 % band."""
     effect = curve_of(state)
     triad = state.imu.triads()[effect.owner]
-    scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
+    scale = triad.scales
     low, high = map(float, effect.interval())
     x = np.linspace(low, high, _POINTS)
     shapes = np.asarray(effect.shapes(x))

@@ -122,7 +122,7 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
     extent = _extent(windows)
     grids = {kind: kind.grid(extent) for kind in kinds}
     bare = model.with_effects()
-    scale = float(np.mean(np.linalg.norm(np.asarray(bare.magnetometer.gain), axis=1)))
+    scale = float(np.mean(bare.magnetometer.scales))
     blocks = []
     for kind, slopes in measurement.dormant_columns(bare, linear.details, grids).items():
         size = np.asarray(kind.dormant().typical_sizes(scale).coefficients)

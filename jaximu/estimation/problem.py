@@ -12,7 +12,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float, PyTree
 
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array
 from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Board, Imu, Triad
 
@@ -43,11 +43,6 @@ def typical_sizes(imu: Imu) -> Imu:
     if isinstance(imu, Board):
         changed["others"] = tuple(map(typical_sizes, imu.others))
     return replace(imu, **changed, setup=tuple(effect.typical_sizes(1.0) for effect in imu.setup))
-
-
-def axis_scales(triad: Triad) -> FloatArray:
-    """Return how much each axis (3,) of a triad puts out for an SI unit, on the host."""
-    return np.linalg.norm(triad.gain, axis=1)
 
 
 def flatten(model: Imu) -> Float[Array, " m"]:

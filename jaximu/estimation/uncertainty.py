@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.estimation.problem import TOLERANCE, Name, axis_scales
+from jaximu.estimation.problem import TOLERANCE, Name
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.quantities import listed, number, size
@@ -141,7 +141,7 @@ def spoken_amount(name: Name, amount: float, model: Imu) -> str:
         output = model.triads()[effect.owner].output_unit if effect.owner in model.triads() else ""
         unit = effect.coefficient_unit(output) if name.part == "coefficients" else effect.inner[name.part].unit
         return size(amount, unit, 2)
-    amount /= float(axis_scales(model.triads()[name.owner])[name.axes[0]])
+    amount /= float(model.triads()[name.owner].scales[name.axes[0]])
     if name.part == "bias":
         return size(amount, SENSOR_UNITS[name.owner], 2)
     return f"{number(100 * amount, 2)} %" if name.axes[0] == name.axes[1] else f"{number(1e3 * amount, 2)} mrad"
@@ -155,7 +155,7 @@ def _in_si(
     for name, weight, typical in zip(names, vector, np.asarray(sizes), strict=True):
         if name.owner == triad and name.effect is None:
             parts[name.part][name.axes] += weight * typical
-    scale = axis_scales(model.triads()[triad]) if triad in model.triads() else np.ones(3)
+    scale = model.triads()[triad].scales if triad in model.triads() else np.ones(3)
     return parts["gain"] / scale[:, None], parts["bias"] / scale
 
 

@@ -1,4 +1,7 @@
-"""A result in parts, before anyone has decided how to show it: on the terminal, as an HTML file, in a notebook."""
+"""A result in parts, before anyone has decided how to show it: on the terminal, as an HTML file, in a notebook.
+
+A part that holds nothing is false, and no renderer shows it: a section of nothing needs no condition where it is made.
+"""
 
 from __future__ import annotations
 
@@ -49,6 +52,9 @@ class Table(Shown):
     marked: Sequence[int] = ()
     brief: int | None = None
 
+    def __bool__(self) -> bool:
+        return bool(self.rows)
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -63,10 +69,13 @@ class Picture:
 
 @dataclass(frozen=True)
 class Items:
-    """A list of sentences."""
+    """A list of sentences, each shown with a capital at its start."""
 
     kind: ClassVar[str] = "items"
     texts: Sequence[str]
+
+    def __bool__(self) -> bool:
+        return bool(self.texts)
 
 
 @dataclass(frozen=True)
@@ -93,6 +102,9 @@ class Section:
     title: str
     parts: Sequence[Part]
     level: int = 2
+
+    def __bool__(self) -> bool:
+        return any(self.parts)
 
 
 Part = str | Statement | Table | Picture | Items | Code | Matrices | Section
@@ -123,16 +135,15 @@ class Page(Shown):
 
     def section(self) -> Section:
         """Return the first screen as one section."""
-        notes = [Items(self.notes)] if self.notes else []
-        return Section(self.title, (*self._headline(), *self.first, *notes), 4)
+        return Section(self.title, (*self._headline(), *self.first, Items(self.notes)), 4)
 
     def chapter(self, name: str, whole: bool) -> Section:
         """Return the page as a section of another, its pictures kept as NAME_….png.
 
         whole: with all that the HTML file shows, not the first screen alone.
         """
-        notes = [Section("Notes", [Items(self.notes)])] if self.notes else []
-        parts = (*self._headline(), *self.first, *(self.rest() if whole else ()), *notes)
+        rest = self.rest() if whole else ()
+        parts = (*self._headline(), *self.first, *rest, Section("Notes", [Items(self.notes)]))
         return Section(self.title, [_inside(part, name) for part in parts])
 
     def _headline(self) -> list[str]:

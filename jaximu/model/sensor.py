@@ -101,6 +101,11 @@ class Triad(eqx.Module):
         """Return K⁻¹(y − b) (..., 3), effects left out, of outputs in NumPy, where nothing is to be traced."""
         return (np.asarray(output) - np.asarray(self.bias)) @ np.linalg.inv(np.asarray(self.gain)).T
 
+    @property
+    def scales(self) -> FloatArray:
+        """How many output units each axis (3,) has per SI unit, in NumPy."""
+        return np.linalg.norm(np.asarray(self.gain), axis=-1)
+
     def inverse(self) -> Float[Array, "3 4"]:
         """Return (A | c) of u = A y + c, the inverse without effects: A = K⁻¹ and c = −K⁻¹ b."""
         matrix = inverse_matrix(self.gain)

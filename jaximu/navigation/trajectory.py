@@ -218,7 +218,7 @@ def of_specification(
     for artefact in case.artefacts:
         for name in ("accelerometer", "gyroscope"):
             if artefact.name == "clipping" and getattr(artefact, name) is not None:
-                scale = np.linalg.norm(np.asarray(case.imu.triads()[name].gain), axis=1)
+                scale = case.imu.triads()[name].scales
                 limits[name] = float(getattr(artefact, name) / scale.max())
     words = f"the motion of {Path(specification.name).name}, {count / case.rate:g} s at {site.latitude:g}° latitude"
     return Trajectory.of(start, stimulus, np.full(count, 1 / case.rate), words), limits

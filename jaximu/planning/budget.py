@@ -78,7 +78,6 @@ from jaximu.planning.setup_errors import (
     ErrorSource,
     Task,
     read_task,
-    scale_of,
     scheme_and_sources,
     task,
     with_effects,
@@ -388,7 +387,7 @@ def _check(
     indices = [names_of(unit).index(name) for name in result.names]
 
     def sheet(triad: Triad) -> Triad:
-        gain = np.diag(scale_of(triad))
+        gain = np.diag(triad.scales)
         return replace(triad, gain=gain, bias=np.zeros(3))
 
     def many(leaf):

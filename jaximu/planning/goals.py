@@ -11,7 +11,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, nearest
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.sensor import Imu
-from jaximu.planning.setup_errors import quantity, scale_of
+from jaximu.planning.setup_errors import quantity
 
 __all__ = ["goal_of", "goal_sigmas", "group_of", "parse_goal", "per_si", "unit_of"]
 
@@ -28,7 +28,7 @@ def per_si(name: Name, unit: Imu) -> float:
     """Return output units per SI unit of a gain's or a bias's axis; one for effects."""
     if name.effect is not None:
         return 1.0
-    return float(scale_of(unit.triads()[name.owner])[name.axes[0]])
+    return float(unit.triads()[name.owner].scales[name.axes[0]])
 
 
 def group_of(name: Name) -> str:

@@ -30,7 +30,7 @@ from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
 from jaximu.model import AxisNoise, parse_quantity, processes
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE
-from jaximu.model.sensor import Imu, Triad
+from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.planning.information import root_of
 from jaximu.recordings.observations import Stations
@@ -44,7 +44,6 @@ __all__ = [
     "Task",
     "quantity",
     "read_task",
-    "scale_of",
     "scheme_and_sources",
     "task",
     "white_density",
@@ -432,7 +431,7 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
         coefficient += len(sizes)
     if shaken := _stated(errors, "vibration").get("noise", 0.0):
         during = np.asarray(stations.turn & stations.gyroscope_used) / np.sqrt(_durations(stations))
-        scale = scale_of(case.imu.triads()["gyroscope"])
+        scale = case.imu.triads()["gyroscope"].scales
         add("vibration", np.diag((shaken * scale[:, None] * during).ravel()), added + 3 * size)
     for name, covariances in (("noise", fast), ("bias_instability", slow)):
         add(name, np.asarray(block_diag(*root_of(covariances))), added)
@@ -444,11 +443,6 @@ def _source(errors: Mapping[str, tuple[Any, str]], name: str, root: FloatArray) 
     value, text = errors.get(name, (None, "by the noise"))
     single = value if name in _SINGLE else None
     return ErrorSource(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), root)
-
-
-def scale_of(triad: Triad) -> FloatArray:
-    """Return how many output units each axis has per SI unit, (3,)."""
-    return np.linalg.norm(np.asarray(triad.gain), axis=1)
 
 
 def _durations(stations: Stations) -> FloatArray:
@@ -480,7 +474,7 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[Interval]):
             unit = "m/s²/√Hz" if name == "accelerometer" else "rad/s/√Hz"
             notes.append(f"no white noise is stated for the {name}: {np.sqrt(density[0]):.2g} {unit} is assumed.")
         *parts, ramps[name] = _mean_covariances(stated, density, *span.T)
-        scale = scale_of(triad)[:, None, None]
+        scale = triad.scales[:, None, None]
         there = np.asarray(used[name])[:count]
         for whole, part in zip((fast, slow), parts, strict=True):
             whole[3 * number : 3 * number + 3, :count, :count] = np.where(there[:, None] & there, part * scale**2, 0.0)
@@ -493,7 +487,7 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[Interval]):
 
 def _effects_by_source(errors: Mapping[str, tuple[Any, str]], unit: Imu, ramps: Mapping[str, FloatArray]):
     """By source: effects that make its errors, each with the sizes of its coefficients."""
-    gains = {name: scale_of(triad) for name, triad in unit.triads().items()}
+    gains = {name: triad.scales for name, triad in unit.triads().items()}
 
     def effect(name: str, sizes) -> tuple[Effect, FloatArray]:
         made = CATALOGUE[name].dormant()

@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +32,7 @@ from jaximu.recordings.readers.kalibr import kalibr_yaml
 from jaximu.recordings.recording import Source
 from jaximu.report.figures import AXES, dressed, new_figure
 from jaximu.report.tables import written_now
+from jaximu.report.words import file_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -145,29 +145,31 @@ def _hours(seconds: float) -> str:
     return f"{seconds / 60:.3g} min" if seconds < 7200 else f"{seconds / 3600:.3g} h"
 
 
+def _shown(analysis: NoiseAnalysis) -> Iterator[tuple[str, str, dict[str, Term]]]:
+    """Yield each triad, the most important first, its quantity, and which of N, B and K show, means of the axes."""
+    for name in [name for name in _ORDER if name in analysis.axes]:
+        mean = mean_terms(analysis.axes[name])
+        yield name, SENSOR_QUANTITIES[name], {term: one for term in "NBK" if (one := mean.get(term)) is not None}
+
+
 def _verdict(analysis: NoiseAnalysis) -> Iterator[str]:
     """Say of each triad what a person should keep."""
     start = f"In {_hours(recorded_seconds(next(iter(analysis.axes.values()))[0]))} at rest, the"
-    for name in [name for name in _ORDER if name in analysis.axes]:
-        quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
-        sizes = [
-            f"{TERM_NAMES[term]} of {_in_unit(estimate.value, quantity, term)}"
-            for term in "NBK"
-            if (estimate := mean.get(term)) is not None
-        ]
+    for name, quantity, terms in _shown(analysis):
+        sizes = [f"{TERM_NAMES[term]} of {_in_unit(mean.value, quantity, term)}" for term, mean in terms.items()]
         yield f"{start} {name} has {listed(sizes) if sizes else 'none of N, B and K'} (mean of the axes)."
         start = "The"
 
 
 def _number(analysis: NoiseAnalysis) -> tuple[str, str]:
     """Return the first term of the most important triad that shows one, and what it is."""
-    for name in [name for name in _ORDER if name in analysis.axes]:
-        quantity, mean = SENSOR_QUANTITIES[name], mean_terms(analysis.axes[name])
-        for term, estimate in [(term, mean.get(term)) for term in "NBK"]:
-            if estimate is not None:
-                low, high = (_in_unit(end, quantity, term) for end in (estimate.low, estimate.high))
-                meaning = f"{TERM_NAMES[term]} of the {name} (mean of the axes), 95 % interval {low} … {high}"
-                return _in_unit(estimate.value, quantity, term), meaning
+    for name, quantity, terms in _shown(analysis):
+        for term, mean in terms.items():
+            low, high = (_in_unit(end, quantity, term) for end in (mean.low, mean.high))
+            return (
+                _in_unit(mean.value, quantity, term),
+                f"{TERM_NAMES[term]} of the {name} (mean of the axes), 95 % interval {low} … {high}",
+            )
     return "", ""
 
 
@@ -298,8 +300,16 @@ def _letter(
     if end < 12 or end > len(tau) - 12:  # on a line that leaves at the side
         spot, align = (8, "left") if end < 12 else (len(tau) - 8, "right")
     box = {"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
-    text = f" {term}  {TERM_NAMES[term]} "
-    panel.annotate(text, (tau[spot], line[spot]), fontsize=8.5, color="0.15", zorder=5, ha=align, va="center", bbox=box)
+    panel.annotate(
+        f" {term}  {TERM_NAMES[term]} ",
+        (tau[spot], line[spot]),
+        fontsize=8.5,
+        color="0.15",
+        zorder=5,
+        ha=align,
+        va="center",
+        bbox=box,
+    )
 
 
 def _headline(name: str, axes: Sequence[Identified]) -> str:
@@ -350,7 +360,6 @@ def kalibr_text(analysis: NoiseAnalysis, topic: str = "/imu0") -> str:
 
 def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
     """Return the page of a noise analysis; `sources`: the files with their SHA-256 and rows, where they are known."""
-    names = ", ".join(Path(path).name for path in analysis.files) or "a recording"
     log = shlex.quote(analysis.files[0]) if analysis.files else "REST"
     terms = _by_triad(
         analysis,
@@ -364,32 +373,34 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
         analysis, "For a Kalman filter", "Of the mean of the axes, in SI; Δt is one over the sample rate.", _filter
     )
     return Page(
-        f"Noise at rest: {names}",
+        f"Noise at rest: {file_names(analysis.files)}",
         [*_verdict(analysis)],
         *_number(analysis),
-        (_picture(analysis), *_cautions(analysis), terms, numbers, *_limits(analysis)),
+        (
+            Picture(
+                "allan",
+                partial(allan_figure, analysis),
+                "Allan deviation against averaging time for " + " and ".join(analysis.axes),
+                "How to read it: average the output over τ seconds, and the difference between one average and the "
+                "next is typically √2 times the height of the curve. On the left, averaging helps: white noise falls "
+                "by √10 for ten times the time. Where the curve is flat (bias instability) or rises (random walk, "
+                "ramp), the bias itself wanders and longer averages no longer help. The squares of the dashed lines "
+                "add up to that of a solid one.",
+            ),
+            _cautions(analysis),
+            terms,
+            numbers,
+            *_limits(analysis),
+        ),
         partial(_details, analysis, sources or [Source(path, "", 0) for path in analysis.files]),
-        [*map(sentence, filter(None, analysis.notes))],
+        [*filter(None, analysis.notes)],
         f"`jaximu calibrate LOG --static {log} -o RESULTS` calibrates the unit with this noise."
         if "accelerometer" in analysis.axes
         else "",
     )
 
 
-def _picture(analysis: NoiseAnalysis) -> Picture:
-    """Return the Allan deviation of all sensors with how to read it."""
-    return Picture(
-        "allan",
-        partial(allan_figure, analysis),
-        "Allan deviation against averaging time for " + " and ".join(analysis.axes),
-        "How to read it: average the output over τ seconds, and the difference between one average and the next is "
-        "typically √2 times the height of the curve. On the left, averaging helps: white noise falls by √10 for ten "
-        "times the time. Where the curve is flat (bias instability) or rises (random walk, ramp), the bias itself "
-        "wanders and longer averages no longer help. The squares of the dashed lines add up to that of a solid one.",
-    )
-
-
-def _cautions(analysis: NoiseAnalysis) -> Iterator[Section]:
+def _cautions(analysis: NoiseAnalysis) -> Section:
     """Say where the terms are not the whole noise, and which sensor is missing."""
     poor = [name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)]
     missing = [name for name in INERTIAL_QUANTITIES if name not in analysis.axes]
@@ -399,23 +410,28 @@ def _cautions(analysis: NoiseAnalysis) -> Iterator[Section]:
         cautions.append(Statement("More than the five terms", f"{text}the notes.", True))
     if missing:
         cautions.append(Statement("Not recorded", f"The recording has no {listed(missing, 'and no')}.", True))
-    if cautions:
-        yield Section("Before you rely on it", cautions)
+    return Section("Before you rely on it", cautions)
 
 
 def _by_triad(analysis: NoiseAnalysis, title: str, text: str, content: _Content) -> Section:
     """Return a section with a part for each triad."""
-    parts: list[Part] = [text] if text else []
-    for name in analysis.axes:
-        parts.append(Section(f"{sentence(name)}, {analysis.rates[name]:.6g} Hz", [*content(analysis, name)], 3))
-    return Section(title, parts)
+    return Section(
+        title,
+        [
+            text,
+            *(
+                Section(f"{sentence(name)}, {analysis.rates[name]:.6g} Hz", [*content(analysis, name)], 3)
+                for name in analysis.axes
+            ),
+        ],
+    )
 
 
 def _terms(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
     """Yield a triad's terms with their intervals, in both units, what is not seen, and the lowest point."""
     axes, quantity = analysis.axes[name], SENSOR_QUANTITIES[name]
-    if rows := [row.row(f"{row.term} {row.meaning}", row.first) for row in term_rows(axes, quantity)]:
-        yield Table(("term", "unit", *_AXES), rows)
+    rows = [row.row(f"{row.term} {row.meaning}", row.first) for row in term_rows(axes, quantity)]
+    yield Table(("term", "unit", *_AXES), rows)
     yield from unseen_notes(axes, quantity)
     at, size = _lowest(axes)
     yield f"Lowest point of the mean's curve: {_in_unit(size, quantity, 'B', 2)} at {_hours(at)}."
@@ -426,13 +442,13 @@ def _terms_in_si(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
     quantity = SENSOR_QUANTITIES[name]
     rows = [row for row in term_rows(analysis.axes[name], quantity) if row.unit == SI_UNITS[quantity][row.term]]
     named = [replace(row, first=True).row(f"{row.term} {row.meaning}") for row in rows]
-    yield Table(("term", "unit", *_AXES), named) if named else _NONE
+    yield Table(("term", "unit", *_AXES), named) or _NONE
 
 
 def _filter(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
     """Yield the numbers that a filter takes of the mean of a triad's axes."""
     rows = [row for row in _filter_rows(filter_numbers(analysis, name)[1]) if row[2]]
-    yield Table(("formula", "number", "value", "unit"), rows) if rows else _NONE
+    yield Table(("formula", "number", "value", "unit"), rows) or _NONE
 
 
 def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
@@ -445,8 +461,9 @@ def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
             "recording resolves four times as long averages."
         )
         triads.setdefault(text, []).append(name)
-    statements = [Statement(sentence(listed(names)), text) for text, names in triads.items()]
-    yield Section("What the length cannot resolve", statements)
+    yield Section(
+        "What the length cannot resolve", [Statement(sentence(listed(names)), text) for text, names in triads.items()]
+    )
     parts: list[Part] = [
         "One recording does not show how the bias changes from power-on to power-on, and the Allan deviation cannot "
         "see it. Give several recordings of the unit, lying alike: `jaximu allan LOG1 LOG2 LOG3 …`"
@@ -456,8 +473,10 @@ def _limits(analysis: NoiseAnalysis) -> Iterator[Part]:
             f"Standard deviation of the bias over {len(analysis.files)} recordings, with its 95 % interval. No Allan "
             "deviation sees it, and a filter needs it as the bias's standard deviation at the start."
         )
-        rows = [row.row(row.meaning) for row in _repeatability_rows(analysis)]
-        parts = [text, Table(("sensor", "unit", *_AXES[:3]), rows)]
+        parts = [
+            text,
+            Table(("sensor", "unit", *_AXES[:3]), [row.row(row.meaning) for row in _repeatability_rows(analysis)]),
+        ]
     yield Section("Repeatability", parts)
 
 
@@ -483,18 +502,25 @@ def _details(analysis: NoiseAnalysis, sources: Sequence[Source]) -> Iterator[Par
     )
     yield Section("For Kalibr", ["The same, as `imu.yaml`:", Code(kalibr_text(analysis))])
     files = [(source.path, str(source.rows or ""), source.sha256) for source in sources]
-    facts = [
-        ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
-        (
-            "Method",
-            "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data supports "
-            "(jaximu.noise.identify); picture: overlapping Allan deviation at octaves",
-        ),
-        ("Software", f"jaximu {__version__}"),
-        ("Report written", written_now()),
-    ]
-    tables = [Table(("file", "rows", "SHA-256"), files)] if files else []
-    yield Section("Where it comes from", [*tables, Table((), facts)])
+    yield Section(
+        "Where it comes from",
+        [
+            Table(("file", "rows", "SHA-256"), files),
+            Table(
+                (),
+                [
+                    ("Sample rate", ", ".join(f"{name} {rate:.6g} Hz" for name, rate in analysis.rates.items())),
+                    (
+                        "Method",
+                        "the five terms Q, N, B, K, R fitted together to the samples, those kept that the data "
+                        "supports (jaximu.noise.identify); picture: overlapping Allan deviation at octaves",
+                    ),
+                    ("Software", f"jaximu {__version__}"),
+                    ("Report written", written_now()),
+                ],
+            ),
+        ],
+    )
 
 
 def _discrete(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
@@ -506,10 +532,9 @@ def _discrete(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
         sizes = [None if one is None else float(to_discrete(term, one.value, rate)) for one in estimates]
         for unit in _DISCRETE_UNITS[quantity] if any(sizes) else ():
             factor = _factor(quantity, "B", unit)
-            cells = ["–" if one is None else number(factor * one, 4) for one in sizes]
-            rows.append((words, unit_text(unit), *cells))
+            rows.append((words, unit_text(unit), *["–" if one is None else number(factor * one, 4) for one in sizes]))
             words = ""
-    yield Table(("", "unit", *_AXES), rows) if rows else "The data supports neither N nor K."
+    yield Table(("", "unit", *_AXES), rows) or "The data supports neither N nor K."
 
 
 def _filter_by_axis(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
@@ -520,7 +545,7 @@ def _filter_by_axis(analysis: NoiseAnalysis, name: str) -> Iterator[Part]:
         for row in zip(*map(_filter_rows, per_axis), strict=True)
         if any(text for _, _, text, _ in row)
     ]
-    yield Table(("formula", "unit", *_AXES[:3]), rows) if rows else _NONE
+    yield Table(("formula", "unit", *_AXES[:3]), rows) or _NONE
     if mean.flat is not None:
         left, right = (_hours(end) for end in sorted(mean.flat))
         yield (

@@ -13,7 +13,7 @@ import scipy
 
 from jaximu.calibration.array_units import Array, ArrayUnit
 from jaximu.ground.page import Page, Picture, Statement, Table
-from jaximu.ground.quantities import number, sentence, with_interval
+from jaximu.ground.quantities import number, with_interval
 from jaximu.report.figures import AXES, dressed, new_figure
 
 if TYPE_CHECKING:
@@ -25,25 +25,31 @@ __all__ = ["page_of"]
 def page_of(array: Array) -> Page:
     """Return what averaging gains, which unit disturbs, and where each unit is."""
     rate, force = (noise[0] / noise[1] for noise in (array.averaged.rate, array.averaged.force))
-    suspects = dict.fromkeys(unit.name for unit, *_ in array.suspects())
-    picture = Picture(
-        "array",
-        partial(_figure, array),
-        "The units' positions and axes",
-        "The units as the first one sees them, from above and from the side: positions with 95 % intervals, and the "
-        "directions of their axes. Numbers: units in the order of the files.",
-    )
     return Page(
         f"An array of {len(array.units)} units",
         (
-            *(f"{Path(name).name} disturbs the array." for name in suspects),
+            *(
+                f"{Path(name).name} disturbs the array."
+                for name in dict.fromkeys(unit.name for unit, *_ in array.suspects())
+            ),
             f"At rest the weighted mean of all {len(array.units)} units has {rate:.2g} times less gyroscope noise and "
             f"{force:.2g} times less accelerometer noise than a typical unit.",
         ),
         f"{rate:.2g}×",
         "less gyroscope noise in the mean of all units",
-        (picture, *_suspects(array), _table(array), *_noise(array)),
-        notes=[sentence(note) for note in array.notes],
+        (
+            Picture(
+                "array",
+                partial(_figure, array),
+                "The units' positions and axes",
+                "The units as the first one sees them, from above and from the side: positions with 95 % intervals, "
+                "and the directions of their axes. Numbers: units in the order of the files.",
+            ),
+            *_suspects(array),
+            _table(array),
+            *_noise(array),
+        ),
+        notes=array.notes,
         next=_next(array),
     )
 
@@ -59,11 +65,12 @@ def _next(array: Array) -> str:
 def _suspects(array: Array) -> Iterator[Statement]:
     """Say which units scatter far more than the others."""
     for unit, words, times in array.suspects():
-        text = (
+        yield Statement(
+            Path(unit.name).name,
             f"It scatters {times:.2g} times as far about the shared motion as a typical unit in {words}: look for the "
-            "cause with `jaximu diagnose`, or leave it out of the mean."
+            "cause with `jaximu diagnose`, or leave it out of the mean.",
+            True,
         )
-        yield Statement(Path(unit.name).name, text, True)
     if len(array.units) == 2:
         yield Statement("Scatter", "Two units cannot show which of them scatters: add a third.")
 
@@ -74,24 +81,25 @@ def _noise(array: Array) -> Iterator[Statement]:
         (array.averaged.rate, "gyroscope", np.degrees(1.0), "°/s"),
         (array.averaged.force, "accelerometer", 1e3, "mm/s²"),
     ):
-        text = (
+        yield Statement(
+            f"Noise of the {words} at rest",
             f"Means of a quarter of a second: {factor * unit:.3g} {printed} of a typical unit, {factor * mean:.3g} "
-            f"{printed} of the mean; {factor * expected:.3g} {printed} if the units' noises were independent."
+            f"{printed} of the mean; {factor * expected:.3g} {printed} if the units' noises were independent.",
         )
-        yield Statement(f"Noise of the {words} at rest", text)
 
 
 def _table(array: Array) -> Table:
     """Return how each unit is turned and placed, how late its clock is, and its scatter; suspects are marked."""
     suspects = [unit for unit, *_ in array.suspects()]
     marked = [index for index, unit in enumerate(array.units) if any(unit is suspect for suspect in suspects)]
-    caption = (
+    return Table(
+        ("unit", "turned [°]", "position x, y, z [mm]", "clock late by [ms]", "scatter [°/s]", "scatter [m/s²]"),
+        [_row(unit, unit is array.units[0]) for unit in array.units],
         "± is 95 %; positions in the first unit's axes. Scatter: standard deviation of an axis about the motion that "
-        "all units share, over eight samples."
+        "all units share, over eight samples.",
+        marked,
+        brief=max([12, *(index + 1 for index in marked)]),
     )
-    rows = [_row(unit, unit is array.units[0]) for unit in array.units]
-    headers = ("unit", "turned [°]", "position x, y, z [mm]", "clock late by [ms]", "scatter [°/s]", "scatter [m/s²]")
-    return Table(headers, rows, caption, marked, brief=max([12, *(index + 1 for index in marked)]))
 
 
 def _row(unit: ArrayUnit, first: bool) -> tuple[str, ...]:
@@ -100,12 +108,11 @@ def _row(unit: ArrayUnit, first: bool) -> tuple[str, ...]:
         with_interval(1e3 * value, 1e3 * sigma) for value, sigma in zip(unit.position, unit.position_sigma, strict=True)
     )
     angle = np.degrees(2 * np.arccos(min(1.0, abs(unit.rotation[0]))))
-    delay = with_interval(1e3 * unit.time_offset, 1e3 * unit.time_offset_sigma)
     return (
         Path(unit.name).name,
         "the first" if first else with_interval(angle, np.degrees(np.max(unit.rotation_sigma))),
         "0" if first else position,
-        "0" if first else delay,
+        "0" if first else with_interval(1e3 * unit.time_offset, 1e3 * unit.time_offset_sigma),
         _scatter(unit.rate_scatter, np.degrees(1.0)),
         _scatter(unit.force_scatter, 1.0),
     )

@@ -13,7 +13,7 @@ from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, sentence, unit_text
 from jaximu.model.mounting import Mounting
 from jaximu.report.calibration import calibration_page
-from jaximu.report.figures import AFTER, BEFORE, dressed, legend, new_figure, zero_line
+from jaximu.report.figures import AFTER, BEFORE, dressed, legend, stacked, zero_line
 from jaximu.report.words import gravity_statements, limits
 
 if TYPE_CHECKING:
@@ -83,28 +83,33 @@ def share_words(calibration: Calibration) -> list[str]:
 
 def page_of(calibration: Calibration, measurement: AgainstAttitude) -> Page:
     """Return the page of a calibration against a measured attitude."""
-    findings = [
-        Statement("The reference", " ".join(mounting_words(calibration))),
-        Statement(
-            "What the misfit is made of",
-            f"{sentence('; '.join(share_words(calibration)))}. The intervals contain all of it.",
-        ),
-    ]
-    picture = Picture(
-        "residuals",
-        partial(_figure, calibration, measurement),
-        "Errors against the reference before and after",
-        "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
-    )
     trust, unknown = gravity_statements(calibration), partial(limits, calibration)
-    return calibration_page(calibration, [picture], trust, unknown, findings=findings)
+    return calibration_page(
+        calibration,
+        [
+            Picture(
+                "residuals",
+                partial(_figure, calibration, measurement),
+                "Errors against the reference before and after",
+                "Grey: the data sheet's unit, mounted as was coarsely found. Blue: calibrated. All three axes.",
+            )
+        ],
+        trust,
+        unknown,
+        findings=[
+            Statement("The reference", " ".join(mounting_words(calibration))),
+            Statement(
+                "What the misfit is made of",
+                f"{sentence('; '.join(share_words(calibration)))}. The intervals contain all of it.",
+            ),
+        ],
+    )
 
 
 def _figure(calibration: Calibration, measurement: AgainstAttitude) -> Figure:
     assert calibration.nominal is not None
     nominal = calibration.nominal.with_effects(*calibration.imu.setup)
-    figure = new_figure(5.2)
-    panels = figure.subplots(2, 1, sharex=True)
+    figure, panels = stacked(2, 2.2, sharex=True)
     before_after = [measurement.errors(imu) for imu in (nominal, calibration.imu)]
     for panel, (name, title) in zip(panels, _PANELS.items(), strict=True):
         for errors, colour, label in zip(before_after, (BEFORE, AFTER), ("before", "calibrated"), strict=True):

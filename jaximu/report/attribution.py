@@ -32,7 +32,7 @@ def page_of(attribution: Attribution) -> Page:
         f"{explained} of {len(parts)}",
         "recordings whose model is adequate, or whose effects explain them",
         [*_first(attribution)],
-        notes=[sentence(note) for note in attribution.notes],
+        notes=attribution.notes,
         next=attribution.suggestion,
         caution=explained < len(parts),
     )
@@ -89,8 +89,7 @@ def _first(attribution: Attribution) -> Iterator[Part]:
             "Coloured: the common time course of each session, in a usual axis. Grey: each axis that has a part in it, "
             "less what follows orientation, divided by its part; where grey follows the line, the course is common.",
         )
-    if attribution.findings:
-        yield _findings_table(attribution)
+    yield _findings_table(attribution)
     yield _verdicts_table(attribution)
     if attribution.common:
         yield Statement(
@@ -107,31 +106,32 @@ def _look_alikes(attribution: Attribution) -> Iterator[Statement]:
         alike = [] if finding.name not in CATALOGUE else list(CATALOGUE[finding.name].look_alikes)
         settled = [name for name in alike if CATALOGUE[name].scope == "session" and "attitude" in CATALOGUE[name].needs]
         if finding.belongs_to == "board" and settled and attribution.latitude is None:
-            text = (
+            yield Statement(
+                "What the common part may be",
                 f"{sentence(effect_title(finding.name))} that all units have in common looks like "
-                f"{listed([effect_title(name) for name in settled], 'or')}. State --latitude: it is then taken off."
+                f"{listed([effect_title(name) for name in settled], 'or')}. State --latitude: it is then taken off.",
+                caution=True,
             )
-            yield Statement("What the common part may be", text, caution=True)
 
 
 def _findings_table(attribution: Attribution) -> Table:
     """Return what each finding belongs to."""
-    rows = [
-        (
-            _title(finding),
-            finding.belongs_to,
-            _names("unit", finding.units, attribution.units),
-            _names("session", finding.sessions, attribution.sessions),
-            f"{100 * finding.share:.0f} %",
-            probability(finding.p_value).removeprefix("= "),
-        )
-        for finding in attribution.findings
-    ]
-    caption = (
+    return Table(
+        ("finding", "belongs to", "units", "sessions", "share", "p-value"),
+        [
+            (
+                _title(finding),
+                finding.belongs_to,
+                _names("unit", finding.units, attribution.units),
+                _names("session", finding.sessions, attribution.sessions),
+                f"{100 * finding.share:.0f} %",
+                probability(finding.p_value).removeprefix("= "),
+            )
+            for finding in attribution.findings
+        ],
         "Share: of the squares of all recordings' estimates, weighted with their information; of a common drift, of "
-        "the variance of all axes. p: that the part is not there, beside scatter from recording to recording."
+        "the variance of all axes. p: that the part is not there, beside scatter from recording to recording.",
     )
-    return Table(("finding", "belongs to", "units", "sessions", "share", "p-value"), rows, caption)
 
 
 def _title(finding: Attributed) -> str:
@@ -147,14 +147,15 @@ def _verdicts_table(attribution: Attribution) -> Table:
         ): f"{_short(part.diagnosis)}\nχ² {number(part.chi2_heldout, 3)}{' *' * part.without_drift}"
         for part in attribution.recordings
     }
-    rows = [
-        (f"unit {unit}", *(cells.get((unit, session), "not recorded") for session in attribution.sessions))
-        for unit in attribution.units
-    ]
-    caption = "χ² per condition on parts left out: 1 is noise and drift alone." + (
-        " *: the common drift was taken off, as the other units show it." if attribution.common else ""
+    return Table(
+        ("", *(f"session {session}" for session in attribution.sessions)),
+        [
+            (f"unit {unit}", *(cells.get((unit, session), "not recorded") for session in attribution.sessions))
+            for unit in attribution.units
+        ],
+        "χ² per condition on parts left out: 1 is noise and drift alone."
+        + (" *: the common drift was taken off, as the other units show it." if attribution.common else ""),
     )
-    return Table(("", *(f"session {session}" for session in attribution.sessions)), rows, caption)
 
 
 def _short(diagnosis: dict) -> str:
@@ -168,8 +169,7 @@ def _drift_figure(attribution: Attribution) -> Figure:
     """Draw the common time course of each session, and each axis scaled by its part in it."""
     drifts: Sequence[CommonDrift] = attribution.drifts
     factor, unit = readable("rad/s", max(drift.size for drift in drifts))
-    figure = figures.new_figure(1.0 + 2.0 * len(drifts))
-    grid = figure.subplots(len(drifts), 1, squeeze=False, sharex=True, sharey=True)[:, 0]
+    figure, grid = figures.stacked(len(drifts), 2.0, 1.0, sharex=True, sharey=True)
     for axes, drift in zip(grid, drifts, strict=True):
         for line in drift.axes:
             axes.plot(drift.times, factor * line, color=figures.BEFORE, linewidth=0.6, alpha=0.5)

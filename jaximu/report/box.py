@@ -48,8 +48,7 @@ def draw_unit(axes: Axes, rotation: FloatArray) -> None:
     from matplotlib.patches import Polygon
 
     half = np.array([0.62, 0.45, 0.2])
-    colors = figures.AXES
-    for axis, (name, color) in enumerate(colors.items()):
+    for axis, (name, color) in enumerate(figures.AXES.items()):
         other, third = (axis + 1) % 3, (axis + 2) % 3
         for sign in (1.0, -1.0):
             corners = np.zeros((4, 3))

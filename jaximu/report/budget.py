@@ -31,42 +31,45 @@ _GROUPS = {"accelerometer": "Accelerometer", "gyroscope": "Gyroscope", "setup": 
 
 def page_of(budget: Budget) -> Page:
     """Return which goals are reached, which source dominates, and what each parameter's uncertainty is made of."""
-    number, meaning = _number(budget)
     return Page(
         f"Error budget of {Path(budget.source).name}",
         tuple(_verdict(budget)),
-        number,
-        meaning,
-        (_picture(budget), *_goals(budget), _sources(budget), _parameters(budget), *_limits(budget)),
-        notes=[sentence(note) for note in budget.notes],
+        *_number(budget),
+        (
+            Picture(
+                "budget",
+                partial(_figure, budget),
+                "Shares of each source in each parameter's variance",
+                "A bar is the variance of one parameter, divided among its sources; the figure beside it is its "
+                "standard deviation (1σ). Independent errors add by their squares, so halving a source removes three "
+                "quarters of its part.",
+            ),
+            _goals(budget),
+            _sources(budget),
+            _parameters(budget),
+            _limits(budget),
+        ),
+        notes=budget.notes,
         next=_next(budget),
     )
 
 
-def _picture(budget: Budget) -> Picture:
-    return Picture(
-        "budget",
-        partial(_figure, budget),
-        "Shares of each source in each parameter's variance",
-        "A bar is the variance of one parameter, divided among its sources; the figure beside it is its standard "
-        "deviation (1σ). Independent errors add by their squares, so halving a source removes three quarters of its "
-        "part.",
+def _goals(budget: Budget) -> Section:
+    """Return each goal with the sizes that would reach it."""
+    return Section(
+        "Goals",
+        [
+            Statement(f"{goal.name} to {_wanted(goal)}", sentence(goal_words(budget, goal)), not goal.reached)
+            for goal in budget.goals
+        ],
     )
 
 
-def _goals(budget: Budget) -> Iterator[Section]:
-    """Return each goal with the sizes that would reach it."""
-    statements = [
-        Statement(f"{goal.name} to {_wanted(goal)}", sentence(goal_words(budget, goal)), not goal.reached)
-        for goal in budget.goals
-    ]
-    if statements:
-        yield Section("Goals", statements)
-
-
 def _sources(budget: Budget) -> Section:
-    headers = ("source", "size (1σ)", "mean share of the variances", "most of")
-    return Section("Sources, dominant first", [Table(headers, source_rows(budget))])
+    return Section(
+        "Sources, dominant first",
+        [Table(("source", "size (1σ)", "mean share of the variances", "most of"), source_rows(budget))],
+    )
 
 
 def _parameters(budget: Budget) -> Section:
@@ -76,22 +79,27 @@ def _parameters(budget: Budget) -> Section:
         (words, sigma, *([simulated] if drawn else []), made)
         for words, sigma, made, simulated in parameter_rows(budget)
     ]
-    caption = (
-        "Standard deviations; scale and misalignment relative to the scale of their axis. To first order, through the "
-        "whole fit."
+    return Section(
+        "Parameters",
+        [
+            Table(
+                ("parameter", "1σ", *drawn, "made of"),
+                rows,
+                "Standard deviations; scale and misalignment relative to the scale of their axis. To first order, "
+                "through the whole fit.",
+                [index for index, row in enumerate(rows) if not row[-1]],
+            )
+        ],
     )
-    marked = [index for index, row in enumerate(rows) if not row[-1]]
-    return Section("Parameters", [Table(("parameter", "1σ", *drawn, "made of"), rows, caption, marked)])
 
 
-def _limits(budget: Budget) -> Iterator[Section]:
+def _limits(budget: Budget) -> Section:
     """Return where the first order is not enough, how it compares with simulated sessions, and what stays open."""
     parts: list[Part] = [Statement("Not linear", text, caution=True) for text in nonlinear_words(budget)]
     if budget.check is not None:
         parts.append(Statement("Against simulated sessions", check_words(budget, budget.check)))
     parts += [Statement("Weak or open", text, caution=True) for text in budget.open]
-    if parts:
-        yield Section("How far it holds", parts)
+    return Section("How far it holds", parts)
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -131,8 +139,7 @@ def _verdict(budget: Budget) -> Iterator[str]:
     if not len(known):
         yield "The scheme determines no parameter."
         return
-    largest = np.argmax(shares(budget)[:, known], axis=0)
-    count = np.bincount(largest, minlength=len(budget.sources))
+    count = np.bincount(np.argmax(shares(budget)[:, known], axis=0), minlength=len(budget.sources))
     order = [int(row) for row in np.argsort(-count, kind="stable") if count[row]]
     parts = [f"{budget.sources[row].words} for {count[row]}" for row in order]
     parts[0] = f"{parts[0]} of {counted(len(known), 'parameter')}"
@@ -146,8 +153,9 @@ def _number(budget: Budget) -> tuple[str, str]:
     shown = {goal.worst: goal for goal in budget.goals if budget.determined[budget.names.index(goal.worst)]}
     if shown:
         goal = max(shown.values(), key=lambda goal: _total(budget, goal) / goal.size)
-        meaning = f"standard deviation (1σ) of the {describe(goal.worst, budget.imu)}; its goal is {_wanted(goal)}"
-        return amount(_total(budget, goal), goal.unit), meaning
+        return amount(
+            _total(budget, goal), goal.unit
+        ), f"standard deviation (1σ) of the {describe(goal.worst, budget.imu)}; its goal is {_wanted(goal)}"
     known = budget.determined
     if not budget.sources or not known.any():
         return "not determined", "the scheme determines no parameter"
@@ -226,11 +234,10 @@ def nonlinear_words(budget: Budget) -> Iterator[str]:
     for row, index in budget.nonlinear():
         source, unit = budget.sources[row], budget.units[index]
         linear, actual = budget.sigma[row, index], budget.actual[row, index]
-        change = 100 * budget.off[row, index]
         yield (
             f"{describe(budget.names[index], budget.imu)}: {source.words} reaches it with "
             f"{amount(actual, unit)} in the whole fit, {amount(linear, unit)} to first order; its total of "
-            f"{amount(budget.total[index], unit)} is {_wrong(change)}."
+            f"{amount(budget.total[index], unit)} is {_wrong(100 * budget.off[row, index])}."
         )
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -73,8 +71,7 @@ def _stations_figure(calibration: Calibration) -> Figure:
     fit, stations = calibration.fit, calibration.stations
     assert fit is not None and stations is not None
     panels = [panel for panel in station_errors(fit.imu, stations, np.asarray(fit.excess)) if len(panel.station)]
-    figure = figures.new_figure(2.3 * len(panels))
-    grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    figure, grid = figures.stacked(len(panels), 2.3, 0.0)
     for axes, panel in zip(grid, panels, strict=True):
         for shift, (axis, color), error, sigma in zip(
             (-0.2, 0.0, 0.2), figures.AXES.items(), panel.error, panel.sigma, strict=True
@@ -102,44 +99,35 @@ def calibration_page(
     before those on the errors; `number`: the one number and what it is, the first error after calibration if None;
     `findings`: what else was found, for the first screen.
     """
-    known, trust = calibration.triads(), [*trust, *words.weak_statements(calibration.weak)]
+    trust = [*trust, *words.weak_statements(calibration.weak)]
     cautions = [statement for statement in trust if statement.caution]
-    warnings = [Section("Before you rely on it", cautions)] if cautions else []
     settled = [statement for statement in trust if not statement.caution]
 
     def rest() -> Iterator[Part]:
-        if settled:
-            yield Section("What to trust", settled)
-        if uncertain := [*uncertainty_parts(calibration)]:
-            yield Section("What is still uncertain", uncertain)
+        yield Section("What to trust", settled)
+        yield Section("What is still uncertain", [*uncertainty_parts(calibration)])
         yield Section("What the data cannot show", [*limits()])
         yield from _equations(calibration)
         yield _correlation(calibration)
         yield from _origin(calibration)
 
-    files = [str(file["file"]) for file in calibration.data.get("files", ())]
-    value, meaning = number or _number(calibration)
     return Page(
-        _title(calibration, files),
+        _title(calibration),
         (*verdict, *_errors(calibration), *_determined(calibration)),
-        value,
-        meaning,
-        (*pictures, *findings, *warnings, *_parameters(calibration)),
+        *(number or _number(calibration)),
+        (*pictures, *findings, Section("Before you rely on it", cautions), *_parameters(calibration)),
         rest,
-        [sentence(note) for note in calibration.notes],
-        f"`jaximu compensate CALIBRATION {shlex.quote(files[0]) if files else 'LOG'} -o CORRECTED.csv` applies it."
-        if "accelerometer" in known
-        else "",
+        calibration.notes,
+        words.compensation(calibration.files, "applies it") if "accelerometer" in calibration.triads() else "",
     )
 
 
-def _title(calibration: Calibration, files: Sequence[str]) -> str:
+def _title(calibration: Calibration) -> str:
     data = calibration.data
     counts = [
         counted(data[kind + "s"], kind) for kind in ("pose", "turn", "interval", "window") if data.get(kind + "s")
     ]
-    names = ", ".join(Path(file).name for file in files) or "a recording"
-    return f"Calibration of {names}: {', '.join([*counts, f'{calibration.method} fit'])}"
+    return f"Calibration of {words.file_names(calibration.files)}: {', '.join([*counts, f'{calibration.method} fit'])}"
 
 
 def _error_words(name: str) -> str:
@@ -190,14 +178,22 @@ def _parameters(calibration: Calibration) -> Iterator[Part]:
     parts: list[Part] = []
     for name, triad in calibration.triads().items():
         rows = tables.rows(calibration, name, triad)
-        marked = [index for index, row in enumerate(rows) if "*" in row[1]]
         parts.append(
-            Section(sentence(name), [Table(("", "parameter", "± 95 %", "in other words"), rows, "", marked)], 3)
+            Section(
+                sentence(name),
+                [
+                    Table(
+                        ("", "parameter", "± 95 %", "in other words"),
+                        rows,
+                        "",
+                        [index for index, row in enumerate(rows) if "*" in row[1]],
+                    )
+                ],
+                3,
+            )
         )
-    others = [one for one in calibration.parameters.values() if "effects" in one.name]
-    if others:
-        parts.append(Section("Effects", [Table(("number", "± 95 %"), [*map(_effect_row, others)])], 3))
-    yield Section("Parameters", [*parts])
+    others = [_effect_row(one) for one in calibration.parameters.values() if "effects" in one.name]
+    yield Section("Parameters", [*parts, Section("Effects", [Table(("number", "± 95 %"), others)], 3)])
     yield (
         "Gain K = S·(1 + M): scales S on the diagonal, misalignments M beside it (1 mrad is 0.1 % of the input); "
         "“misalignment y from x” is how much of the input along x appears on output y."
@@ -212,8 +208,7 @@ def _biases_of_the_recording(calibration: Calibration) -> str:
     """Say what the biases are good for, and how well their means over the recording are known."""
     means = []
     for name, sigma in calibration.bias_sigma_recording.items():
-        triad = calibration.triads()[name]
-        scale = np.linalg.norm(np.asarray(triad.gain), axis=1)
+        scale = calibration.triads()[name].scales
         means.append(f"± {size(Z95 * float(np.max(sigma / scale)), SENSOR_UNITS[name], 2)} ({name})")
     return (
         "The biases, and their intervals, are for use after the recording, for as long again as it took and without "
@@ -246,8 +241,9 @@ def _correlation(calibration: Calibration) -> Picture:
     )
     if shared:
         caption += " The accelerometer's scales go together as far as they share the uncertainty of gravity."
-    draw = partial(figures.correlation_figure, calibration)
-    return Picture("correlation", draw, "Correlation of the fitted parameters", caption)
+    return Picture(
+        "correlation", partial(figures.correlation_figure, calibration), "Correlation of the fitted parameters", caption
+    )
 
 
 def _origin(calibration: Calibration) -> Iterator[Part]:

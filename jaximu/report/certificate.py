@@ -39,7 +39,7 @@ def page_of(acceptance: Acceptance) -> Page:
         + f" of {counted(len(items), 'item')}",
         (Section("Results", [_results(items), *_remarks(items), *_rule(acceptance)]),),
         lambda: [_uncertainty(items)],
-        [sentence(note) for note in acceptance.notes],
+        acceptance.notes,
         _next(acceptance),
         caution=acceptance.verdict != PASS,
     )
@@ -91,22 +91,30 @@ def _next(acceptance: Acceptance) -> str:
 
 
 def _results(items: Sequence[Item]) -> Table:
-    rows = [item_row(item) for item in items]
-    headers = ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict")
-    cells = [tuple(row[column] for column in _COLUMNS[:5]) for row in rows]
-    return Table(headers, cells, marked=[index for index, item in enumerate(items) if item.verdict != PASS])
+    return Table(
+        ("quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"),
+        [tuple(row[column] for column in _COLUMNS[:5]) for row in map(item_row, items)],
+        marked=[index for index, item in enumerate(items) if item.verdict != PASS],
+    )
 
 
 def _uncertainty(items: Sequence[Item]) -> Section:
-    headers = ("quantity", "U covers", "degrees of freedom", "U from the recording", "U from gravity")
-    rows = [item_row(item) for item in items if item.sigma is not None]
-    caption = (
-        "U is the expanded uncertainty, k = 2 times the standard uncertainty; how probably it covers follows from the "
-        "effective degrees of freedom. The last two columns are its budget: the recording (noise, drift and scatter) "
-        "and the local gravity; they add by their squares."
+    return Section(
+        "Uncertainty",
+        [
+            Table(
+                ("quantity", "U covers", "degrees of freedom", "U from the recording", "U from gravity"),
+                [
+                    (row["name"], *(row[column] for column in _COLUMNS[5:]))
+                    for row in map(item_row, items)
+                    if row["coverage"]
+                ],
+                "U is the expanded uncertainty, k = 2 times the standard uncertainty; how probably it covers follows "
+                "from the effective degrees of freedom. The last two columns are its budget: the recording (noise, "
+                "drift and scatter) and the local gravity; they add by their squares.",
+            )
+        ],
     )
-    cells = [(row["name"], *(row[column] for column in _COLUMNS[5:])) for row in rows]
-    return Section("Uncertainty", [Table(headers, cells, caption)])
 
 
 def _remarks(items: Sequence[Item]) -> Iterator[Statement]:
@@ -128,8 +136,11 @@ def _rule(acceptance: Acceptance) -> Iterator[Statement]:
 def item_row(item: Item) -> dict[str, str]:
     """Return an item's cells, in the unit of its limits; value and U to the second digit of U."""
     shown, factor = in_shown_unit(item.unit, item.stated)
-    limits = between(item.low, item.high, item.unit, item.stated)
-    row = {"name": spoken(item.name), "limits": limits, "verdict": item.verdict}
+    row = {
+        "name": spoken(item.name),
+        "limits": between(item.low, item.high, item.unit, item.stated),
+        "verdict": item.verdict,
+    }
     if item.value is None or item.sigma is None:
         return dict.fromkeys(_COLUMNS, "") | {"value": "not determined"} | row
     expanded = 2 * factor * item.sigma
@@ -170,24 +181,26 @@ def _item(trace: dict, facts: dict[str, str]) -> Section:
 
 def _traceability(acceptance: Acceptance, calibration: Calibration, issued: str) -> Iterator[Part]:
     trace = acceptance.trace or {}
-    references = [(reference["name"], _reference(reference)) for reference in trace["reference"]]
     hashes = [
         (f"Recording {Path(str(file.get('file', ''))).name}", str(file.get("sha256", "")))
         for file in calibration.data.get("files", ())
     ]
     hashes += [("Calibration", acceptance.digest or "not sealed"), ("Limits", acceptance.limits["sha256"])]
     hashes += [("Verdict (acceptance.json)", digest(acceptance.document()))]
-    statement = (
-        "The accelerometer's scale is traced to the local gravity stated above, the gyroscope's scale to the angles "
-        "of turns, as gravity or a table shows them, and to the clock of the recording, by the references below; the "
-        "results are traceable to the SI (1 g is 9.80665 m/s²). The hashes let anyone check with `jaximu verify` "
-        "that no file was changed."
+    yield Section(
+        "Traceability",
+        [
+            "The accelerometer's scale is traced to the local gravity stated above, the gyroscope's scale to the "
+            "angles of turns, as gravity or a table shows them, and to the clock of the recording, by the references "
+            "below; the results are traceable to the SI (1 g is 9.80665 m/s²). The hashes let anyone check with "
+            "`jaximu verify` that no file was changed.",
+            Table((), [(reference["name"], _reference(reference)) for reference in trace["reference"]]),
+            Table((), hashes),
+            f"Issued {issued}. Authorised by {trace['certificate']['authorised_by']}. The results hold for this item "
+            "as it was calibrated. The certificate may not be reproduced except in full without approval of the "
+            "laboratory.",
+        ],
     )
-    closing = (
-        f"Issued {issued}. Authorised by {trace['certificate']['authorised_by']}. The results hold for this item as it "
-        "was calibrated. The certificate may not be reproduced except in full without approval of the laboratory."
-    )
-    yield Section("Traceability", [statement, Table((), references), Table((), hashes), closing])
 
 
 def _reference(reference: dict[str, str]) -> str:

@@ -40,7 +40,13 @@ def page_of(
         _metres(_at_end(consequences.total)),
         f"error of position after {_end(consequences)} (1σ)",
         (
-            _budget_picture(consequences),
+            Picture(
+                "budget",
+                partial(_budget_figure, consequences),
+                "Position error over time, and the share of each term",
+                "Above: the error of position in space (1σ) and its largest terms. Below: how the squares of the "
+                "terms share the sum.",
+            ),
             f"Path: {consequences.trajectory.words}. Position, velocity and attitude at the start are taken as known "
             "exactly.",
             *_statements(consequences),
@@ -48,7 +54,7 @@ def page_of(
             *_for_estimators(noise, files),
         ),
         partial(_tracks, consequences),
-        [sentence(note) for note in consequences.notes],
+        consequences.notes,
         _next(consequences),
     )
 
@@ -72,16 +78,6 @@ def _next(consequences: Consequences) -> str:
     return f"`jaximu plan {file} -o plan` plans the poses and turns that improve the calibration most."
 
 
-def _budget_picture(consequences: Consequences) -> Picture:
-    return Picture(
-        "budget",
-        partial(_budget_figure, consequences),
-        "Position error over time, and the share of each term",
-        "Above: the error of position in space (1σ) and its largest terms. Below: how the squares of the terms share "
-        "the sum.",
-    )
-
-
 def _tracks(consequences: Consequences) -> Iterator[Part]:
     if consequences.check is not None:
         yield Picture(
@@ -96,12 +92,19 @@ def _tracks(consequences: Consequences) -> Iterator[Part]:
 def _tables(consequences: Consequences) -> Iterator[Section]:
     """Return the position error by term, and all errors by direction, at the times that are shown."""
     times = _headers(consequences)
-    caption = (
-        "Position: root sum of squares of east, north and up. A term is what it makes by itself; correlated terms of "
-        "the calibration together are in the row “calibration, all together”. To first order along the path."
+    yield Section(
+        "Position error by term (1σ)",
+        [
+            Table(
+                ("", *times),
+                _budget_rows(consequences),
+                "Position: root sum of squares of east, north and up. A term is what it makes by itself; correlated "
+                "terms of the calibration together are in the row “calibration, all together”. To first order along "
+                "the path.",
+                brief=8,
+            )
+        ],
     )
-    budget = _budget_rows(consequences)
-    yield Section("Position error by term (1σ)", [Table(("", *times), budget, caption, brief=8)])
     yield Section("All errors, by direction (1σ)", [Table(("", *times), _total_rows(consequences))])
 
 
@@ -109,11 +112,10 @@ def _for_estimators(noise: Mapping[str, EstimatorNoise], files: Mapping[str, byt
     """Return the noise for estimators, by where it is from, and the files that carry it."""
     for origin, one in noise.items():
         page = one.summary()
-        notes = [Items(page.notes)] if page.notes else []
-        yield Section(f"Noise for estimators, {origin}", (*page.verdict, *page.first, *notes))
-    if files:
-        parts = [Section(name, [Code(text.decode().rstrip())], 3) for name, text in files.items()]
-        yield Section("Files for estimators", parts)
+        yield Section(f"Noise for estimators, {origin}", (*page.verdict, *page.first, Items(page.notes)))
+    yield Section(
+        "Files for estimators", [Section(name, [Code(text.decode().rstrip())], 3) for name, text in files.items()]
+    )
 
 
 # --- words ------------------------------------------------------------------------------------------------------------
@@ -176,8 +178,10 @@ def _total_rows(consequences: Consequences) -> list[tuple[str, ...]]:
     shown = []
     for part, what in enumerate(("position", "velocity", "attitude")):
         for axis, direction in enumerate(("east", "north", "up")):
-            values = sigma[rows, 3 * part + axis]
-            words = [f"{number(np.degrees(value), 2)}°" if part == 2 else _metres(value) for value in values]
+            words = [
+                f"{number(np.degrees(value), 2)}°" if part == 2 else _metres(value)
+                for value in sigma[rows, 3 * part + axis]
+            ]
             about = "about " if part == 2 else ""
             shown.append((f"{what}, {about}{direction}", *(f"{word}/s" if part == 1 else word for word in words)))
     return shown
@@ -243,8 +247,7 @@ def _budget_figure(consequences: Consequences) -> Figure:
     whole = np.maximum(np.sum(list(variances.values()), axis=0), 1e-300)
     visible = [name for name in _order(consequences) if np.max(variances[name] / whole) >= LEAST_SHARE]
     drawn, end = visible[: len(PALETTE)], f"after {_end(consequences)}"
-    figure = figures.new_figure(7.2)
-    above, below = figure.subplots(2, 1, sharex=True)
+    figure, (above, below) = figures.stacked(2, 3.2, sharex=True)
     for name, color in zip(drawn, PALETTE, strict=False):
         above.plot(consequences.times, np.sqrt(variances[name]), color=color, linewidth=1.4)
     above.plot(
@@ -299,7 +302,11 @@ def _tracks_figure(consequences: Consequences) -> Figure:
     plane.set_aspect("equal", "datalim")
     for side in (-1, 1):
         height.plot(consequences.times, side * sigma, color=figures.FLAGGED, linewidth=1.6)
-    title = f"{min(100, len(check.errors))} draws over {_end(consequences)}"
-    dressed(plane, title, xlabel="error east (m)", ylabel="error north (m)")
+    dressed(
+        plane,
+        f"{min(100, len(check.errors))} draws over {_end(consequences)}",
+        xlabel="error east (m)",
+        ylabel="error north (m)",
+    )
     dressed(height, "and their heights", xlabel="time (s)", ylabel="error up (m)")
     return figure

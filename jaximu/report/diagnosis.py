@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterator
 from functools import cache, partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +29,7 @@ from jaximu.noise.deviations import deviation
 from jaximu.recordings.finding import Finding
 from jaximu.report import figures
 from jaximu.report.figures import band, dressed, legend, zero_line
+from jaximu.report.words import compensation, file_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,8 +55,6 @@ _SCOPES = {"device": "unit", "session": "recording", "fixture": "set-up"}
 
 def page_of(diagnosis: Diagnosis) -> Page:
     """Return what is wrong, how sure that is, what it costs, what the extension gains, and what to do next."""
-    files = [str(file["file"]) for file in diagnosis.calibration.data.get("files", ())]
-    names = ", ".join(Path(file).name for file in files) or "a recording"
 
     @cache
     def twin() -> tuple[Experiment, State]:
@@ -65,13 +63,13 @@ def page_of(diagnosis: Diagnosis) -> Page:
         return simulated, simulated.fit(asking=())
 
     return Page(
-        f"Diagnosis of {names}: {diagnosis.verdict}",
+        f"Diagnosis of {file_names(diagnosis.calibration.files)}: {diagnosis.verdict}",
         [*filter(None, (*_what_is_wrong(diagnosis), _gained(diagnosis)))],
         *_number(diagnosis),
         [*_first(diagnosis, twin)],
         rest=partial(_rest, diagnosis, twin),
-        notes=[sentence(note) for note in diagnosis.notes],
-        next=_next(diagnosis, [shlex.quote(file) for file in files] or ["LOG"]),
+        notes=diagnosis.notes,
+        next=_next(diagnosis),
     )
 
 
@@ -87,19 +85,15 @@ def _first(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
     )
     yield from _certainty(diagnosis)
     yield from _cost(diagnosis)
-    mistakes = [_mistake(diagnosis, finding) for finding in diagnosis.preflight]
-    if mistakes:
-        yield Section("The recording itself", mistakes)
-    if diagnosis.effects:
-        yield Section("What is missing in the model", [_effects_table(diagnosis)])
+    yield Section("The recording itself", [_mistake(diagnosis, finding) for finding in diagnosis.preflight])
+    yield Section("What is missing in the model", [_effects_table(diagnosis)])
     yield from _lines_part(diagnosis)
     yield from _learned_part(diagnosis)
-    yield from _gains(diagnosis)
+    yield Section("What the extension gains on data that was not fitted", [*_gains(diagnosis)])
     if diagnosis.verdict == "adequate":
         yield Section("What could still hide in this recording", [*_limits(diagnosis)])
     wrong = [check for check in diagnosis.checks if check.adjusted < _DOUBT]
-    if wrong:
-        yield Section("What the fitted model gets wrong", [_checks_table(wrong)])
+    yield Section("What the fitted model gets wrong", [_checks_table(wrong)])
 
 
 def _rest(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
@@ -110,8 +104,7 @@ def _rest(diagnosis: Diagnosis, twin: Twin) -> Iterator[Part]:
     yield Section("What the fitted model gets right", [_checks_table(right), *_evidence(diagnosis, twin)])
     if diagnosis.verdict != "adequate":
         yield Section("What could still hide in this recording", [*_limits(diagnosis)])
-    if diagnosis.not_observable:
-        yield Section("Not observable here", [_blind_table(diagnosis)])
+    yield Section("Not observable here", [_blind_table(diagnosis)])
 
 
 def _what_is_wrong(diagnosis: Diagnosis) -> Iterator[str]:
@@ -223,8 +216,9 @@ def _number(diagnosis: Diagnosis) -> tuple[str, str]:
     return size(measured, shown.unit, 2), meaning
 
 
-def _next(diagnosis: Diagnosis, files: list[str]) -> str:
+def _next(diagnosis: Diagnosis) -> str:
     """Return what to record or run next."""
+    files = [*map(shlex.quote, diagnosis.calibration.files)] or ["LOG"]
     repairs = dict.fromkeys(finding.repair for finding in _standing(diagnosis) if finding.repair)
     by_hand = diagnosis.experiment.data.by_hand  # else the command has more arguments
     if repairs and by_hand:
@@ -235,7 +229,7 @@ def _next(diagnosis: Diagnosis, files: list[str]) -> str:
         recorded = by_hand and " record" in diagnosis.suggestion and not _standing(diagnosis)
         return diagnosis.suggestion + f" {together}" * recorded
     what = "extended calibration" if diagnosis.extended.effects else "calibration"
-    return f"`jaximu compensate CALIBRATION {files[0]} -o CORRECTED.csv` applies the {what}."
+    return compensation(diagnosis.calibration.files, f"applies the {what}")
 
 
 def _mistake(diagnosis: Diagnosis, finding: Finding) -> Statement:
@@ -252,8 +246,10 @@ def _mistake(diagnosis: Diagnosis, finding: Finding) -> Statement:
 
 def _effects_table(diagnosis: Diagnosis) -> Table:
     """Return each cause with what it is, what it adds to the output, its coefficients and its evidence."""
-    headers = ("effect", "adds up to", "coefficients ± 95 %", "evidence")
-    return Table(headers, [_effect_row(effect) for effect in diagnosis.effects])
+    return Table(
+        ("effect", "adds up to", "coefficients ± 95 %", "evidence"),
+        [_effect_row(effect) for effect in diagnosis.effects],
+    )
 
 
 def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
@@ -271,30 +267,46 @@ def _lines_part(diagnosis: Diagnosis) -> Iterator[Section]:
     """Return the spectral lines that move, over the spectrum that they were followed in."""
     if not diagnosis.lines:
         return
-    picture = Picture(
-        "lines",
-        partial(_lines_figure, diagnosis),
-        "Frequency over time, at rest",
-        "Dark: power over the noise beside it, in windows at rest. Coloured: the lines that move, as followed; a line "
-        "that reaches zero frequency or half the sample rate (the edges) goes on as its mirror image.",
+    yield Section(
+        "Lines that move",
+        [
+            Picture(
+                "lines",
+                partial(_lines_figure, diagnosis),
+                "Frequency over time, at rest",
+                "Dark: power over the noise beside it, in windows at rest. Coloured: the lines that move, as "
+                "followed; a line that reaches zero frequency or half the sample rate (the edges) goes on as its "
+                "mirror image.",
+            )
+        ],
     )
-    yield Section("Lines that move", [picture])
 
 
 def _lines_figure(diagnosis: Diagnosis) -> Figure:
     """Draw the spectrum over time of the axes with lines that move, those that cross zero frequency first."""
     parts = diagnosis.calibration.segmentations
     axes_of = list(dict.fromkeys((one.recording, one.triad, one.line.axis) for one in diagnosis.lines))[:_PANELS]
-    figure = figures.new_figure(0.6 + 2.4 * len(axes_of))
-    grid = figure.subplots(len(axes_of), 1, squeeze=False)[:, 0]
+    figure, grid = figures.stacked(len(axes_of), 2.4, 0.6)
     for axes, key in zip(grid, axes_of, strict=True):
         mine = [one for one in diagnosis.lines if (one.recording, one.triad, one.line.axis) == key]
         times, power = spectrum_at_rest(parts[key[0]], key[1], key[2])
-        edges = np.linspace(0, mine[0].line.rate / 2, power.shape[1])
-        axes.pcolormesh(times, edges, np.log10(power.T), cmap="Greys", vmin=0.0, vmax=2.0, rasterized=True)
+        axes.pcolormesh(
+            times,
+            np.linspace(0, mine[0].line.rate / 2, power.shape[1]),
+            np.log10(power.T),
+            cmap="Greys",
+            vmin=0.0,
+            vmax=2.0,
+            rasterized=True,
+        )
         for index, one in enumerate(mine):
-            color = figures.PALETTE[index % len(figures.PALETTE)]
-            axes.plot(one.line.times, one.line.recorded, color=color, linewidth=1.2, alpha=0.8)
+            axes.plot(
+                one.line.times,
+                one.line.recorded,
+                color=figures.PALETTE[index % len(figures.PALETTE)],
+                linewidth=1.2,
+                alpha=0.8,
+            )
         dressed(axes, mine[0].axis, ylabel="frequency (Hz)")
     grid[-1].set_xlabel("time (s)")
     return figure
@@ -305,41 +317,40 @@ def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
     learned = diagnosis.learned
     if learned is None:
         return
-    text = (
-        f"No known effect explains it, but the {learned.triad}'s misfit depends on {learned.covariate}: a smooth curve "
-        f"({learned.effect.name}) follows it, and the extended calibration contains the curve."
+    yield Section(
+        "What the misfit depends on",
+        [
+            f"No known effect explains it, but the {learned.triad}'s misfit depends on {learned.covariate}: a smooth "
+            f"curve ({learned.effect.name}) follows it, and the extended calibration contains the curve.",
+            Picture(
+                "learned",
+                partial(_learned, learned),
+                "The smooth curve that the misfit follows, with its band",
+                f"What the {learned.triad} puts out by {learned.covariate}, learned from the recording without a "
+                "cause, with its 95 % band; a constant is part of the bias. Beyond its ends the extended calibration "
+                "keeps the curve constant.",
+            ),
+        ],
     )
-    picture = Picture(
-        "learned",
-        partial(_learned, learned),
-        "The smooth curve that the misfit follows, with its band",
-        f"What the {learned.triad} puts out by {learned.covariate}, learned from the recording without a cause, with "
-        "its 95 % band; a constant is part of the bias. Beyond its ends the extended calibration keeps the curve "
-        "constant.",
-    )
-    yield Section("What the misfit depends on", [text, picture])
 
 
-def _gains(diagnosis: Diagnosis) -> Iterator[Section]:
-    """Return the errors on data that was not fitted, with what was added to the model."""
-    gains = [("extended model", diagnosis.gain)]
+def _gains(diagnosis: Diagnosis) -> Iterator[Table]:
+    """Yield the errors on data that was not fitted, with what was added to the model."""
+    if diagnosis.gain is not None:
+        yield _gain_table(diagnosis, "extended model", diagnosis.gain)
     if diagnosis.learned is not None:
-        gains.append(("with the smooth curve", diagnosis.learned.gain))
-    tables = [_gain_table(diagnosis, what, gain) for what, gain in gains if gain is not None]
-    if tables:
-        yield Section("What the extension gains on data that was not fitted", tables)
+        yield _gain_table(diagnosis, "with the smooth curve", diagnosis.learned.gain)
 
 
 def _gain_table(diagnosis: Diagnosis, what: str, gain: Gain) -> Table:
     """Return the errors of a model without and with an extension."""
     words = _kind_words(diagnosis)
     before, after = (part.chi_squared / part.count for part in (gain.before, gain.after))
-    caption = (
-        f"Measured on {gain.data}. χ² per condition {before:.2f} → {after:.2f} (1 is noise alone), log-likelihood "
-        f"{gain.log_likelihood:+.1f}."
-    )
     return Table(
-        ("error, rms", f"base model → {what}"), [(words[kind], gain.errors(kind)) for kind in gain.before.rms], caption
+        ("error, rms", f"base model → {what}"),
+        [(words[kind], gain.errors(kind)) for kind in gain.before.rms],
+        f"Measured on {gain.data}. χ² per condition {before:.2f} → {after:.2f} (1 is noise alone), log-likelihood "
+        f"{gain.log_likelihood:+.1f}.",
     )
 
 
@@ -376,8 +387,9 @@ def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
         yield Statement("What it costs without the extension", f"In this recording, {'; '.join(outputs)}.")
     elif diagnosis.verdict == "unexplained":
         cause = "A mistake in the recording" if _standing(diagnosis) else "An unmodelled effect"
-        text = f"{cause} may bias the parameters by more than their intervals show."
-        yield Statement("What it costs", text, caution=True)
+        yield Statement(
+            "What it costs", f"{cause} may bias the parameters by more than their intervals show.", caution=True
+        )
 
 
 def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
@@ -387,17 +399,19 @@ def _limits(diagnosis: Diagnosis) -> Iterator[Part]:
         "that its test finds with 90 % power. It would shift the calibrated numbers by as much as the last column "
         "says, in their standard deviations (σ): the intervals do not include that."
     )
-    rows = [
-        (
-            effect_title(cause.name),
-            size(cause.limit, cause.unit, 2),
-            f"{number(_in_plausible_sizes(diagnosis, cause.name, cause.limit), 2)} ×",
-            _shift_words(diagnosis, cause),
-        )
-        for cause in diagnosis.hidden
-    ]
-    headers = ("effect", "detection limit", "compared with a plausible size", "would shift most")
-    yield Table(headers, rows, brief=6)
+    yield Table(
+        ("effect", "detection limit", "compared with a plausible size", "would shift most"),
+        [
+            (
+                effect_title(cause.name),
+                size(cause.limit, cause.unit, 2),
+                f"{number(_in_plausible_sizes(diagnosis, cause.name, cause.limit), 2)} ×",
+                _shift_words(diagnosis, cause),
+            )
+            for cause in diagnosis.hidden
+        ],
+        brief=6,
+    )
 
 
 def _shift_words(diagnosis: Diagnosis, cause: Hidden) -> str:
@@ -413,7 +427,7 @@ def _in_plausible_sizes(diagnosis: Diagnosis, name: str, limit: float) -> float:
     """Return an effect's detection limit in multiples of a plausible size."""
     kind, imu = CATALOGUE[name], diagnosis.base.imu
     triad = imu.triads().get(kind.owner, imu.accelerometer)
-    scale = float(np.mean(np.linalg.norm(np.asarray(triad.gain), axis=-1)))
+    scale = float(np.mean(triad.scales))
     return limit / (kind.typical * (scale if kind.unit.startswith("output") else 1.0))
 
 
@@ -425,21 +439,24 @@ def _options(diagnosis: Diagnosis) -> Iterator[Part]:
     )
     first = diagnosis.options[0]
     lines = [("this recording", first.before), *((option.text, option.powers) for option in diagnosis.options)]
-    rows = [(text, *(f"{100 * power:.0f} %" for power in powers.values())) for text, powers in lines]
-    yield Table(("do this", *map(effect_title, first.powers)), rows)
+    yield Table(
+        ("do this", *map(effect_title, first.powers)),
+        [(text, *(f"{100 * power:.0f} %" for power in powers.values())) for text, powers in lines],
+    )
 
 
 def _checks_table(checks: list[Check]) -> Table:
     """Return checks of the base model, the most significant first."""
-    rows = [
-        (*check.text.rpartition(": ")[::2], probability(check.adjusted).removeprefix("= "))
-        for check in sorted(checks, key=lambda check: check.adjusted)
-    ]
-    caption = (
+    return Table(
+        ("check of the base model", "statistic", "p-value"),
+        [
+            (*check.text.rpartition(": ")[::2], probability(check.adjusted).removeprefix("= "))
+            for check in sorted(checks, key=lambda check: check.adjusted)
+        ],
         "p-values allow for all checks together: below 0.01 the model or its noise is wrong there; above, chance does "
-        "as much."
+        "as much.",
+        brief=6,
     )
-    return Table(("check of the base model", "statistic", "p-value"), rows, caption, brief=6)
 
 
 def _evidence(diagnosis: Diagnosis, twin: Twin) -> Iterator[Picture]:
@@ -465,11 +482,13 @@ def _evidence(diagnosis: Diagnosis, twin: Twin) -> Iterator[Picture]:
 def _blind_table(diagnosis: Diagnosis) -> Table:
     """Return each reason once, with the effects that it hides."""
     reasons = diagnosis.not_observable
-    rows = [
-        (sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))
-        for reason in dict.fromkeys(reasons.values())
-    ]
-    return Table(("reason", "effects that it hides"), rows)
+    return Table(
+        ("reason", "effects that it hides"),
+        [
+            (sentence(reason), "; ".join(effect_title(name) for name in reasons if reasons[name] == reason))
+            for reason in dict.fromkeys(reasons.values())
+        ],
+    )
 
 
 def _kind_words(diagnosis: Diagnosis) -> dict[str, str]:
@@ -524,8 +543,11 @@ def _ranking(panel: Axes, diagnosis: Diagnosis) -> None:
     order = sorted(best, key=lambda name: (best[name], name not in named))[:_SHOWN][::-1]
     rivals = {name for effect in diagnosis.effects for name in effect.rivals}
     colours = [_EXTENDED if n in named else ("#56B4E9" if n in rivals else "#C4C4C4") for n in order]
-    labels = [effect_title(name).replace(" (", "\n(") for name in order]
-    panel.barh(labels, [-np.log10(best[name]) for name in order], color=colours)
+    panel.barh(
+        [effect_title(name).replace(" (", "\n(") for name in order],
+        [-np.log10(best[name]) for name in order],
+        color=colours,
+    )
     panel.axvline(-np.log10(evidence.critical(0.05)), color="black", linestyle="--", linewidth=1)
     dressed(panel, "each effect, tested alone", xlabel="evidence: −log₁₀ of the p-value")
     panel.tick_params(axis="y", labelsize=7)
@@ -606,8 +628,7 @@ def _noise(diagnosis: Diagnosis, twin: Twin) -> Figure:
 def _allan(experiment: Experiment, name: str) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Averaging times (k,), s, Allan deviation of a triad over its longest pose, root mean square of axes; interval."""
     parts, rate = experiment.still_parts(name)
-    longest = max(parts, key=len)
-    curve = deviation(longest.T, rate)
+    curve = deviation(max(parts, key=len).T, rate)
     value = np.sqrt(np.mean(curve.value**2, axis=0))
     # three axes, taken as independent and alike, know their mean √3 times as well as each its own
     known = (curve.value > 0).all(axis=0)  # output may not change at all

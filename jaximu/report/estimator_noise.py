@@ -30,7 +30,7 @@ def page_of(noise: EstimatorNoise) -> Page:
         f"{number(triad.applied[at])} (95 %: {number(triad.low[at])} to {number(triad.high[at])})",
         f"times the {name}'s white noise N",
         (*statements(noise), _table(noise)),
-        notes=[sentence(note) for note in noise.notes],
+        notes=noise.notes,
     )
 
 
@@ -75,12 +75,12 @@ def _table(noise: EstimatorNoise) -> Table:
     for name, values in noise.nees.items():
         rows.append((f"NEES of {name}, as stated", *(number(value, 2) for value in values[:, 0])))
         rows.append((f"NEES of {name}, multiplied", *(number(value, 2) for value in values[:, 1])))
-    headers = ("", *(f"over {length:g} s" for length in noise.lengths))
-    caption = (
+    return Table(
+        ("", *(f"over {length:g} s" for length in noise.lengths)),
+        rows,
         "Terms after a dash: what each would make by itself, as a multiple of N. NEES: squared error over what the "
-        "estimator expects; it should be one."
+        "estimator expects; it should be one.",
     )
-    return Table(headers, rows, caption)
 
 
 def _multipliers(triad: TriadNoise) -> list[str]:

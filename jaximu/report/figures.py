@@ -50,6 +50,7 @@ __all__ = [
     "recording_of",
     "residuals_of",
     "signals_figure",
+    "stacked",
     "zero_line",
 ]
 
@@ -85,6 +86,14 @@ def new_figure(height: float, width: float = _WIDTH) -> Figure:
     figure = _shown()(figsize=(width, height), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def stacked(
+    count: int, height: float = 1.7, more: float = 0.8, width: float = _WIDTH, **shared: Any
+) -> tuple[Figure, list[Any]]:
+    """Return a figure with so many panels below each other, each so many inches high, and `more` for what is beside."""
+    figure = new_figure(more + height * count, width)
+    return figure, figure.subplots(count, 1, squeeze=False, **shared)[:, 0].tolist()
 
 
 def png(figure: Figure) -> bytes:
@@ -161,8 +170,9 @@ def envelope(time: FloatArray, values: FloatArray, most: int = _MOST_POINTS) -> 
     starts = np.linspace(0, count, stretches, endpoint=False).astype(int)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     ends = np.append(starts[1:], count) - 1
-    thinned = np.stack([low, high], axis=1).reshape(-1, values.shape[1])
-    return np.stack([time[starts], time[ends]], axis=1).reshape(-1), thinned
+    return np.stack([time[starts], time[ends]], axis=1).reshape(-1), np.stack([low, high], axis=1).reshape(
+        -1, values.shape[1]
+    )
 
 
 def _traces(axes: Axes, signal: Signal, offset: float = 0.0, named: bool = True) -> None:
@@ -176,8 +186,7 @@ def _traces(axes: Axes, signal: Signal, offset: float = 0.0, named: bool = True)
 def signals_figure(recording: Recording) -> Figure:
     """Draw all signals of a recording against time, in SI units."""
     signals = recording.signals
-    figure = new_figure(0.8 + 1.7 * len(signals))
-    grid = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+    figure, grid = stacked(len(signals), sharex=True)
     for axes, (name, signal) in zip(grid, signals.items(), strict=True):
         _traces(axes, signal)
         unit = unit_text(SENSOR_UNITS.get(name, signal.unit))
@@ -197,8 +206,7 @@ def recording_of(calibration: Calibration) -> Figure:
             "this calibration holds no recording with poses: files and fits to several kinds of data do not keep it."
         )
     rows = 1 + ("gyroscope" in parts[0].recording.signals)
-    figure = new_figure(2.0 + 2.0 * rows)
-    grid = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    figure, grid = stacked(rows, 2.0, 2.0, sharex=True)
     shift, still, spans = 0.0, 0.0, []
     for part in parts:
         time, intervals = part.recording.accelerometer.time, part.intervals
@@ -269,8 +277,7 @@ def _rms(values: FloatArray) -> float:
 def residual_figure(errors: PoseAndTurnErrors) -> Figure:
     """Draw the errors by pose and by turn, before and after, with what the noise explains."""
     rows = 3 if len(errors.turn) else 2
-    figure = new_figure(2.35 * rows)
-    grid = figure.subplots(rows, 1, sharex=True, height_ratios=(0.7, 1, 1)[:rows])
+    figure, grid = stacked(rows, 2.35, 0.0, sharex=True, height_ratios=(0.7, 1, 1)[:rows])
     pose, turn = np.arange(1, len(errors.norm_after) + 1), errors.turn + 1.5  # a turn lies between its two poses
 
     before, after = _rms(errors.norm_before), _rms(errors.norm_after)

@@ -17,7 +17,7 @@ from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.effects.magnetic_field import SetupMagneticField
 from jaximu.report.attitude import mounting_words
 from jaximu.report.calibration import calibration_page
-from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, new_figure, zero_line
+from jaximu.report.figures import AXES, band, dressed, legend, logarithmic, stacked, zero_line
 from jaximu.report.vehicle import vehicle_page
 from jaximu.report.words import BEYOND, gravity_statements, limits
 
@@ -38,6 +38,8 @@ _HOUR = np.degrees(3600.0)
 def statements(calibration: Calibration, history: History) -> Iterator[Statement]:
     """Say whether the innovations are noise, when each kind of number was known, and what the Earth's rotation is."""
     assert calibration.filter is not None
+    if calibration.reference:
+        yield Statement("The reference", " ".join(mounting_words(calibration)))
     if (text := calibration.filter.get("diverged")) is not None:
         yield Statement("Diverged", sentence(text), True)
     nis = calibration.filter["nis"]
@@ -119,31 +121,27 @@ def page_of(calibration: Calibration, history: History) -> Page:
     if "vehicle" in calibration.filter:
         return vehicle_page(calibration, history)
     bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
-    scale = np.mean(np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1))
+    scale = np.mean(calibration.triads()["gyroscope"].scales)
     worst = np.degrees(Z95 * max(bias) / scale)
     minutes = (history.time[-1] - history.time[0]) / 60
     verdict = "diverged" if calibration.filter.get("diverged") else "followed the unit"
-    picture = Picture(
-        "residuals",
-        partial(_figure, calibration, history),
-        "States of the filter over time with 95 % bands",
-        "Lines: what the filter knew at each time from the recording so far; bands: 95 %. Grey: rests. Bottom: squared "
-        "innovations over what their uncertainty expects; noise gives about 1.",
-    )
     return calibration_page(
         calibration,
-        [picture],
+        [
+            Picture(
+                "residuals",
+                partial(_figure, calibration, history),
+                "States of the filter over time with 95 % bands",
+                "Lines: what the filter knew at each time from the recording so far; bands: 95 %. Grey: rests. "
+                "Bottom: squared innovations over what their uncertainty expects; noise gives about 1.",
+            )
+        ],
         gravity_statements(calibration),
         partial(_limits, calibration, calibration.filter["open"]),
         (f"The filter {verdict} through {minutes:.1f} min of rests and motion.",),
         (f"±{number(worst, 2)} °/s", "how well the gyroscope's bias is known at the end (95 %, the worst axis)"),
-        [*_mounting(calibration), *statements(calibration, history)],
+        statements(calibration, history),
     )
-
-
-def _mounting(calibration: Calibration) -> Iterator[Statement]:
-    if calibration.reference:
-        yield Statement("The reference", " ".join(mounting_words(calibration)))
 
 
 def _limits(calibration: Calibration, left_open: Sequence[str]) -> Iterator[Statement]:
@@ -159,7 +157,7 @@ _Line = tuple[FloatArray, FloatArray, str, str]
 def _triads(calibration: Calibration, history: History) -> Iterator[tuple[str, list[_Line]]]:
     """Yield the title of each panel of biases and scales, and its lines, less their last values."""
     for owner, part, title, factor in _PANELS:
-        gain, lines = np.linalg.norm(np.asarray(getattr(calibration.imu, owner).gain), axis=1), []
+        gain, lines = getattr(calibration.imu, owner).scales, []
         for state in _places(history, owner, part):
             axes = history.names[state].axes
             if len(set(axes)) == 1:
@@ -178,15 +176,15 @@ def _effects(calibration: Calibration, history: History) -> Iterable[tuple[str, 
         if effect is not None and state not in history.earth:
             title = f"{sentence(effect.english)} [{effect.coefficient_unit(units.get(name.owner, ''))}]"
             lines = groups.setdefault(title, [])
-            text = label(name, calibration.imu)
-            lines.append((history.values[:, state], history.sigmas[:, state], f"C{len(lines)}", text))
+            lines.append(
+                (history.values[:, state], history.sigmas[:, state], f"C{len(lines)}", label(name, calibration.imu))
+            )
     return groups.items()
 
 
 def _figure(calibration: Calibration, history: History) -> Figure:
     drawn = [*_triads(calibration, history), *_effects(calibration, history)]
-    figure = new_figure(2.4 * (len(drawn) + 1))
-    panels = figure.subplots(len(drawn) + 1, 1, sharex=True)
+    figure, panels = stacked(len(drawn) + 1, 2.4, 0.0, sharex=True)
     time = history.time
     middle = np.searchsorted(time, (time[0] + time[-1]) / 2)
     for panel, (title, lines) in zip(panels, drawn, strict=False):

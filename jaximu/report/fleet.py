@@ -45,7 +45,7 @@ def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
     def rest() -> Iterator[Part]:
         yield from _lots(fleet)
         yield from _prior(fleet)
-        yield from _diagnoses(fleet)
+        yield _diagnoses(fleet)
 
     return Page(
         f"Fleet of {counted(fleet.recordings, 'recording')}, {Path(fleet.table).name}",
@@ -54,13 +54,13 @@ def page_of(fleet: Fleet, magnetometers: Sequence[str] = ()) -> Page:
         "recordings calibrated",
         (
             *_population(fleet),
-            *_outliers(fleet, document),
+            _outliers(fleet, document),
             *_differences(fleet),
-            *_failures(fleet, document),
-            *([Section("Magnetometers", [Items(magnetometers)])] if magnetometers else []),
+            _failures(fleet, document),
+            Section("Magnetometers", [Items(magnetometers)]),
         ),
         rest,
-        [sentence(note) for note in fleet.notes],
+        fleet.notes,
         _next(fleet),
         caution=not done,
     )
@@ -99,27 +99,35 @@ def _next(fleet: Fleet) -> str:
     return f"`jaximu accept {table} --limits LIMITS.toml -o LINE` holds every unit to limits and follows the line."
 
 
-def _outliers(fleet: Fleet, document: str) -> Iterator[Part]:
-    if not fleet.strangers:
-        return
-    rows = [
-        (
-            stranger.device,
-            "; ".join(
-                f"{describe(name)} ({z:+.1f}σ)".replace("-", "−") for name, _, z in stranger.parameters if abs(z) > 2
-            )
-            or "no single parameter, but their combination",
-            probability(stranger.p_value).removeprefix("= "),
-            Path(stranger.file).name,
-        )
-        for stranger in fleet.strangers[:MOST_ROWS]
-    ]
+def _outliers(fleet: Fleet, document: str) -> Section:
     more = len(fleet.strangers) - MOST_ROWS
     caption = "p: probability that a fleet of this size has a unit as far off as this one, if all belonged."
     if more > 0:
         caption += f" {more} more outliers are in `{document}`."
-    headers = ("device", "most unlike the others in", "p", "file")
-    yield Section("Outliers", [Table(headers, rows, caption, brief=10)])
+    return Section(
+        "Outliers",
+        [
+            Table(
+                ("device", "most unlike the others in", "p", "file"),
+                [
+                    (
+                        stranger.device,
+                        "; ".join(
+                            f"{describe(name)} ({z:+.1f}σ)".replace("-", "−")
+                            for name, _, z in stranger.parameters
+                            if abs(z) > 2
+                        )
+                        or "no single parameter, but their combination",
+                        probability(stranger.p_value).removeprefix("= "),
+                        Path(stranger.file).name,
+                    )
+                    for stranger in fleet.strangers[:MOST_ROWS]
+                ],
+                caption,
+                brief=10,
+            )
+        ],
+    )
 
 
 def _differences(fleet: Fleet) -> Iterator[Part]:
@@ -130,8 +138,17 @@ def _differences(fleet: Fleet) -> Iterator[Part]:
         for difference in fleet.differences
     ]
     if rows:
-        caption = "± 95 %. p: probability of a difference at least as large by chance, all questions allowed for."
-        yield Section("Lots, dates, repeated recordings", [Table(("", "difference", "p"), rows, caption, brief=5)])
+        yield Section(
+            "Lots, dates, repeated recordings",
+            [
+                Table(
+                    ("", "difference", "p"),
+                    rows,
+                    "± 95 %. p: probability of a difference at least as large by chance, all questions allowed for.",
+                    brief=5,
+                )
+            ],
+        )
     elif fleet.population is not None:
         lots = len({lot for lot in fleet.lots if lot})
         yield (
@@ -153,10 +170,8 @@ def difference_words(difference: Difference) -> str:
     return sentence(difference.text + (f": {', '.join(parts)}" if parts else ""))
 
 
-def _failures(fleet: Fleet, document: str) -> Iterator[Part]:
-    """Yield the commonest reasons why recordings were not calibrated, with files; what is left out is counted."""
-    if not fleet.failed:
-        return
+def _failures(fleet: Fleet, document: str) -> Section:
+    """Return the commonest reasons why recordings were not calibrated, with files; what is left out is counted."""
     most = 20
     rows = [
         (sentence(reason), str(len(files)), _first([Path(file).name for file in files], 5))
@@ -165,19 +180,23 @@ def _failures(fleet: Fleet, document: str) -> Iterator[Part]:
     if others := [*fleet.failed.values()][most:]:
         rows.append((f"{len(others)} other reasons", str(sum(map(len, others))), ""))
     statuses = ", ".join(f"{count} {status}" for status, count in fleet.statuses.most_common())
-    caption = f"By status: {statuses}. All files are listed in `{document}`."
-    yield Section("Not calibrated", [Table(("reason", "recordings", "files"), rows, caption, brief=5)])
+    return Section(
+        "Not calibrated",
+        [
+            Table(
+                ("reason", "recordings", "files"),
+                rows,
+                f"By status: {statuses}. All files are listed in `{document}`.",
+                brief=5,
+            )
+        ],
+    )
 
 
-def _diagnoses(fleet: Fleet) -> Iterator[Part]:
-    parts: list[Part] = []
-    if fleet.verdicts:
-        parts.append(f"Verdicts: {', '.join(f'{count} {name}' for name, count in fleet.verdicts.most_common())}.")
-    if fleet.effects:
-        rows = [(effect_title(name), str(count)) for name, count in fleet.effects.most_common()]
-        parts.append(Table(("effect", "units"), rows))
-    if parts:
-        yield Section("Diagnoses", parts)
+def _diagnoses(fleet: Fleet) -> Section:
+    verdicts = ", ".join(f"{count} {name}" for name, count in fleet.verdicts.most_common())
+    rows = [(effect_title(name), str(count)) for name, count in fleet.effects.most_common()]
+    return Section("Diagnoses", [verdicts and f"Verdicts: {verdicts}.", Table(("effect", "units"), rows)])
 
 
 def amount(name: Name, value: float, sigma: float = 0.0) -> str:
@@ -207,9 +226,17 @@ def _population(fleet: Fleet) -> Iterator[Picture]:
 def _lots(fleet: Fleet) -> Iterator[Section]:
     lots = [difference for difference in fleet.differences if difference.kind == "lot"]
     if lots and fleet.population is not None:
-        caption = "The parameter that differs most, unit by unit in each lot; lots that differ are orange."
-        picture = Picture("lots", partial(lot_figure, fleet, lots[0]), "A parameter by lot", caption)
-        yield Section("Lots", [picture])
+        yield Section(
+            "Lots",
+            [
+                Picture(
+                    "lots",
+                    partial(lot_figure, fleet, lots[0]),
+                    "A parameter by lot",
+                    "The parameter that differs most, unit by unit in each lot; lots that differ are orange.",
+                )
+            ],
+        )
 
 
 def _prior(fleet: Fleet) -> Iterator[Section]:
@@ -223,19 +250,22 @@ def _prior(fleet: Fleet) -> Iterator[Section]:
         sizes = (mean, fleet.population.spread[k], alone[k], prior[k])
         rows.append((describe(name), *(amount(name, float(size)) for size in sizes)))
     helped = np.flatnonzero(prior < 0.8 * alone).tolist()
-    headers = (
-        "parameter",
-        "mean",
-        "spread between units (1σ)",
-        "a unit by itself (1σ)",
-        "with the fleet as prior (1σ)",
-    )
-    caption = (
-        "Scale and misalignment are relative to the data sheet's scale. The last two columns are the 90th percentile "
-        "of the units' uncertainties, without gravity's part, which all units share; marked where the prior "
-        "makes it a fifth smaller or more."
-    )
-    parts: list[Part] = [Table(headers, rows, caption, helped)]
+    parts: list[Part] = [
+        Table(
+            (
+                "parameter",
+                "mean",
+                "spread between units (1σ)",
+                "a unit by itself (1σ)",
+                "with the fleet as prior (1σ)",
+            ),
+            rows,
+            "Scale and misalignment are relative to the data sheet's scale. The last two columns are the 90th "
+            "percentile of the units' uncertainties, without gravity's part, which all units share; marked where the "
+            "prior makes it a fifth smaller or more.",
+            helped,
+        )
+    ]
     if helped:
         parts.insert(
             0,
@@ -347,8 +377,15 @@ def lot_figure(fleet: Fleet, difference: Difference) -> Figure:
     axes = figure.add_subplot()
     for column, lot in enumerate(names):
         points = values[lots == lot]
-        color = _STRANGER if lot in different else _UNIT
-        axes.plot(_beside(column, len(points)), points, ".", color=color, alpha=0.5, ms=5, mew=0)
+        axes.plot(
+            _beside(column, len(points)),
+            points,
+            ".",
+            color=_STRANGER if lot in different else _UNIT,
+            alpha=0.5,
+            ms=5,
+            mew=0,
+        )
         axes.plot([column - 0.3, column + 0.3], [np.median(points)] * 2, color="black", linewidth=2)
     dressed(axes, ylabel=f"off the mean [{kind[4]}]")
     axes.set_xticks(range(len(names)), names, rotation=0 if len(names) < 15 else 90, fontsize=8)

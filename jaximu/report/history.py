@@ -29,15 +29,13 @@ _DRAWN = 4
 
 def page_of(history: UnitHistory) -> Page:
     """Return what moved, in uncertainties and in the output, each number's drift, and when limits are reached."""
-    value, meaning = _number(history)
     return Page(
         f"What moved over {counted(len(history.files), 'calibration')} of a unit?",
         tuple(_verdict(history)),
-        value,
-        meaning,
+        *_number(history),
         tuple(_first(history)),
         partial(_rest, history),
-        [sentence(note) for note in (*history.notes, *history.left_out)],
+        (*history.notes, *history.left_out),
         _next(history),
         caution=history.verdict == "moved",
     )
@@ -49,8 +47,7 @@ def page_of(history: UnitHistory) -> Page:
 def _amount(movement: Movement, value: float, sigma: float, sign: bool = True) -> str:
     """Return an amount of a number with its 95 % interval, in the unit in which its kind is shown."""
     shown, factor = in_shown_unit(movement.unit)
-    unit = movement.unit if factor == 1.0 else shown  # an effect's is read with the prefix that suits it
-    return with_interval(factor * value, factor * sigma, unit, sign)
+    return with_interval(factor * value, factor * sigma, movement.unit if factor == 1.0 else shown, sign)
 
 
 def _drift(history: UnitHistory, movement: Movement) -> str:
@@ -113,11 +110,11 @@ def _number(history: UnitHistory) -> tuple[str, str]:
     if history.interval is not None:
         return _time(history.interval, history.per), "until the first limit's guard band is reached"
     for owner, change in history.output.items():
-        meaning = (
+        return (
+            with_interval(change.worst, change.sigma, change.unit),
             f"largest error of the {owner}, up to {size(change.over, change.unit)}, with the first calibration on the "
-            "unit as it is in the last, 95 % interval"
+            "unit as it is in the last, 95 % interval",
         )
-        return with_interval(change.worst, change.sigma, change.unit), meaning
     return f"p {probability(history.together['all'].p_value)}", "probability of differences as large if nothing moved"
 
 
@@ -135,7 +132,17 @@ def _next(history: UnitHistory) -> str:
 
 
 def _first(history: UnitHistory) -> Iterator[Part]:
-    yield _pictured_over_time(history) if len(history.files) > 2 else _pictured_changes(history)
+    yield (
+        Picture(
+            "history",
+            partial(_history_figure, history),
+            "The numbers that changed most surely, over time, with their drift",
+            "The numbers whose change is surest, with their 95 % intervals, without an error of gravity that all "
+            "share. The line is the drift, with its 95 % band.",
+        )
+        if len(history.files) > 2
+        else _pictured_changes(history)
+    )
     yield _numbers_table(history)
     yield _together_table(history)
     for owner, change in history.output.items():
@@ -147,8 +154,7 @@ def _first(history: UnitHistory) -> Iterator[Part]:
             f"{size(change.rms, change.unit)} rms over all directions, at {size(change.over, change.unit)}{zeroed}. "
             f"The uncertainty of both calibrations alone makes {size(change.expected, change.unit)} rms.",
         )
-    if history.limits:
-        yield _limits_table(history)
+    yield _limits_table(history)
 
 
 def _rest(history: UnitHistory) -> Iterator[Part]:
@@ -162,13 +168,15 @@ def _rest(history: UnitHistory) -> Iterator[Part]:
             "The numbers that changed most surely, over the temperatures of their recordings",
             "The same numbers over the temperature of their recordings: what follows it has not aged.",
         )
-    headers = ("calibration", "date", f"time [{history.per}s]", "temperature")
     columns = zip(history.files, history.dates, history.times, history.temperatures, strict=True)
-    rows = [
-        (file, day.isoformat() if day else "", f"{time:.2f}".replace("-", "−"), "" if t is None else f"{t:.1f} °C")
-        for file, day, time, t in columns
-    ]
-    yield Table(headers, rows, "In the order of time, counted from the last.")
+    yield Table(
+        ("calibration", "date", f"time [{history.per}s]", "temperature"),
+        [
+            (file, day.isoformat() if day else "", f"{time:.2f}".replace("-", "−"), "" if t is None else f"{t:.1f} °C")
+            for file, day, time, t in columns
+        ],
+        "In the order of time, counted from the last.",
+    )
 
 
 def _numbers_table(history: UnitHistory) -> Table:
@@ -216,9 +224,10 @@ def _together_table(history: UnitHistory) -> Table:
         )
         for name, test in history.together.items()
     ]
-    caption = "Jointly, with all correlations: χ² of no change."
     marked = [len(rows) - 1] if history.together["all"].p_value < history.level / 2 else []
-    return Table(("together", "χ²", "degrees of freedom", "p"), rows, caption, marked)
+    return Table(
+        ("together", "χ²", "degrees of freedom", "p"), rows, "Jointly, with all correlations: χ² of no change.", marked
+    )
 
 
 def _limits_table(history: UnitHistory) -> Table:
@@ -229,16 +238,23 @@ def _limits_table(history: UnitHistory) -> Table:
         movement, limit = movements[reached.name], reached.limit
         after = "never, at this drift" if reached.after is None else _duration(history, reached.after)
         level = _amount(movement, movement.line.level, float(np.sqrt(movement.line.covariance[0, 0])))
-        bounds = between(limit.low, limit.high, limit.unit, limit.stated)
-        return spoken(reached.name), bounds, level, _drift(history, movement), after
+        return (
+            spoken(reached.name),
+            between(limit.low, limit.high, limit.unit, limit.stated),
+            level,
+            _drift(history, movement),
+            after,
+        )
 
     ordered = sorted(history.limits, key=lambda limit: np.inf if limit.after is None else limit.after)
-    headers = ("limit on", "bounds", "now ± 95 %", "drift ± 95 %", "guard band reached after")
-    caption = (
+    return Table(
+        ("limit on", "bounds", "now ± 95 %", "drift ± 95 %", "guard band reached after"),
+        [row(reached) for reached in ordered],
         "The time from the last calibration until the line, with its uncertainty and the guard band of the decision "
-        "rule, leaves the bounds: the calibration interval is the shortest. It assumes that the drift goes on."
+        "rule, leaves the bounds: the calibration interval is the shortest. It assumes that the drift goes on.",
+        [0] * bool(ordered),
+        brief=6,
     )
-    return Table(headers, [row(reached) for reached in ordered], caption, [0] * bool(ordered), brief=6)
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
@@ -251,16 +267,6 @@ def _pictured_changes(history: UnitHistory) -> Picture:
         "Change of every number from the first calibration to the last, in standard deviations",
         "Last calibration less the first, in standard deviations of that difference. Within the grey band a single "
         "number has not changed (95 %). Orange: moved, with all numbers allowed for; grey: not tested.",
-    )
-
-
-def _pictured_over_time(history: UnitHistory) -> Picture:
-    return Picture(
-        "history",
-        partial(_history_figure, history),
-        "The numbers that changed most surely, over time, with their drift",
-        "The numbers whose change is surest, with their 95 % intervals, without an error of gravity that all share. "
-        "The line is the drift, with its 95 % band.",
     )
 
 
@@ -282,16 +288,18 @@ def _surest(history: UnitHistory) -> list[Movement]:
     return sorted(history.movements, key=lambda movement: (not movement.tested, movement.p_value))[:_DRAWN]
 
 
-def _panels(movements: list[Movement]) -> tuple[Figure, list[Axes]]:
-    figure = figures.new_figure(0.8 + 1.7 * len(movements))
-    return figure, figure.subplots(len(movements), 1, sharex=True, squeeze=False)[:, 0].tolist()
-
-
 def _points(panel: Axes, movement: Movement, at: NDArray[Any]) -> tuple[float, str]:
     """Draw a number's values with their intervals; return the factor to its unit, and the unit."""
     shown, factor = in_shown_unit(movement.unit)
-    half = factor * Z95 * np.array(movement.apart)
-    panel.errorbar(at, factor * np.array(movement.values), half, fmt="o", color=figures.FLAGGED, markersize=4, zorder=3)
+    panel.errorbar(
+        at,
+        factor * np.array(movement.values),
+        factor * Z95 * np.array(movement.apart),
+        fmt="o",
+        color=figures.FLAGGED,
+        markersize=4,
+        zorder=3,
+    )
     figures.dressed(panel, spoken(movement.name))
     panel.set_ylabel(shown)
     return factor, shown
@@ -299,7 +307,7 @@ def _points(panel: Axes, movement: Movement, at: NDArray[Any]) -> tuple[float, s
 
 def _history_figure(history: UnitHistory) -> Figure:
     movements = _surest(history)
-    figure, panels = _panels(movements)
+    figure, panels = figures.stacked(len(movements), sharex=True)
     dated = history.per == "year"
     at = np.array(history.dates, "datetime64[D]") if dated else history.times
     for panel, movement in zip(panels, movements, strict=True):
@@ -317,7 +325,7 @@ def _history_figure(history: UnitHistory) -> Figure:
 
 def _temperature_figure(history: UnitHistory) -> Figure:
     movements = _surest(history)
-    figure, panels = _panels(movements)
+    figure, panels = figures.stacked(len(movements), sharex=True)
     for panel, movement in zip(panels, movements, strict=True):
         _points(panel, movement, np.array(history.temperatures, float))
     panels[-1].set_xlabel("temperature [°C]")

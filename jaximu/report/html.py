@@ -18,6 +18,7 @@ from markupsafe import Markup, escape
 from jaximu.ground.atomic import write_files, write_folder
 from jaximu.ground.errors import worded
 from jaximu.ground.page import Page, Part, Picture, Result, Section
+from jaximu.ground.quantities import sentence
 
 if TYPE_CHECKING:
     import jinja2
@@ -53,8 +54,9 @@ def encoded(page: Page) -> tuple[bytes, dict[str, bytes]]:
             drawings[picture.name], pictures[f"{picture.name}.png"] = _drawn(picture.draw(), picture.name)
         except Exception as error:
             drawings[picture.name] = failure(f"The figure “{picture.name}”", error)
-    template = environment().get_template("page.html.jinja")
-    text = _FOLDERS.sub("", template.render(page=page, first=first, rest=rest, drawings=drawings))
+    text = _FOLDERS.sub(
+        "", environment().get_template("page.html.jinja").render(page=page, first=first, rest=rest, drawings=drawings)
+    )
     return text.encode("utf-8", "backslashreplace"), pictures  # names of files need not be valid text
 
 
@@ -139,7 +141,7 @@ def environment() -> jinja2.Environment:
         "script": script,
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     }
-    made.filters |= {"inline": _inline, "kind_of_cell": _kind_of_cell, "anchor": _anchor}
+    made.filters |= {"inline": _inline, "sentence": sentence, "kind_of_cell": _kind_of_cell, "anchor": _anchor}
     return made
 
 

@@ -56,15 +56,17 @@ def page_of(line: Line) -> Page:
             "differences from the unit before.",
         )
     ]
-    value, meaning = _number(line, able)
     return Page(
         f"Production line, {Path(line.table.file).name}",
         tuple(_verdict(line, able)),
-        value,
-        meaning,
-        (*(pictures if charts else []), *_capability(line, able), *_alarms(line)),
-        lambda: [*_not_passed(line), *_worst_lots(able), *_gauge(line)],
-        [sentence(note) for note in line.notes],
+        *_number(line, able),
+        (
+            *(pictures if charts else []),
+            _capability(line, able),
+            Section("Alarms", [Table(("alarm", "what it shows"), _alarm_rows(line), brief=8)]),
+        ),
+        lambda: [_not_passed(line), _worst_lots(able), _gauge(line)],
+        line.notes,
         _next(line),
         caution=bool(line.counts[FAIL] or (able and able[0][1] < _CAPABLE)),
     )
@@ -82,8 +84,9 @@ def _by_capability(line: Line) -> list[tuple[FollowedQuantity, float]]:
 def _number(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> tuple[str, str]:
     """Return the worst Cpk with its interval, else how many recordings pass, and what it is."""
     if able and (capability := able[0][0].capability) is not None:
-        meaning = f"Cpk of {spoken(able[0][0].name)}, the worst quantity (95 %); a capable line has {_CAPABLE} or more"
-        return _index(capability.cpk), meaning
+        return _index(
+            capability.cpk
+        ), f"Cpk of {spoken(able[0][0].name)}, the worst quantity (95 %); a capable line has {_CAPABLE} or more"
     if line.limits is not None:
         return f"{100 * line.counts[PASS] / line.table.total:.3g} %", "of the recordings pass"
     return "", ""
@@ -136,19 +139,22 @@ def _next(line: Line) -> str:
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
-def _capability(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> Iterator[Section]:
-    if not able:
-        return
+def _capability(line: Line, able: Sequence[tuple[FollowedQuantity, float]]) -> Section:
     judged = line.judged
     failed = {} if judged is None else dict(zip(judged.names, np.sum(judged.verdict == FAIL, axis=0), strict=True))
-    headers = ("quantity", "Cpk (95 %)", "Cp (95 %)", "mean ± standard deviation", "limits", "fail")
-    caption = (
-        "Of each device's first recording; the deviation is that of all units, drift between them included. Marked: "
-        f"Cpk below {_CAPABLE}. Fail: recordings of all."
+    return Section(
+        "Capability",
+        [
+            Table(
+                ("quantity", "Cpk (95 %)", "Cp (95 %)", "mean ± standard deviation", "limits", "fail"),
+                [_capability_row(quantity, failed.get(quantity.name, 0)) for quantity, _ in able],
+                "Of each device's first recording; the deviation is that of all units, drift between them included. "
+                f"Marked: Cpk below {_CAPABLE}. Fail: recordings of all.",
+                [row for row, (_, cpk) in enumerate(able) if cpk < _CAPABLE],
+                brief=6,
+            )
+        ],
     )
-    rows = [_capability_row(quantity, failed.get(quantity.name, 0)) for quantity, _ in able]
-    marked = [row for row, (_, cpk) in enumerate(able) if cpk < _CAPABLE]
-    yield Section("Capability", [Table(headers, rows, caption, marked, brief=6)])
 
 
 def _capability_row(quantity: FollowedQuantity, failed: int) -> tuple[str, ...]:
@@ -166,14 +172,13 @@ def _capability_row(quantity: FollowedQuantity, failed: int) -> tuple[str, ...]:
     )
 
 
-def _worst_lots(able: Sequence[tuple[FollowedQuantity, float]]) -> Iterator[Section]:
+def _worst_lots(able: Sequence[tuple[FollowedQuantity, float]]) -> Section:
     rows = []
     for quantity, _ in able:
         if quantity.lots:
             worst = min(quantity.lots, key=lambda lot: quantity.lots[lot].cpk[0])
             rows.append((spoken(quantity.name), worst, _index(quantity.lots[worst].cpk)))
-    if rows:
-        yield Section("Worst lots", [Table(("quantity", "lot", "Cpk of the lot (95 %)"), rows)])
+    return Section("Worst lots", [Table(("quantity", "lot", "Cpk of the lot (95 %)"), rows)])
 
 
 def _index(ends: tuple[float, float, float]) -> str:
@@ -188,22 +193,24 @@ def _alarm_rows(line: Line) -> list[tuple[str, str]]:
     return [(_TITLES[alarm.kind], f"{sentence(alarm.words(stated.get(alarm.name, '')))}.") for alarm in ordered]
 
 
-def _alarms(line: Line) -> Iterator[Section]:
-    if line.alarms:
-        yield Section("Alarms", [Table(("alarm", "what it shows"), _alarm_rows(line), brief=8)])
-
-
-def _not_passed(line: Line) -> Iterator[Section]:
+def _not_passed(line: Line) -> Section:
     cells = ("name", "value", "limits", "probability", "verdict")
     rows = [(device, *(item_row(item)[cell] for cell in cells)) for device, item in line.items(MOST_ROWS)]
     more = sum(len(line.missed(row)) for row in range(len(line.table.rows))) - len(rows)
-    if rows:
-        headers = ("device", "quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict")
-        caption = f"And {more} more; the table's column `not_passed` has all." if more else ""
-        yield Section("What does not pass", [Table(headers, rows, caption)])
+    caption = f"And {more} more; the table's column `not_passed` has all." if more else ""
+    return Section(
+        "What does not pass",
+        [
+            Table(
+                ("device", "quantity", "value ± U (k = 2)", "limits", "conforms with probability", "verdict"),
+                rows,
+                caption,
+            )
+        ],
+    )
 
 
-def _gauge(line: Line) -> Iterator[Section]:
+def _gauge(line: Line) -> Section:
     questions, rows, marked = max(1, len(line.followed)), [], []
     for quantity in line.followed:
         gauge, unit, stated = quantity.gauge, si_unit(quantity.name), quantity.limit.stated if quantity.limit else ""
@@ -222,15 +229,27 @@ def _gauge(line: Line) -> Iterator[Section]:
             f"{gauge.explained:.2f}{' *' if gauge.p_value * questions < _LEVEL else ''}",
         )
         rows.append(row)
-    if rows:
-        headers = ("quantity", "repeatability (95 %)", "between stations", "between units", "ndc", "observed / stated")
-        caption = (
-            "Standard deviations by analysis of variance. ndc: groups of units that the measurement can distinguish; "
-            "marked below 5 (AIAG). Observed / stated: scatter of a unit's repeated recordings, in multiples of the "
-            "uncertainty that each states; 1 is expected, and * marks what chance does not explain (p < 1 %, all "
-            "quantities allowed for)."
-        )
-        yield Section("Gauge: repeated recordings", [Table(headers, rows, caption, marked)])
+    return Section(
+        "Gauge: repeated recordings",
+        [
+            Table(
+                (
+                    "quantity",
+                    "repeatability (95 %)",
+                    "between stations",
+                    "between units",
+                    "ndc",
+                    "observed / stated",
+                ),
+                rows,
+                "Standard deviations by analysis of variance. ndc: groups of units that the measurement can "
+                "distinguish; marked below 5 (AIAG). Observed / stated: scatter of a unit's repeated recordings, "
+                "in multiples of the uncertainty that each states; 1 is expected, and * marks what chance does "
+                "not explain (p < 1 %, all quantities allowed for).",
+                marked,
+            )
+        ],
+    )
 
 
 # --- charts -----------------------------------------------------------------------------------------------------------
@@ -251,8 +270,7 @@ def _to_draw(line: Line) -> list[tuple[FollowedQuantity, str]]:
 
 def _chart_figure(line: Line, drawn: list[tuple[FollowedQuantity, str]]) -> Figure:
     """Draw control charts: values, moving average and limits above, moving ranges below."""
-    drawing = figures.new_figure(0.6 + 3.0 * len(drawn))
-    rows = drawing.subplots(2 * len(drawn), 1, height_ratios=[2.2, 1] * len(drawn), squeeze=False)[:, 0]
+    drawing, rows = figures.stacked(2 * len(drawn), 1.5, 0.6, height_ratios=[2.2, 1] * len(drawn))
     for (quantity, station), above, below in zip(drawn, rows[::2], rows[1::2], strict=True):
         chart, places = quantity.charts[station]
         unit, factor = in_shown_unit(si_unit(quantity.name), quantity.limit.stated if quantity.limit else "")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaximu.ground.page import Items, Page, Part, Section, Statement
@@ -29,23 +28,11 @@ def page_of(
     `documents`: what `jaximu info` says of each log. `refused`: by verb, why it gave no result. `assumed`: what the
     logs do not say. `after`: the next command. `whole`: with what only HTML files show.
     """
-
-    @cache
-    def parts() -> list[Part]:
-        return [
-            *(_assumed(assumed) if assumed else ()),
-            *(page.chapter(verb, whole) for verb, page in chapters.items()),
-            *(_refused(refused) if refused else ()),
-            *(log_page(document, ()).chapter(f"log{number}", whole) for number, document in enumerate(documents)),
-        ]
-
     page = chapters[lead]
-    return Page(title, page.verdict[:1], page.number, page.meaning, parts(), next=after, caution=page.caution)
-
-
-def _assumed(texts: Sequence[str]) -> Iterator[Part]:
-    yield Section("What was assumed", [Items([*map(sentence, texts)])])
-
-
-def _refused(texts: Mapping[str, str]) -> Iterator[Part]:
-    yield Section("What these logs do not allow", [Statement(verb, sentence(text)) for verb, text in texts.items()])
+    parts: list[Part] = [
+        Section("What was assumed", [Items(assumed)]),
+        *(page.chapter(verb, whole) for verb, page in chapters.items()),
+        Section("What these logs do not allow", [Statement(verb, sentence(text)) for verb, text in refused.items()]),
+        *(log_page(document, ()).chapter(f"log{number}", whole) for number, document in enumerate(documents)),
+    ]
+    return Page(title, page.verdict[:1], page.number, page.meaning, parts, next=after, caution=page.caution)

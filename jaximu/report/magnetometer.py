@@ -38,8 +38,11 @@ def _lead(calibration: Calibration) -> tuple[str, str, str]:
         "parts left out"
     )
     if heading is None:
-        meaning = "scatter of the field's strength on parts of the recording that were left out of the fit"
-        return f"After calibration {strength}.", f"{100 * spread['after']:.2g} %", meaning
+        return (
+            f"After calibration {strength}.",
+            f"{100 * spread['after']:.2g} %",
+            "scatter of the field's strength on parts of the recording that were left out of the fit",
+        )
     return (
         f"A level heading in this recording's surroundings is good to {number(heading['rms'], 2)}° (one standard "
         f"deviation); without calibration it is off by {number(heading['before']['rms'], 2)}° (rms). Iron elsewhere, "
@@ -129,12 +132,16 @@ def page_of(
     )
     if heading is not None:
         caption += " Right: how good a heading is, one standard deviation, by where the unit points."
-    picture = Picture(
-        "residuals", partial(_figure, calibration, measurement, heading), "Directions and headings", caption
-    )
     verdict, number, meaning = _lead(calibration)
-    findings = statements(calibration)
-    return calibration_page(calibration, [picture], (), tuple, (verdict, *remarks), (number, meaning), findings)
+    return calibration_page(
+        calibration,
+        [Picture("residuals", partial(_figure, calibration, measurement, heading), "Directions and headings", caption)],
+        (),
+        tuple,
+        (verdict, *remarks),
+        (number, meaning),
+        statements(calibration),
+    )
 
 
 def _figure(calibration: Calibration, measurement: MagneticField, heading: Heading | None) -> Figure:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaximu.ground.page import Page, Table
-from jaximu.ground.quantities import number, readable, sentence, size
+from jaximu.ground.quantities import number, readable, size
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_UNITS
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def page_of(model: NoiseModel) -> Page:
         _density(name, np.mean(noise.white)),
         f"white noise of the {name}, root mean square of its axes",
         [Table(("axis", "white noise", "slow bias (standard deviation)"), rows)],
-        notes=[*map(sentence, model.notes)],
+        notes=model.notes,
     )
 
 

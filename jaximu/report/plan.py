@@ -15,7 +15,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.projection import output_uncertainty
 from jaximu.estimation.uncertainty import describe, spoken_amount
 from jaximu.ground.page import Page, Picture, Section, Statement, Table
-from jaximu.ground.quantities import Z95, number, plain, sentence
+from jaximu.ground.quantities import Z95, number, plain
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.planning import Proposal
 from jaximu.report import figures
@@ -48,9 +48,12 @@ def page_of(proposal: Proposal) -> Page:
             Section("The poses", [_picture(proposal), *_map(proposal), *_instructions(proposal), _poses(proposal)]),
             *_turns(proposal),
             Section("What they are expected to gain", [_parameters(proposal)]),
-            *_open(proposal),
+            Section(
+                "What stays open",
+                [Statement("Weak" if one.determined else "Not determined", one.text, True) for one in proposal.open],
+            ),
         ),
-        notes=[sentence(note) for note in proposal.notes],
+        notes=proposal.notes,
         next=_next(proposal),
     )
 
@@ -138,24 +141,31 @@ def _poses(proposal: Proposal) -> Table:
     """Return each pose's number, words and, where each turn leads from one pose to the next, the turn to it."""
     chained = proposal.equipment.chained
     turns = ["", *(turn.words for turn in proposal.turns)] if proposal.turns else [""] * len(proposal.poses)
-    rows = [
-        (str(index + 1), pose.words, *([turns[index]] if chained else [])) for index, pose in enumerate(proposal.poses)
-    ]
     legend = "The top is the face that +z leaves, the bottom the one opposite."
     if any(" corner " in pose.words for pose in proposal.poses):
         legend += " A corner lies halfway, at 45°, between the two sides."
-    return Table(("", "pose", *(["turn to it"] if chained else [])), rows, legend)
+    return Table(
+        ("", "pose", *(["turn to it"] if chained else [])),
+        [
+            (str(index + 1), pose.words, *([turns[index]] if chained else []))
+            for index, pose in enumerate(proposal.poses)
+        ],
+        legend,
+    )
 
 
 def _turns(proposal: Proposal) -> Iterator[Section]:
     """Return the turns of a table; by hand, on a robot and in a sequence they stand beside the poses."""
     if proposal.turns and not proposal.equipment.chained:
         rows = [(str(index), turn.words) for index, turn in enumerate(proposal.turns, 1)]
-        words = (
-            "About the vertical axis of the table, the unit mounted as the turn says. schedule.csv holds poses and "
-            "turns in this order; correct its times once they are done."
+        yield Section(
+            f"{len(rows)} turns",
+            [
+                "About the vertical axis of the table, the unit mounted as the turn says. schedule.csv holds poses and "
+                "turns in this order; correct its times once they are done.",
+                Table(("", "turn"), rows),
+            ],
         )
-        yield Section(f"{len(rows)} turns", [words, Table(("", "turn"), rows)])
 
 
 def _parameters(proposal: Proposal) -> Table:
@@ -166,23 +176,17 @@ def _parameters(proposal: Proposal) -> Table:
 
     first = _parameter(proposal)
     sigmas = zip(proposal.names, proposal.before, proposal.after, strict=True)
-    rows = [
-        (describe(name, proposal.imu), interval(name, before), interval(name, after), f"{_times(before / after)}×")
-        for name, before, after in sorted(sigmas, key=lambda row: (row[0] != first, -row[1] / row[2]))
-    ]
-    headers = ("parameter", "known", "after these poses", "times smaller")
     caption = "A prediction from the noise, to first order, without errors of the set-up; ± is 95 %."
-    return Table(headers, rows, f"{_criterion(proposal)} {caption}", [0] if first else [], brief=8)
-
-
-def _open(proposal: Proposal) -> Iterator[Section]:
-    """Return what stays open, in words."""
-    if proposal.open:
-        statements = [
-            Statement("Weak" if weak.determined else "Not determined", weak.text, caution=True)
-            for weak in proposal.open
-        ]
-        yield Section("What stays open", statements)
+    return Table(
+        ("parameter", "known", "after these poses", "times smaller"),
+        [
+            (describe(name, proposal.imu), interval(name, before), interval(name, after), f"{_times(before / after)}×")
+            for name, before, after in sorted(sigmas, key=lambda row: (row[0] != first, -row[1] / row[2]))
+        ],
+        f"{_criterion(proposal)} {caption}",
+        [0] if first else [],
+        brief=8,
+    )
 
 
 # --- the picture ------------------------------------------------------------------------------------------------------
@@ -197,8 +201,7 @@ def _picture(proposal: Proposal) -> Picture:
         view = "Seen a little from above; headings are counted from an arbitrary zero."
     else:
         view = "Seen a little from above; the heading on the table does not matter."
-    caption = f"{view} {AXES_WORDS}"
-    return Picture("poses", partial(_poses_figure, proposal), "The unit drawn in each pose", caption)
+    return Picture("poses", partial(_poses_figure, proposal), "The unit drawn in each pose", f"{view} {AXES_WORDS}")
 
 
 def _map(proposal: Proposal) -> Iterator[Picture]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,14 @@ def page_of(recording: Recording) -> Page:
     """Return which sensors are in a recording, how they were sampled, and what reading it had to assume."""
     names = [source.path for source in recording.sources]
     signals = {name: signal_facts(signal) for name, signal in recording.signals.items()}
-    picture = Picture("signals", recording.plot, "All signals against time", "As recorded, in SI units.")
     after = f"`jaximu info {shlex.quote(names[0])}` shows what it can be used for." if names else ""
-    title = ", ".join(Path(name).name for name in names) or "recording"
-    return _page(title, signals, (picture, _table(signals)), recording.notes, after)
+    return _page(
+        ", ".join(Path(name).name for name in names) or "recording",
+        signals,
+        (Picture("signals", recording.plot, "All signals against time", "As recorded, in SI units."), _table(signals)),
+        recording.notes,
+        after,
+    )
 
 
 def log_page(document: Mapping[str, Any], commands: Sequence[str]) -> Page:
@@ -32,13 +36,16 @@ def log_page(document: Mapping[str, Any], commands: Sequence[str]) -> Page:
     uses: list[Part] = []
     for use, command in zip(document["uses"] if commands else (), commands, strict=True):
         uses += [f"{sentence(use['why'])}:", Code(command)]
-    parts = [
-        _table(document["signals"]),
-        *_guess(document.get("guess")),
-        Section("What was noticed", [Items([*map(sentence, document["findings"])])]),
-        *([Section("What it can be used for", uses)] if uses else []),
-    ]
-    return _page(document["file"], document["signals"], parts)
+    return _page(
+        document["file"],
+        document["signals"],
+        [
+            _table(document["signals"]),
+            *_guess(document.get("guess")),
+            Section("What was noticed", [Items(document["findings"])]),
+            Section("What it can be used for", uses),
+        ],
+    )
 
 
 def signal_facts(signal: Signal, used: Signal | None = None) -> dict[str, Any]:
@@ -65,7 +72,7 @@ def _page(
     title: str,
     signals: Mapping[str, Mapping[str, Any]],
     parts: Sequence[Part],
-    notes: Iterable[str] = (),
+    notes: Sequence[str] = (),
     after: str = "",
 ) -> Page:
     """Return the page of signals that are described by their facts: which sensors, at what rate, and for how long."""
@@ -75,25 +82,11 @@ def _page(
     if longest["samples"] > 1:
         rate, duration = f" at {longest['rate']:.5g} Hz", f"{longest['duration']:.5g} s"
         meaning = f"from the first to the last of {longest['samples']} samples"
-    text = sentence(f"{listed(sensors)}{rate}.")
-    return Page(title, (text,), duration, meaning, parts, notes=[*map(sentence, notes)], next=after)
+    return Page(title, (sentence(f"{listed(sensors)}{rate}."),), duration, meaning, parts, notes=notes, next=after)
 
 
 def _table(signals: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return a row a signal: how it was sampled, and between which values it lies."""
-    rows = [
-        (
-            name.replace("_", " "),
-            unit_text(facts["unit"]),
-            str(facts["samples"]),
-            f"{facts['rate']:.5g}",
-            number(round(1e3 * facts["jitter"], 6)),
-            f"{facts['longest_gap']:.3g}",
-            f"{facts['duration']:.5g}",
-            *(" ".join(f"{value:.4g}" for value in facts[key]).replace("-", "−") for key in ("minimum", "maximum")),
-        )
-        for name, facts in signals.items()
-    ]
     return Table(
         (
             "signal",
@@ -106,7 +99,19 @@ def _table(signals: Mapping[str, Mapping[str, Any]]) -> Table:
             "minimum",
             "maximum",
         ),
-        rows,
+        [
+            (
+                name.replace("_", " "),
+                unit_text(facts["unit"]),
+                str(facts["samples"]),
+                f"{facts['rate']:.5g}",
+                number(round(1e3 * facts["jitter"], 6)),
+                f"{facts['longest_gap']:.3g}",
+                f"{facts['duration']:.5g}",
+                *(" ".join(f"{value:.4g}" for value in facts[key]).replace("-", "−") for key in ("minimum", "maximum")),
+            )
+            for name, facts in signals.items()
+        ],
     )
 
 
@@ -118,7 +123,7 @@ def _guess(guess: Mapping[str, Any] | None) -> Iterator[Part]:
     parts: list[Part] = [
         f"The file does not say all of this. Check it{blanks}, then paste:",
         Code(guess["line"]),
-        Items([sentence(text) for text in (*guess["reasons"], *guess["questions"])]),
+        Items((*guess["reasons"], *guess["questions"])),
     ]
     if guess["rows"]:
         columns = list(zip(*guess["rows"], strict=True))

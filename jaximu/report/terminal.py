@@ -14,6 +14,7 @@ from rich.table import Table as Grid
 
 from jaximu.ground.errors import worded
 from jaximu.ground.page import Code, Items, Page, Part, Section, Statement, Table
+from jaximu.ground.quantities import sentence
 
 __all__ = ["console", "show", "text"]
 
@@ -59,19 +60,17 @@ def show(content: Page | Part, screen: Console | None = None) -> None:
             _print_parts(parts, screen)
         case Page():
             screen.print(content.title, style="bold")
-            for sentence in content.verdict:
-                show(sentence, screen)
+            for verdict in content.verdict:
+                show(verdict, screen)
             if content.number:
                 screen.print(f"{content.number}  {content.meaning}")
-            _print_parts(content.first, screen)
-            if content.notes:
-                show(Section("Notes", (Items(content.notes),)), screen)
+            _print_parts((*content.first, Section("Notes", (Items(content.notes),))), screen)
             if content.next:
                 show(f"\nNext: {content.next}", screen)
 
 
 def _print_parts(parts: Sequence[Part], screen: Console) -> None:
-    for part in parts:
+    for part in filter(None, parts):
         show(part, screen)
 
 
@@ -79,7 +78,7 @@ def _print_items(texts: Sequence[str], screen: Console) -> None:
     """Print a list, its lines indented below their bullets."""
     grid = Grid.grid(padding=(0, 1, 0, 0))
     for words in texts:
-        grid.add_row("-", worded(words))
+        grid.add_row("-", worded(sentence(words)))
     screen.print(grid)
 
 

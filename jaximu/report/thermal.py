@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +24,7 @@ from jaximu.mistakes.titles import effect_title
 from jaximu.planning.ramps import next_ramps
 from jaximu.recordings.recording import Recording, smoothed_slope
 from jaximu.report.figures import dressed, legend, new_figure, zero_line
-from jaximu.report.words import how_much_smaller
+from jaximu.report.words import compensation, file_names, how_much_smaller
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,24 +51,21 @@ _BESIDE_DATA = 0.04  # of the range of temperatures and of rates, about the bloc
 def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] = ()) -> Page:
     """Return what temperature did to each sensor, what remains of it, by which model, and what an autopilot loses."""
     files, command = files_and_next(thermal.blocks.recordings)
-    value, meaning = _number(thermal)
-    effects = effect_table(thermal.calibration)
     return Page(
         f"Bias over temperature of {files}",
         (*_verdict(thermal),),
-        value,
-        meaning,
+        *_number(thermal),
         (
             *(_band_picture(thermal, name) for name in thermal.fits),
             _remainder(thermal),
             *(_model(thermal, name) for name in thermal.fits),
             Section("What these recordings can separate", [*thermal.identifiability.words, *_ways(thermal)]),
-            *([Section("Effects", [effects])] if effects.rows else []),
+            Section("Effects", [effect_table(thermal.calibration)]),
             Section("Models that were tried", [*_candidates(thermal)]),
             *(_export(export, thermal) for export in exports),
         ),
         partial(_rest, thermal),
-        [sentence(note) for note in thermal.notes],
+        thermal.notes,
         command,
     )
 
@@ -78,9 +73,7 @@ def page_of(thermal: ThermalCalibration, exports: Sequence[AutopilotParameters] 
 def files_and_next(recordings: Sequence[Recording]) -> tuple[str, str]:
     """Return the names of the recordings' files, and the sentence on what to run next."""
     files = [str(source.path) for recording in recordings for source in recording.sources]
-    log = shlex.quote(files[0]) if files else "LOG"
-    names = ", ".join(Path(file).name for file in files) or "a recording"
-    return names, f"`jaximu compensate CALIBRATION {log} -o CORRECTED.csv` applies it at the logged temperatures."
+    return file_names(files), compensation(files, "applies it at the logged temperatures")
 
 
 def _size(name: str, axes: FloatArray) -> str:
@@ -98,15 +91,12 @@ def _parts(thermal: ThermalCalibration) -> str:
     return "ramps" if len(thermal.identifiability.legs) > 3 else "stretches"
 
 
-def _span(thermal: ThermalCalibration) -> str:
-    return "{:.0f} and {:.0f} °C".format(*thermal.blocks.range).replace("-", "−")
-
-
 def _verdict(thermal: ThermalCalibration) -> Iterator[str]:
     """Say what temperature did to each sensor and what remains, and whether the recordings show more than one way."""
     jumps = ", jumps included" * bool(thermal.jumps)
+    span = "{:.0f} and {:.0f} °C".format(*thermal.blocks.range).replace("-", "−")
     for name, fit in thermal.fits.items():
-        moves = f"{_size(name, fit.before)} (rms) between {_span(thermal)}"
+        moves = f"{_size(name, fit.before)} (rms) between {span}"
         if fit.candidate.names:
             after = f"with the model {_size(name, fit.after)} remain{jumps}"
             yield f"The {name}'s output at rest moves by {moves}; {after}."
@@ -201,8 +191,13 @@ def candidate_table(thermal: ThermalCalibration, name: str) -> Table:
             (chosen + title, effects or "none", _size(name, candidate.held.rms), f"{gap:+.1f}".replace("-", "−"))
         )
     chosen_rows = range(len({*fit.families}))
-    headers = ("model", "effects kept by the information criterion", "left out, rms", "score, nats")
-    return Table(headers, rows, "", chosen_rows, brief=max(3, len(chosen_rows)))
+    return Table(
+        ("model", "effects kept by the information criterion", "left out, rms", "score, nats"),
+        rows,
+        "",
+        chosen_rows,
+        brief=max(3, len(chosen_rows)),
+    )
 
 
 def effect_table(calibration: Calibration) -> Table:
@@ -249,7 +244,7 @@ def _largest_change(calibration: Calibration, owner: str, plain: str) -> tuple[s
     """Return the largest change of steady bias that an effect makes over the range, ± 95 %, by axis, and the unit."""
     low, high = calibration.data["temperature_range"]
     temperature = np.linspace(low, high, 101)
-    scale = np.linalg.norm(np.asarray(calibration.triads()[owner].gain), axis=1)
+    scale = calibration.triads()[owner].scales
     value, sigma = (values / scale for values in change(calibration, owner, (plain,), temperature))
     rows = np.argmax(np.abs(value), axis=0), np.arange(3)
     factor, unit = readable(SENSOR_UNITS[owner], np.max(np.abs(value)))
@@ -259,42 +254,52 @@ def _largest_change(calibration: Calibration, owner: str, plain: str) -> tuple[s
 
 def _export(export: AutopilotParameters, thermal: ThermalCalibration) -> Section:
     """Say what an autopilot's parameters lose, and how to use them."""
-    return Section(f"{export.name} parameters", [loss_words(export, thermal), Items([*map(sentence, export.notes)])])
+    return Section(f"{export.name} parameters", [loss_words(export, thermal), Items(export.notes)])
 
 
 def _rest(thermal: ThermalCalibration) -> Iterator[Part]:
     """Return the temperatures covered, each sensor's surface and residuals, and how it was done."""
-    covered = Picture(
-        "covered",
-        partial(covered_figure, thermal),
-        "Temperatures and rates covered",
-        "Each dot is a block of the recording. Where dots lie on one line only, temperature and its rate go together, "
-        "and their effects cannot be separated.",
+    yield Section(
+        "Temperatures covered",
+        [
+            Picture(
+                "covered",
+                partial(covered_figure, thermal),
+                "Temperatures and rates covered",
+                "Each dot is a block of the recording. Where dots lie on one line only, temperature and its rate go "
+                "together, and their effects cannot be separated.",
+            )
+        ],
     )
-    yield Section("Temperatures covered", [covered])
     for name in thermal.fits:
-        surface = Picture(
-            f"surface_{name}",
-            partial(surface_figure, thermal, name),
-            f"Bias of the {name} over temperature and its rate",
-            f"The {name}'s bias, counted from {thermal.reference:g} °C: the model as a surface, as far as the data go, "
-            "and the data as dots, less the level of each rest.",
+        yield Section(
+            f"The {name}",
+            [
+                Picture(
+                    f"surface_{name}",
+                    partial(surface_figure, thermal, name),
+                    f"Bias of the {name} over temperature and its rate",
+                    f"The {name}'s bias, counted from {thermal.reference:g} °C: the model as a surface, as far as the "
+                    "data go, and the data as dots, less the level of each rest.",
+                ),
+                Picture(
+                    f"residual_{name}",
+                    partial(residual_figure, thermal, name),
+                    f"Residuals of the {name}",
+                    "Residuals of the model, less the level of each rest, jumps included; a slope, a curve or two "
+                    "colours apart would be something it misses.",
+                ),
+            ],
         )
-        residual = Picture(
-            f"residual_{name}",
-            partial(residual_figure, thermal, name),
-            f"Residuals of the {name}",
-            "Residuals of the model, less the level of each rest, jumps included; a slope, a curve or two colours "
-            "apart would be something it misses.",
-        )
-        yield Section(f"The {name}", [surface, residual])
-    text = (
-        f"{len(thermal.blocks)} blocks of {thermal.blocks.duration:.3g} s. The rate of temperature is the slope of a "
-        f"line through {TEMPERATURE_WINDOW:g} s (attenuates {RATE_BANDWIDTH:.2g} Hz by 29 %). Least squares with the "
-        "covariance of the noise, which ties blocks to each other: a long soak counts for no more than it contains, "
-        f"and slow bias does not pass for temperature. jaximu {thermal.software['version']}."
+    yield Section(
+        "How it was done",
+        [
+            f"{len(thermal.blocks)} blocks of {thermal.blocks.duration:.3g} s. The rate of temperature is the slope "
+            f"of a line through {TEMPERATURE_WINDOW:g} s (attenuates {RATE_BANDWIDTH:.2g} Hz by 29 %). Least squares "
+            "with the covariance of the noise, which ties blocks to each other: a long soak counts for no more than "
+            f"it contains, and slow bias does not pass for temperature. jaximu {thermal.software['version']}."
+        ],
     )
-    yield Section("How it was done", [text])
 
 
 def _ways(thermal: ThermalCalibration) -> list[Part]:
@@ -306,13 +311,19 @@ def _ways(thermal: ThermalCalibration) -> list[Part]:
     then = options[0].parts
     if all(then[name].apart < _WORTH * now[name].apart for name in weak):
         return []
-    text = (
-        f"{sentence(options[0].text)}, with a soak at each end ({options[0].duration / 60:.0f} min), and give both "
-        "recordings to `jaximu thermal`: of the ramps tried it separates best what looks alike now."
+    shares = Table(
+        ("effect", "share that no other can imitate, now", "with that ramp"),
+        [(name.replace("_", " "), *(_share(parts[name].apart) for parts in (now, then))) for name in weak],
     )
-    rows = [(name.replace("_", " "), *(_share(parts[name].apart) for parts in (now, then))) for name in weak]
-    shares = Table(("effect", "share that no other can imitate, now", "with that ramp"), rows)
-    return [Statement("What to record next", text, True), shares]
+    return [
+        Statement(
+            "What to record next",
+            f"{sentence(options[0].text)}, with a soak at each end ({options[0].duration / 60:.0f} min), and give both "
+            "recordings to `jaximu thermal`: of the ramps tried it separates best what looks alike now.",
+            True,
+        ),
+        shares,
+    ]
 
 
 def _share(share: float) -> str:
@@ -338,11 +349,11 @@ def _ambient(thermal: ThermalCalibration) -> Iterator[Statement]:
         added = blocks.means[name] - fit.level.T[blocks.level]
         fits = [multifactor(factors, values) for values in added.T]
         held, kept = np.array([rms for _, rms in fits]), max(len(terms) for terms, _ in fits)
-        text = (
+        yield Statement(
+            f"Regression of the {name} on sensor and ambient temperature and their rates",
             f"At most {kept} of 15 terms kept: {_size(name, held)} rms on fifths left out, against "
-            f"{_size(name, fit.candidate.held.rms)} of the model above on {_parts(thermal)} left out."
+            f"{_size(name, fit.candidate.held.rms)} of the model above on {_parts(thermal)} left out.",
         )
-        yield Statement(f"Regression of the {name} on sensor and ambient temperature and their rates", text)
 
 
 def loss_words(parameters: AutopilotParameters, thermal: ThermalCalibration) -> str:

@@ -33,15 +33,13 @@ _POWER = {name: power for power, name in enumerate(POWERS, 1)}
 def page_of(thermal: HandHeldThermal) -> Page:
     """Return which effects of temperature are needed, the errors without and with them, and what may still hide."""
     files, command = files_and_next(thermal.experiment.recordings)
-    value, meaning = _number(thermal)
     return Page(
         f"Bias and scale over temperature of {files}",
         _verdict(thermal),
-        value,
-        meaning,
+        *_number(thermal),
         (*_first(thermal),),
         partial(_rest, thermal),
-        [*map(sentence, thermal.notes), f"Written by jaximu {thermal.software['version']}."],
+        (*thermal.notes, f"Written by jaximu {thermal.software['version']}."),
         command,
     )
 
@@ -62,8 +60,9 @@ def _verdict(thermal: HandHeldThermal) -> list[str]:
 def _sizes(thermal: HandHeldThermal) -> list[tuple[str, float, float, str]]:
     """Return each kind of error in words, its rms without and with the effects, and the unit."""
     before, after = (thermal.experiment.real.rms(state.conditions) for state in (thermal.base, thermal.state))
-    kinds = thermal.experiment.real.kinds
-    return [(kind.words, before[kind.name][0], after[kind.name][0], kind.unit) for kind in kinds]
+    return [
+        (kind.words, before[kind.name][0], after[kind.name][0], kind.unit) for kind in thermal.experiment.real.kinds
+    ]
 
 
 def _number(thermal: HandHeldThermal) -> tuple[str, str]:
@@ -93,20 +92,21 @@ def _first(thermal: HandHeldThermal) -> Iterator[Part]:
         "from its direction, and what the gyroscope shows at rest. What goes with temperature the model lacks.",
     )
     if thermal.steps:
-        rows = [(sentence(words), changed(before, after, unit)) for words, before, after, unit in _sizes(thermal)]
-        yield Table(("error, rms", "one bias and scale → with the effects"), rows)
+        yield Table(
+            ("error, rms", "one bias and scale → with the effects"),
+            [(sentence(words), changed(before, after, unit)) for words, before, after, unit in _sizes(thermal)],
+        )
         yield Section("Effects", [effect_table(thermal.calibration)])
     yield Section("What may still hide", [*_limits(thermal)])
 
 
 def _limits(thermal: HandHeldThermal) -> Iterator[Part]:
     """Return the smallest effects that would have been found, and those that the recordings do not determine."""
-    if thermal.limits:
-        yield Table(
-            ("effect", "size that could hide", "at the end of the range"),
-            _limit_rows(thermal),
-            "Effects that were tested and are not needed. Larger ones would have been found nine times in ten.",
-        )
+    yield Table(
+        ("effect", "size that could hide", "at the end of the range"),
+        _limit_rows(thermal),
+        "Effects that were tested and are not needed. Larger ones would have been found nine times in ten.",
+    )
     for name, why in thermal.undetermined.items():
         yield Statement(sentence(effect_title(name)), f"Not determined: {why}.", True)
     yield (
@@ -124,8 +124,7 @@ def _limit_rows(thermal: HandHeldThermal) -> list[tuple[str, ...]]:
     extent = max(abs(end - thermal.calibration.imu.accelerometer.temperature_reference) for end in thermal.range)
     for name, (value, unit) in thermal.limits.items():
         kind = CATALOGUE[name]
-        triad = thermal.calibration.triads()[kind.owner]
-        scale = np.mean(np.linalg.norm(np.asarray(triad.gain), axis=1))
+        scale = float(np.mean(thermal.calibration.triads()[kind.owner].scales))
         most = value * extent ** _POWER.get(kind.plain, 1) / scale
         shown = size(most, SENSOR_UNITS[kind.owner], 2) if kind.plain in POWERS else size(100 * most, "%", 2)
         rows.append((kind.title, size(value, unit, 2), shown))
@@ -148,10 +147,9 @@ def _change_figure(thermal: HandHeldThermal) -> Figure:
     temperature, calibration = np.linspace(*thermal.range, 101), thermal.calibration
     drawn = []
     for owner, word, names, force in _changed(thermal):
-        scale = np.linalg.norm(np.asarray(calibration.triads()[owner].gain), axis=1)
+        scale = calibration.triads()[owner].scales
         value, sigma = (values / scale for values in change(calibration, owner, names, temperature, force=force))
-        most = np.max(np.abs(value))
-        factor, unit = readable(SENSOR_UNITS[owner], most) if word == "bias" else (100.0, "%")
+        factor, unit = readable(SENSOR_UNITS[owner], np.max(np.abs(value))) if word == "bias" else (100.0, "%")
         drawn.append((f"{sentence(owner)} {word} [{unit}]", factor * value, factor * sigma))
     rows = -(-len(drawn) // 2)
     figure = new_figure(2.9 * rows)
@@ -191,12 +189,11 @@ def _error_figure(thermal: HandHeldThermal) -> Figure:
     return figure
 
 
-def _rest(thermal: HandHeldThermal) -> Iterator[Part]:
+def _rest(thermal: HandHeldThermal) -> list[Section]:
     """Return what each effect gained."""
-    if thermal.steps:
-        rows = [(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in thermal.steps]
-        caption = (
-            "In the order in which they were taken in: χ² of the score test when tested, and log-likelihood gained on "
-            "parts left out."
-        )
-        yield Section("What each effect gained", [Table(("effect", "χ²", "gain, nats"), rows, caption)])
+    rows = [(effect_title(name), f"{statistic:.0f}", f"{gain:+.1f}") for name, statistic, gain in thermal.steps]
+    caption = (
+        "In the order in which they were taken in: χ² of the score test when tested, and log-likelihood gained on "
+        "parts left out."
+    )
+    return [Section("What each effect gained", [Table(("effect", "χ²", "gain, nats"), rows, caption)])]

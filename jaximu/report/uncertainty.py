@@ -103,8 +103,9 @@ def _recorded(calibration: Calibration) -> Calibration:
 
 def at_rest(calibration: Calibration) -> FloatArray:
     """Return `over_sphere` of a calibration, without gravity's own error."""
-    temperature = float(np.mean(Range.of(calibration).temperature))
-    rest = partial(steady, gravity=calibration.gravity.value, temperature=temperature)
+    rest = partial(
+        steady, gravity=calibration.gravity.value, temperature=float(np.mean(Range.of(calibration).temperature))
+    )
     return over_sphere(_recorded(calibration).uncertainty_of, rest)
 
 
@@ -145,8 +146,7 @@ def _at_rest(calibration: Calibration, half: FloatArray) -> Iterator[str]:
 def _turning(calibration: Calibration, extent: Range) -> str:
     """Say how well the corrected rate is known at rest, and at the end of the range about the worst axis."""
     rates = np.concatenate([np.zeros((1, 3)), extent.rate * _FACES])
-    up = np.tile([0.0, 0.0, 1.0], (len(rates), 1))
-    stimulus = steady(up, extent.gravity, np.mean(extent.temperature), rates)
+    stimulus = steady(np.tile([0.0, 0.0, 1.0], (len(rates), 1)), extent.gravity, np.mean(extent.temperature), rates)
     half = Z95 * np.degrees(calibration.uncertainty_of(stimulus)["gyroscope"].largest)
     worst = 1 + int(np.argmax(half[1:]))
     still, turning = (
@@ -170,8 +170,7 @@ def _panels(calibration: Calibration, extent: Range) -> Iterator[tuple[str, str,
     warm = {name for name, triad in triads.items() if any("temperature" in effect.needs for effect in triad.effects)}
     low, high = calibration.data.get("temperature_range", extent.temperature)
     temperatures = np.linspace(low, high, _STEPS)
-    faces = np.tile(_FACES, (len(temperatures), 1))
-    stimulus = steady(faces, gravity, np.repeat(temperatures, len(_FACES)))
+    stimulus = steady(np.tile(_FACES, (len(temperatures), 1)), gravity, np.repeat(temperatures, len(_FACES)))
     uncertainty = calibration.uncertainty_of(stimulus) if warm & {"accelerometer", "gyroscope"} else {}
     for name, title, factor, unit in (
         ("accelerometer", "Specific force at rest, the worst of six faces up", 1e3, "mm/s²"),
@@ -189,8 +188,7 @@ def _map_points() -> tuple[NDArray[np.bool_], FloatArray]:
 
 
 def _curves_figure(panels: list) -> Figure:
-    figure = figures.new_figure(2.6 * len(panels), 6.4)
-    grid = figure.subplots(len(panels), 1, squeeze=False)[:, 0]
+    figure, grid = figures.stacked(len(panels), 2.6, 0.0, width=6.4)
     for axes, (title, across, up, lines, heights) in zip(grid, panels, strict=True):
         for (name, values), height in zip(lines.items(), heights, strict=True):
             axes.plot(
@@ -217,8 +215,16 @@ def poses_on_sphere(
     from matplotlib.patches import Circle
 
     figure = figures.new_figure(4.6, 6.8)
-    filled = np.array(colors or ["white"] * len(poses), dtype=object)
-    panels, grid = figures.hemispheres(figure, 2, poses, names, filled, s=60, edgecolors="black", linewidths=0.9)
+    panels, grid = figures.hemispheres(
+        figure,
+        2,
+        poses,
+        names,
+        np.array(colors or ["white"] * len(poses), dtype=object),
+        s=60,
+        edgecolors="black",
+        linewidths=0.9,
+    )
     for axes, sign, here, spot in panels:
         axes.add_patch(Circle((0, 0), 1, facecolor="white", edgecolor="#777777", hatch="///", linewidth=0, zorder=0))
         figures.number_dots(axes, spot, np.flatnonzero(here) + 1)
@@ -259,8 +265,9 @@ def sphere_figure(
     at = np.unravel_index(int(np.argmax(np.where(inside, half, -1.0))), half.shape)
     for panel, axes in enumerate(panels):
         edge = Circle((0, 0), 1, transform=axes.transData)
-        heights = np.ma.masked_invalid(half[panel])
-        shades = axes.contourf(_GRID, _GRID, heights, levels=levels, norm=norm, cmap=colormap, zorder=1)
+        shades = axes.contourf(
+            _GRID, _GRID, np.ma.masked_invalid(half[panel]), levels=levels, norm=norm, cmap=colormap, zorder=1
+        )
         shades.set_clip_path(edge)
         if at[0] == panel:
             text = f"±{number(half[at], 2)} {unit}" if np.isfinite(half[at]) else "not determined"
@@ -269,8 +276,7 @@ def sphere_figure(
             style = {"fontsize": 10, "color": "#CC0033", "fontweight": "bold", "zorder": 6, "ha": "center"}
             box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 1.0}
             axes.annotate(text, (0.75 * x, y), (0, -17), textcoords="offset points", bbox=box, **style)
-    cell = figure.add_subplot(grid[1, :2])
-    bar = figure.colorbar(ScalarMappable(norm, colormap), cax=cell, orientation="horizontal")
+    bar = figure.colorbar(ScalarMappable(norm, colormap), cax=figure.add_subplot(grid[1, :2]), orientation="horizontal")
     bar.set_label(f"specific force at rest, ± 95 % ({unit})", fontsize=10)
     what = called if np.isfinite(half[at]) else "Not determined"
     figure.suptitle(

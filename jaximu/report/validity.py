@@ -36,7 +36,6 @@ _OUTPUTS = {
 def page_of(validity: Validity) -> Page:
     """Return what moved, what explains it, what using the old calibration would cost, and the errors under both."""
     log = str(validity.data.get("file", "LOG"))
-    number, meaning = _number(validity)
     following = {
         "valid": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
         "session": "`jaximu compensate CALIBRATION LOG -o CORRECTED.csv` applies the calibration.",
@@ -47,11 +46,10 @@ def page_of(validity: Validity) -> Page:
     return Page(
         f"Is the calibration still valid for {Path(log).name}?",
         (f"{sentence(validity.verdict)}: {validity.headline()}",),
-        number,
-        meaning,
+        *_number(validity),
         (*_shifts(validity), *_statements(validity), *_errors_table(validity)),
         rest=lambda: [_picture(validity)],
-        notes=[sentence(note) for note in validity.notes],
+        notes=validity.notes,
         next=following[validity.verdict].replace("LOG", shlex.quote(log)),
     )
 
@@ -78,18 +76,22 @@ def _shifts(validity: Validity) -> Iterator[Part]:
             "(gains at 1 g and 1 rad/s), with the 95 % interval of the difference. Coloured: moved, with all "
             "parameters allowed for.",
         )
-    if validity.shifts:
-        yield _shifts_table(validity)
+    yield _shifts_table(validity)
 
 
 def _shifts_table(validity: Validity) -> Table:
     """Return each parameter's old value, its shift, and that in the output, the most significant first."""
-    headers = ("parameter", "old", "shift ± 95 %", "in the output ± 95 %", "σ", "p-value, all allowed for")
     statistic, freedom, p_value = validity.difference
     together = f"All {freedom} together: χ² {statistic:.1f}, p {probability(p_value)}." if freedom else ""
     shifts = sorted(validity.shifts, key=_rank)
     moved = range(len(validity.moved))
-    return Table(headers, [_shift_row(shift) for shift in shifts], together, moved, brief=max(3, len(moved)))
+    return Table(
+        ("parameter", "old", "shift ± 95 %", "in the output ± 95 %", "σ", "p-value, all allowed for"),
+        [_shift_row(shift) for shift in shifts],
+        together,
+        moved,
+        brief=max(3, len(moved)),
+    )
 
 
 def _rank(shift: Shift) -> tuple[bool, float]:
@@ -129,9 +131,11 @@ def _statements(validity: Validity) -> Iterator[Statement]:
 def _errors_table(validity: Validity) -> Iterator[Table]:
     if validity.experiment is not None:
         words = {kind.name: kind.words for kind in validity.experiment.real.kinds}
-        rows = [(words[name], change(*sizes)) for name, sizes in validity.errors.items()]
         counts = f"{validity.data['poses']} poses, {validity.data['turns']} turns"
-        yield Table((f"error, rms ({counts})", "old calibration → fresh calibration"), rows)
+        yield Table(
+            (f"error, rms ({counts})", "old calibration → fresh calibration"),
+            [(words[name], change(*sizes)) for name, sizes in validity.errors.items()],
+        )
 
 
 def _picture(validity: Validity) -> Picture:
@@ -165,8 +169,14 @@ def _shifts_figure(validity: Validity) -> Figure:
         shown = [shift for shift in validity.shifts if shift.parameter.owner == triad and _drawn(shift)][::-1]
         for row, shift in enumerate(shown):
             assert shift.in_si is not None and shift.sigma_in_si is not None
-            colour = figures.FLAGGED if shift.moved else figures.BEFORE
-            panel.errorbar(1e3 * shift.in_si, row, xerr=1.96e3 * shift.sigma_in_si, fmt="o", color=colour, markersize=5)
+            panel.errorbar(
+                1e3 * shift.in_si,
+                row,
+                xerr=1.96e3 * shift.sigma_in_si,
+                fmt="o",
+                color=figures.FLAGGED if shift.moved else figures.BEFORE,
+                markersize=5,
+            )
         panel.axvline(0.0, color="0.5", linewidth=0.8)
         figures.dressed(panel, triad, xlabel=f"shift [{unit}]")
         panel.set_yticks(range(len(shown)), [short_name(shift.parameter) for shift in shown], fontsize=8)
@@ -182,11 +192,13 @@ def _errors(validity: Validity, experiment: Experiment) -> Figure:
     times = real.covariates[TIME][norms], real.covariates[TIME][turns][::2]
     extended = [cause.title for cause in validity.causes if cause.scope != "parameter"]
     fresh = " with ".join(["fresh calibration", *([", ".join(extended)] if extended else [])])
-    labels = (("old calibration", figures.FLAGGED), (fresh, figures.AFTER))
-    for (label, colour), conditions in zip(labels, validity.conditions, strict=True):
+    for (label, colour), conditions in zip(
+        (("old calibration", figures.FLAGGED), (fresh, figures.AFTER)), validity.conditions, strict=True
+    ):
         norm = 1e3 * conditions[norms]
-        angle = np.degrees(np.linalg.norm(conditions[turns].reshape(-1, 2), axis=1))
-        for panel, time, values in zip(panels, times, (norm, angle), strict=True):
+        for panel, time, values in zip(
+            panels, times, (norm, np.degrees(np.linalg.norm(conditions[turns].reshape(-1, 2), axis=1))), strict=True
+        ):
             panel.plot(time, values, "o", color=colour, markersize=4, label=label)
     for panel, title, unit in zip(
         panels, ("gravity norm at rest", "gravity carried over a turn"), ("mm/s²", "°"), strict=True

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -15,8 +14,8 @@ from jaximu.ground.page import Items, Page, Part, Picture, Section, Statement
 from jaximu.ground.quantities import Z95, counted, listed, size, with_interval, with_intervals
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.report.calibration import calibration_page
-from jaximu.report.figures import AXES, band, dressed, legend, new_figure, zero_line
-from jaximu.report.words import limits
+from jaximu.report.figures import AXES, band, dressed, legend, stacked, zero_line
+from jaximu.report.words import compensation, limits
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,28 +30,28 @@ def vehicle_page(calibration: Calibration, history: History) -> Page:
     """Return the page of a gyroscope that was calibrated by the stops of a vehicle."""
     assert calibration.filter is not None
     vehicle = calibration.filter["vehicle"]
-    scale = np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)
+    scale = calibration.triads()["gyroscope"].scales
     worst = float(np.max(Z95 * calibration.bias_sigma_recording["gyroscope"] / scale))
-    picture = Picture(
-        "vehicle",
-        partial(_figure, calibration, history),
-        "Gyroscope bias and tilt at each stop, and the speeds gained and lost beside stops",
-        "Top: the bias as a filter knew it after each stop, with 95 % bands. Middle: how much more than on average the "
-        "vehicle tilts at each stop, which is the slope of the road. Bottom: speeds gained in the seconds after a stop "
-        "and lost in those before one, along the vehicle and to its left; backwards they are negative.",
-    )
     page = calibration_page(
         calibration,
-        [picture],
+        [
+            Picture(
+                "vehicle",
+                partial(_figure, calibration, history),
+                "Gyroscope bias and tilt at each stop, and the speeds gained and lost beside stops",
+                "Top: the bias as a filter knew it after each stop, with 95 % bands. Middle: how much more than on "
+                "average the vehicle tilts at each stop, which is the slope of the road. Bottom: speeds gained in the "
+                "seconds after a stop and lost in those before one, along the vehicle and to its left; backwards they "
+                "are negative.",
+            )
+        ],
         [],
         partial(limits, calibration),
         (f"The vehicle stood still at {counted(len(vehicle['stops']), 'stop')}, {vehicle['seconds']:.0f} s in all.",),
         (f"±{size(worst, 'rad/s', 2)}", "how well the gyroscope's bias over the drive is known (95 %, the worst axis)"),
         [*_statements(calibration, vehicle), Section("What stays open", [Items(calibration.filter["open"])], 3)],
     )
-    files = calibration.data.get("files", ())
-    log = shlex.quote(str(files[0]["file"])) if files else "LOG"
-    return replace(page, next=f"`jaximu compensate CALIBRATION {log} -o CORRECTED.csv` takes the gyroscope's bias off.")
+    return replace(page, next=compensation(calibration.files, "takes the gyroscope's bias off"))
 
 
 def _statements(calibration: Calibration, vehicle: Mapping[str, Any]) -> Iterator[Part]:
@@ -75,9 +74,11 @@ def _statements(calibration: Calibration, vehicle: Mapping[str, Any]) -> Iterato
         texts = with_intervals(change["value"], change["sigma"], "rad/s")
         moved = np.max(np.abs(change["value"]) / np.array(change["sigma"])) > _SURE
         advice = " Use it for this drive, and let the unit warm up before the next." * bool(moved)
-        axes = [f"{axis} {text}" for axis, text in zip("xyz", texts, strict=True)]
         yield Statement(
-            "Bias over the drive", f"From the first stop to the last it changed by {listed(axes)}.{advice}", bool(moved)
+            "Bias over the drive",
+            "From the first stop to the last it changed by "
+            f"{listed([f'{axis} {text}' for axis, text in zip('xyz', texts, strict=True)])}.{advice}",
+            bool(moved),
         )
     yield Statement("Earth's rotation", _earth(calibration))
 
@@ -106,19 +107,18 @@ def _earth(calibration: Calibration) -> str:
             f"Up to {size(EARTH_RATE, 'rad/s', 2)} of it are in the bias, and its interval allows for that. With "
             "--latitude its vertical part is taken off."
         )
-    level = EARTH_RATE * np.cos(np.radians(latitude))
     return (
-        f"Its vertical part was taken off. Of the horizontal part up to {size(level, 'rad/s', 2)} are in the bias, as "
-        "the heading is unknown, and its interval allows for that."
+        "Its vertical part was taken off. Of the horizontal part up to "
+        f"{size(EARTH_RATE * np.cos(np.radians(latitude)), 'rad/s', 2)} are in the bias, as the heading is unknown, "
+        "and its interval allows for that."
     )
 
 
 def _figure(calibration: Calibration, history: History) -> Figure:
     assert calibration.filter is not None
     vehicle = calibration.filter["vehicle"]
-    scale = np.linalg.norm(np.asarray(calibration.triads()["gyroscope"].gain), axis=1)
-    figure = new_figure(7.5)
-    bias, tilt, speed = figure.subplots(3, 1)
+    scale = calibration.triads()["gyroscope"].scales
+    figure, (bias, tilt, speed) = stacked(3, 2.5, 0.0)
     for row, (axis, color) in enumerate(AXES.items()):
         values, sigmas = (
             np.degrees(history.values[:, row] / scale[row]),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -16,8 +18,10 @@ from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
 __all__ = [
     "BEYOND",
+    "compensation",
     "counts",
     "direction_words",
+    "file_names",
     "gravity_statements",
     "how_much_smaller",
     "limits",
@@ -29,6 +33,16 @@ __all__ = [
 BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
 _CHANCE = 0.01
 """Share of recordings in which noise alone scatters more than a scatter that is called noise."""
+
+
+def file_names(paths: Sequence[str]) -> str:
+    """Return the names of recordings' files, without their folders."""
+    return ", ".join(Path(path).name for path in paths) or "a recording"
+
+
+def compensation(paths: Sequence[str], does: str) -> str:
+    """Return the command that applies a calibration to the first recording, and what it does."""
+    return f"`jaximu compensate CALIBRATION {shlex.quote(paths[0]) if paths else 'LOG'} -o CORRECTED.csv` {does}."
 
 
 def counts(calibration: Calibration) -> tuple[int, int]:
@@ -118,11 +132,15 @@ def scatter_statements(calibration: Calibration) -> list[Statement]:
             why = "there is a little more than noise, and the intervals include it."
         entries.append(Statement(about, f"{sentence(subject)} scatter {how} their measured noise: {why}", large))
     if any(entry.caution for entry in entries):
-        text = (
-            "The intervals below include it as if it were random. A cause that repeats may have shifted the parameters "
-            "by more than they say, and will act again when the calibration is used. Run `jaximu diagnose` to find it."
+        entries.append(
+            Statement(
+                "What scatter beyond noise means",
+                "The intervals below include it as if it were random. A cause that repeats may have shifted the "
+                "parameters by more than they say, and will act again when the calibration is used. Run `jaximu "
+                "diagnose` to find it.",
+                True,
+            )
         )
-        entries.append(Statement("What scatter beyond noise means", text, True))
     return entries
 
 

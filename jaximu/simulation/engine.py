@@ -303,7 +303,7 @@ class _Logger:
 
 def _per_output(triad: Triad) -> FloatArray | float:
     """Noise is in SI: per axis, the output units of one SI unit."""
-    return np.linalg.norm(np.asarray(triad.gain), axis=1) if triad.output_unit == "count" else 1.0
+    return triad.scales if triad.output_unit == "count" else 1.0
 
 
 _UNITS = {"temperature": "degC", "ambient_temperature": "degC", "current": "A", "attitude": "1", "table_rate": "rad/s"}

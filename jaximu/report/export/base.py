@@ -82,8 +82,11 @@ class Logged:
 
     def correction(self, correction: Correction) -> Correction:
         """What a correction of the sensor's output makes of the log's values, in the log's axes."""
-        offset = np.linalg.solve(self.matrix, correction.offset - self.offset)
-        return replace(correction, matrix=self.frame.T @ correction.matrix @ self.matrix, offset=offset)
+        return replace(
+            correction,
+            matrix=self.frame.T @ correction.matrix @ self.matrix,
+            offset=np.linalg.solve(self.matrix, correction.offset - self.offset),
+        )
 
 
 @dataclass(frozen=True)
@@ -158,8 +161,9 @@ class ExportedUnit:
             words += ", if it was read without --axes, which this calibration does not say"
         if shared and "accelerometer" in calibration.triads() and not np.array_equal(maps["accelerometer"], first):
             words += "; the log's accelerometer has minus specific force, and the answer is specific force"
-        frames = dict.fromkeys(maps, first if shared else np.eye(3))
-        return cls(calibration, {}, {}, {}, "", noise or {}, instance, device)._in(maps, frames, f"Axes: {words}.")
+        return cls(calibration, {}, {}, {}, "", noise or {}, instance, device)._in(
+            maps, dict.fromkeys(maps, first if shared else np.eye(3)), f"Axes: {words}."
+        )
 
     def _in(self, maps: Mapping[str, FloatArray], frames: Mapping[str, FloatArray], axes: str) -> ExportedUnit:
         """Make them for outputs and answers in these axes: y = Aᵀ y_body and u = Fᵀ u_body, so the gain is AᵀKF."""
@@ -277,7 +281,6 @@ def yaml_matrices(named: Mapping[str, FloatArray], indent: int, rows: int) -> li
 def comments(parameters: ExportedUnit, sign: str = "#") -> str:
     """Where the numbers come from and what axes they are for, for the head of a file."""
     calibration = parameters.calibration
-    files = [str(file["file"]) for file in calibration.data.get("files", ())]
-    safe = "".join(letter if letter.isprintable() else "?" for letter in ", ".join(files) or "a recording")
+    safe = "".join(letter if letter.isprintable() else "?" for letter in ", ".join(calibration.files) or "a recording")
     version = calibration.software.get("version", "")
     return f"{sign} Calibrated by jaximu {version} from {safe}. {parameters.axes}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 from importlib import import_module
@@ -11,7 +10,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from jaximu.ground.atomic import write_files
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import InputError, nearest
 
 if TYPE_CHECKING:
     from jaximu.report.export.base import ExportedUnit, Written
@@ -46,10 +45,7 @@ def writer(name: str) -> ModuleType:
         parts = re.split("[-_]", known)  # "c" is the C header, "ros" the YAML of ROS, "imu-tk" is imu_tk
         if plain in ("".join(parts), parts[0]):
             return import_module(module)
-    near = difflib.get_close_matches(name, WRITERS, 1)
-    raise InputError(
-        f"--to: {name!r} is no format{f' (did you mean {near[0]}?)' if near else ''}; there are {', '.join(WRITERS)}."
-    )
+    raise InputError(f"--to: {name!r} is no format; {nearest(name, WRITERS)}")
 
 
 def export(parameters: ExportedUnit, to: str, path: str | os.PathLike[str]) -> tuple[Written, tuple[Path, ...]]:

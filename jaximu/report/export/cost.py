@@ -45,8 +45,12 @@ class Range:
         """The range of a calibration: 250 °/s, and 20 K about the temperature that it holds for, unless stated."""
         about = float(calibration.data.get("temperature", calibration.imu.accelerometer.temperature_reference))
         field = None if calibration.magnetic is None else float(calibration.magnetic["field"]["strength"]["value"])
-        span = temperature or (about - 20.0, about + 20.0)
-        return cls(calibration.gravity.value, rate or np.radians(250.0), span, field=field)
+        return cls(
+            calibration.gravity.value,
+            rate or np.radians(250.0),
+            temperature or (about - 20.0, about + 20.0),
+            field=field,
+        )
 
     def text(self) -> str:
         """The range in words."""
@@ -74,14 +78,19 @@ class Range:
         still = np.zeros((_SAMPLES, 3))
         swing = 1.0 - np.abs(1.0 - time / 30.0)
         slope = (high - low) / 5400.0 * np.where(time < 30.0, 1.0, -1.0)
-        middle = np.full(_SAMPLES, 0.5 * (low + high))
         return (
-            self._stimulus(time, force, rate, self.rate * share * frequency * np.cos(angle), middle, still[:, 0]),
+            self._stimulus(
+                time,
+                force,
+                rate,
+                self.rate * share * frequency * np.cos(angle),
+                np.full(_SAMPLES, 0.5 * (low + high)),
+                still[:, 0],
+            ),
             self._stimulus(180.0 * time, force, rate, still, low + (high - low) * swing, slope),
         )
 
     def _stimulus(self, time, force, rate, acceleration, temperature, slope) -> Stimulus:
-        level = np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(time), 4))
         return Stimulus(
             np.array(force),
             np.array(rate),
@@ -89,7 +98,7 @@ class Range:
             np.array(temperature),
             np.array(slope),
             time,
-            np.array(level),
+            np.array(np.broadcast_to([1.0, 0.0, 0.0, 0.0], (len(time), 4))),
             np.full(len(time), self.vibration),
             (self.field or 0.0) / self.gravity * np.array(force),
             self.current * np.sin(0.4 * np.arange(len(time))),
@@ -191,8 +200,11 @@ def _gap(
 
 def _loss(what: str, gaps: dict[str, FloatArray]) -> Loss:
     lengths = {name: np.linalg.norm(gap, axis=1) for name, gap in gaps.items()}
-    worst = {name: float(length.max()) for name, length in lengths.items()}
-    return Loss(what, worst, {name: float(np.sqrt(np.mean(length**2))) for name, length in lengths.items()})
+    return Loss(
+        what,
+        {name: float(length.max()) for name, length in lengths.items()},
+        {name: float(np.sqrt(np.mean(length**2))) for name, length in lengths.items()},
+    )
 
 
 def _uncertainty(calibration: Calibration, extent: Range) -> Loss:

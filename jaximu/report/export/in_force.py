@@ -119,31 +119,41 @@ class Composition:
 
     def section(self) -> Section:
         """Return the changes as a page has them."""
-        rows = [
+        return Section(
+            "What changes:",
             (
-                change["parameter"],
-                plain(change["in_force"]),
-                with_interval(change["new"], change["half_width"] / Z95)
-                if change["half_width"]
-                else f"{plain(change['new'])} (not determined)",
-                _words(change["at_rest"]),
-            )
-            for change in self.changes()
-        ]
-        caption = f"Offsets in m/s² and rad/s. All together, at most at rest: {_words(self.at_rest())}."
-        headers = ("Parameter", "In force", "New (± 95 %)", "Changes at rest")
-        return Section("What changes:", (Table(headers, rows, caption),))
+                Table(
+                    ("Parameter", "In force", "New (± 95 %)", "Changes at rest"),
+                    [
+                        (
+                            change["parameter"],
+                            plain(change["in_force"]),
+                            with_interval(change["new"], change["half_width"] / Z95)
+                            if change["half_width"]
+                            else f"{plain(change['new'])} (not determined)",
+                            _words(change["at_rest"]),
+                        )
+                        for change in self.changes()
+                    ],
+                    f"Offsets in m/s² and rad/s. All together, at most at rest: {_words(self.at_rest())}.",
+                ),
+            ),
+        )
 
     def document(self) -> dict[str, Any]:
         """Return the changes as JSON has them."""
-        shared = {"file": self.file.path, "composition": self.unit.composition}
-        return shared | {"changes": self.changes(), "at_rest": self.at_rest()}
+        return {"file": self.file.path, "composition": self.unit.composition} | {
+            "changes": self.changes(),
+            "at_rest": self.at_rest(),
+        }
 
     def _parameters(self, name: str) -> list[list[str]]:
         """The names of a triad's offsets, and of its scales if it has some."""
         tool = _firmware(self.to).tool(self.unit.instance or 0)
-        words = [tool.offset, *([tool.scale] if name == "accelerometer" else [])]
-        return [[tool.patterns[name].format(word=word, axis=axis) for axis in "XYZ"] for word in words]
+        return [
+            [tool.patterns[name].format(word=word, axis=axis) for axis in "XYZ"]
+            for word in [tool.offset, *([tool.scale] if name == "accelerometer" else [])]
+        ]
 
     def _correction(self, name: str, file: ParameterFile) -> tuple[FloatArray, FloatArray]:
         """(3,) offset and (3,) scale of a triad."""

@@ -48,8 +48,9 @@ def write(parameters: ExportedUnit) -> Written:
         gyro, rotation, sensitivity = view["gyro_matrix"], view["gyro_rotation"], view["g_sensitivity"]
         blocks, bias = {"M": gyro, "A": sensitivity, "C_gyro_i": rotation}, vector_text(view["gyro_bias"])
         lines += ["  gyroscopes:", *yaml_matrices(blocks, 4, 4), f"    bias: {bias}"]
-        inverse = rotation.T @ np.linalg.inv(gyro)
-        corrections["gyroscope"] = Correction(inverse, view["gyro_bias"], sensitivity @ rotation, frame)
+        corrections["gyroscope"] = Correction(
+            rotation.T @ np.linalg.inv(gyro), view["gyro_bias"], sensitivity @ rotation, frame
+        )
         equation += (
             f"\nw = transpose(C_gyro_i) inverse(M) (y - b - A C_gyro_i f)\nM = {matrix_text(gyro)}"
             f"\nC_gyro_i = {matrix_text(rotation)}\nA = {matrix_text(sensitivity)}\nb = {bias}"

@@ -22,12 +22,11 @@ One table, `TARGETS`; a value is factor · densityᵉ · rateᵖ of a continuous
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.recordings.readers.kalibr import KALIBR_UNITS, kalibr_yaml
 
 __all__ = ["TARGETS", "Key", "Target", "noise_files", "noise_values", "target"]
@@ -150,9 +149,7 @@ def target(name: str) -> str:
     plain = name.strip().lower().replace("_", "-")
     key = {"vins-fusion": "vins", "vins-mono": "vins", "liosam": "lio-sam"}.get(plain, plain)
     if key not in TARGETS:
-        near = difflib.get_close_matches(key, TARGETS, 1)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        raise InputError(f"{name!r} is no estimator known here{hint}; there are {', '.join(TARGETS)}.")
+        raise InputError(f"{name!r} is no estimator known here; {nearest(key, TARGETS)}")
     return key
 
 
@@ -195,8 +192,13 @@ def noise_files(
             made.file: kalibr_yaml({key: (value, "") for key, value in values.items()}, rate, comments=head).encode()
         }
     rows = [made.row.format(key=key.name, value=values[key.name], unit=key.unit) for key in made.keys]
-    tail = made.tail.format(rate=rate, gravity=gravity)
-    lines = [made.opening, *(f"# {text}" for text in head), made.head, *rows, tail]
+    lines = [
+        made.opening,
+        *(f"# {text}" for text in head),
+        made.head,
+        *rows,
+        made.tail.format(rate=rate, gravity=gravity),
+    ]
     return {made.file: ("\n".join(filter(None, lines)) + "\n").encode()}
 
 

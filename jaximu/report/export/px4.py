@@ -107,5 +107,6 @@ def write(parameters: ExportedUnit) -> Written:
             f" PX4 uses them only where {' and '.join(f'CAL_{sensor}{number}_ID' for sensor in left)} are the sensor's:"
             " these are left as they are; state --device to write one device's."
         )
-    text = text_file([*head, *rows])
-    return Written(text, convention, equation, corrections, parameters=parameters, values=dict(values))
+    return Written(
+        text_file([*head, *rows]), convention, equation, corrections, parameters=parameters, values=dict(values)
+    )

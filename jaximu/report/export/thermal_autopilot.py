@@ -137,8 +137,9 @@ class _Targets:
     """
 
     def __init__(self, calibration: Calibration | ThermalCalibration):
-        by_itself = isinstance(calibration, Calibration)
-        self.working, self.calibration = (None, calibration) if by_itself else (calibration, calibration.calibration)
+        self.working, self.calibration = (
+            (None, calibration) if isinstance(calibration, Calibration) else (calibration, calibration.calibration)
+        )
         span = self.calibration.data.get("temperature_range")
         if span is None:
             raise NotPossibleError(
@@ -174,8 +175,7 @@ class _Targets:
             error = error - error.mean(axis=0)
         self.loss[name] = _rms(error)
         if self.working is not None:
-            rest = self.working.blocks.means[name] - written
-            self.left[name] = self.working.blocks.left(name, rest)
+            self.left[name] = self.working.blocks.left(name, self.working.blocks.means[name] - written)
         reading = self.calibration.reading
         return cubic if reading is None else cubic @ reading.autopilot_maps[name]
 
