@@ -16,7 +16,8 @@ import numpy as np
 from common import Table, arguments, finish
 
 from jaximu.estimation.uncertainty import describe
-from jaximu.planning.budget import budget, task
+from jaximu.planning.budget import budget
+from jaximu.planning.setup_errors import task
 from jaximu.report.budget import amount, goal_words, parameter_rows, source_rows
 
 jax.config.update("jax_enable_x64", True)

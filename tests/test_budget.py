@@ -19,9 +19,9 @@ from jaximu.ground.rotation import integrate_rates
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model import BiasInstability, RandomWalk
 from jaximu.planning import budget as planning
-from jaximu.planning.budget import budget, task
+from jaximu.planning.budget import budget
 from jaximu.planning.goals import parse_goal, per_si
-from jaximu.planning.setup_errors import _mean_covariances, scheme_and_sources
+from jaximu.planning.setup_errors import _mean_covariances, scheme_and_sources, task
 from jaximu.report.budget import goal_words
 from jaximu.simulation.protocols import Positions, attitude_of
 

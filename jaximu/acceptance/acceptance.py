@@ -19,11 +19,10 @@ from jaximu.calibration import Calibration
 from jaximu.estimation.problem import flatten, names_of, typical_sizes
 from jaximu.estimation.uncertainty import pose_advice, station_advice
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.errors import FilePath
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import Z95
-
-__all__ = ["SCHEMA", "Acceptance", "Judged", "accept", "judge"]
 
 SCHEMA = "jaximu.acceptance/1"
 _BY_HAND = ("joint", "two-step", "two-step-rk4", "accelerometer")
@@ -37,7 +36,7 @@ class Acceptance(Result, Document, page="certificate"):
     rule: Rule
     file: str
     limits: Mapping[str, str]
-    trace: dict[str, Any] | None = None
+    trace: Json | None = None
     digest: str | None = None
     notes: tuple[str, ...] = ()
 
@@ -51,7 +50,7 @@ class Acceptance(Result, Document, page="certificate"):
         """The unit's serial number, "" where it is not known."""
         return str((self.trace or {}).get("serial", ""))
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the verdict as the JSON document of schema `jaximu.acceptance/1`."""
         return {
             "schema": SCHEMA,
@@ -154,7 +153,7 @@ def accept(
     calibration: Calibration,
     limits: Limits,
     noise: Mapping[str, Any] | None = None,
-    file: str | os.PathLike[str] = "calibration",
+    file: FilePath = "calibration",
 ) -> Acceptance:
     """Hold a calibrated unit to limits.
 

@@ -10,16 +10,14 @@ standard uncertainties to both sides (JCGM 106, 8.3.2 and 8.3.3). *Simple*: the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import student_cdf, student_isf
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
-
-__all__ = ["FAIL", "PASS", "UNDECIDED", "VERDICTS", "Rule", "coverage", "probability_of_conformity", "worst"]
 
 PASS, FAIL, UNDECIDED = "pass", "fail", "undecided"
 VERDICTS = (PASS, UNDECIDED, FAIL)
@@ -68,7 +66,7 @@ class Rule:
             "uncertainties (more with few degrees of freedom)."
         )
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the rule as JSON has it."""
         return {"rule": self.kind, "risk": self.risk, "text": self.words()}
 

@@ -27,8 +27,6 @@ from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.model.conventions import lower_triangular_frame
 from jaximu.model.effects import CATALOGUE
 
-__all__ = ["Epoch", "Scales", "epochs_of", "in_own_axes", "over_temperature", "owner_of", "require_apart"]
-
 Scales = Mapping[str, tuple[FloatArray, FloatArray]]
 """By triad in counts, counts per SI unit (3,) and counts at zero input (3,)."""
 

@@ -31,7 +31,7 @@ from jaximu.estimation.projection import output_error
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import holm
-from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
@@ -40,8 +40,6 @@ from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES, SENSOR_U
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
-
-__all__ = ["RATE", "LimitReached", "Movement", "OutputChange", "UnitHistory", "compare"]
 
 SCHEMA = "jaximu.compare/1"
 RATE = float(np.radians(250.0))
@@ -77,7 +75,7 @@ class Movement:
         """The difference in standard deviations."""
         return self.difference / self.sigma
 
-    def document(self, per: str) -> dict[str, Any]:
+    def document(self, per: str) -> Json:
         """Return it as JSON has it; `per`: unit of time."""
         return {
             "name": self.name,
@@ -169,10 +167,10 @@ class UnitHistory(Result, Document, page="history"):
         except OverflowError:
             return None
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the comparison as the JSON document of schema `jaximu.compare/1`."""
 
-        def reached(limit: LimitReached) -> dict[str, Any]:
+        def reached(limit: LimitReached) -> Json:
             low, high = (end if np.isfinite(end) else None for end in (limit.limit.low, limit.limit.high))
             due = None if limit.after is None else self.due(limit.after)
             return {

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -26,9 +25,8 @@ from jaximu.acceptance.item import Item
 from jaximu.acceptance.line import Line
 from jaximu.acceptance.words import between
 from jaximu.ground.atomic import atomic_write
-from jaximu.ground.errors import InputError
-
-__all__ = ["check_measurements", "write_measurements"]
+from jaximu.ground.document import Json
+from jaximu.ground.errors import FilePath, InputError
 
 _COLUMNS = (
     "device",
@@ -47,7 +45,7 @@ _COLUMNS = (
 _NOT_CALIBRATED = Item("calibration", -np.inf, np.inf, "", "", reason="the unit was not calibrated")
 
 
-def check_measurements(path: str | os.PathLike[str]) -> str:
+def check_measurements(path: FilePath) -> str:
     """Return the suffix of a file for measurements. Raises `InputError` for another."""
     suffix = Path(path).suffix.lower()
     if suffix not in _WRITERS:
@@ -55,7 +53,7 @@ def check_measurements(path: str | os.PathLike[str]) -> str:
     return suffix
 
 
-def write_measurements(verdicts: Sequence[Acceptance] | Line, path: str | os.PathLike[str]) -> None:
+def write_measurements(verdicts: Sequence[Acceptance] | Line, path: FilePath) -> None:
     """Write verdicts by the suffix of `path`, whole or not at all: `.csv`, `.xml` (JUnit) or `.json` (OpenHTF).
 
     Raises `InputError` for another suffix, or where it cannot be written.
@@ -66,7 +64,7 @@ def write_measurements(verdicts: Sequence[Acceptance] | Line, path: str | os.Pat
         temporary.write_bytes(writer(rows))
 
 
-def _of_units(verdicts: Sequence[Acceptance]) -> Iterator[dict[str, Any]]:
+def _of_units(verdicts: Sequence[Acceptance]) -> Iterator[Json]:
     for acceptance in verdicts:
         day = str((acceptance.trace or {}).get("date", ""))
         for item in acceptance.items:
@@ -78,7 +76,7 @@ def _of_units(verdicts: Sequence[Acceptance]) -> Iterator[dict[str, Any]]:
             }
 
 
-def _of_line(line: Line) -> Iterator[dict[str, Any]]:
+def _of_line(line: Line) -> Iterator[Json]:
     table = line.table
     for row, (device, file, day) in enumerate(zip(table.devices, table.files, table.days.tolist(), strict=True)):
         date = "" if np.isnan(day) else str(np.datetime64(int(day), "D"))
@@ -93,18 +91,18 @@ def _of_line(line: Line) -> Iterator[dict[str, Any]]:
         }
 
 
-def _by_unit(rows: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+def _by_unit(rows: list[Json]) -> Iterator[tuple[str, list[Json]]]:
     for (device, _), some in groupby(rows, lambda row: (row["device"], row["file"])):
         yield device, list(some)
 
 
-def _csv(rows: list[dict[str, Any]]) -> bytes:
+def _csv(rows: list[Json]) -> bytes:
     sink = pa.BufferOutputStream()
     pc.write_csv(pa.table({name: [row[name] for row in rows] for name in _COLUMNS}), sink)
     return sink.getvalue().to_pybytes()
 
 
-def _said(row: dict[str, Any]) -> str:
+def _said(row: Json) -> str:
     item: Item = row["item"]
     if item.value is None:
         return item.said() or "no value"
@@ -112,7 +110,7 @@ def _said(row: dict[str, Any]) -> str:
     return f"{text}; the limits are {between(item.low, item.high, item.unit)}. {item.said()}".strip()
 
 
-def _junit(rows: list[dict[str, Any]]) -> bytes:
+def _junit(rows: list[Json]) -> bytes:
     suites = ElementTree.Element("testsuites", name="jaximu accept")
     for device, some in _by_unit(rows):
         count = {verdict: str(sum(row["verdict"] == verdict for row in some)) for verdict in (FAIL, UNDECIDED)}
@@ -136,7 +134,7 @@ def _junit(rows: list[dict[str, Any]]) -> bytes:
     return ElementTree.tostring(suites, encoding="utf-8", xml_declaration=True)
 
 
-def _openhtf(rows: list[dict[str, Any]]) -> bytes:
+def _openhtf(rows: list[Json]) -> bytes:
     records = []
     for device, some in _by_unit(rows):
         verdict = worst([row["verdict"] for row in some])
@@ -174,7 +172,7 @@ def _openhtf(rows: list[dict[str, Any]]) -> bytes:
     return json.dumps(records[0] if len(records) == 1 else records, indent=1, allow_nan=False).encode()
 
 
-def _measurement(row: dict[str, Any]) -> dict[str, Any]:
+def _measurement(row: Json) -> Json:
     low, high = row["low"], row["high"]
     bound = (
         f"{low:g} <= x <= {high:g}" if None not in (low, high) else f"x <= {high:g}" if low is None else f"x >= {low:g}"

@@ -9,8 +9,7 @@ import numpy as np
 
 from jaximu.acceptance.decision import UNDECIDED
 from jaximu.acceptance.limits import Limit
-
-__all__ = ["Item", "deciding"]
+from jaximu.ground.document import Json
 
 _MOST = 100.0
 """Times the poses from which no recording is advised any more."""
@@ -49,7 +48,7 @@ class Item:
         """Return why it is undecided and what would decide it, in sentences; "" where nothing is to be said."""
         return " ".join(filter(None, (self.reason and f"{self.reason[:1].upper()}{self.reason[1:]}.", self.advice)))
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the item as JSON has it; uncertainty is expanded, k = 2."""
         return {
             "name": self.name,

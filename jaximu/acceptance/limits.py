@@ -39,14 +39,12 @@ import numpy as np
 
 from jaximu.acceptance.decision import Rule, probability_of_conformity
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import file_digest, read_toml
-from jaximu.ground.errors import InputError, only
+from jaximu.ground.document import Json, file_digest, read_toml
+from jaximu.ground.errors import FilePath, InputError, only
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS, unit
 from jaximu.model.data_sheet import SI_UNITS, parse_quantity
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.columns.nominal import parse_offset, parse_scale
-
-__all__ = ["FROM_ALLAN", "OF_ONE_UNIT", "OUTPUTS", "TYPICAL", "Limit", "Limits", "read_limits"]
 
 TYPICAL = 3.0
 """Limit of what a data sheet calls typical, in typical values: 99.7 % of a normal population lie within."""
@@ -96,7 +94,7 @@ class Limit:
         """Return how far a value is from the nearer bound."""
         return min(abs(self.high - value), abs(value - self.low))
 
-    def judged(self, rule: Rule, value: float, sigma: float) -> dict[str, Any]:
+    def judged(self, rule: Rule, value: float, sigma: float) -> Json:
         """Return what an item says of a value that is normally distributed with this standard uncertainty."""
         probability = probability_of_conformity(value, sigma, self.low, self.high)
         verdict = str(rule.verdicts(probability, self.low <= value <= self.high))
@@ -123,7 +121,7 @@ class Limits:
         return limit.axes == named or (not limit.axes and named not in others)
 
 
-def read_limits(path: str | os.PathLike[str], rule: str | None = None, risk: float | None = None) -> Limits:
+def read_limits(path: FilePath, rule: str | None = None, risk: float | None = None) -> Limits:
     """Read limits. Raises `InputError` naming file and key for what is no limit, has no unit or contradicts itself.
 
     **Arguments:** `rule`, `risk`: instead of the file's.

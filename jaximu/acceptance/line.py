@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -34,25 +33,14 @@ from jaximu.acceptance.statistics import (
 from jaximu.acceptance.words import amount, si_unit, spoken
 from jaximu.fleets.population import LEVEL, days_of, read_fleet
 from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, covariances, free_places, require_table
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.distributions import student_cdf
-from jaximu.ground.document import Document, file_digest
-from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.document import Document, Json, file_digest
+from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.units import SENSORS
 from jaximu.model.sensor import Imu
-
-__all__ = [
-    "Alarm",
-    "Batch",
-    "FollowedQuantity",
-    "Line",
-    "follow",
-    "population_limits",
-    "read_table",
-    "write_verdicts",
-]
 
 _FEWEST = 8  # units of a chart
 _GOLDEN = 4  # recordings of a unit from which its drift is asked about
@@ -89,7 +77,7 @@ class Batch:
 
     file: str
     total: int
-    rows: NDArray[np.int64]
+    rows: IntArray
     units: Units
     devices: tuple[str, ...]
     files: tuple[str, ...]
@@ -138,7 +126,7 @@ class FollowedQuantity:
     limit: Limit | None
     capability: Capability | None
     lots: dict[str, Capability]
-    charts: dict[str, tuple[Chart, NDArray[np.int64]]]
+    charts: dict[str, tuple[Chart, IntArray]]
     gauge: Gauge | None
     drift: Drift | None
 
@@ -192,14 +180,14 @@ class Line(Result, Document, page="line"):
 
     def _item(self, judged: Judged, row: int, index: int) -> Item:
         at, measured = judged.places[index], judged.measured
-        numbers: dict[str, Any] = {"reason": "not determined"}
+        numbers: Json = {"reason": "not determined"}
         if at >= 0 and measured.determined[row, at]:
             numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
             numbers["probability"] = float(judged.probability[row, index])
         verdict = str(judged.verdict[row, index])
         return Item.of(judged.limits[index], judged.names[index], verdict=verdict, **numbers)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return verdicts and statistics as JSON has them; single units' verdicts stand in the table."""
         items = [item.document() | {"device": device} for device, item in self.items()]
         limits = self.limits
@@ -218,7 +206,7 @@ class Line(Result, Document, page="line"):
         }
 
 
-def _entry(quantity: FollowedQuantity) -> dict[str, Any]:
+def _entry(quantity: FollowedQuantity) -> Json:
     able = quantity.capability
     return {
         "name": quantity.name,
@@ -251,7 +239,7 @@ def _entry(quantity: FollowedQuantity) -> dict[str, Any]:
 # --- the table --------------------------------------------------------------------------------------------------------
 
 
-def read_table(path: str | os.PathLike[str]) -> Batch:
+def read_table(path: FilePath) -> Batch:
     """Read the calibrated rows of a fleet's table.
 
     Raises `InputError` where it is no such table, `NotPossibleError` where nothing in it was calibrated.
@@ -277,7 +265,7 @@ def read_table(path: str | os.PathLike[str]) -> Batch:
         return tuple(text or "" for text in kept[column].to_pylist()) if known else ("",) * len(rows)
 
     triads = {short: SENSORS[short] for short in ("accel", "gyro")[: 1 + gyroscope]}
-    outputs: dict[str, Any] = {}
+    outputs: Json = {}
     for short, owner in triads.items():
         output_units = sorted(set(words(f"{short}_unit")))
         if len(output_units) > 1:
@@ -331,7 +319,7 @@ def _conditions(
     return conditions
 
 
-def population_limits(path: str | os.PathLike[str], rule: Rule) -> Limits:
+def population_limits(path: FilePath, rule: Rule) -> Limits:
     """Return limits that hold 99 % of a table's population with 95 % confidence, for each parameter of both triads.
 
     Units that do not belong to the population, as `jaximu fleet` names them, are left out, and of each device the first
@@ -365,7 +353,7 @@ def _in_counts(table: Batch, nominal: Mapping[str, tuple[FloatArray, FloatArray]
     return {owner: scales for owner, scales in nominal.items() if triads[owner].output_unit == "count"}
 
 
-def _first_recordings(table: Batch) -> NDArray[np.int64]:
+def _first_recordings(table: Batch) -> IntArray:
     """Return the place of each device's first recording, by date, in the order of the dates; undated ones come last."""
     order = np.argsort(np.where(np.isnan(table.days), np.inf, table.days), kind="stable")
     first = np.unique(np.array(table.devices)[order], return_index=True)[1]
@@ -440,7 +428,7 @@ def _when(table: Batch, row: int) -> str:
 def _alarms(
     table: Batch,
     name: str,
-    charts: dict[str, tuple[Chart, NDArray[np.int64]]],
+    charts: dict[str, tuple[Chart, IntArray]],
     course: Drift | None,
     golden: str,
     questions: int,
@@ -474,7 +462,7 @@ def _alarms(
     return alarms
 
 
-def _groups(labels: Sequence[str], first: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+def _groups(labels: Sequence[str], first: IntArray) -> dict[str, IntArray]:
     """Return the places of units with the same label, of labels with enough of them; empty where there is but one."""
     of_first = np.array(labels)[first]
     names = [label for label in sorted(set(of_first.tolist())) if label]
@@ -485,10 +473,10 @@ def _groups(labels: Sequence[str], first: NDArray[np.int64]) -> dict[str, NDArra
 
 def _compared(
     kind: str,
-    groups: dict[str, NDArray[np.int64]],
+    groups: dict[str, IntArray],
     name: str,
     values: FloatArray,
-    first: NDArray[np.int64],
+    first: IntArray,
     questions: int,
 ) -> list[Alarm]:
     """Name the stations or lots whose units (first,) differ from the others', the surest first."""
@@ -509,7 +497,7 @@ def _compared(
     return alarms
 
 
-def _shift(values: FloatArray, inside: NDArray[np.bool_], all_of: NDArray[np.bool_]) -> tuple[float, float]:
+def _shift(values: FloatArray, inside: BoolArray, all_of: BoolArray) -> tuple[float, float]:
     """Return by how much the values inside differ from the others in the mean, and the p-value of Welch's test."""
     sides = values[inside], values[all_of & ~inside]
     parts = np.array([np.var(side, ddof=1) / len(side) for side in sides])
@@ -518,7 +506,7 @@ def _shift(values: FloatArray, inside: NDArray[np.bool_], all_of: NDArray[np.boo
     return shift, 2 * float(student_cdf(-abs(shift) / np.sqrt(variance), freedom))
 
 
-def write_verdicts(line: Line, path: str | os.PathLike[str]) -> None:
+def write_verdicts(line: Line, path: FilePath) -> None:
     """Write the fleet's table with the columns `acceptance` (pass, fail, undecided) and `not_passed` (items), whole.
 
     Raises `InputError` where it cannot be written.

@@ -24,8 +24,6 @@ from jaximu.navigation.trajectory import Place, level_driving
 from jaximu.noise.stated import sensor_noise
 from jaximu.planning.information import gravity_sensitivity
 
-__all__ = ["navigation_items"]
-
 _LATITUDE = 45.0  # deg, of the path
 _UP = 8  # of the nine errors: the rotation about the vertical
 

@@ -17,13 +17,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from numpy.typing import NDArray
 
 from jaximu.acceptance.limits import Limit
 from jaximu.calibration import Calibration
@@ -31,15 +29,14 @@ from jaximu.estimation.problem import Name, flatten, names_of, typical_sizes, un
 from jaximu.estimation.projection import output_error
 from jaximu.estimation.uncertainty import UNDETERMINED
 from jaximu.ground import stored
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSORS
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.planning.chunks import in_chunks
-
-__all__ = ["Measured", "Units", "measure", "of_calibration", "output_stimulus", "share_of"]
 
 _CHUNK = 512  # units that are computed at once
 _GRID = np.array([point for point in product(range(-2, 3), repeat=3) if max(map(abs, point)) == 2], float)
@@ -77,8 +74,8 @@ class Measured:
     sigma: FloatArray
     gravity: FloatArray
     freedom: FloatArray
-    determined: NDArray[np.bool_]
-    fixed: NDArray[np.bool_]
+    determined: BoolArray
+    fixed: BoolArray
     slope: FloatArray
 
 
@@ -193,7 +190,7 @@ def _parameter_names(imu: Imu) -> list[str]:
 
 def output_stimulus(limit: Limit, imu: Imu) -> Stimulus:
     """Return the inputs (points, 3) of a range: 98 directions at its end, at the ends and the middle of temperature."""
-    inputs: dict[str, Any] = {SENSOR_QUANTITIES[limit.owner]: limit.over * _GRID}
+    inputs: Json = {SENSOR_QUANTITIES[limit.owner]: limit.over * _GRID}
     if limit.temperature is not None:
         low, high = limit.temperature
         warmth = np.repeat([low, (low + high) / 2, high], len(_GRID))

@@ -4,27 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, f_tails, normal_isf, student_cdf
-
-__all__ = [
-    "Capability",
-    "Chart",
-    "Drift",
-    "Gauge",
-    "capability",
-    "control_chart",
-    "drift",
-    "gauge",
-    "tolerance_factor",
-    "with_ends",
-]
+from jaximu.ground.document import Json
 
 _WEIGHT = 0.2  # of the newest value in the moving average
 _MEAN_RANGE = 2 / np.sqrt(np.pi)  # mean range of two normal numbers, d2 = 1.128
@@ -83,9 +69,9 @@ class Chart:
     deviation: float
     bound: float
     average_bound: FloatArray
-    beyond: NDArray[np.int64]
-    jumps: NDArray[np.int64]
-    drifting: NDArray[np.int64]
+    beyond: IntArray
+    jumps: IntArray
+    drifting: IntArray
 
 
 def control_chart(values: FloatArray, level: float) -> Chart:
@@ -147,7 +133,7 @@ class Gauge:
         """Number of distinct categories: 1.41 times the parts' deviation over the gauge's, cut to a whole number."""
         return int(_CATEGORIES * self.parts / self.total) if self.total > 0 else 0
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return it as JSON has it."""
         return {
             "repeatability": with_ends(self.repeatability),

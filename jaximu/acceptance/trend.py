@@ -16,8 +16,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, student_cdf, student_isf
-
-__all__ = ["Sameness", "StraightLine", "sameness"]
+from jaximu.ground.document import Json
 
 _ROUNDING = 1e-12
 """Of the largest eigenvalue of a correlation matrix: what is below it is no direction of its own."""
@@ -38,7 +37,7 @@ class Sameness:
     freedom: int
     p_value: float
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return it as JSON has it."""
         return {"chi_squared": self.statistic, "degrees_of_freedom": self.freedom, "p_value": self.p_value}
 
@@ -127,7 +126,7 @@ class StraightLine:
         times = [float(t.real) for t in solutions if not t.imag and t.real > 0 and distance - approach * t.real >= 0]
         return min(times, default=None)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the drift as JSON has it, per unit of time."""
         return {
             "value": self.slope,

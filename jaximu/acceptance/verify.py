@@ -8,14 +8,12 @@ chain is its last hash, kept elsewhere (on the printed certificate).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from jaximu.ground.document import digest, file_digest, read_document
-
-__all__ = ["CHANGED", "INTACT", "Link", "state_of", "verify"]
+from jaximu.ground.errors import FilePath
 
 INTACT, CHANGED, MISSING, UNSEALED = "intact", "changed", "not found", "without a hash"
 
@@ -29,7 +27,7 @@ class Link:
     state: str
 
 
-def verify(path: str | os.PathLike[str], folder: str | os.PathLike[str] | None = None) -> list[Link]:
+def verify(path: FilePath, folder: FilePath | None = None) -> list[Link]:
     """Check a document of jaximu and everything that it names by its hash.
 
     **Arguments:** `folder`: where files are looked for as well that are not where they were; the document's own folder
@@ -40,7 +38,7 @@ def verify(path: str | os.PathLike[str], folder: str | os.PathLike[str] | None =
     return list(_links(Path(path), [Path(path).parent, *([Path(folder)] if folder is not None else [])], "document"))
 
 
-def state_of(path: str | os.PathLike[str]) -> str:
+def state_of(path: FilePath) -> str:
     """Return the state of a document by itself, without the files behind it."""
     return next(_links(Path(path), [], "document")).state
 

@@ -10,8 +10,6 @@ from jaximu.ground.quantities import number, plain, unit_text
 from jaximu.ground.units import SENSOR_UNITS, STANDARD_GRAVITY
 from jaximu.model.data_sheet import parse_quantity
 
-__all__ = ["amount", "between", "in_shown_unit", "si_unit", "spoken"]
-
 _SHOWN = {
     "m/s^2": ("mm/s²", 1e3),
     "rad/s": ("°/s", 180 / math.pi),

@@ -8,20 +8,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
     from jaximu.acceptance import Acceptance, Limits, Line
     from jaximu.calibration import Calibration
 
-__all__ = ["AcceptCommand", "limits_of", "write_line"]
 
 _STATUS = {"pass": 0, "fail": 3, "undecided": 4}
 
@@ -218,7 +218,7 @@ def _refuse_doubled(calibrations: Sequence[Calibration], paths: Sequence[Path]) 
         earlier[serial] = path
 
 
-def _together(acceptances: Sequence[Acceptance], verdict: str) -> dict[str, Any]:
+def _together(acceptances: Sequence[Acceptance], verdict: str) -> Json:
     """Return one document of several units, whose items say which unit they are of."""
     documents = [acceptance.document() for acceptance in acceptances]
     items = [

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.ground.document import Json
 from jaximu.ground.gravity import STANDARD
 
 if TYPE_CHECKING:
     from jaximu.noise.analysis import NoiseAnalysis
-
-__all__ = ["AllanCommand", "document"]
 
 
 @dataclass(frozen=True)
@@ -54,13 +53,13 @@ class AllanCommand:
         )
 
 
-def document(analysis: NoiseAnalysis) -> dict[str, Any]:
+def document(analysis: NoiseAnalysis) -> Json:
     """Return `allan.json`: the analysis, `mean` (each term over a triad's axes, see `mean_terms`), and `filter`."""
     from jaximu.ground.units import SENSOR_QUANTITIES
     from jaximu.model.data_sheet import SI_UNITS
     from jaximu.noise.filter_noise import filter_document, mean_terms
 
-    mean: dict[str, Any] = {}
+    mean: Json = {}
     for name, quantity in SENSOR_QUANTITIES.items():
         terms = mean_terms(analysis.axes[name]) if name in analysis.axes else None
         mean[name] = terms and {

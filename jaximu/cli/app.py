@@ -14,8 +14,6 @@ from jaximu.cli.streams import open_streams
 from jaximu.cli.usage import check_options, command_of, completion, help_text, listed, usage_mistake
 from jaximu.ground.errors import InputError, JaximuError, command_line
 
-__all__ = ["GROUPS", "VERBS", "command", "main"]
-
 VERBS = (
     "info",
     "demo",

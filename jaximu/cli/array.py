@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 
-__all__ = ["ArrayCommand"]
-
 
 @dataclass(frozen=True)
 class ArrayCommand(options.Fits):

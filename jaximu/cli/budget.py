@@ -14,8 +14,6 @@ from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
-__all__ = ["BudgetCommand"]
-
 
 @dataclass(frozen=True)
 class BudgetCommand:
@@ -52,8 +50,9 @@ class BudgetCommand:
             print(inspect.getdoc(planning))
             return
         from jaximu.planning.goals import parse_goal
+        from jaximu.planning.setup_errors import read_task
 
-        task = planning.read_task(self.specification_file)
+        task = read_task(self.specification_file)
         task = replace(task, goals=(*task.goals, *map(parse_goal, self.goal)))
         self.results.prepare()
         with progress("propagating errors"):

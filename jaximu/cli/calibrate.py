@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from jaximu.calibration import Calibration
     from jaximu.ground.gravity import LocalGravity
 
-__all__ = ["CalibrateCommand"]
-
 
 @dataclass(frozen=True)
 class CalibrateCommand(options.Fits):

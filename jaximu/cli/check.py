@@ -10,8 +10,6 @@ from tyro.conf import arg
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 
-__all__ = ["CheckCommand"]
-
 
 @dataclass(frozen=True)
 class CheckCommand(options.Fits):

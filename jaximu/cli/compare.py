@@ -13,8 +13,6 @@ from jaximu.cli.messages import progress
 from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
-__all__ = ["CompareCommand"]
-
 
 @dataclass(frozen=True)
 class CompareCommand:

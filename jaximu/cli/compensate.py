@@ -10,8 +10,6 @@ from jaximu.cli import options
 from jaximu.cli.messages import progress, say
 from jaximu.cli.options import option
 
-__all__ = ["CompensateCommand"]
-
 
 @dataclass(frozen=True)
 class CompensateCommand:

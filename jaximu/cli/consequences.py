@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from jaximu.navigation.trajectory import Place, Trajectory
     from jaximu.noise.stated import SensorNoise
 
-__all__ = ["ConsequencesCommand"]
 
 _LATITUDE = 45.0
 _LIMITS = {"accelerometer": ("--accel-range", "specific_force"), "gyroscope": ("--gyro-range", "angular_rate")}

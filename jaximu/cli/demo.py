@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from jaximu.model.effects import Effect
     from jaximu.model.sensor import Imu
 
-__all__ = ["DemoCommand"]
 
 _HIDDEN = {
     "accel.quadratic": 3e-4,

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from jaximu.diagnosis import Diagnosis
     from jaximu.ground.gravity import LocalGravity
 
-__all__ = ["DiagnoseCommand", "give_diagnosis"]
-
 
 @dataclass(frozen=True)
 class DiagnoseCommand(options.Fits):

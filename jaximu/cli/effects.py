@@ -5,12 +5,13 @@ from __future__ import annotations
 import difflib
 import inspect
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.options import option
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.page import Page, Section, Table
 from jaximu.ground.quantities import joined, plain, unit_text
@@ -19,7 +20,6 @@ from jaximu.ground.reexport import later
 if TYPE_CHECKING:
     from jaximu.model.effects import Effect
 
-__all__ = ["EffectsCommand"]
 
 _SCOPES = {
     "device": "device: belongs to the unit and holds in other recordings",
@@ -58,7 +58,7 @@ class EffectsCommand:
             later("report.terminal", "show")(_catalogue(kinds) if self.name is None else _page(kinds[0]))
 
 
-def _entry(kind: type[Effect]) -> dict[str, Any]:
+def _entry(kind: type[Effect]) -> Json:
     return {
         "name": kind.name,
         "description": inspect.getdoc(kind),

@@ -16,8 +16,6 @@ from jaximu.ground.reexport import later
 from jaximu.report.export.catalogue import WRITERS, writer
 from jaximu.report.export.noise import TARGETS
 
-__all__ = ["ExportCommand"]
-
 
 @dataclass(frozen=True)
 class ExportCommand:

@@ -15,8 +15,6 @@ from jaximu.cli.reference import read_reference
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 
-__all__ = ["FilterCommand"]
-
 
 @dataclass(frozen=True)
 class FilterCommand(options.Fits):

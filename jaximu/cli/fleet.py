@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from jaximu.fleets.population import Fleet
     from jaximu.ground.page import Page
 
-__all__ = ["FleetCommand"]
 
 _EVERY = 10.0
 """Seconds between two lines of progress where stderr is no terminal."""

@@ -6,23 +6,21 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
+from jaximu.ground.array_types import BoolArray
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.quantities import Z95, listed, sentence, with_interval
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from jaximu.ground.array_types import FloatArray
     from jaximu.recordings.columns.guess import Advice
     from jaximu.recordings.recording import Recording, Signal
 
-__all__ = ["InfoCommand", "Use", "allowed", "describe", "read_openly"]
 
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
 _PARTS = 8  # of a rest, by which the interval of its mean is told
@@ -168,7 +166,7 @@ def _shown(advice: Advice) -> str:
 
 def describe(
     recording: Recording, advice: Advice | None = None, guessed: list[str] | None = None
-) -> tuple[dict[str, Any], list[Use]]:
+) -> tuple[Json, list[Use]]:
     """Return what the log holds, what was noticed, and what it can be used for, as `--json` prints it; and its uses."""
     from jaximu.mistakes import prepare
     from jaximu.report.recording import signal_facts
@@ -363,7 +361,7 @@ def _tilt(signal: Signal, intervals: FloatArray) -> float:
     return float(np.degrees(np.arccos(np.clip(up @ middle / max(np.linalg.norm(middle), 1e-9), -1.0, 1.0))).max())
 
 
-def _still_seconds(recording: Recording) -> tuple[float, NDArray[np.bool_], FloatArray]:
+def _still_seconds(recording: Recording) -> tuple[float, BoolArray, FloatArray]:
     """When the first of all seconds begins; which (n,) are at rest, by their scatter and how their means move; and the
     means (n, 3) in them of the gyroscope, rad/s, or none.
     """

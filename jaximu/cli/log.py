@@ -19,6 +19,7 @@ from jaximu.cli import options
 from jaximu.cli.info import Use, describe, in_other_units, read_openly
 from jaximu.cli.messages import progress, say
 from jaximu.cli.usage import command_of
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.quantities import sentence
 from jaximu.ground.reexport import later
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from jaximu.ground.page import Page
     from jaximu.recordings.columns.guess import Advice, OpenPoint
 
-__all__ = ["LogCommand"]
 
 _ORDER = ("calibrate", "diagnose", "turntable", "reference", "filter", "magnetometer", "allan", "thermal")
 """Verbs that need no more than logs."""
@@ -96,7 +96,7 @@ class _Content:
 
     path: Path
     log: options.LogOptions
-    document: dict[str, Any]
+    document: Json
     uses: Sequence[Use]
 
     def allows(self, verb: str) -> bool:
@@ -194,11 +194,11 @@ def _settled(path: Path, log: options.LogOptions, asker: _Asker) -> tuple[option
     return log, None
 
 
-def _advised(path: Path, log: options.LogOptions) -> tuple[Advice | None, dict[str, Any]]:
+def _advised(path: Path, log: options.LogOptions) -> tuple[Advice | None, Json]:
     """Return how the columns of a log can be understood, and the options that say it; a "?" is left open."""
     from jaximu.recordings.readers import advise_reading
 
-    values: dict[str, Any] = {name: getattr(log, name) for name in _READ_AS}
+    values: Json = {name: getattr(log, name) for name in _READ_AS}
     if log.columns is not None:
         blanks = {"rate": "time" not in log.columns, "gyro_scale": "gyro [count]" in log.columns}
         return None, values | {name: "?" for name, blank in blanks.items() if blank and values[name] is None}
@@ -213,7 +213,7 @@ def _advised(path: Path, log: options.LogOptions) -> tuple[Advice | None, dict[s
     return advice, values
 
 
-def _numbers(values: Mapping[str, Any]) -> dict[str, Any]:
+def _numbers(values: Mapping[str, Any]) -> Json:
     """Return options with the rate as a number, where it is known."""
     rate = values["rate"]
     try:
@@ -309,7 +309,7 @@ class _Collected(options.Results):
 
 def _commands(
     contents: Sequence[_Content], references: Sequence[Path], local: options.GravityOptions, noise: options.NoiseOptions
-) -> dict[str, Any]:
+) -> Json:
     """Return what the logs allow, ready to run: each verb with all the logs that allow it and are read alike."""
     by_hand = [content for content in contents if content.allows("diagnose")]
     rests = [content.path for content in contents if content not in by_hand and content.allows("allan")]
@@ -319,7 +319,7 @@ def _commands(
     commands = {}
     for verb in _ORDER:
         logs = [content for content in contents if content.allows(verb)]
-        stated: dict[str, Any] = {"local": local, "noise": noise}
+        stated: Json = {"local": local, "noise": noise}
         if verb == "reference" and references and not logs:
             logs = [content for content in contents if "gyroscope" in content.document["signals"]]
             stated["reference"] = references[0]
@@ -350,7 +350,7 @@ def _run_all(commands: Mapping[str, Any]) -> tuple[dict[str, _Outcome], dict[str
     return _ordered(outcomes), _ordered(refused)
 
 
-def _ordered(by_verb: Mapping[str, Any]) -> dict[str, Any]:
+def _ordered(by_verb: Mapping[str, Any]) -> Json:
     return {verb: by_verb[verb] for verb in _ORDER if verb in by_verb}
 
 
@@ -418,7 +418,7 @@ class _Report:
             whole,
         )
 
-    def _document(self, after: str) -> dict[str, Any]:
+    def _document(self, after: str) -> Json:
         printed = {verb: json.loads(outcome.text()) for verb, outcome in self.outcomes.items()}
         verdict = printed[self.lead].get("verdict") or " ".join(self.outcomes[self.lead].page().verdict[:1])
         return {

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import UseAppendAction
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
 from jaximu.cli.options import option
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from jaximu.calibration import FieldStrength, MagneticLog
     from jaximu.model.effects import Effect
 
-__all__ = ["MagnetometerCommand"]
 
 _NEAR_THE_EQUATOR = 20.0  # degrees of latitude within which the field may point up or down
 
@@ -104,7 +104,7 @@ class MagnetometerCommand(options.Reads):
 
 
 def _strength(
-    text: str | None, local: options.Local, longitude: float | None, trace: dict[str, Any] | None
+    text: str | None, local: options.Local, longitude: float | None, trace: Json | None
 ) -> FieldStrength | None:
     """Return the field as it was stated, or of the World Magnetic Model, or None where nothing is known."""
     if longitude is not None:

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-__all__ = ["level", "progress", "say"]
-
 level = 1
 """0: errors alone; 1: stages, and how long those that are slow took; 2: how long every stage took."""
 _LONG = 2.0  # s; a stage that takes longer says how long it took

@@ -17,6 +17,7 @@ from tyro.conf import Positional, Suppress, UseAppendAction, arg
 
 from jaximu.cli.messages import progress, say
 from jaximu.ground.atomic import write_folder
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, JaximuError, readable
 from jaximu.ground.gravity import STANDARD, LocalGravity, parse_gravity, wgs84_gravity
 from jaximu.ground.magnetic_field import FieldStrength
@@ -33,47 +34,6 @@ if TYPE_CHECKING:
     from jaximu.recordings.readers import ReadOptions
     from jaximu.recordings.recording import Recording
     from jaximu.recordings.segmentation import SegmentationOptions
-
-__all__ = [
-    "INERTIAL",
-    "LOCAL",
-    "NOISE",
-    "POSES",
-    "READING",
-    "RESULTS",
-    "TRACED",
-    "CalibrationFile",
-    "EffectNames",
-    "FieldText",
-    "Fits",
-    "ForceFlag",
-    "JsonFlag",
-    "Local",
-    "LogOptions",
-    "Logs",
-    "LossChoice",
-    "Noise",
-    "NoiseFile",
-    "NoiseOptions",
-    "Output",
-    "Poses",
-    "Reading",
-    "Reads",
-    "RepairFlag",
-    "Results",
-    "Traced",
-    "beginning",
-    "draw",
-    "effects_of",
-    "field_strength",
-    "is_toml",
-    "option",
-    "print_json",
-    "require_apart",
-    "require_files",
-    "stated_noise",
-    "typed",
-]
 
 
 def option(metavar: str, text: str, **more: Any) -> Any:
@@ -352,7 +312,7 @@ class TraceOptions:
     fixture: Annotated[str | None, option("TEXT", "What the unit is mounted in.")] = None
     date: Annotated[str | None, option("DATE", "Date of the calibration, such as 2026-03-04.")] = None
 
-    def value(self, logs: tuple[Path, ...]) -> dict[str, Any] | None:
+    def value(self, logs: tuple[Path, ...]) -> Json | None:
         """Return what the file, the file beside the first log and the options say; None where nothing is said."""
         from jaximu.recordings.trace import read_trace, sidecar
 
@@ -517,7 +477,7 @@ def print_json(value: Any) -> None:
     print(json.dumps(value, indent=1, allow_nan=False))
 
 
-def effects_of(stated: tuple[str, ...]) -> dict[str, Any]:
+def effects_of(stated: tuple[str, ...]) -> Json:
     """Return, as the library's arguments, the effects that options name and the deviations stated as NAME+-SIGMA."""
     names, sigmas = [], {}
     for text in stated:

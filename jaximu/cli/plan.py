@@ -17,8 +17,6 @@ from jaximu.ground.errors import InputError
 if TYPE_CHECKING:
     from jaximu.planning import Known
 
-__all__ = ["PlanCommand"]
-
 
 @dataclass(frozen=True)
 class PlanCommand(options.Reads):

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from jaximu.recordings.readers.stream import Lines
     from jaximu.recordings.recording import Recording
 
-__all__ = ["RecordCommand"]
 
 _FIRST = 100  # lines before the log is read for the first time
 _EARLY = 1000  # lines from which on a log that cannot be read is a mistake

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from jaximu.recordings.attitude import Attitude
     from jaximu.recordings.recording import Recording
 
-__all__ = ["ReferenceCommand", "read_reference"]
-
 
 @dataclass(frozen=True)
 class ReferenceCommand(options.Fits):

@@ -20,7 +20,6 @@ from jaximu.ground.errors import InputError
 if TYPE_CHECKING:
     from jaximu.report.guide import LivePage
 
-__all__ = ["PageServer", "open_in_browser"]
 
 _HOST = "127.0.0.1"
 _WAIT = 1.0  # s after which a browser that waits for a change is sent what there is, or a sign of life

@@ -17,8 +17,6 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.page import Code, Page, Section
 from jaximu.ground.reexport import later
 
-__all__ = ["SimulateCommand"]
-
 
 @dataclass(frozen=True)
 class SimulateCommand:

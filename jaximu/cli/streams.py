@@ -7,8 +7,6 @@ import os
 import sys
 import unicodedata
 
-__all__ = ["open_streams"]
-
 _SPELLED = {
     "−": "-",
     "–": "-",

@@ -14,8 +14,6 @@ from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 from jaximu.ground.reexport import later
 
-__all__ = ["ThermalCommand"]
-
 
 @dataclass(frozen=True)
 class ThermalCommand(options.Fits):

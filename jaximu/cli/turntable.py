@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from jaximu.recordings.recording import Recording
     from jaximu.recordings.reference import Entry
 
-__all__ = ["TurntableCommand", "references_of"]
-
 
 @dataclass(frozen=True)
 class TurntableCommand(options.Fits):

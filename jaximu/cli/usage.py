@@ -19,19 +19,6 @@ from typing import Any
 from jaximu.cli.messages import say
 from jaximu.ground.errors import InputError
 
-__all__ = [
-    "COMMON",
-    "EXIT_STATUS",
-    "OptionHelp",
-    "check_options",
-    "command_of",
-    "completion",
-    "help_text",
-    "listed",
-    "options_of",
-    "usage_mistake",
-]
-
 EXIT_STATUS = (
     "Exit status: 0 done; 1 understood but not possible (the message says what to record); 2 bad input or usage."
 )

@@ -13,8 +13,6 @@ from jaximu.cli.options import option
 from jaximu.ground.page import Page, Table
 from jaximu.ground.reexport import later
 
-__all__ = ["VerifyCommand"]
-
 
 @dataclass(frozen=True)
 class VerifyCommand:

@@ -30,7 +30,7 @@ from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
-from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.page import Result
@@ -86,7 +86,7 @@ class BoardRecording:
     file: str
     unit: str
     session: str
-    diagnosis: dict[str, Any]
+    diagnosis: Json
     named: tuple[Named, ...]
     chi2_heldout: float
     evidence: Evidence
@@ -131,7 +131,7 @@ class BoardRecording:
         """Its unit and session, in words."""
         return f"unit {self.unit} in session {self.session}"
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the recording as `diagnosis.json` has it."""
         return {
             "file": self.file,
@@ -405,7 +405,7 @@ class Attributed:
     values: dict[str, list[float]] = field(default_factory=dict)
     unit: str = ""
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the finding as `diagnosis.json` has it."""
         return {**vars(self), "units": list(self.units), "sessions": list(self.sessions)}
 
@@ -444,7 +444,7 @@ class Attribution(Result, Document, page="attribution"):
             return "unexplained"
         return "effects" if "effects" in verdicts or self.findings else "adequate"
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the board's diagnosis as a document of schema `jaximu.diagnosis/1`.
 
         Of effects, checks and what could hide it keeps the most striking recording's, by name.
@@ -518,9 +518,9 @@ class Attribution(Result, Document, page="attribution"):
         ] + [f"{file} was skipped: {why}" for file, why in self.skipped.items()]
 
 
-def _by_name(documents: Sequence[dict[str, Any]], key: str, rank: Callable[[dict[str, Any]], float]) -> list[dict]:
+def _by_name(documents: Sequence[Json], key: str, rank: Callable[[Json], float]) -> list[dict]:
     """Return of all recordings' entries of a list the first of each name, in order of rank."""
-    entries: dict[str, dict[str, Any]] = {}
+    entries: dict[str, Json] = {}
     for entry in sorted((entry for document in documents for entry in document[key]), key=rank):
         entries.setdefault(entry["name"], entry)
     return list(entries.values())

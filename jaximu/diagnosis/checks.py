@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from jaximu.estimation.leave_out import off
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, holm, kolmogorov_sf
+from jaximu.ground.document import Json
 
 _KINDS = {
     "gravity_norm": ("gravity norm at rest", "the magnitude of the specific force in the poses"),
@@ -36,7 +36,7 @@ class Check:
     text: str
     adjusted: float = 1.0
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the check as `diagnosis.json` has it."""
         return {
             "name": self.name,

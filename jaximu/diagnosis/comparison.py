@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.diagnosis.evidence import EffectBlock, Evidence
@@ -17,7 +16,7 @@ from jaximu.estimation.data import About, Data
 from jaximu.estimation.fitting import Prior, effect_numbers, fit
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, without_equipment
 from jaximu.estimation.uncertainty import label
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.model.effects import CATALOGUE
@@ -235,7 +234,7 @@ class Fresh:
         left = np.eye(len(right)) - slope @ covariance @ slope.T
         return cls(old.imu, difference, new, new + old.covariance, right + slope @ difference, left, True)
 
-    def known(self, old: Old) -> NDArray[np.bool_]:
+    def known(self, old: Old) -> BoolArray:
         """Which parameters (p,) the recording tells at all."""
         return np.sqrt(np.diag(self.covariance)) < _COMPARABLE * old.sizes
 

@@ -31,7 +31,7 @@ from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import fit
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.page import Result
@@ -134,7 +134,7 @@ class Named:
         """Return the most that it adds, with its unit."""
         return size(self.largest, "m/s^2" if self.triad == "accelerometer" else "rad/s")
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the effect as `diagnosis.json` has it."""
         inner = {
             name: {
@@ -158,7 +158,7 @@ class Named:
             "evidence": self.evidence,
         }
 
-    def _improvement(self, gain: Gain) -> dict[str, Any]:
+    def _improvement(self, gain: Gain) -> Json:
         kind = gain.best_kind(self.effect)
         (before, unit), (after, _) = gain.before.rms[kind], gain.after.rms[kind]
         return {
@@ -230,7 +230,7 @@ class Diagnosis(Result, Document, page="diagnosis"):
         """The effects that are terms of the model."""
         return tuple(effect for effect in self.effects if isinstance(effect, Named))
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the diagnosis as the JSON document of schema `jaximu.diagnosis/1`."""
         return {
             "schema": SCHEMA,

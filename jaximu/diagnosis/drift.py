@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.data.drift import (
     DRIFT_ESTIMATED,
@@ -25,7 +24,7 @@ from jaximu.data.drift import (
 from jaximu.estimation.data import Data, Handling
 from jaximu.estimation.fitting import Linear
 from jaximu.estimation.leave_out import off, orthonormal
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 
@@ -84,7 +83,7 @@ class DriftComponents:
         added = np.einsum("k,kii->i", np.exp(self.log_size[first:]), self.components[first:])
         return np.asarray(added)
 
-    def draws(self, weights: FloatArray, jacobian: FloatArray, used: NDArray[np.bool_], seed: int) -> FloatArray:
+    def draws(self, weights: FloatArray, jacobian: FloatArray, used: BoolArray, seed: int) -> FloatArray:
         """Return whitened noise (n, `DRAWS`) of the real conditions, from each draw of which the sizes were estimated.
 
         The true log sizes are as uncertain as they are: off by ε they change noise that `weights` (n, n) whiten by
@@ -129,7 +128,7 @@ def drifted(noise: NoiseModel, drift: DriftComponents) -> NoiseModel:
 def estimate_drift(
     data: Data,
     linear: Linear,
-    used: NDArray[np.bool_],
+    used: BoolArray,
     imu: Imu,
     noise: NoiseModel,
     columns: FloatArray,
@@ -169,7 +168,7 @@ def _by_hand(hands: Handling) -> FloatArray:
 
 
 def hands_of(
-    data: Data, details: Any, used: NDArray[np.bool_], imu: Imu, noise: NoiseModel, drift: DriftComponents
+    data: Data, details: Any, used: BoolArray, imu: Imu, noise: NoiseModel, drift: DriftComponents
 ) -> DriftComponents:
     """Return what hands added to another recording, at the sizes that were estimated; its drift is in the noise."""
     hands = data.handling(imu, details, noise)

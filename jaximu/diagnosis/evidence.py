@@ -15,11 +15,10 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from jaximu.diagnosis.drift import DRAWS
 from jaximu.estimation.leave_out import off
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
 
 BLIND = 1e-4
@@ -76,7 +75,7 @@ class Scores:
     """
 
     statistic: FloatArray
-    freedom: NDArray[np.int64]
+    freedom: IntArray
     p_value: FloatArray
     outside: tuple[float, int, float]
     unit: float
@@ -136,7 +135,7 @@ class Evidence:
         """Return the columns of a block."""
         return slice(self._edges[block], self._edges[block + 1])
 
-    def span(self, blocks: Iterable[int]) -> NDArray[np.int64]:
+    def span(self, blocks: Iterable[int]) -> IntArray:
         """Return the columns of several blocks."""
         places = [np.arange(self._edges[block], self._edges[block + 1]) for block in blocks]
         return np.concatenate(places) if places else np.zeros(0, np.int64)
@@ -168,7 +167,7 @@ class Evidence:
         return detection_limit(gram, self._reach[inside] / sizes, len(blocks), self.critical(FAMILY_LEVEL))
 
     @cached_property
-    def _groups(self) -> list[tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]]:
+    def _groups(self) -> list[tuple[IntArray, IntArray, FloatArray]]:
         """Blocks of as many columns each: blocks (b,), columns (b, q), AᵀA (b, q, q)."""
         groups, size = [], np.diff(self._edges)
         for q in np.unique(size):
@@ -311,7 +310,7 @@ def _scaled(gram: FloatArray, lengths: FloatArray) -> FloatArray:
     return gram / scale[..., :, None] / scale[..., None, :]
 
 
-def _roots(gram: FloatArray, lengths: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+def _roots(gram: FloatArray, lengths: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return R (b, q, q) with R Rᵀ the pseudo-inverse of each Gram matrix, and the ranks (b,).
 
     What is left of a direction counts if it is more than a share of the column's whole reach: the rest is rounding, and
@@ -323,7 +322,7 @@ def _roots(gram: FloatArray, lengths: FloatArray) -> tuple[FloatArray, NDArray[n
     return root / _safe(lengths)[..., :, None], keep.sum(axis=-1)
 
 
-def _quadratic(gram: FloatArray, product: FloatArray, lengths: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+def _quadratic(gram: FloatArray, product: FloatArray, lengths: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return bᵀ G⁺ b (b,) and the ranks."""
     root, rank = _roots(gram, lengths)
     return np.sum(np.einsum("bqr,bq->br", root, product) ** 2, axis=1), rank

@@ -21,7 +21,8 @@ from jaximu.estimation.fitting import Linear, Prior, effect_numbers, fit, linear
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import added
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
+from jaximu.ground.document import Json
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.base import Extent
@@ -132,7 +133,7 @@ class Experiment(Data):
     setup: tuple[Effect, ...] = ()
     excess: FloatArray | None = None
     shift: FloatArray | float = 0.0
-    reference: dict[str, Any] | None = None
+    reference: Json | None = None
 
     def __post_init__(self) -> None:
         self.excess_names, self.coarse = self.data.excess_names, self.data.coarse
@@ -164,7 +165,7 @@ class Experiment(Data):
             conditions = _Shifted(conditions, np.asarray(self.shift)[None])  # pyright: ignore[reportCallIssue]
         return replace(about, conditions=conditions, covariance=lifted, columns=about.columns[..., mine])
 
-    def _evaluated(self, imu: Imu) -> tuple[About, FloatArray | None, FloatArray, NDArray[np.bool_]]:
+    def _evaluated(self, imu: Imu) -> tuple[About, FloatArray | None, FloatArray, BoolArray]:
         """Return the data about a unit and its fixture, as a batch of one, and what of their covariance is noise.
 
         With it the covariance (n, n) of noise, None where nothing is beside what was measured; what the fixture may do
@@ -194,7 +195,7 @@ class Experiment(Data):
     # --- what was recorded ----------------------------------------------------------------------------------------
 
     @cached_property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> BoolArray:
         """Which of the conditions are real."""
         return self.rows(self.start).used
 
@@ -226,7 +227,7 @@ class Experiment(Data):
         parts, rate = self.still_parts("accelerometer")
         return float(np.median([len(part) for part in parts])) / rate
 
-    def parts(self, real: Rows | None = None, count: int = _PARTS) -> list[NDArray[np.int64]]:
+    def parts(self, real: Rows | None = None, count: int = _PARTS) -> list[IntArray]:
         """Return the observations that are left out in turn, in the order of time."""
         return self.data.parts(self.real if real is None else real, count)
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import null_space
 
 from jaximu.diagnosis.evidence import Evidence
@@ -16,7 +15,7 @@ from jaximu.diagnosis.selection import select
 from jaximu.estimation.leave_out import LeftOut, leave_out, off
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.quantities import change
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu
@@ -207,7 +206,7 @@ def _models(evidence: Evidence) -> list[tuple[float, tuple[int, ...]]]:
     return [(weight / total, blocks) for weight, blocks in models]
 
 
-def _left_out(base: State, blocks: Sequence[int], rows: NDArray[np.bool_]) -> tuple[LeftOut, FloatArray]:
+def _left_out(base: State, blocks: Sequence[int], rows: BoolArray) -> tuple[LeftOut, FloatArray]:
     """Predict conditions, a mask, with blocks in the model; return what the others' numbers leave of all (n,), too."""
     evidence = base.evidence
     columns = np.concatenate([evidence.jacobian, *(evidence.blocks[k].columns for k in blocks)], axis=1)

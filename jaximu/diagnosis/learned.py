@@ -14,14 +14,14 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.diagnosis.experiment import LEAST_WARMING, Experiment, State
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
 from jaximu.estimation.fitting import Prior
 from jaximu.estimation.leave_out import leave_out
 from jaximu.estimation.problem import Name
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.document import Json
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import Learned as Curve
@@ -61,7 +61,7 @@ class LearnedTerm:
         """Whose output it is: the accelerometer's or the gyroscope's."""
         return self.effect.owner
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the term as `diagnosis.json` has it."""
         kinds = {kind: (before, self.gain.after.rms[kind]) for kind, before in self.gain.before.rms.items()}
         output = getattr(self.state.imu, self.triad).output_unit
@@ -180,13 +180,13 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
     return effect
 
 
-def _folds(experiment: Experiment) -> list[NDArray[np.bool_]]:
+def _folds(experiment: Experiment) -> list[BoolArray]:
     """Conditions (n,) that touch each of the parts, in the order of time, which are left out in turn."""
     parts = [experiment.real.touching(part) for part in experiment.parts()]
     return [rows for rows in parts if rows.any()]
 
 
-def _predicted_folds(experiment: Experiment, *states: State) -> list[NDArray[np.bool_]]:
+def _predicted_folds(experiment: Experiment, *states: State) -> list[BoolArray]:
     """Conditions (n,) of the parts that all fits predict from the others: the rest are no comparison."""
     nothing = np.zeros((len(states[0].conditions), 0))
     return [fold for fold in _folds(experiment) if all(_left_out(state, nothing, 1.0, [fold])[2] for state in states)]

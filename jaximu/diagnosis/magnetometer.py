@@ -7,7 +7,6 @@ What the fit left is part of the weights there as white noise, so an effect stan
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import numpy as np
@@ -22,6 +21,7 @@ from jaximu.estimation.leave_out import leave_out
 from jaximu.estimation.rows import Rows
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.effects import CATALOGUE, Effect
@@ -65,7 +65,7 @@ class MagneticCause:
             f"from {self.before:.2g} to {self.after:.2g} µT (log-likelihood {self.gain:+.3g})."
         )
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the cause as `calibration.json` has it under `diagnosis`."""
         return {
             "name": self.effect.name,
@@ -88,7 +88,7 @@ class MagneticDiagnosis:
     p_value: float
     not_asked: dict[str, str]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the diagnosis as `calibration.json` has it."""
         return {
             "verdict": "effects" if self.causes else "adequate",
@@ -189,7 +189,7 @@ class MagneticShift:
             "magnetic was added, taken off or magnetised: use the new one."
         )
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the comparison as `calibration.json` has it under `check`."""
         return {
             "verdict": "valid" if self.holds else "moved",
@@ -247,7 +247,7 @@ def check_magnetometer(old: Calibration, new: Calibration) -> MagneticShift:
     )
 
 
-def _heading_off(triads, magnetic: dict[str, Any]) -> float | None:
+def _heading_off(triads, magnetic: Json) -> float | None:
     """Degrees, rms over level headings, that the first triad's heading is off in the field that the second was in."""
     field = magnetic["field"]
     if field["dip"] is None:

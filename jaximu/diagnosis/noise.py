@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import scipy
@@ -23,6 +23,7 @@ from jaximu.diagnosis.learned import curves
 from jaximu.diagnosis.selection import Selection
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_median, f_tails, normal_isf, normal_sf
+from jaximu.ground.document import Json
 from jaximu.ground.quantities import number, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
@@ -108,7 +109,7 @@ class NoiseFinding:
         values = zip(self.axes, self.factor, self.sigma, strict=True)
         return [f"{axis} {with_interval(value, sigma)}" for axis, value, sigma in values]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the finding as `diagnosis.json` has it among the effects."""
         return {
             "name": self.name,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.learned import left_out_likelihood
 from jaximu.diagnosis.noise import usual_noise
 from jaximu.diagnosis.selection import criterion
-from jaximu.ground.document import Document
+from jaximu.ground.document import Document, Json
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.page import Result
@@ -60,7 +59,7 @@ class HandHeldThermal(Result, Document, page="thermal_hand_held"):
     notes: tuple[str, ...] = ()
     software: dict[str, str] = field(default_factory=lambda: {"name": "jaximu", "version": __version__})
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return everything as the JSON document of schema `jaximu.thermal/1`."""
         return {
             "schema": SCHEMA,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
-from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import probability, size, with_interval
 from jaximu.mistakes.titles import effect_title
@@ -77,7 +76,7 @@ class Shift:
         """Whether it was tested."""
         return self.comparable and not self.allowed
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the shift as `check.json` has it."""
         si = (
             None
@@ -135,7 +134,7 @@ class Cause:
         }[self.scope]
         return f"{self.title}: {meaning}" if meaning else f"{self.title} moved"
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the cause as `check.json` has it."""
         return {
             "name": self.name,
@@ -181,7 +180,7 @@ class Validity(Result, Document, page="validity"):
     causes: tuple[Cause, ...]
     conditions: tuple[FloatArray, FloatArray]  # (n,) under the old calibration and under the fresh one
     scatter: dict[str, float]
-    data: dict[str, Any]
+    data: Json
     calibration: Calibration
     errors: dict[str, tuple[float, float, str]] = field(default_factory=dict)
     output_errors: dict[str, OutputError] = field(default_factory=dict)
@@ -258,7 +257,7 @@ class Validity(Result, Document, page="validity"):
             return None
         return float(self.history.innovations.sum() / max(self.history.freedom.sum(), 1))
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the JSON document of schema `jaximu.check/1`."""
         statistic, freedom, p_value = self.difference
         return {

@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.problem import Name, without_equipment_or_effects
@@ -26,7 +25,7 @@ from jaximu.estimation.rows import Rows
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
 from jaximu.ground.tracing import array_module, first, lifted
 from jaximu.model.effects.base import Effect, Extent, Place, inner_owners
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -82,9 +81,9 @@ class Observed:
     react: Callable[[str, FloatArray], FloatArray]
     share: FloatArray
     up: FloatArray | None = None
-    still: NDArray[np.bool_] | None = None
-    number: NDArray[np.int64] | None = None
-    alone: NDArray[np.int64] | None = None
+    still: BoolArray | None = None
+    number: IntArray | None = None
+    alone: IntArray | None = None
     duration: float | None = None
     attitude: FloatArray | None = None
     curves: FloatArray | None = None
@@ -101,7 +100,7 @@ class OutputMeans:
 
     start: FloatArray
     stop: FloatArray
-    recording: NDArray[np.int64]
+    recording: IntArray
     reactions: Mapping[str, FloatArray]
     scale: Mapping[str, FloatArray]
     noise: NoiseModel
@@ -111,7 +110,7 @@ class OutputMeans:
         cls,
         start: FloatArray,
         stop: FloatArray,
-        recording: NDArray[np.int64],
+        recording: IntArray,
         reactions: Mapping[str, FloatArray],
         scale: Mapping[str, FloatArray],
         variance: Mapping[str, FloatArray],
@@ -173,7 +172,7 @@ class Data(ABC):
         """Return whether a number is free: all but those of the accelerometer's gain that fix the frame."""
         return without_equipment_or_effects(name)
 
-    def take(self, lanes: NDArray[np.int64]) -> Data:
+    def take(self, lanes: IntArray) -> Data:
         """Return the measurement of some of the units; of a single one, itself."""
         return self
 
@@ -301,7 +300,7 @@ class Data(ABC):
         """Return effects, by name, that this recording cannot show, and why."""
         return {}
 
-    def parts(self, real: Rows, count: int) -> list[NDArray[np.int64]]:
+    def parts(self, real: Rows, count: int) -> list[IntArray]:
         """Return the observations that are left out in turn; `real`: the rows that are no padding."""
         return real.parts(count)
 

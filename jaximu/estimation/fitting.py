@@ -22,14 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from jaximu.estimation.covariance import Chain, ChainWeights, Covariance, Weights, parts_of, update_excess
 from jaximu.estimation.data import Conditions, Data
 from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, typical_sizes, unflatten
 from jaximu.estimation.solver import MAX_STEPS, Failure, solve
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, Computed, FloatArray
+from jaximu.ground.array_types import Array, BoolArray, Computed, FloatArray, IntArray
 from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
@@ -595,7 +594,7 @@ class _Passes:
         """Return the free numbers (N, p)."""
         return self.numerics.concatenate([reference[:, self.index], numbers[:, self.kept]], axis=1)
 
-    def model(self, state: _State, lanes: NDArray[np.int64]) -> Imu:
+    def model(self, state: _State, lanes: IntArray) -> Imu:
         """Return units where the passes are; `state` is of `lanes`."""
         bare = unflatten(self.like, state.reference)
         if not self.numbers.shape[1]:
@@ -603,7 +602,7 @@ class _Passes:
         start = jax.tree.map(lambda leaf: leaf[lanes], self.full)
         return bare.with_effects(*_with_numbers(start, state.numbers).all_effects().values())
 
-    def known(self, state: _State, lanes: NDArray[np.int64], blunt: bool | Array) -> tuple[Array, Array]:
+    def known(self, state: _State, lanes: IntArray, blunt: bool | Array) -> tuple[Array, Array]:
         """Return mean (N, p) and root (N, p, p) of what is known beforehand, about where the passes are, scaled."""
         numerics, here = self.numerics, self.values(state.reference, state.numbers)
         effects = self.full.all_effects()
@@ -630,7 +629,7 @@ class _Passes:
         whole = whole + np.diag(np.arange(count + self.spare) >= count).astype(float)
         return mean, whole
 
-    def once(self, one: Callable, state: _State, lanes: NDArray[np.int64], blunt: bool | Array = False) -> Any:
+    def once(self, one: Callable, state: _State, lanes: IntArray, blunt: bool | Array = False) -> Any:
         """Evaluate the data where the passes are, and run `_single_pass` or `_no_step`; `state` is of `lanes`."""
         imu = self.model(state, lanes)
         data = self.data if self.numerics is jnp else [kind.take(lanes) for kind in self.data]
@@ -667,9 +666,7 @@ class _Passes:
             ~yes,
         )
 
-    def advanced(
-        self, state: _State, lanes: NDArray[np.int64], out: _Pass, number: int | Array
-    ) -> tuple[_State, Array]:
+    def advanced(self, state: _State, lanes: IntArray, out: _Pass, number: int | Array) -> tuple[_State, Array]:
         """Return where the passes go from units that all are active, and which of them keep what a pass found.
 
         A pass solves a problem that is linear in what the turns rotate by and in what effects add. Where its step made
@@ -714,7 +711,7 @@ class _Passes:
             fine & still,
         ), fine
 
-    def moved(self, state: _State, lanes: NDArray[np.int64], z: Array) -> tuple[Array, Array]:
+    def moved(self, state: _State, lanes: IntArray, z: Array) -> tuple[Array, Array]:
         """Return reference and numbers after a step z (N, p) in typical sizes."""
         base, wide = self.base, len(self.names)
         step = self.sizes[lanes] * z[:, :wide]
@@ -745,7 +742,7 @@ class _Passes:
         assert result is not None
         return self.fit(state, result.there, result.cost, result.steps, result.converged, result.finite)
 
-    def chunks(self, chosen: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    def chunks(self, chosen: BoolArray) -> Iterator[tuple[IntArray, IntArray]]:
         """Yield the units that are chosen, a chunk after the other, and the same filled up with the last of them."""
         lanes, size = np.flatnonzero(chosen), 1 if self.count == 1 else _CHUNK
         for part in np.split(lanes, range(size, len(lanes), size)):
@@ -842,7 +839,7 @@ def _where(numerics: Any, chosen: Array, one: Array, other: Array) -> Array:
     return numerics.where(chosen.reshape(-1, *[1] * (np.ndim(one) - 1)), one, other)
 
 
-def _of(tree: Any, lanes: NDArray[np.int64] | slice) -> Any:
+def _of(tree: Any, lanes: IntArray | slice) -> Any:
     """Return arrays of some of the units."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], tree)
 
@@ -852,5 +849,5 @@ def _room(count: int, leaf: FloatArray) -> FloatArray:
     return np.zeros((count, *leaf.shape[1:]), leaf.dtype)
 
 
-def _put(lanes: NDArray[np.int64], leaf: FloatArray, new: FloatArray) -> None:
+def _put(lanes: IntArray, leaf: FloatArray, new: FloatArray) -> None:
     leaf[lanes] = new

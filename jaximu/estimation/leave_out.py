@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 
 _RANK = 1e-9
 """Share of the largest singular value below which a combination of columns is none."""
@@ -28,7 +28,7 @@ class LeftOut(NamedTuple):
     others predict nothing are not among them. numbers (p,): θ as fitted to all other rows.
     """
 
-    rows: NDArray[np.integer] | NDArray[np.bool_]
+    rows: NDArray[np.integer] | BoolArray
     errors: FloatArray
     precisions: FloatArray
     directions: FloatArray
@@ -59,7 +59,7 @@ def leave_out(
     weights: FloatArray,
     columns: FloatArray,
     target: FloatArray,
-    parts: Sequence[NDArray[np.integer] | NDArray[np.bool_]],
+    parts: Sequence[NDArray[np.integer] | BoolArray],
 ) -> Iterator[LeftOut]:
     """Yield for each part of the rows how all others predict it.
 

@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import ArrayLike, Float, PyTree
 
 from jaximu.ground.array_types import Array
+from jaximu.ground.document import Json
 from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Board, Imu, Triad
 
@@ -39,7 +40,7 @@ def typical_sizes(imu: Imu) -> Imu:
         gain = 0.1 * numerics.broadcast_to(scale[..., None], (*scale.shape, 3))
         return replace(triad, gain=gain, bias=bias * scale, effects=effects)
 
-    changed: dict[str, Any] = {name: sizes(triad, _BIAS_SIZE[name]) for name, triad in imu.triads().items()}
+    changed: Json = {name: sizes(triad, _BIAS_SIZE[name]) for name, triad in imu.triads().items()}
     if isinstance(imu, Board):
         changed["others"] = tuple(map(typical_sizes, imu.others))
     return replace(imu, **changed, setup=tuple(effect.typical_sizes(1.0) for effect in imu.setup))

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 
 TIME, TEMPERATURE = "time [s]", "temperature [°C]"
 """The covariate that all conditions have, and the one that those with a thermometer have."""
@@ -45,11 +44,11 @@ class Rows:
     """
 
     kinds: tuple[ResidualKind, ...]
-    kind: NDArray[np.int64]
-    first: NDArray[np.int64]
-    last: NDArray[np.int64]
+    kind: IntArray
+    first: IntArray
+    last: IntArray
     to_si: FloatArray
-    used: NDArray[np.bool_]
+    used: BoolArray
     covariates: dict[str, FloatArray]
     spans: FloatArray
     observation: str = "pose"
@@ -62,15 +61,15 @@ class Rows:
         arrays = {name: getattr(self, name)[self.used] for name in ("kind", "first", "last", "to_si", "used")}
         return replace(self, **arrays, covariates={name: x[self.used] for name, x in self.covariates.items()})
 
-    def of_kind(self, name: str) -> NDArray[np.bool_]:
+    def of_kind(self, name: str) -> BoolArray:
         """Return which rows (n,) are of the kind of that name."""
         return np.equal(self.kind, [kind.name for kind in self.kinds].index(name))
 
-    def touching(self, observations: Sequence[int] | NDArray[np.int64]) -> NDArray[np.bool_]:
+    def touching(self, observations: Sequence[int] | IntArray) -> BoolArray:
         """Return which rows (n,) touch one of the observations."""
         return np.isin(self.first, observations) | np.isin(self.last, observations)
 
-    def parts(self, count: int) -> list[NDArray[np.int64]]:
+    def parts(self, count: int) -> list[IntArray]:
         """Return the observations in so many parts, in the order of time, to be left out in turn."""
         return np.array_split(np.arange(int(self.last.max()) + 1), count)
 

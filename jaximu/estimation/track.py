@@ -14,10 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array
+from jaximu.ground.array_types import Array, BoolArray, IntArray
 from jaximu.ground.differences import interpolated, slopes
 from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Imu
@@ -42,7 +41,7 @@ class Track(eqx.Module):
     observation: Int[Array, "... n"]
 
     @classmethod
-    def padded(cls, stimulus: Stimulus, observation: NDArray[np.int64], count: int) -> Track:
+    def padded(cls, stimulus: Stimulus, observation: IntArray, count: int) -> Track:
         """Return a track of `count` observations up to a bucket's length: like shapes share compiled code.
 
         The last sample is repeated, as one of no observation; the time goes on.
@@ -57,12 +56,12 @@ class Track(eqx.Module):
         """Return the next bucket's length beyond so many samples."""
         return samples + _BUCKET - samples % _BUCKET
 
-    def renumbered(self, numbers: NDArray[np.int64]) -> Track:
+    def renumbered(self, numbers: IntArray) -> Track:
         """Return the track with other numbers of the observations, the last of them for samples of none."""
         observation = np.minimum(np.asarray(self.observation), len(numbers) - 1)
         return Track(self.stimulus, numbers[observation])
 
-    def inside(self) -> NDArray[np.bool_]:
+    def inside(self) -> BoolArray:
         """Return which samples (n,) lie before the last one that belongs to an observation: no padding at the end."""
         observation = np.asarray(self.observation)
         return np.arange(len(observation)) <= np.flatnonzero(observation < observation.max())[-1]

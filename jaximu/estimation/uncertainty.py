@@ -4,10 +4,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.estimation.problem import TOLERANCE, Name
-from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.quantities import listed, number, size
 from jaximu.ground.units import SENSOR_UNITS, STANDARD_GRAVITY
@@ -178,7 +177,7 @@ _CHANCE = 1e-3
 
 
 def allowing_for_neighbours(
-    covariance: Array, sizes: Array, residual: Array, jacobian: Array, order: NDArray[np.int64]
+    covariance: Array, sizes: Array, residual: Array, jacobian: Array, order: IntArray
 ) -> FloatArray | None:
     """Return a covariance (p, p) for errors of which neighbours in time are alike; None where they are not.
 

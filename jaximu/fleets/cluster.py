@@ -12,8 +12,7 @@ import ray  # pyright: ignore[reportMissingImports]
 from jaximu.fleets.jobs import ONE_THREAD, PATIENCE, Job, Rows, Settings, batches, own_effects, register_all
 from jaximu.fleets.rows import ReadJob, finish, read_job
 from jaximu.ground import stored
-
-__all__ = ["compute"]
+from jaximu.ground.document import Json
 
 _AHEAD = 2
 """Batches that each actor has before it: one is read while another is fitted."""
@@ -29,9 +28,7 @@ def compute(jobs: Sequence[Job], indices: Sequence[int], settings: Settings, wor
     folder = None if away else stored.folder()  # on other machines there is no such folder
     started, effects = not ray.is_initialized(), own_effects()
     if started:
-        where: dict[str, Any] = (
-            {} if away else {"num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
-        )
+        where: Json = {} if away else {"num_cpus": workers, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
         ray.init(log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": ONE_THREAD}, **where)
     graphics = int(ray.cluster_resources().get("GPU", 0))
 
@@ -48,7 +45,7 @@ def compute(jobs: Sequence[Job], indices: Sequence[int], settings: Settings, wor
             stored.prepare_process(folder)
             register_all(effects)
 
-        def rows(self, *prepared: ReadJob) -> list[dict[str, Any]]:
+        def rows(self, *prepared: ReadJob) -> list[Json]:
             return finish(prepared, settings)
 
     fitting: Any = ray.remote(num_cpus=0, num_gpus=1 if graphics else 0, max_restarts=-1, max_task_retries=-1)(

@@ -20,8 +20,6 @@ from jaximu.fleets.jobs import ONE_THREAD, PATIENCE, Job, Rows, Settings, batche
 from jaximu.fleets.rows import row_begun, rows_of
 from jaximu.ground.errors import InputError
 
-__all__ = ["ENGINES", "local"]
-
 Engine = Callable[[Sequence[Job], Sequence[int], Settings, int], Iterator[Rows]]
 _TRIES = 2
 """Times that a batch may bring its process down before its jobs are tried one by one."""

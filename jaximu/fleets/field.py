@@ -7,10 +7,8 @@ the angle to gravity are not used, so the gain (lower triangle) is in the magnet
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -18,13 +16,12 @@ import pyarrow.parquet as pq
 from jaximu.calibration.magnetometer import FieldStrength, field_start
 from jaximu.estimation.fitting import Fit
 from jaximu.fleets.fit import FleetUnit
-from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.document import Json
+from jaximu.ground.errors import FilePath, NotPossibleError
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import Segmentation, observed_poses, rest_statistics
-
-__all__ = ["FieldUnit", "field_row", "field_unit", "field_words"]
 
 _FEWEST = 2
 """Samples of a rest: of fewer nothing tells the noise."""
@@ -58,7 +55,7 @@ def field_unit(signal: Signal, segmentation: Segmentation, strength: FieldStreng
     return FieldUnit(FleetUnit(observations, nominal, False), field, signal.unit, len(rests))
 
 
-def field_row(magnetometer: FieldUnit, fit: Fit, rms: float) -> dict[str, Any]:
+def field_row(magnetometer: FieldUnit, fit: Fit, rms: float) -> Json:
     """Return what a table says of a fitted magnetometer, per µT; `rms`: of its norm, m/s²."""
     factor = STANDARD_GRAVITY / magnetometer.field.value
     sigma = np.zeros(12)
@@ -77,7 +74,7 @@ def field_row(magnetometer: FieldUnit, fit: Fit, rms: float) -> dict[str, Any]:
     }
 
 
-def field_words(table: str | os.PathLike[str]) -> list[str]:
+def field_words(table: FilePath) -> list[str]:
     """Say how many magnetometers of a table are calibrated, and why others are not; nothing where there is none."""
     rows = pq.read_table(table, columns=["file", "mag_unit", "mag_message"]).to_pylist()
     done = sum(row["mag_unit"] is not None for row in rows)

@@ -17,8 +17,6 @@ from jaximu.model.sensor import Imu
 from jaximu.planning.chunks import in_chunks
 from jaximu.recordings.observations import Observations
 
-__all__ = ["FleetUnit", "fit_units"]
-
 _BATCH, _SHAPE = 256, 16
 """Units that are in memory together, and those that a compiled program takes at once."""
 _KINDS = ("gravity_norm", "gravity_direction", "static_gyroscope")

@@ -14,20 +14,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 from jaximu._version import __version__
-from jaximu.ground.document import file_digest
-from jaximu.ground.errors import InputError, only, readable
+from jaximu.ground.document import Json, file_digest
+from jaximu.ground.errors import FilePath, InputError, only, readable
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.magnetic_field import FieldStrength
 from jaximu.recordings.readers import ReadOptions
 from jaximu.recordings.readers.archive import SUFFIXES, is_log, logs_below
 from jaximu.recordings.segmentation import SegmentationOptions
 
-__all__ = ["ONE_THREAD", "PATIENCE", "Job", "Rows", "Settings", "batches", "find_jobs", "own_effects", "register_all"]
-
-Rows = tuple[Sequence[int], list[dict[str, Any]]]
+Rows = tuple[Sequence[int], list[Json]]
 # XLA's pool reads NPROC; a flag of XLA's would make it compile everything anew
 ONE_THREAD: dict[str, str] = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC"), "1"
@@ -126,9 +123,9 @@ def _stamp(path: str) -> tuple[int, int]:
 
 
 def find_jobs(
-    logs: Iterable[str | os.PathLike[str]],
-    output: str | os.PathLike[str] | None = None,
-    static: str | os.PathLike[str] | None = None,
+    logs: Iterable[FilePath],
+    output: FilePath | None = None,
+    static: FilePath | None = None,
 ) -> list[Job]:
     """Return the jobs that logs, folders, patterns and manifests name, in a fixed order.
 
@@ -181,7 +178,7 @@ def find_jobs(
     return jobs
 
 
-def _recordings_at_rest(static: str | os.PathLike[str] | None) -> dict[str, Path]:
+def _recordings_at_rest(static: FilePath | None) -> dict[str, Path]:
     """Return recordings at rest by device; one for all under the name `_ALL`."""
     if static is None:
         return {}

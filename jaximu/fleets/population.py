@@ -15,33 +15,20 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import scipy
-from numpy.typing import NDArray
 
 from jaximu.estimation.problem import Name
 from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, SCHEMA, covariances, free_places, require_table
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
-from jaximu.ground.document import Document
-from jaximu.ground.errors import NotPossibleError
+from jaximu.ground.document import Document, Json
+from jaximu.ground.errors import FilePath, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.mistakes.titles import effect_title
-
-__all__ = [
-    "Difference",
-    "Fleet",
-    "Population",
-    "Stranger",
-    "days_of",
-    "estimate_population",
-    "read_fleet",
-    "write_shrunk",
-]
 
 FEWEST = 8
 """Units from which a population is spoken of."""
@@ -144,7 +131,7 @@ class Shifts:
     drift: FloatArray
     middle: float
 
-    def of(self, rows: Sequence[dict[str, Any]]) -> FloatArray:
+    def of(self, rows: Sequence[Json]) -> FloatArray:
         """Return what is to be taken off (n, p) to make units of all lots and dates alike."""
         none = np.zeros_like(self.drift)
         lots = np.array([self.lots.get(row["lot"] or "", none) for row in rows]).reshape(len(rows), len(none))
@@ -181,7 +168,7 @@ class Fleet(Result, Document, page="fleet"):
     rms: FloatArray
     notes: tuple[str, ...]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the findings as a JSON document of schema `jaximu.fleet/1`."""
         population = self.population
         return {
@@ -285,12 +272,12 @@ class _Units:
     names: tuple[Name, ...]
     values: FloatArray
     covariances: FloatArray
-    rows: list[dict[str, Any]]
+    rows: list[Json]
     factor: FloatArray
     offset: FloatArray
 
 
-def _units(rows: Sequence[dict[str, Any]], gyroscope: bool) -> _Units:
+def _units(rows: Sequence[Json], gyroscope: bool) -> _Units:
     """Bring calibrated rows to one scale: gains in nominal scales, biases as inputs in SI."""
     indices = free_places(gyroscope)
     count, size = len(rows), len(PARAMETERS)
@@ -309,7 +296,7 @@ def _units(rows: Sequence[dict[str, Any]], gyroscope: bool) -> _Units:
     )
 
 
-def _groups(path: Path, gyroscope: bool, columns: Sequence[str] | None = None) -> Iterator[list[dict[str, Any]]]:
+def _groups(path: Path, gyroscope: bool, columns: Sequence[str] | None = None) -> Iterator[list[Json]]:
     """Give the calibrated rows of a table that have (or lack) a gyroscope, some at a time."""
     with pq.ParquetFile(path) as file:
         for batch in file.iter_batches(batch_size=1024, columns=None if columns is None else list(columns)):
@@ -319,7 +306,7 @@ def _groups(path: Path, gyroscope: bool, columns: Sequence[str] | None = None) -
                 yield rows
 
 
-def read_fleet(table: str | os.PathLike[str]) -> Fleet:
+def read_fleet(table: FilePath) -> Fleet:
     """Question a table of `jaximu fleet` as a whole. Raises `InputError` where it is no such table."""
     path = Path(table)
     require_table(path, (*_COLUMNS, "gyro_unit"))
@@ -346,7 +333,7 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     if others:
         notes.append(f"{others} units {'without' if gyroscope else 'with'} a gyroscope are not part of the population.")
     step = max(1, -(-total // _MOST))
-    kept: list[dict[str, Any]] = []
+    kept: list[Json] = []
     passed = 0
     for rows in _groups(path, gyroscope, _COLUMNS):
         kept += [row for number, row in enumerate(rows, passed) if number % step == 0]
@@ -379,7 +366,7 @@ def read_fleet(table: str | os.PathLike[str]) -> Fleet:
     return replace(fleet, notes=tuple(notes), **_of_population(path, _units(kept, gyroscope), gyroscope, total))
 
 
-def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> dict[str, Any]:
+def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> Json:
     """What units of a table say as a population, by the fields of `Fleet`; total: units of the table."""
     differences, shifts = _lots_and_dates(units)
     shift = shifts.of(units.rows)
@@ -444,7 +431,7 @@ class _Groups:
     """
 
     names: tuple[str, ...]
-    lot: NDArray[np.int64]
+    lot: IntArray
     years: FloatArray
     middle: float
 
@@ -639,7 +626,7 @@ def _shared_effects(units: _Units) -> list[Difference]:
 # --- shrunk estimates -------------------------------------------------------------------------------------------------
 
 
-def write_shrunk(fleet: Fleet, path: str | os.PathLike[str]) -> None:
+def write_shrunk(fleet: Fleet, path: FilePath) -> None:
     """Write the units' parameters with the population as prior, in output units like the table's, beside its columns.
 
     Columns: device, file, and gains, biases and their sigmas (without gravity's uncertainty). Raises

@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -24,7 +23,8 @@ from jaximu.fleets.field import FieldUnit, field_row, field_unit
 from jaximu.fleets.fit import FleetUnit, fit_units
 from jaximu.fleets.jobs import Job, Settings
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
+from jaximu.ground.document import Json
+from jaximu.ground.errors import FilePath, InputError, JaximuError, NotPossibleError
 from jaximu.ground.units import SENSORS
 from jaximu.mistakes import prepared
 from jaximu.model.noise_model import NoiseModel
@@ -33,20 +33,6 @@ from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observed_poses, segment
-
-__all__ = [
-    "COLUMN_PLACES",
-    "PARAMETERS",
-    "SCHEMA",
-    "ReadJob",
-    "covariances",
-    "finish",
-    "free_places",
-    "read_job",
-    "require_table",
-    "row_begun",
-    "rows_of",
-]
 
 PARAMETERS = names_of(Imu.nominal())
 """Names of the 24 numbers of a row, in the order of its column `covariance`."""
@@ -104,7 +90,7 @@ SCHEMA = pa.schema(
 """Columns of the table. The first ones are the fixed surface; what does not apply is null."""
 
 
-def require_table(path: str | os.PathLike[str], needed: Sequence[str]) -> None:
+def require_table(path: FilePath, needed: Sequence[str]) -> None:
     """Raise `InputError` where a file is no table of `jaximu fleet` with these columns."""
     name = os.fspath(path)
     try:
@@ -138,12 +124,12 @@ class ReadJob:
     field: the same of its magnetometer, None where there is none.
     """
 
-    row: dict[str, Any]
+    row: Json
     unit: FleetUnit | None
     field: FieldUnit | None = None
 
 
-def row_begun(job: Job) -> dict[str, Any]:
+def row_begun(job: Job) -> Json:
     """Return a job's row before anything is known of it but the job."""
     known = {name: getattr(job, name) or None for name in ("device", "file", "date", "lot", "static", "station")}
     return dict.fromkeys(SCHEMA.names) | known
@@ -192,9 +178,9 @@ def _unit(
     return FleetUnit(observations, nominal, recording.gyroscope is not None), notes
 
 
-def _facts(recording: Recording, unit: FleetUnit, notes: Sequence[str]) -> dict[str, Any]:
+def _facts(recording: Recording, unit: FleetUnit, notes: Sequence[str]) -> Json:
     poses, turns = unit.observations.poses, unit.observations.turns
-    row: dict[str, Any] = {
+    row: Json = {
         "poses": int(np.sum(poses.mask)),
         "turns": int(np.sum(turns.mask)) if unit.gyroscope else None,
         "notes": list(dict.fromkeys(notes)),
@@ -210,7 +196,7 @@ def _facts(recording: Recording, unit: FleetUnit, notes: Sequence[str]) -> dict[
     return row
 
 
-def _diagnosed(recording: Recording, settings: Settings, noise: NoiseModel | None) -> dict[str, Any]:
+def _diagnosed(recording: Recording, settings: Settings, noise: NoiseModel | None) -> Json:
     from jaximu.diagnosis import diagnose  # it is not cheap to import, and most runs ask for no diagnosis
 
     try:
@@ -220,7 +206,7 @@ def _diagnosed(recording: Recording, settings: Settings, noise: NoiseModel | Non
     return {"verdict": diagnosis.verdict, "effects": [effect.name for effect in diagnosis.effects]}
 
 
-def _failure(error: Exception) -> dict[str, Any]:
+def _failure(error: Exception) -> Json:
     if isinstance(error, NotPossibleError):
         status = "not possible"
     else:
@@ -234,7 +220,7 @@ def _sentence(error: Exception) -> str:
     return f"this should not happen ({type(error).__name__}: {error})".splitlines()[0][:500]
 
 
-def finish(prepared: Sequence[ReadJob], settings: Settings) -> list[dict[str, Any]]:
+def finish(prepared: Sequence[ReadJob], settings: Settings) -> list[Json]:
     """Fit what was prepared, in one batch, and return its rows in the same order."""
     units = [job.unit for job in prepared if job.unit is not None]
     fits = iter(fit_units([*units, *(job.field.unit for job in prepared if job.field is not None)]))
@@ -245,12 +231,12 @@ def finish(prepared: Sequence[ReadJob], settings: Settings) -> list[dict[str, An
     ]
 
 
-def rows_of(jobs: Sequence[Job], settings: Settings) -> list[dict[str, Any]]:
+def rows_of(jobs: Sequence[Job], settings: Settings) -> list[Json]:
     """Return the rows of jobs: what every engine computes, wherever it does."""
     return finish([read_job(job, settings) for job in jobs], settings)
 
 
-def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> dict[str, Any]:
+def _row(prepared: ReadJob, fit: Fit, rms: FloatArray, settings: Settings) -> Json:
     row, unit = prepared.row, prepared.unit
     assert unit is not None
     try:
@@ -301,7 +287,7 @@ def _require(fit: Fit, poses: int, where: str, sensor: str) -> None:
         raise NotPossibleError(f"{where}: {Failure.MAX_STEPS.value}.")
 
 
-def _field(magnetometer: FieldUnit, fit: Fit, rms: FloatArray, where: str) -> dict[str, Any]:
+def _field(magnetometer: FieldUnit, fit: Fit, rms: FloatArray, where: str) -> Json:
     try:
         _require(fit, magnetometer.poses, where, "magnetometer")
     except NotPossibleError as error:

@@ -11,9 +11,7 @@ from pathlib import Path
 from jaximu.fleets.engines import ENGINES
 from jaximu.fleets.jobs import Job, Settings
 from jaximu.fleets.store import Store
-from jaximu.ground.errors import InputError
-
-__all__ = ["available_cores", "run_fleet"]
+from jaximu.ground.errors import FilePath, InputError
 
 
 def available_cores() -> int:
@@ -23,7 +21,7 @@ def available_cores() -> int:
 
 def run_fleet(
     jobs: Sequence[Job],
-    output: str | os.PathLike[str],
+    output: FilePath,
     settings: Settings | None = None,
     engine: str = "local",
     workers: int | None = None,

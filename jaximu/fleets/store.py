@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -16,9 +16,8 @@ import pyarrow.parquet as pq
 
 from jaximu.fleets.rows import SCHEMA
 from jaximu.ground.atomic import atomic_write
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
-
-__all__ = ["Store", "kept_rows"]
 
 _PART = SCHEMA.insert(0, pa.field("key", pa.string()))
 _GROUP = 1024
@@ -83,7 +82,7 @@ class Store:
         self._owner[indices] = len(self._parts)
         self._parts.append(path)
 
-    def add(self, places: Sequence[int], rows: Sequence[dict[str, Any]]) -> None:
+    def add(self, places: Sequence[int], rows: Sequence[Json]) -> None:
         """Keep the rows of some places. Raises `InputError` where they cannot be written."""
         fresh = [(index, row) for index, row in zip(places, rows, strict=True) if self._owner[index] < 0]
         if not fresh:
@@ -106,11 +105,11 @@ class Store:
                 "repair it, and give the same command again."
             ) from error
 
-    def rows(self) -> Iterator[list[dict[str, Any]]]:
+    def rows(self) -> Iterator[list[Json]]:
         """Give all rows in the order of the jobs, some at a time; parts are opened when they are needed."""
         left = np.bincount(self._owner, minlength=len(self._parts))
-        opened: dict[int, dict[str, dict[str, Any]]] = {}
-        group: list[dict[str, Any]] = []
+        opened: dict[int, dict[str, Json]] = {}
+        group: list[Json] = []
         for index, part in enumerate(self._owner.tolist()):
             if part not in opened:
                 opened[part] = {row.pop("key"): row for row in pq.read_table(self._parts[part]).to_pylist()}
@@ -134,7 +133,7 @@ class Store:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def _table(rows: Sequence[dict[str, Any]], schema: pa.Schema) -> pa.Table:
+def _table(rows: Sequence[Json], schema: pa.Schema) -> pa.Table:
     return pa.table([pa.array([row[field.name] for row in rows], field.type) for field in schema], schema=schema)
 
 

@@ -11,8 +11,6 @@ import jax.numpy as jnp
 from jaximu.ground.array_types import Array
 from jaximu.ground.rotation import product, right_jacobian_rows
 
-__all__ = ["Matrix", "Vector", "cross", "matvec", "right_jacobian", "transpose", "turn"]
-
 Vector = list[Array]
 Matrix = list[list[Array]]
 

@@ -20,13 +20,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.data.preintegration import increments
 from jaximu.estimation.problem import Name, names_of
-from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
@@ -41,17 +40,6 @@ from jaximu.navigation.trajectory import Trajectory
 from jaximu.noise.stated import SensorNoise
 from jaximu.planning.goals import group_of
 from jaximu.planning.information import root_of
-
-__all__ = [
-    "NOISE_WORDS",
-    "Consequences",
-    "MonteCarlo",
-    "Run",
-    "consequences",
-    "kind_of",
-    "position",
-    "prepared",
-]
 
 SCHEMA = "jaximu.consequences/1"
 _PROCESSES: dict[str, Callable[[FloatArray], Process]] = {
@@ -151,17 +139,17 @@ class Consequences(Result, Document, page="consequences"):
             spans.append((names[index], float(start), float(time)))
         return spans
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the budget as the JSON document of schema `jaximu.consequences/1`; all figures are 1σ."""
 
         def track(values: FloatArray, part: int) -> list[list[float]]:
             return values[:, 3 * part : 3 * part + 3].tolist()
 
-        def tracks(sigma: FloatArray) -> dict[str, Any]:
+        def tracks(sigma: FloatArray) -> Json:
             names = ("position_sigma", "velocity_sigma", "attitude_sigma")
             return {name: track(sigma, part) for part, name in enumerate(names)}
 
-        def listed(errors: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
+        def listed(errors: Mapping[str, FloatArray]) -> list[Json]:
             return [{"term": name, "position": values.tolist()} for name, values in errors.items()]
 
         check, against = self.check, self.against
@@ -373,7 +361,7 @@ def _variances(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.maximum(np.einsum("tip,pq,tiq->ti", slopes, covariance, slopes, optimize=True), 0.0)
 
 
-def _given(covariance: FloatArray, chosen: NDArray[np.bool_]) -> FloatArray:
+def _given(covariance: FloatArray, chosen: BoolArray) -> FloatArray:
     """Covariance of the others were these known exactly (normal distribution, conditioned)."""
     cross, inverse = (
         covariance[np.ix_(~chosen, chosen)],

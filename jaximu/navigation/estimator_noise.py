@@ -30,12 +30,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.data.preintegration import preintegrate_samples
-from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import Gravity
 from jaximu.ground.page import Result
@@ -53,17 +52,6 @@ from jaximu.noise.stated import SensorNoise
 from jaximu.planning.information import root_of
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.recording import Recording
-
-__all__ = [
-    "LENGTHS",
-    "EstimatorNoise",
-    "MeasuredErrors",
-    "ModelledErrors",
-    "TriadNoise",
-    "estimator_noise",
-    "nees",
-    "steady_stamps",
-]
 
 SCHEMA = "jaximu.estimator-noise/1"
 LENGTHS = (0.1, 1.0, 10.0)
@@ -92,12 +80,12 @@ class Stretches(NamedTuple):
     forces: FloatArray
     held: FloatArray
     start: FloatArray
-    rows: NDArray[np.int64]
+    rows: IntArray
     errors: FloatArray | None = None
     velocity_errors: FloatArray | None = None
 
 
-def _spread(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def _spread(rows: IntArray) -> IntArray:
     """Return at most `_MOST` rows, evenly spread."""
     return rows if len(rows) <= _MOST else rows[np.linspace(0, len(rows) - 1, _MOST).astype(int)]
 
@@ -176,7 +164,7 @@ class MeasuredErrors:
     velocity: FloatArray | None
     position: FloatArray | None
     gravity: float
-    steady: NDArray[np.bool_]
+    steady: BoolArray
     words: str
     notes: tuple[str, ...] = ()
 
@@ -293,7 +281,7 @@ class MeasuredErrors:
         return np.concatenate(errors, axis=1), velocity_errors
 
 
-def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> NDArray[np.bool_]:
+def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> BoolArray:
     """Whether a reference's velocity (T, 3) changes at each stamp (T,) about as the unit's acceleration (T, 3) says."""
     mean = (acceleration[1:] + acceleration[:-1]) / 2
     off = np.linalg.norm(np.diff(velocity, axis=0) / np.diff(stamp)[:, None] - mean, axis=1)
@@ -302,7 +290,7 @@ def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatAr
     return ~np.concatenate([near, [False]])[1 : len(stamp) + 1]
 
 
-def _without_gaps(since: FloatArray, until: FloatArray, start: FloatArray, stop: FloatArray) -> NDArray[np.bool_]:
+def _without_gaps(since: FloatArray, until: FloatArray, start: FloatArray, stop: FloatArray) -> BoolArray:
     """Whether no sample between two times holds far longer than others do."""
     lengths = until - since
     long = np.concatenate([[0], np.cumsum(lengths > 2.5 * np.median(lengths))])
@@ -398,7 +386,7 @@ class EstimatorNoise(Result, Document, page="estimator_noise"):
         ]
         return f"For an estimator whose states are {at} apart, multiply {' and '.join(parts)}; {self.words}."
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return it as the JSON document of schema `jaximu.estimator-noise/1`; densities are SI and continuous."""
         return {
             "schema": SCHEMA,
@@ -547,7 +535,7 @@ class _Length(NamedTuple):
     whole: FloatArray
     root: FloatArray | None
     terms: dict[str, dict[str, FloatArray]]
-    block: NDArray[np.int64]
+    block: IntArray
 
 
 def _squared(root: FloatArray) -> FloatArray:
@@ -615,9 +603,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
     return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ root_of(covariance), terms, block)
 
 
-def _measured_part(
-    stretches: Stretches, spread: dict[tuple[str, str], FloatArray], block: NDArray[np.int64]
-) -> _Length:
+def _measured_part(stretches: Stretches, spread: dict[tuple[str, str], FloatArray], block: IntArray) -> _Length:
     errors, velocity_errors = stretches.errors, stretches.velocity_errors
     assert errors is not None
     moments = {"gyroscope": errors[:, :3], "accelerometer": velocity_errors}
@@ -689,7 +675,7 @@ def _with_interval(
     known: FloatArray,
     moment: FloatArray,
     root: FloatArray | None,
-    block: NDArray[np.int64],
+    block: IntArray,
     draws: int,
     rng: np.random.Generator,
 ) -> tuple[float, float, float]:

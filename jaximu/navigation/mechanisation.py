@@ -30,9 +30,6 @@ from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, 
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.navigation.by_component import cross, matvec, right_jacobian, transpose, turn
 
-__all__ = ["Navigation", "deviation", "linearised", "mechanise", "mechanise_increments"]
-
-
 _TOGETHER = 10
 """Samples that are put into the level frame at once, at the most."""
 

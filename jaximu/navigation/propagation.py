@@ -9,8 +9,6 @@ from jaxtyping import Float
 from jaximu.ground.array_types import Array
 from jaximu.model.state_space import LinearSystem
 
-__all__ = ["noise_covariance"]
-
 
 def noise_covariance(
     transition: Float[Array, "S n n"] | None, reaction: Float[Array, "S n 3"], system: LinearSystem

@@ -28,8 +28,6 @@ from jaximu.simulation import Specification
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.motion import earth_rate, smooth_course
 
-__all__ = ["Place", "Trajectory", "level_driving", "of_recording", "of_specification"]
-
 _MOST = 120_000
 """Samples of a path: the derivatives of all of them are held at once."""
 _SPEED, _REST, _RISE = 15.0, 5.0, 10.0  # m/s; s at rest, and until the speed is reached

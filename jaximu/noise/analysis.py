@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_isf
-from jaximu.ground.document import SOFTWARE, read_document
+from jaximu.ground.document import SOFTWARE, Json, read_document
 from jaximu.ground.equality import Comparable
-from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import size
 from jaximu.ground.units import SENSOR_QUANTITIES
@@ -22,8 +20,6 @@ from jaximu.model.data_sheet import SI_UNITS
 from jaximu.noise.cleaning import PeriodicLine, without_outliers
 from jaximu.noise.identification import Identified, identify
 from jaximu.recordings.recording import Recording, Signal, recordings_of
-
-__all__ = ["NoiseAnalysis", "analyse_noise", "at_rest", "evenly_sampled", "read_analysis"]
 
 SCHEMA = "jaximu.allan/1"
 _UNEVEN = 0.25
@@ -34,7 +30,7 @@ _STEP = {"accelerometer": 0.1, "gyroscope": 0.01, "magnetometer": 1.0}
 """Difference (m/s², rad/s, µT) of the means of neighbouring seconds that no drift makes."""
 
 
-def read_analysis(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_analysis(path: FilePath) -> Json:
     """Read an `allan.json`. Raises `InputError` for any other file."""
     return read_document(path, SCHEMA, "an allan.json of `jaximu allan LOG -o DIR`: a noise file must state its units")
 
@@ -58,10 +54,10 @@ class NoiseAnalysis(Result, Comparable, page="allan"):
         """The periodic lines found, by triad and axis: frequency (Hz) and amplitude (SI)."""
         return {name: [axis.lines for axis in axes] for name, axes in self.axes.items()}
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the analysis as the JSON document of schema `jaximu.allan/1`: SI, continuous, two-sided, 95 %."""
 
-        def document(axis: Identified, units: Mapping[str, str]) -> dict[str, Any]:
+        def document(axis: Identified, units: Mapping[str, str]) -> Json:
             return {
                 "terms": {name: term and term.document(units[name]) for name, term in axis.terms.items()},
                 "limits": {name: {"value": size, "unit": units[name]} for name, size in axis.limits.items()},

@@ -10,8 +10,6 @@ from jaximu.noise.analysis import at_rest
 from jaximu.noise.cleaning import BRIDGED, filled, periodic_lines
 from jaximu.recordings.recording import Recording, recordings_of, runs_of
 
-__all__ = ["fit_noise", "noise_of"]
-
 _OF_ITS_OWN = {"data.periodic", "data.gap"}
 """Findings that the fit makes itself, with numbers."""
 _FEWEST = 1000

@@ -9,21 +9,9 @@ from itertools import pairwise
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.recordings.recording import runs_of
-
-__all__ = [
-    "BRIDGED",
-    "FALSE_LINE",
-    "PeriodicLine",
-    "filled",
-    "lowest",
-    "periodic_lines",
-    "without_line",
-    "without_outliers",
-]
 
 BRIDGED = 5
 """Samples missing in a row that are filled in: a few in a thousand change no term, but would break long averages."""
@@ -195,7 +183,7 @@ def _skirts(power: FloatArray, low: int, high: int) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=8)
-def _median_edges(count: int) -> NDArray[np.int64]:
+def _median_edges(count: int) -> IntArray:
     """Edges of blocks over which the median is taken: an eighth of an octave, sixty-four ordinates at least."""
     edges = [4]
     while edges[-1] < count:

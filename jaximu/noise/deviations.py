@@ -15,12 +15,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_isf
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
-
-__all__ = ["KINDS", "RESOLUTIONS", "Deviation", "averaging_factors", "degrees_of_freedom", "deviation"]
 
 _BLOCK = 1 << 15
 """Differences squared, or averages compared, at once: what short averages need of the phase stays in the cache."""
@@ -59,17 +57,17 @@ class Deviation(Comparable):
 
     kind: str
     tau: FloatArray
-    factor: NDArray[np.int64]
+    factor: IntArray
     value: FloatArray
     low: FloatArray
     high: FloatArray
-    count: NDArray[np.int64]
-    exponent: NDArray[np.int64]
+    count: IntArray
+    exponent: IntArray
     freedom: FloatArray
     confidence: float
 
 
-def averaging_factors(samples: int, kind: str = "overlapping", spacing: str | int = "octave") -> NDArray[np.int64]:
+def averaging_factors(samples: int, kind: str = "overlapping", spacing: str | int = "octave") -> IntArray:
     """Return the numbers of samples to average: octaves (1, 2, 4 …), decades (1, 2, 4, 10, 20, 40 …), or so many spaced
     evenly in their logarithm. The longest leaves at least two differences (one degree of freedom apart from the mean).
     """
@@ -155,7 +153,7 @@ def deviation(
         )
     grid = _grid(chosen, samples, difference, multi)
 
-    def analysed(row: FloatArray) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+    def analysed(row: FloatArray) -> tuple[FloatArray, IntArray, IntArray]:
         points, lost = (row, None) if phase else _integrated(row)
         alpha = _exponents(points, grid.factor) if exponent is None else np.full(len(grid.factor), exponent)
         return *_mean_squares(points, lost, grid, difference), alpha
@@ -213,14 +211,14 @@ class _Grid:
     The points are every 1st, 2nd, 4th … phase point: every 2^level-th.
     """
 
-    factor: NDArray[np.int64]
-    lag: NDArray[np.int64]
-    level: NDArray[np.int64]
-    first: NDArray[np.int64]
-    count: NDArray[np.int64]
+    factor: IntArray
+    lag: IntArray
+    level: IntArray
+    first: IntArray
+    count: IntArray
 
 
-def _grid(factors: NDArray[np.int64], samples: int, kind: _DeviationKind, multi: bool) -> _Grid:
+def _grid(factors: IntArray, samples: int, kind: _DeviationKind, multi: bool) -> _Grid:
     zero = np.zeros_like(factors)
     if not multi:
         # a mirrored phase begins samples − 1 points earlier; its differences are centred on the inner points
@@ -239,7 +237,7 @@ def _grid(factors: NDArray[np.int64], samples: int, kind: _DeviationKind, multi:
     return _Grid(factor, lag, level, zero[kept], (samples >> level) + 1 - 2 * lag)
 
 
-def _full_count(samples: int, factors: NDArray[np.int64], kind: _DeviationKind) -> NDArray[np.int64]:
+def _full_count(samples: int, factors: IntArray, kind: _DeviationKind) -> IntArray:
     """Differences there are without gaps."""
     if kind.total:
         return np.full(len(factors), samples - 1)
@@ -260,7 +258,7 @@ def _integrated(row: FloatArray) -> tuple[FloatArray, NDArray[np.int32] | None]:
 
 def _mean_squares(
     points: FloatArray, lost: NDArray[np.int32] | None, grid: _Grid, kind: _DeviationKind
-) -> tuple[FloatArray, NDArray[np.int64]]:
+) -> tuple[FloatArray, IntArray]:
     """Mean squares (T,) of the differences of phase points (n + 1,), and of how many that miss nothing."""
     order = kind.order
     if kind.modified:  # a difference averaged over m places is one of the next order of the running sum, over m
@@ -306,7 +304,7 @@ def _product(left: FloatArray, right: FloatArray) -> float:
     return float(np.einsum("i,i", left, right))
 
 
-def _exponents(points: FloatArray, factors: NDArray[np.int64]) -> NDArray[np.int64]:
+def _exponents(points: FloatArray, factors: IntArray) -> IntArray:
     """The exponents (T,) of the noise by its phase: means over a factor are differences of every so manieth point.
 
     Those with too few averages take the exponent of the one before.

@@ -17,29 +17,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.model.data_sheet import SI_UNITS
 from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.identification import Identified, Term
-
-__all__ = [
-    "FilterNumbers",
-    "MeanTerm",
-    "Walk",
-    "filter_document",
-    "filter_numbers",
-    "flat_part",
-    "mean_terms",
-    "random_walk_only",
-    "recorded_seconds",
-    "white_noise_only",
-]
 
 FLICKER = 2 * math.log(2) / math.pi
 """Allan variance of flicker noise of B = 1: 0.664²."""
@@ -187,7 +174,7 @@ class FilterNumbers:
             ("driving_variance", "Q = B²(1−φ²)", "its drive a step", self.driving_variance, squared),
         ]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the numbers with their units for JSON; null where the data supports no such term."""
         return {
             key: None if value is None else {"value": value, "unit": unit} for key, _, _, value, unit in self.rows()
@@ -237,10 +224,10 @@ def _numbers(sizes: Mapping[str, float], tau: FloatArray, quantity: str, rate: f
     return FilterNumbers(quantity, rate, white, walk, sigma, time, flat)
 
 
-def filter_document(analysis: NoiseAnalysis) -> dict[str, Any]:
+def filter_document(analysis: NoiseAnalysis) -> Json:
     """Return the key `filter` of `allan.json`: by triad the rate, the numbers of three axes and of their mean."""
 
-    def of_triad(name: str) -> dict[str, Any]:
+    def of_triad(name: str) -> Json:
         axes, mean = filter_numbers(analysis, name)
         return {
             "rate": analysis.rates[name],

@@ -17,20 +17,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_isf
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov
 from jaximu.noise.cleaning import BRIDGED, PeriodicLine, filled, lowest, periodic_lines, without_line, without_outliers
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation
-
-__all__ = ["TERMS", "GaussMarkov", "Identified", "Term", "WarmUp", "identify"]
 
 TERMS = "QNBKR"
 _SHORTEST = 256
@@ -60,7 +58,7 @@ class Term:
     low: float
     high: float
 
-    def document(self, unit: str) -> dict[str, Any]:
+    def document(self, unit: str) -> Json:
         """Return the term as JSON has it."""
         return vars(self) | {"unit": unit}
 
@@ -279,9 +277,9 @@ class _Spectrum:
     count: FloatArray
     power: FloatArray
     node: FloatArray
-    octave: NDArray[np.int64]
+    octave: IntArray
     coefficient: FloatArray  # (J,) lowest coefficients, by place from 1
-    inside: NDArray[np.int64]  # (J,) bin of each, −1 if left out
+    inside: IntArray  # (J,) bin of each, −1 if left out
     slope: float
     high_pass: float | None = None  # time constant (s) of what took out what is slow
 
@@ -321,7 +319,7 @@ class _Spectrum:
 
 
 @lru_cache(maxsize=8)
-def _bins(samples: int) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
+def _bins(samples: int) -> tuple[IntArray, FloatArray, IntArray]:
     """Edges (B + 1,) of the bins in places j, their nodes (B, 3), and the octave (B,) each belongs to."""
     edges = [*range(1, min(_SINGLE, samples))]
     while edges[-1] < samples:

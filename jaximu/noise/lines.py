@@ -20,10 +20,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.noise.cleaning import FALSE_LINE
-
-__all__ = ["SpectralLine", "follow", "spectra", "swing", "windows_at_rest"]
 
 _OVER = 2
 """Points of the frequency grid an ordinate: a line between two loses 4 % of its size."""
@@ -65,7 +63,7 @@ class SpectralLine:
     axis: int
     times: FloatArray
     frequency: FloatArray
-    visible: NDArray[np.bool_]
+    visible: BoolArray
     size: float
     rate: float
     resolution: float
@@ -98,7 +96,7 @@ class SpectralLine:
         return self.times[:-1][crossed] + share * np.diff(self.times)[crossed]
 
 
-def windows_at_rest(time: FloatArray, rests: FloatArray, rate: float) -> tuple[NDArray[np.int64], int]:
+def windows_at_rest(time: FloatArray, rests: FloatArray, rate: float) -> tuple[IntArray, int]:
     """Return first samples (k,) of windows of equal length at rest, and that length: half of a usual rest.
 
     **Arguments:** `time` (n,): stamps, s; `rests` (r, 2): starts and stops, s; `rate`: Hz. Windows with gaps are left
@@ -221,7 +219,7 @@ def _forward(odds: FloatArray, gaps: FloatArray) -> FloatArray:
     return total
 
 
-def _likeliest(odds: FloatArray, gaps: FloatArray, drift: float, walk: float) -> NDArray[np.int64]:
+def _likeliest(odds: FloatArray, gaps: FloatArray, drift: float, walk: float) -> IntArray:
     """Return the likeliest course (k,) on the grid, not folded, of a drift and a walk; `odds` (k, n): logarithms."""
     points = odds.shape[1]
     score, steps = odds[0], []
@@ -240,7 +238,7 @@ def _likeliest(odds: FloatArray, gaps: FloatArray, drift: float, walk: float) ->
     return course if np.median(course) >= 0 else -course
 
 
-def _covered(ordinates: FloatArray, at: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _covered(ordinates: FloatArray, at: NDArray[np.intp]) -> BoolArray:
     """Return the ordinates (k, f) that a line reaches: its main lobe, and as far as their median is no noise's.
 
     Of noise half of the windows exceed a value with the tail of a binomial law; other lines cross in fewer.
@@ -266,7 +264,7 @@ def _size(
     times: FloatArray,
     rate: float,
     noise: FloatArray,
-    visible: NDArray[np.bool_],
+    visible: BoolArray,
 ) -> float:
     """Return the amplitude of a line, its drift within the windows (k, w) undone, and noise taken off its power."""
     time = (np.arange(tapered.shape[1]) - (tapered.shape[1] - 1) / 2) / rate

@@ -10,15 +10,13 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import damage
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model import BiasInstability
 from jaximu.model.data_sheet import SI_UNITS, convert
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.noise.analysis import read_analysis
 from jaximu.recordings.readers.kalibr import read_noise
-
-__all__ = ["SensorNoise", "model_of", "read_sensor_noise", "sensor_noise"]
 
 SensorNoise = Mapping[str, Mapping[str, FloatArray]]
 """By triad and term (Q, N, B, K, repeatability), the figure of each axis (3,), SI, two-sided."""
@@ -28,7 +26,7 @@ _SHORTEST = 0.1
 """s: flicker noise that is quicker is white noise to means over poses."""
 
 
-def read_sensor_noise(path: str | os.PathLike[str]) -> dict[str, dict[str, FloatArray]]:
+def read_sensor_noise(path: FilePath) -> dict[str, dict[str, FloatArray]]:
     """Read Q, N, B, K and repeatability from an `allan.json`, or N and K from an `imu.yaml`, whose keys fix units.
 
     Raises `InputError` for anything else, or without units.

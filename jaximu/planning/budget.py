@@ -48,13 +48,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from jaximu.calibration.turntable import fit_turntable, free_on_table
@@ -65,8 +63,8 @@ from jaximu.estimation.problem import TOLERANCE, Name, Parameters, Problem, flat
 from jaximu.estimation.solver import solve
 from jaximu.estimation.uncertainty import UNDETERMINED, weak_directions
 from jaximu.ground import stored
-from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.array_types import Array, BoolArray, FloatArray
+from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects import CATALOGUE
@@ -77,14 +75,10 @@ from jaximu.planning.setup_errors import (
     ErrorScheme,
     ErrorSource,
     Task,
-    read_task,
     scheme_and_sources,
-    task,
     with_effects,
 )
 from jaximu.recordings.observations import Stations
-
-__all__ = ["SCHEMA", "Budget", "Goal", "Need", "Task", "Trials", "budget", "read_task", "task"]
 
 SCHEMA = "jaximu.budget/1"
 _OFF = 0.05  # of a total: a source whose linear share is wrong by more is said to be
@@ -147,7 +141,7 @@ class Budget(Result, Document, page="budget"):
     sources: tuple[ErrorSource, ...]
     sigma: FloatArray
     actual: FloatArray
-    determined: NDArray[np.bool_]
+    determined: BoolArray
     excess: FloatArray
     open: tuple[str, ...]
     goals: tuple[Goal, ...]
@@ -177,12 +171,12 @@ class Budget(Result, Document, page="budget"):
         weight = share[:, self.determined].sum(axis=1)
         return [int(row) for row in np.argsort(-weight, kind="stable")]
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the budget as the JSON document of schema `jaximu.budget/1`."""
         order, total, off = self.order(), self.total, self.nonlinear()
         parameters = []
         for index, (name, unit) in enumerate(zip(self.names, self.units, strict=True)):
-            entry: dict[str, Any] = {"name": name, "unit": unit, "determined": bool(self.determined[index])}
+            entry: Json = {"name": name, "unit": unit, "determined": bool(self.determined[index])}
             if self.determined[index]:
                 ranked = sorted(order, key=lambda row: -self.sigma[row, index])
                 entry["sigma"] = float(total[index])
@@ -296,7 +290,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     return replace(result, check=_check(task, result, scheme, per, truth, draws, seed)) if draws else result
 
 
-def _determined(jacobian: FloatArray, scale: FloatArray, sigma: FloatArray) -> NDArray[np.bool_]:
+def _determined(jacobian: FloatArray, scale: FloatArray, sigma: FloatArray) -> BoolArray:
     """Which parameters (p,) the scheme determines: what the data sheet's tolerance holds is as uncertain as that."""
     known = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(scale)) / TOLERANCE**2)
     held = scale * np.linalg.norm(known, axis=1) / TOLERANCE

@@ -8,8 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 
-__all__ = ["in_chunks"]
-
 
 def in_chunks(function: Callable[..., Any], size: int, *trees: Any) -> Any:
     """Return a function of `size` rows for all rows of its arguments' arrays, in NumPy.

@@ -13,8 +13,6 @@ from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model.sensor import Imu
 from jaximu.planning.setup_errors import quantity
 
-__all__ = ["goal_of", "goal_sigmas", "group_of", "parse_goal", "per_si", "unit_of"]
-
 
 def parse_goal(text: str) -> tuple[str, str]:
     """Split "accelerometer.bias 0.001 m/s^2" into what and how much. Raises `InputError` where one is missing."""

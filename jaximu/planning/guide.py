@@ -14,13 +14,12 @@ from itertools import pairwise
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration, calibrate
 from jaximu.calibration.nominal import as_stated
 from jaximu.estimation.problem import names_of
 from jaximu.ground import stored
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.model.sensor import Imu
@@ -34,8 +33,6 @@ from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import SegmentationOptions, segment
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.positions import directions
-
-__all__ = ["GoalProgress", "Guide", "Moment"]
 
 _BOX = np.array([up for up, _ in directions(26)])
 _FEWEST, _MOST = 9, 60  # poses that a calibration needs; poses after which a goal is given up
@@ -209,7 +206,7 @@ class Guide:
         return progress
 
 
-def _upward(imu: Imu, signal: Signal, rows: NDArray[np.int64]) -> FloatArray:
+def _upward(imu: Imu, signal: Signal, rows: IntArray) -> FloatArray:
     """Return the body's mean upward directions (n, 3) over spans of rows (n, 2)."""
     means = np.array([signal.values[first:last].mean(axis=0) for first, last in rows]).reshape(-1, 3)
     gain, bias = np.asarray(imu.accelerometer.gain), np.asarray(imu.accelerometer.bias)

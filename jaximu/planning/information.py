@@ -33,21 +33,6 @@ from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.observations import Observations, Poses, Turns
 from jaximu.simulation.protocols.motion import smooth_course
 
-__all__ = [
-    "COARSE",
-    "RAMP",
-    "STIMULI",
-    "Accuracy",
-    "Design",
-    "gravity_sensitivity",
-    "hand_held_information",
-    "robot_information",
-    "root_of",
-    "table_information",
-    "turn_vectors",
-    "up_vectors",
-]
-
 STIMULI = ("specific_force", "angular_rate", "attitude")
 """What a design tells of the stimulus: effects that need no more can be among the parameters."""
 SAMPLES = 12

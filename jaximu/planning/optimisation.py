@@ -35,20 +35,6 @@ from jaximu.planning.information import (
     up_vectors,
 )
 
-__all__ = [
-    "CRITERIA",
-    "FEW_STEPS",
-    "STEPS",
-    "DesignCovariance",
-    "DesignQuestion",
-    "Step",
-    "covariance",
-    "objective",
-    "optimise",
-    "score",
-]
-
-
 CRITERIA: dict[str, Callable[[Array, Array], Array]] = {
     "D": lambda covariance, _: jnp.linalg.slogdet(covariance)[1] / (2 * covariance.shape[0]),
     "A": lambda covariance, _: jnp.log(jnp.trace(covariance) / covariance.shape[0]) / 2,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import numpy as np
@@ -15,7 +14,7 @@ from jaximu.data.attitude import INTERVALS
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
 from jaximu.estimation.uncertainty import WeakDirection, weak_directions
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document
+from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.page import Result
@@ -56,8 +55,6 @@ from jaximu.planning.setup_errors import white_density
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.positions import directions, spiral
-
-__all__ = ["AS_GOOD", "EQUIPMENT", "Equipment", "Known", "Pose", "Proposal", "Turn", "propose", "question_of"]
 
 SCHEMA = "jaximu.plan/1"
 _STARTS, _FEW_STARTS = 10, 4
@@ -294,7 +291,7 @@ class Proposal(Result, Document, page="plan"):
             now += duration + setting
         return "\n".join(lines) + "\n"
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the proposal as the JSON document of schema `jaximu.plan/1`."""
         sigmas = zip(self.names, self.before.tolist(), self.after.tolist(), strict=True)
         return {

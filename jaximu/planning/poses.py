@@ -3,24 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.simulation.protocols.course import attitude_of
-
-__all__ = [
-    "attitude_words",
-    "box_words",
-    "first_heading",
-    "heading_of",
-    "pose_words",
-    "round_attitude",
-    "round_direction",
-    "short_order",
-    "turned_to",
-    "up_of",
-]
 
 
 def up_of(attitude: FloatArray) -> FloatArray:
@@ -98,7 +84,7 @@ def heading_of(attitude: FloatArray) -> float:
     return float(np.degrees(turned.as_rotvec()[2]))
 
 
-def short_order(up: FloatArray) -> NDArray[np.int64]:
+def short_order(up: FloatArray) -> IntArray:
     """Return an order of directions (P, 3) with little turning between neighbours: nearest next, then 2-opt."""
     angle = np.arccos(np.clip(up @ up.T, -1, 1))
     order = [int(np.argmax(up[:, 2]))]

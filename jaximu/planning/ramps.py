@@ -19,8 +19,6 @@ from jaximu.data.rest_blocks import RestBlocks, joined
 from jaximu.estimation.track import Track
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["Ramp", "next_ramps"]
-
 _BLOCKS = 60  # of each way
 _RATES = {1.0: "at the same rate", 2.0: "twice as quickly", 0.5: "half as quickly", 0.25: "at a quarter of the rate"}
 _SOAK = 0.2  # of a way's duration, before and after each

@@ -36,8 +36,6 @@ from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Positions, Protocol, RateTable
 from jaximu.simulation.protocols import HandHeld as TurnedByHand
 
-__all__ = ["advised", "options", "suggestion"]
-
 _LEVEL = 0.01  # of the test that rules a rival out
 _WARMING = 20.0  # K, what a hair dryer or a cold box gives
 _POSES = 40

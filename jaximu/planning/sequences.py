@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import qr
 from scipy.spatial.transform import Rotation
 
@@ -33,7 +32,7 @@ from jaximu.estimation.information_filter import Knowledge, WhiteRows, estimate,
 from jaximu.estimation.problem import Name, Parameters, flatten, without_equipment_or_effects
 from jaximu.estimation.uncertainty import spoken_amount, weak_directions
 from jaximu.ground import stored
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects.base import Effect
@@ -48,8 +47,6 @@ from jaximu.simulation import simulate
 from jaximu.simulation.protocols import Environment, Rotations
 from jaximu.simulation.protocols.course import Course, attitude_of
 from jaximu.simulation.protocols.rotations import NINETEEN, rotation_vector
-
-__all__ = ["FILTERED", "Filter", "filter_of", "propose_sequence"]
 
 FILTERED = replace(EQUIPMENT["table"], rest=20.0, turn=8.0, setting=0.0, in_sequence=True)
 """A table that turns a unit from one position to the next while it is recorded."""
@@ -96,7 +93,7 @@ class Filter:
     turn: float
     names: tuple[Name, ...]
     size: FloatArray
-    index: NDArray[np.int64]
+    index: IntArray
     prior: Knowledge
     beyond: int = 0
     _legs: dict[tuple, tuple[WhiteRows, Rotation]] = field(default_factory=dict, repr=False)

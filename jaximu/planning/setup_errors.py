@@ -17,14 +17,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from jaximu.data.observe_stations import TYPICAL_NOISE, scheme_stations
-from jaximu.ground.array_types import Array, FloatArray
-from jaximu.ground.document import read_toml
-from jaximu.ground.errors import InputError, NotPossibleError, only
+from jaximu.ground.array_types import Array, FloatArray, IntArray
+from jaximu.ground.document import Json, read_toml
+from jaximu.ground.errors import FilePath, InputError, NotPossibleError, only
 from jaximu.ground.rotation import apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
 from jaximu.model import AxisNoise, parse_quantity, processes
@@ -37,18 +36,6 @@ from jaximu.recordings.observations import Stations
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.protocols import Environment, Interval, Motion
 from jaximu.simulation.specification import Draw
-
-__all__ = [
-    "ErrorScheme",
-    "ErrorSource",
-    "Task",
-    "quantity",
-    "read_task",
-    "scheme_and_sources",
-    "task",
-    "white_density",
-    "with_effects",
-]
 
 _TURN_ONLY = ("rate-table", "single-axis-table")  # their angle about the vertical is all that is set
 _FLICKER_INTERVAL = 0.01  # s; flicker noise faster than this averages out like white noise
@@ -127,7 +114,7 @@ class Task:
     name: str
 
 
-def read_task(path: str | os.PathLike[str]) -> Task:
+def read_task(path: FilePath) -> Task:
     """Read and check a specification with its errors and goals.
 
     Raises `InputError`, naming file and key, for anything that is not understood.
@@ -175,9 +162,9 @@ def quantity(value: Any, unit: str, where: str) -> float:
     return parsed
 
 
-def _errors(table: Any, name: str, environment: Mapping[str, Any]) -> dict[str, Any]:
+def _errors(table: Any, name: str, environment: Mapping[str, Any]) -> Json:
     """Check the table; sizes in SI, with the text they were stated in."""
-    sizes_of: dict[str, Any] = {}
+    sizes_of: Json = {}
     latitude = "latitude" in environment
     for key, value in only(table, _ERRORS, name, "[errors]").items():
         where = f"{name}: errors.{key}"
@@ -298,8 +285,8 @@ class _Stops:
     """
 
     up: FloatArray
-    setting: NDArray[np.int64]
-    ends: NDArray[np.int64]
+    setting: IntArray
+    ends: IntArray
 
 
 def _stops(intervals: tuple[Interval, ...], motion: Motion) -> _Stops:

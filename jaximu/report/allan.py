@@ -38,13 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "allan_figure",
-    "kalibr_text",
-    "page_of",
-    "term_rows",
-    "unseen_notes",
-]
 
 _DISCRETE_UNITS = {
     "angular_rate": ("deg/s", "rad/s"),

@@ -19,8 +19,6 @@ from jaximu.report.figures import AXES, dressed, new_figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["page_of"]
-
 
 def page_of(array: Array) -> Page:
     """Return what averaging gains, which unit disturbs, and where each unit is."""

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from jaximu.data.attitude import AgainstAttitude
 
-__all__ = ["mounting_words", "page_of"]
 
 _PANELS = {
     "rotation": "Rate off the reference's, mean of each interval",

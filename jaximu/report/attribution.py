@@ -18,8 +18,6 @@ from jaximu.report import figures
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["page_of"]
-
 
 def page_of(attribution: Attribution) -> Page:
     """Return the verdict, what belongs to units, sessions and the board, each recording's verdict, and time courses."""

@@ -12,7 +12,6 @@ from jaximu.report import figures
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["AXES_WORDS", "draw_floor", "draw_unit"]
 
 AXES_WORDS = (
     "Arrows are its axes, coloured faces their positive ends; dashed arrows point away from you. A minus marks the "

@@ -21,7 +21,6 @@ from jaximu.report.uncertainty import uncertainty_parts
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["calibration_page", "page_of"]
 
 _ERRORS = {
     "gravity_norm": "Error against gravity at rest",

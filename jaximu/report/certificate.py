@@ -21,8 +21,6 @@ from jaximu.ground.quantities import counted, sentence, unit_text
 from jaximu.recordings.trace import missing
 from jaximu.report.tables import provenance
 
-__all__ = ["certificate_of", "item_row", "page_of"]
-
 _COLUMNS = ("name", "value", "limits", "probability", "verdict", "coverage", "freedom", "recording", "gravity")
 
 

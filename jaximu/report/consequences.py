@@ -22,7 +22,6 @@ from jaximu.report.figures import LEAST_SHARE, OTHERS, PALETTE, dressed, legend,
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["page_of"]
 
 _SHOWN = (1.0, 10.0, 60.0, 600.0)  # s
 _COMMON = 0.1  # by how much the calibration's terms together may differ from their root sum of squares unsaid

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     Twin = Callable[[], tuple[Experiment, State]]
     """The recording as the fitted model simulates it, and its fit; made when a picture first needs it."""
 
-__all__ = ["page_of"]
 
 _MEASURED, _TWIN, _EXTENDED = figures.FLAGGED, figures.BEFORE, figures.AFTER
 _SHOWN = 12

@@ -10,8 +10,6 @@ from jaximu.ground.page import Page, Statement, Table
 from jaximu.ground.quantities import number, sentence
 from jaximu.navigation.estimator_noise import EstimatorNoise, TriadNoise
 
-__all__ = ["page_of", "statements"]
-
 _LEAST = 0.05
 """Terms that stay below this multiple of N are not shown."""
 _QUIETER = 0.99

@@ -13,8 +13,6 @@ from jaximu.data.poses import EXCESS_NAMES
 from jaximu.ground.array_types import FloatArray
 from jaximu.simulation.protocols.positions import spiral
 
-__all__ = ["PoseAndTurnErrors", "evidence", "largest_gap"]
-
 
 @dataclass(frozen=True)
 class PoseAndTurnErrors:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import number, raised, readable, size, unit_text
 from jaximu.ground.units import SENSOR_UNITS
@@ -29,30 +29,6 @@ if TYPE_CHECKING:  # matplotlib takes half a second to import: only drawing need
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "AFTER",
-    "AXES",
-    "BEFORE",
-    "FLAGGED",
-    "LEAST_SHARE",
-    "OTHERS",
-    "PALETTE",
-    "band",
-    "dressed",
-    "hemispheres",
-    "legend",
-    "legend_below",
-    "logarithmic",
-    "new_figure",
-    "number_dots",
-    "png",
-    "raised_to_sphere",
-    "recording_of",
-    "residuals_of",
-    "signals_figure",
-    "stacked",
-    "zero_line",
-]
 
 # Okabe and Ito's palette, which colour-blind readers can tell apart.
 AXES = {"x": "#0072B2", "y": "#D55E00", "z": "#009E73"}
@@ -392,7 +368,7 @@ def raised_to_sphere(x: FloatArray, y: FloatArray, sign: int) -> FloatArray:
 
 def hemispheres(
     figure: Figure, columns: int, directions: FloatArray, names: Sequence[str], colors: Any = None, **dots: Any
-) -> tuple[list[tuple[Axes, int, NDArray[np.bool_], FloatArray]], Any]:
+) -> tuple[list[tuple[Axes, int, BoolArray, FloatArray]], Any]:
     """Draw directions (n, 3), called by their names, on the two half spheres about ±z; `colors` (n,): values.
 
     **Returns:** the two panels, each with the sign of its z, which directions (n,) lie in it, and where (m, 2); and

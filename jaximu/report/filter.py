@@ -24,7 +24,6 @@ from jaximu.report.words import BEYOND, gravity_statements, limits
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["page_of"]
 
 _PANELS = (
     ("gyroscope", "bias", "Gyroscope bias less its last value [°/s]", np.degrees(1.0)),

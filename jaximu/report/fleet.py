@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["amount", "difference_words", "lot_figure", "page_of", "population_figure", "prior_figure"]
 
 _UNIT, _STRANGER, _PRIOR = figures.AXES.values()
 _KINDS = (

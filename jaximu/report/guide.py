@@ -27,7 +27,6 @@ from jaximu.simulation.protocols.course import attitude_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Capture", "LivePage"]
 
 _LASTING = 1.0  # s after which a stage is shown: most take less
 _STEP = np.radians(1.0)  # change of an attitude for which the unit is drawn again

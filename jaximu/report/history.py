@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["page_of"]
 
 _DRAWN = 4
 """Numbers that are drawn over time and temperature: those whose change is surest."""

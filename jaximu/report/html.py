@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup, escape
 
 from jaximu.ground.atomic import write_files, write_folder
-from jaximu.ground.errors import worded
+from jaximu.ground.errors import FilePath, worded
 from jaximu.ground.page import Page, Part, Picture, Result, Section
 from jaximu.ground.quantities import sentence
 
@@ -26,12 +26,11 @@ if TYPE_CHECKING:
 
     from jaximu.report.vector import Drawing
 
-__all__ = ["encoded", "environment", "failure", "fragment", "packaged", "write_failure", "write_report"]
 
 _LONG_WORD = 40  # letters from which on a cell's word is broken
 
 
-def write_report(result: Result | Page, folder: str | os.PathLike[str]) -> Path:
+def write_report(result: Result | Page, folder: FilePath) -> Path:
     """Write a result's page as `report.html` and its pictures as PNGs into `folder`, which is made if it is missing.
 
     **Returns:** the path of `report.html`. Everything is drawn before anything is written, and each file is written

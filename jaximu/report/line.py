@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["page_of"]
 
 _CHARTS = 4  # drawn
 _CAPABLE, _CATEGORIES, _LEVEL = 1.33, 5, 0.01

@@ -9,8 +9,6 @@ from jaximu.ground.page import Items, Page, Part, Section, Statement
 from jaximu.ground.quantities import sentence
 from jaximu.report.recording import log_page
 
-__all__ = ["page_of"]
-
 
 def page_of(
     title: str,

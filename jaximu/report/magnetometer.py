@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaximu.calibration import Calibration
+from jaximu.ground.document import Json
 from jaximu.ground.page import Page, Picture, Statement
 from jaximu.ground.quantities import Z95, number, sentence
 from jaximu.report.calibration import calibration_page
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from jaximu.calibration import Heading
     from jaximu.data.field import MagneticField
 
-__all__ = ["next_words", "page_of"]
 
 _PAYS = 0.8
 """Share of what is uncertain of a heading that must be left for further directions to be worth a turn."""
@@ -103,7 +103,7 @@ def statements(calibration: Calibration) -> Iterator[Statement]:
         )
 
 
-def next_words(plan: dict[str, Any]) -> str:
+def next_words(plan: Json) -> str:
     """Say how to hold the unit next and what that buys, or that nothing is missing; plan: `next` of `magnetic`."""
     now, then = (number(plan[key], 2) for key in ("heading_now", "heading_then"))
     if plan["heading_then"] >= _PAYS * plan["heading_now"]:

@@ -13,8 +13,6 @@ from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_UNITS
 if TYPE_CHECKING:
     from jaximu.model.noise_model import NoiseModel
 
-__all__ = ["page_of"]
-
 
 def page_of(model: NoiseModel) -> Page:
     """Return each axis's white noise and the spread of its slow bias."""

@@ -25,7 +25,6 @@ from jaximu.report.uncertainty import Known, Rest, over_sphere, sphere_figure, s
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["page_of"]
 
 _COLUMNS = 3
 _ABOVE = 0.08  # inches between the figure's edge and its title, for which the layout keeps a line

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from jaximu.ground.document import Json
 from jaximu.ground.page import Code, Items, Page, Part, Picture, Section, Table
 from jaximu.ground.quantities import listed, number, sentence, unit_text
 from jaximu.ground.units import SENSORS
 from jaximu.recordings.recording import Recording, Signal
-
-__all__ = ["log_page", "page_of", "signal_facts"]
 
 
 def page_of(recording: Recording) -> Page:
@@ -48,7 +47,7 @@ def log_page(document: Mapping[str, Any], commands: Sequence[str]) -> Page:
     )
 
 
-def signal_facts(signal: Signal, used: Signal | None = None) -> dict[str, Any]:
+def signal_facts(signal: Signal, used: Signal | None = None) -> Json:
     """Return how a signal was sampled and between which values it lies.
 
     **Arguments:** `used`: the signal as every other verb takes it; where its stamps were put right, those count.

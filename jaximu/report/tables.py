@@ -8,19 +8,16 @@ from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe, label
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.page import Matrices, Part
 from jaximu.ground.quantities import Z95, number, plain, raised, unit_text, with_interval
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
-
-__all__ = ["MOST_ROWS", "equations", "provenance", "rows", "short_name", "snippet"]
 
 
 class _Input(NamedTuple):
@@ -160,7 +157,7 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
     ]
 
 
-def _along(gain: FloatArray, sigma: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _along(gain: FloatArray, sigma: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the gain (3,) of each output along the axis that it is of, and whether that is another's for certain."""
     axis = np.argmax(np.abs(gain), axis=1)
     along = gain[range(3), axis]

@@ -16,8 +16,6 @@ from jaximu.ground.errors import worded
 from jaximu.ground.page import Code, Items, Page, Part, Section, Statement, Table
 from jaximu.ground.quantities import sentence
 
-__all__ = ["console", "show", "text"]
-
 _WIDTH = 100
 
 

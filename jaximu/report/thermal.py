@@ -17,6 +17,7 @@ from jaximu.calibration.thermal_terms import LEARNED, NETWORK
 from jaximu.data.rest_blocks import LEAST_RANGE, RATE_BANDWIDTH
 from jaximu.estimation.track import TEMPERATURE_WINDOW
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import Json
 from jaximu.ground.page import Items, Page, Part, Picture, Section, Statement, Table
 from jaximu.ground.quantities import Z95, listed, number, readable, sentence, size, unit_text, with_interval
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
@@ -31,15 +32,6 @@ if TYPE_CHECKING:
 
     from jaximu.report.export.thermal_autopilot import AutopilotParameters
 
-__all__ = [
-    "band_figure",
-    "candidate_table",
-    "effect_table",
-    "files_and_next",
-    "loss_words",
-    "page_of",
-    "residual_figure",
-]
 
 _ROWS = 45  # three to a term of a regression
 _WORTH = 1.2  # times as large a share that a ramp must leave of some effect to be proposed
@@ -227,7 +219,7 @@ def effect_table(calibration: Calibration) -> Table:
     return Table(("effect", "x", "y", "z", "unit"), rows, caption)
 
 
-def _coefficient_rows(title: str, entry: dict[str, Any]) -> list[tuple[str, ...]]:
+def _coefficient_rows(title: str, entry: Json) -> list[tuple[str, ...]]:
     """Return an effect's coefficients, three a row, with intervals where they are known."""
     coefficients = entry["coefficients"]
     sigma = entry["sigma"] or [0.0] * len(coefficients)

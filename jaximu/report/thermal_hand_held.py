@@ -25,7 +25,6 @@ from jaximu.report.words import how_much_smaller
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["page_of"]
 
 _POWER = {name: power for power, name in enumerate(POWERS, 1)}
 

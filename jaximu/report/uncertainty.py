@@ -8,11 +8,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.calibration import Calibration
 from jaximu.estimation.projection import OutputUncertainty
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.page import Part, Picture, Statement
 from jaximu.ground.quantities import Z95, listed, number, readable, size
 from jaximu.model.stimulus import Stimulus
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.gridspec import GridSpec
 
-__all__ = ["Known", "Rest", "at_rest", "over_sphere", "poses_on_sphere", "sphere_figure", "steady", "uncertainty_parts"]
 
 Known = Callable[[Stimulus], dict[str, OutputUncertainty]]
 Rest = Callable[[FloatArray], Stimulus]
@@ -181,7 +179,7 @@ def _panels(calibration: Calibration, extent: Range) -> Iterator[tuple[str, str,
             yield title, "temperature (°C)", f"± 95 % ({unit})", {"": temperatures}, half[None]
 
 
-def _map_points() -> tuple[NDArray[np.bool_], FloatArray]:
+def _map_points() -> tuple[BoolArray, FloatArray]:
     """Return which points (n, n) of the map's grid are on it, and the directions (2, n, n, 3) of both halves."""
     x, y = np.meshgrid(_GRID, _GRID)
     return x**2 + y**2 <= 1, np.stack([figures.raised_to_sphere(x, y, sign) for sign in (1, -1)])

@@ -24,7 +24,6 @@ from jaximu.report.tables import short_name
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["page_of"]
 
 _OUTPUTS = {
     "accelerometer": "accelerometer's output",

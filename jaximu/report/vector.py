@@ -8,9 +8,11 @@ import json
 import re
 import threading
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
+from jaximu.ground.document import Json
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -18,7 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-__all__ = ["Drawing", "drawing", "named"]
 
 _MOST_MARKS, _MOST_OF_ALL, _MOST_VERTICES = 1500, 4000, 6000
 """Marks of one artist, marks of a figure, vertices of a line: what has more is an image, or the page would be large."""
@@ -112,10 +113,10 @@ def _mark(figure: Figure) -> dict[str, dict[str, str]]:
     return attributes
 
 
-def _panel(axes: Axes, width: float, height: float) -> dict[str, Any]:
+def _panel(axes: Axes, width: float, height: float) -> Json:
     """Return where a panel is, in points from the top left, and what its axes are, if it shows them."""
     (left, bottom), (right, top) = axes.get_position().get_points()
-    panel: dict[str, Any] = {
+    panel: Json = {
         "box": [round(edge, 2) for edge in (left * width, height * (1 - top), right * width, height * (1 - bottom))]
     }
     if not axes.axison:
@@ -130,14 +131,14 @@ def _panel(axes: Axes, width: float, height: float) -> dict[str, Any]:
     return panel
 
 
-def _axis(axis: Axis, labels: Sequence[str], ends: tuple[float, float]) -> dict[str, Any]:
+def _axis(axis: Axis, labels: Sequence[str], ends: tuple[float, float]) -> Json:
     """Return an axis' ends, kind, words and unit, and the names of its places where it has names and no numbers."""
     from matplotlib.dates import DateConverter
     from matplotlib.ticker import FixedLocator
 
     text = next((label for label in labels if label), "").replace("\n", " ")
     words, unit = re.fullmatch(r"(.*?)\s*(?:[(\[]([^()\[\]]*)[)\]][^()\[\]]*)?", text).groups()  # type: ignore[union-attr]
-    attributes: dict[str, Any] = {"ends": [float(f"{end:.9g}") for end in ends], "words": words or labels[-1]}
+    attributes: Json = {"ends": [float(f"{end:.9g}") for end in ends], "words": words or labels[-1]}
     attributes |= {"unit": unit} if unit and len(unit) <= _LONGEST_UNIT and " to " not in unit else {}
     attributes |= {"scale": "log"} if axis.get_scale() == "log" else {}
     attributes |= {"scale": "date"} if isinstance(axis.get_converter(), DateConverter) else {}

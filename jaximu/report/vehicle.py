@@ -20,7 +20,6 @@ from jaximu.report.words import compensation, limits
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["vehicle_page"]
 
 _SURE = 4.0
 """Standard deviations from which on a change of the bias is a caution."""

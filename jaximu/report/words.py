@@ -16,20 +16,6 @@ from jaximu.ground.page import Statement
 from jaximu.ground.quantities import Z95, listed, number, sentence, size
 from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
-__all__ = [
-    "BEYOND",
-    "compensation",
-    "counts",
-    "direction_words",
-    "file_names",
-    "gravity_statements",
-    "how_much_smaller",
-    "limits",
-    "scatter_statements",
-    "trust",
-    "weak_statements",
-]
-
 BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
 _CHANCE = 0.01
 """Share of recordings in which noise alone scatters more than a scatter that is called noise."""

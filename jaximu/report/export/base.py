@@ -15,17 +15,6 @@ from jaximu.model.conventions import Kalibr
 from jaximu.model.effects.g_sensitivity import GyroGSensitivity
 from jaximu.recordings.recording import Reading
 
-__all__ = [
-    "Correction",
-    "ExportedUnit",
-    "LinearTriad",
-    "Written",
-    "matrix_text",
-    "text_file",
-    "vector_text",
-    "yaml_matrices",
-]
-
 SYMBOLS = {"accelerometer": "f", "gyroscope": "w", "magnetometer": "h"}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from importlib import import_module
 from pathlib import Path
@@ -10,12 +9,11 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from jaximu.ground.atomic import write_files
-from jaximu.ground.errors import InputError, nearest
+from jaximu.ground.errors import FilePath, InputError, nearest
 
 if TYPE_CHECKING:
     from jaximu.report.export.base import ExportedUnit, Written
 
-__all__ = ["WRITERS", "export", "writer"]
 
 WRITERS = {
     name: f"jaximu.report.export.{name.replace('-', '_')}"
@@ -48,7 +46,7 @@ def writer(name: str) -> ModuleType:
     raise InputError(f"--to: {name!r} is no format; {nearest(name, WRITERS)}")
 
 
-def export(parameters: ExportedUnit, to: str, path: str | os.PathLike[str]) -> tuple[Written, tuple[Path, ...]]:
+def export(parameters: ExportedUnit, to: str, path: FilePath) -> tuple[Written, tuple[Path, ...]]:
     """Write a calibration for another tool, all of its files or none; return what was written, and where.
 
     A format of several files puts its endings before the suffix: `unit.calib` becomes `unit_acc.calib`.

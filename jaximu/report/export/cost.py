@@ -17,8 +17,6 @@ from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.report.export.base import ExportedUnit, Written
 
-__all__ = ["Loss", "Range", "losses"]
-
 _SAMPLES = 1080
 _NOTHING = 1e-12  # m/s² or rad/s: rounding
 

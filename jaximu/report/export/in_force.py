@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from jaximu.estimation.problem import flatten, names_of, unflatten
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.page import Section, Table
 from jaximu.ground.quantities import Z95, plain, size, with_interval
@@ -25,8 +26,6 @@ from jaximu.report.export.autopilot import MARKS, Firmware
 from jaximu.report.export.base import ExportedUnit, Logged
 from jaximu.report.export.catalogue import writer
 from jaximu.report.export.cost import Range
-
-__all__ = ["Composition"]
 
 _HELD = {True: "what the autopilot had corrected by them", False: "raw outputs"}
 
@@ -81,7 +80,7 @@ class Composition:
         logged = {name: composition._logged(name, corrected) for name in unit.triads}
         return replace(composition, unit=replace(composition.unit, logged=logged))
 
-    def changes(self) -> list[dict[str, Any]]:
+    def changes(self) -> list[Json]:
         """Return how each parameter changes, as JSON has it: `parameter`, `in_force`, `new`, `half_width`, `at_rest`.
 
         half_width: of the 95 % interval of `new`; None where no recording determined it. at_rest: what it changes at
@@ -140,7 +139,7 @@ class Composition:
             ),
         )
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the changes as JSON has them."""
         return {"file": self.file.path, "composition": self.unit.composition} | {
             "changes": self.changes(),

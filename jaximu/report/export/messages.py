@@ -25,10 +25,8 @@ import numpy as np
 
 from jaximu.calibration import Calibration
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import FilePath, InputError
 from jaximu.recordings.recording import Recording, Signal
-
-__all__ = ["is_messages", "write_messages"]
 
 _BLOCK = 1 << 12  # messages that are made at once
 _NOT_HELD = -1.0
@@ -46,14 +44,12 @@ class _Stream:
     numbers: FloatArray
 
 
-def is_messages(path: str | os.PathLike[str]) -> bool:
+def is_messages(path: FilePath) -> bool:
     """Whether a path asks for messages: an .mcap file, or a folder, which a bag of ROS 2 is."""
     return Path(path).suffix.lower() in (".mcap", "")
 
 
-def write_messages(
-    calibration: Calibration, raw: Recording, corrected: Recording, path: str | os.PathLike[str]
-) -> None:
+def write_messages(calibration: Calibration, raw: Recording, corrected: Recording, path: FilePath) -> None:
     """Write a recording before and after its correction, whole or not at all: `NAME.mcap`, or NAME, a bag's folder.
 
     Raises `InputError` where rosbags is not installed, the folder exists, or the path cannot be written.

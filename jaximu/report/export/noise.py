@@ -29,8 +29,6 @@ from dataclasses import dataclass
 from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.recordings.readers.kalibr import KALIBR_UNITS, kalibr_yaml
 
-__all__ = ["TARGETS", "Key", "Target", "noise_files", "noise_values", "target"]
-
 _DENSITIES = _ACCEL, _GYRO, _, _ = (
     "accelerometer_noise_density",
     "gyroscope_noise_density",

@@ -21,8 +21,6 @@ from jaximu.calibration.thermal_terms import NETWORK, RATES, SCALE, memories
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 
-__all__ = ["AutopilotParameters", "ardupilot_parameters", "px4_parameters"]
-
 _POINTS = 401
 _STEADY = 0.05  # weight of the calibration at steady temperatures, over that of the recordings
 _ARDUPILOT_REFERENCE = 35.0  # °C
