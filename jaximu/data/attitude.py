@@ -72,7 +72,7 @@ _SMOOTH = 0.05
 _FIELDS: dict[type[Effect], str] = {
     kind: name for kind, name in zip(MOUNTING_EFFECTS, Mounting._fields, strict=True) if kind is not AccelLeverArm
 }
-_LATE, _STOOD = ("delay", "clock_scale"), ("rotation", "tilt", "filter_variance")
+_MOVING, _TURNING = ("delay", "clock_scale"), ("rotation", "tilt", "filter_variance")
 """Fields of `Mounting` that move the reference's stamps, and that turn what it says."""
 _WINDOWS, _SAMPLES = 4, 16
 """Lengths are padded to multiples of these: few programs, and few rows for nothing in matrices of all conditions."""
@@ -422,9 +422,11 @@ class AgainstAttitude(OfOneUnit):
                 return parts[0](imu), parts
 
             # only what is late moves the ends of the integrals, whose derivatives take long
-            late, stood = ({name: jnp.asarray(getattr(mounting, name)) for name in names} for names in (_LATE, _STOOD))
-            by_late, parts = jax.jacfwd(of, has_aux=True)(late)
-            return *parts, by_late | jax.jacfwd(lambda numbers: of(numbers)[0])(stood)
+            delays, stances = (
+                {name: jnp.asarray(getattr(mounting, name)) for name in names} for names in (_MOVING, _TURNING)
+            )
+            by_delay, parts = jax.jacfwd(of, has_aux=True)(delays)
+            return *parts, by_delay | jax.jacfwd(lambda numbers: of(numbers)[0])(stances)
 
         def by_samples(imu, conditions, reactions, slopes):
             force, rate = (inverse_matrix(imu.triads()[name].gain) @ slopes[name] for name in TRIADS)
