@@ -12,7 +12,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Array", "BoolArray", "Computed", "FloatArray", "IntArray"]
 
-FloatArray, IntArray, BoolArray = NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 
 def __getattr__(name: str) -> Any:
