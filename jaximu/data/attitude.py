@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
-from jaximu.data.preintegration import linear_slope, preintegrate_samples, white_covariance
+from jaximu.data.preintegration import increments, linear_slope, preintegrate_samples, white_covariance
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, Observed, OfOneUnit, free_columns
 from jaximu.estimation.problem import Parameters
@@ -121,7 +121,11 @@ class Reactions(eqx.Module):
 
     def react(self, force: Float[Array, "m 3 k"], rate: Float[Array, "m 3 k"], windows: int) -> Float[Array, "n k"]:
         """Return how the conditions react to additions to the specific force and to the rate at every sample."""
-        both = jnp.einsum("tsij,tsjk->tik", self.reaction, jnp.concatenate([rate, force], axis=1)[self.sample])
+        return self.react_inside(jnp.concatenate([rate, force], axis=1)[self.sample], windows)
+
+    def react_inside(self, changes: Float[Array, "T S 6 k"], windows: int) -> Float[Array, "n k"]:
+        """Return how they react to additions to rate and force at the samples of each interval."""
+        both = jnp.einsum("tsij,tsjk->tik", self.reaction, changes)
         turned, pushed = both[:, :3], both[:, 3:]
         summed = jnp.sum(pushed.reshape(windows, len(pushed) // windows, *pushed.shape[1:]), axis=1)
         return jnp.concatenate([turned, summed]).reshape(3 * (len(turned) + windows), both.shape[-1])
@@ -201,6 +205,13 @@ def _added(imu: Imu, data: Intervals, around: Stimulus) -> dict[str, Float[Array
     return outputs
 
 
+def _held(mounting: Mounting, data: Intervals, samples: Int[Array, "T S"]) -> Float[Array, "T S"]:
+    """Return how long the samples hold inside their interval, s of the reference's time, in which rates are meant."""
+    stamps = mounting.on_log(data.stamp)
+    held = jnp.minimum(data.until[samples], stamps[1:, None]) - jnp.maximum(data.since[samples], stamps[:-1, None])
+    return jnp.maximum(held, 0.0) / (1 + mounting.clock_scale)
+
+
 def evaluated(
     imu: Imu,
     mounting: Mounting,
@@ -219,8 +230,7 @@ def evaluated(
     """
     gyroscope, accelerometer = imu.triads()["gyroscope"], imu.accelerometer
     stamps = mounting.on_log(data.stamp)
-    held = jnp.minimum(data.until[samples], stamps[1:, None]) - jnp.maximum(data.since[samples], stamps[:-1, None])
-    held = jnp.maximum(held, 0.0) / (1 + mounting.clock_scale)  # of the reference's time, in which rates are meant
+    held = _held(mounting, data, samples)
     turning, sensed = data.rate[samples], data.force[samples]
     whole = preintegrate_samples(gyroscope.recover(turning), accelerometer.recover(sensed), held)
     inverse = gyroscope.inverse()[:, :3]
@@ -428,9 +438,16 @@ class AgainstAttitude(OfOneUnit):
             by_delay, parts = jax.jacfwd(of, has_aux=True)(delays)
             return *parts, by_delay | jax.jacfwd(lambda numbers: of(numbers)[0])(stances)
 
-        def by_samples(imu, conditions, reactions, slopes):
-            force, rate = (inverse_matrix(imu.triads()[name].gain) @ slopes[name] for name in TRIADS)
-            columns = -reactions.react(force, rate, len(conditions.window))
+        def by_samples(imu, mounting, data, conditions, reactions, slopes):
+            held, triads = _held(mounting, data, reactions.sample), imu.triads()
+            rates = triads["gyroscope"].recover(data.rate[reactions.sample])
+
+            def bent(change):  # coning and sculling change with it
+                return increments(rates, change, held)[1] / jnp.where(held > 0, held, 1.0)[..., None]
+
+            changes = [inverse_matrix(triads[name].gain) @ slopes[name] for name in reversed(TRIADS)]
+            changes = [jax.vmap(bent, -1, -1)(change[reactions.sample]) for change in changes]
+            columns = -reactions.react_inside(jnp.concatenate(changes, axis=2), len(conditions.window))
             turns = 3 * len(conditions.turn)
             error = conditions(imu)[:turns].reshape(-1, 3)
             turned = jnp.linalg.solve(right_jacobian(error), columns[:turns].reshape(*error.shape, columns.shape[1]))
@@ -439,7 +456,9 @@ class AgainstAttitude(OfOneUnit):
         conditions, spread, duration, leaning, reactions, by_mounting = stored.call(
             compute, f"against attitude {group}", bare, mounting, data, self._places(mounting), noise, quick=False
         )
-        columns = stored.call(by_samples, "against attitude by samples", bare, conditions, reactions, slopes)
+        columns = stored.call(
+            by_samples, "against attitude by samples", bare, mounting, data, conditions, reactions, slopes
+        )
         parted = []
         for effect in effects.values():
             if field := _FIELDS.get(type(effect)):
