@@ -48,7 +48,8 @@ def inverse_matrix(matrix: Matrix) -> Matrix:
 
 def unit_vectors(vectors: Float[Array, "... m"]) -> Float[Array, "... m"]:
     """Return vectors scaled to length one, with NumPy or under a trace with JAX."""
-    return vectors / array_module(vectors).sqrt((vectors**2).sum(axis=-1, keepdims=True))
+    squared = (vectors**2).sum(axis=-1, keepdims=True)
+    return vectors / array_module(squared).sqrt(squared)
 
 
 def product(p: Sequence[Any], q: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
@@ -89,8 +90,9 @@ def rotation_rows(quaternion: Sequence[Any]) -> list[list[Any]]:
 
 def rotation_matrix(q: Quaternion) -> Matrix:
     """Return the rotation matrix of a unit quaternion: `rotation_matrix(q) @ v == rotate(q, v)`."""
-    stack = array_module(q).stack
-    return stack([stack(row, axis=-1) for row in rotation_rows(_parts(q))], axis=-2)
+    rows = rotation_rows(_parts(q))
+    stack = array_module(rows).stack
+    return stack([stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def rotate(q: Quaternion, vector: Vector) -> Vector:
