@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 
 from jaximu.cli import options
 from jaximu.cli.messages import progress
-from jaximu.ground.array_types import BoolArray
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.quantities import Z95, listed, sentence, with_interval
 
 if TYPE_CHECKING:
-    from jaximu.ground.array_types import FloatArray
+    from jaximu.ground.array_types import BoolArray, FloatArray
     from jaximu.recordings.columns.guess import Advice
     from jaximu.recordings.recording import Recording, Signal
 
