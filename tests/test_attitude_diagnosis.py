@@ -130,12 +130,18 @@ def test_reactions_are_the_changes_of_the_conditions(calibrated):
 
 
 def test_columns_are_the_derivatives_of_the_conditions(calibrated):
-    """By every number of the mounting and of effects, against differences of the conditions as they are."""
+    """By every number of the mounting and of effects, against differences of the conditions as they are.
+
+    Set-ups of other kinds, a field or a table, have no part in them.
+    """
     calibration, experiment = calibrated
     mounted = calibration.imu.all_effects().values()
     effects = (
         CATALOGUE["accel.step"].make([0.01, 0.02, -0.01], onset=20.0),
         CATALOGUE["gyro.g_sensitivity"].make(1e-4 * np.arange(9.0)),
+        CATALOGUE["setup.time_offset"].make([1e-3]),
+        CATALOGUE["setup.magnetic_field"].make([20.0, 0.0, 40.0]),
+        CATALOGUE["setup.table_rate_scale"].make([1e-3]),
         *mounted,
     )
     imu = jax.tree.map(np.asarray, calibration.imu.with_effects(*effects))

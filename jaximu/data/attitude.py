@@ -42,7 +42,6 @@ from jaximu.ground.rotation import (
     unit_vectors,
 )
 from jaximu.model.effects import Effect
-from jaximu.model.effects.lever_arm import AccelLeverArm
 from jaximu.model.effects.reference_filter import behind
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -69,11 +68,8 @@ came out a tenth too small in recordings of 30 s, which show too little of the n
 _MARGIN = 3
 _SMOOTH = 0.05
 """Seconds over which the slope of the rate is taken."""
-_FIELDS: dict[type[Effect], str] = {
-    kind: name for kind, name in zip(MOUNTING_EFFECTS, Mounting._fields, strict=True) if kind is not AccelLeverArm
-}
-_MOVING, _TURNING = ("delay", "clock_scale"), ("rotation", "tilt", "filter_variance")
-"""Fields of `Mounting` that move the reference's stamps, and that turn what it says."""
+_MOVING = ("delay", "clock_scale")
+"""Fields of `Mounting` that move the reference's stamps, and with them the ends of the integrals."""
 _WINDOWS, _SAMPLES = 4, 16
 """Lengths are padded to multiples of these: few programs, and few rows for nothing in matrices of all conditions."""
 
@@ -203,6 +199,11 @@ def _added(imu: Imu, data: Intervals, around: Stimulus) -> dict[str, Float[Array
         )
         outputs = added(imu, dict.fromkeys(TRIADS, Track(stimulus, jnp.zeros(len(time), int))))
     return outputs
+
+
+def _stands(effect: Effect) -> bool:
+    """Whether an effect says how the reference stands, and adds nothing to the unit's outputs."""
+    return effect.owner == "setup" and effect.scope == "fixture"
 
 
 def _held(mounting: Mounting, data: Intervals, samples: Int[Array, "T S"]) -> Float[Array, "T S"]:
@@ -431,12 +432,10 @@ class AgainstAttitude(OfOneUnit):
                 parts = evaluated(imu, mounting._replace(**numbers), data, samples, noise, group)
                 return parts[0](imu), parts
 
-            # only what is late moves the ends of the integrals, whose derivatives take long
-            delays, stances = (
-                {name: jnp.asarray(getattr(mounting, name)) for name in names} for names in (_MOVING, _TURNING)
-            )
+            fields = {name: jnp.asarray(values) for name, values in mounting._asdict().items()}
+            delays = {name: fields.pop(name) for name in _MOVING}  # apart: derivatives of the integrals take long
             by_delay, parts = jax.jacfwd(of, has_aux=True)(delays)
-            return *parts, by_delay | jax.jacfwd(lambda numbers: of(numbers)[0])(stances)
+            return *parts, by_delay | jax.jacfwd(lambda numbers: of(numbers)[0])(fields)
 
         def by_samples(imu, mounting, data, conditions, reactions, slopes):
             held, triads = _held(mounting, data, reactions.sample), imu.triads()
@@ -459,24 +458,26 @@ class AgainstAttitude(OfOneUnit):
         columns = stored.call(
             by_samples, "against attitude by samples", bare, mounting, data, conditions, reactions, slopes
         )
-        parted = []
+        kinds: list[type[Effect]] = [*MOUNTING_EFFECTS]
+        by_kind = {kind: by_mounting[field] for kind, field in zip(kinds, Mounting._fields, strict=True)}
+        parted: list[Any] = [columns[:, :0]]
         for effect in effects.values():
-            if field := _FIELDS.get(type(effect)):
-                parted.append(by_mounting[field].reshape(len(columns), -1))
-            else:
-                mine, columns = np.split(columns, [effect.size + len(effect.inner)], axis=1)
-                parted.append(mine)
-        columns = free_columns(effects, np.concatenate([*parted, columns], axis=1))
+            size = effect.size + len(effect.inner)
+            mine = by_kind.get(type(effect), np.zeros((len(columns), size))).reshape(len(columns), size)
+            if not _stands(effect):
+                mine, columns = np.split(columns, [size], axis=1)
+            parted.append(mine)
+        columns = free_columns(effects, np.concatenate(parted, axis=1))
         covariance = self._covariance(conditions, spread, duration, leaning, white)
         return About(conditions, covariance, columns, details=AttitudeDetails(duration, reactions, self, imu))
 
     def _freed(self, imu: Imu) -> tuple[Intervals, dict[str, FloatArray]]:
         """Return what was recorded without what effects add, and the slopes (m, 3, q) of that by their numbers.
 
-        Effects of how the reference is mounted add nothing, but for the lever arm.
+        How the reference stands adds nothing.
         """
         data, bare = self.intervals, imu.with_effects()
-        adding = bare.with_effects(*(effect for effect in imu.all_effects().values() if type(effect) not in _FIELDS))
+        adding = bare.with_effects(*(effect for effect in imu.all_effects().values() if not _stands(effect)))
         parameters = Parameters.select(adding, lambda name: name.effect is not None)
         if not parameters.names:
             return data, dict.fromkeys(TRIADS, np.zeros((*data.rate.shape, 0)))
