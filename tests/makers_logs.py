@@ -63,7 +63,8 @@ def _noted(read: list[Any]) -> Iterator[None]:
         for verb in VERBS:
 
             def run(command):
-                logs, *_ = vars(command).values()
+                arguments = vars(command)
+                logs = arguments.get("logs") or arguments["log_path"]
                 path = logs[0] if isinstance(logs, tuple) else logs
                 read.append(command.log.with_gyroscope(path).read(path, check=False, alone=True))
                 command.results.present(
