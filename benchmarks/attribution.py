@@ -78,7 +78,7 @@ def judged(parts, sensitive, warm):
             reported.add((COMMON_DRIFT, "session", session))
             shared[session] = np.stack([drift.times, drift.curve], axis=1)
     estimates = [part.estimate(EFFECT, {}, {}, shared.get(part.session)) for part in parts]
-    shares = split(estimates, [part.unit for part in parts], [part.session for part in parts], LEVEL)
+    shares = split(estimates, [part.unit for part in parts], [part.session for part in parts], LEVEL).parts
     reported |= {(EFFECT, part.belongs_to, label) for part in shares for label in part.values}
     return true, reported
 

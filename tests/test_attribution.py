@@ -96,7 +96,7 @@ def test_estimates_are_split_by_what_they_repeat_over(kind):
         random = np.random.default_rng([seed, 7])
         values = 0.1 * random.standard_normal((UNITS, SESSIONS, 3))
         values[{"unit": np.s_[1], "session": np.s_[:, 1], "board": np.s_[:]}[kind]] += random.standard_normal(3)
-        parts = split(drawn(random, values), *LABELS, 0.05)
+        parts = split(drawn(random, values), *LABELS, 0.05).parts
         right += [part.belongs_to for part in parts] == [kind]
         there += bool(parts) and [*parts[0].values] == (["1"] if kind != "board" else [""])
     assert right >= 36 and there >= 36  # of 40: 95 % right passes with 95 % probability
@@ -107,17 +107,33 @@ def test_what_repeats_nowhere_belongs_to_nothing():
     for seed in range(100):
         random = np.random.default_rng([seed, 8])
         values = random.standard_normal((UNITS, SESSIONS, 3))
-        false += bool(split(drawn(random, values), *LABELS, 0.05))
+        false += bool(split(drawn(random, values), *LABELS, 0.05).parts)
     assert false <= 10  # at 5 % more than ten have the probability 1 %
 
 
 def test_the_board_s_part_and_the_units_own_are_told_apart():
     random = np.random.default_rng(9)
     common, apart = random.standard_normal(3), random.standard_normal((UNITS, 1, 3))
-    parts = split(drawn(random, 3 * common + apart), *LABELS, 0.05)
+    parts = split(drawn(random, 3 * common + apart), *LABELS, 0.05).parts
     assert {part.belongs_to for part in parts} == {"board", "unit"}
     value = next(part for part in parts if part.belongs_to == "board").values[""]
     assert np.linalg.norm(value - 3 * common - apart.mean(axis=(0, 1))) < np.linalg.norm(common)
+
+
+def test_what_the_others_tell_is_as_well_known_as_it_says():
+    """The board's part is told of every recording, the own part of a unit by its other sessions; the rest scatters."""
+    squares = []
+    for seed in range(60):
+        random = np.random.default_rng([seed, 10])
+        common, apart = random.standard_normal(3), np.zeros((UNITS, 1, 3))
+        apart[1] = random.standard_normal(3)
+        values = common + apart + 0.2 * random.standard_normal((UNITS, SESSIONS, 3))
+        divided = split(drawn(random, values), *LABELS, 0.05)
+        for index in (0, SESSIONS + 1):
+            mean, covariance = divided.told(index)
+            off = values.reshape(-1, 3)[index] - mean
+            squares.append(off @ np.linalg.solve(covariance, off))
+    assert 0.8 < np.mean(squares) / 3 < 1.3  # 360 squares of normal numbers: 1 ± 0.07, the variances estimated
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,11 @@ class RecordedByHand(OfOneUnit):
         """Return start and stop (k, 2), s, of the poses of each recording."""
         return [part.intervals for part in self.segmentations]
 
+    def hidden(self) -> dict[str, str]:
+        """Return what is taken off beforehand: the Earth's rotation, where a latitude tells it."""
+        effects = () if self.known is None else self.known.all_effects().values()
+        return {effect.name: "it is known, and taken off" for effect in effects}
+
     def counts(self) -> dict[str, int]:
         """Return the numbers of poses and turns."""
         return {name: int(np.sum(getattr(self.observations, name).mask)) for name in ("poses", "turns")}

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from jaximu.diagnosis.checking import check
     from jaximu.diagnosis.checks import Check
     from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose, twin_of
+    from jaximu.diagnosis.experiment import KnownEffect
     from jaximu.diagnosis.magnetometer import (
         MagneticDiagnosis,
         MagneticShift,
@@ -27,6 +28,7 @@ __all__ = [
     "Check",
     "CommonDrift",
     "Diagnosis",
+    "KnownEffect",
     "MagneticDiagnosis",
     "MagneticShift",
     "Named",
@@ -51,6 +53,7 @@ __getattr__ = lazily(
         "jaximu.diagnosis.checking": "check",
         "jaximu.diagnosis.checks": "Check",
         "jaximu.diagnosis.diagnosis": "Diagnosis, Named, diagnose, twin_of",
+        "jaximu.diagnosis.experiment": "KnownEffect",
         "jaximu.diagnosis.magnetometer": "MagneticDiagnosis, MagneticShift, check_magnetometer, diagnose_magnetometer",
         "jaximu.diagnosis.thermal": "diagnose_thermal",
         "jaximu.diagnosis.turntable": "diagnose_turntable",

@@ -24,11 +24,12 @@ from jaximu.data.drift import restricted_likelihood
 from jaximu.diagnosis.diagnosis import Diagnosis, Named, diagnose
 from jaximu.diagnosis.drift import DRAWS
 from jaximu.diagnosis.evidence import BLIND, FEWEST_DIMENSIONS, Evidence
+from jaximu.diagnosis.experiment import KnownEffect
 from jaximu.diagnosis.improvement import cross_validated
 from jaximu.diagnosis.lines import MOVING_LINE, MovingLine, coincident
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.track import TRIADS
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -80,7 +81,7 @@ class BoardRecording:
 
     diagnosis: the document. named: the effects that it names. chi2_heldout: per condition, on parts left out, with the
     effects in the model. alone: the verdict with what the session has in common. without_drift: that was taken off.
-    lines: at rest, that move.
+    lines: at rest, that move. told: effects that were taken off, as the other recordings tell them.
     """
 
     file: str
@@ -94,6 +95,7 @@ class BoardRecording:
     alone: str
     without_drift: bool = False
     lines: tuple[MovingLine, ...] = ()
+    told: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, file: str, unit: str, session: str, diagnosis: Diagnosis) -> BoardRecording:
@@ -126,6 +128,17 @@ class BoardRecording:
             lines=diagnosis.lines,
         )
 
+    def explained(self, repeated: BoardRecording, told: tuple[str, ...], without_drift: bool) -> BoardRecording:
+        """Return the recording as diagnosed once more, effects taken off; estimates still come from before that."""
+        return replace(
+            repeated,
+            evidence=self.evidence,
+            rests=self.rests,
+            alone=self.alone,
+            without_drift=without_drift,
+            told=told,
+        )
+
     @property
     def place(self) -> str:
         """Its unit and session, in words."""
@@ -140,6 +153,7 @@ class BoardRecording:
             "verdict": self.diagnosis["verdict"],
             "verdict_alone": self.alone,
             "without_common_drift": self.without_drift,
+            "told_by_others": list(self.told),
             "effects": self.diagnosis["effects"],
             "chi2_heldout": self.chi2_heldout,
         }
@@ -181,6 +195,17 @@ class BoardRecording:
         kept = s > BLIND * np.max(np.linalg.norm(columns, axis=0), initial=1e-300)
         return u[:, kept].T @ evidence.residual, s[kept, None] * v[kept]
 
+    def known(
+        self, name: str, inner: Mapping[str, float], mean: FloatArray, covariance: FloatArray
+    ) -> Iterator[KnownEffect]:
+        """Yield an effect whose coefficients have this mean and covariance, in units of their sizes, if it can be."""
+        block = self.block(name, inner)
+        if block is not None:
+            asked = self.evidence.blocks[block]
+            values, vectors = np.linalg.eigh(covariance)
+            root = asked.sizes[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+            yield KnownEffect(CATALOGUE[name].make(mean * asked.sizes, **asked.inner), root)
+
 
 def _inner(effect: Named) -> dict[str, float]:
     """Return an effect's inner parameters."""
@@ -202,9 +227,33 @@ class Part:
     p_value: float
 
 
+@dataclass(frozen=True)
+class Split:
+    """Estimates of an effect, split into parts of the board, of units and of sessions.
+
+    measured (n,): the whitened estimates z of all r recordings. rows (n, r, q): how they depend on each recording's
+    coefficients. owner (n,): whose each is. shared (r, r): covariance of a coefficient between recordings.
+    """
+
+    parts: list[Part]
+    measured: FloatArray
+    rows: FloatArray
+    owner: IntArray
+    shared: FloatArray
+
+    def told(self, index: int) -> tuple[FloatArray, FloatArray]:
+        """Return what the other recordings tell of a recording's coefficients: mean (q,) and covariance (q, q)."""
+        others = self.owner != index
+        common = np.tensordot(self.rows[others], self.shared, (1, 0))
+        spread = np.tensordot(common, self.rows[others], ((1, 2), (2, 1))) + np.eye(int(others.sum()))
+        pulled = np.linalg.solve(spread, np.column_stack([self.measured[others], common[..., index]]))
+        own = self.shared[index, index] * np.eye(self.rows.shape[2])
+        return common[..., index].T @ pulled[:, 0], own - common[..., index].T @ pulled[:, 1:]
+
+
 def split(
     estimates: Sequence[tuple[FloatArray, FloatArray]], units: Sequence[str], sessions: Sequence[str], level: float
-) -> list[Part]:
+) -> Split:
     """Split estimates of an effect, one of each recording, into parts of the board, of units and of sessions.
 
     A unit's part is there, or a session's or the board's, if without it the estimates scatter by more than they do
@@ -223,6 +272,7 @@ def split(
         for label in dict.fromkeys(labels)
         if labels.count(label) > 1
     }
+    alike = {key: np.equal(groups[key[0]], key[1]).astype(float) for key in columns}
     components = [sum(rows[:, k] @ rows[:, k].T for k in range(len(estimates)))]
     chosen: dict[tuple[str, str], float] = {}
     while True:
@@ -249,7 +299,10 @@ def split(
         share = 1 - float(left @ left) / float(measured @ measured)
         p_value = min(p for (of, _), p in chosen.items() if of == kind)
         parts.append(Part(kind, mine, min(max(share, 0.0), 1.0), p_value))
-    return parts
+    shared = variances[0] * np.eye(len(estimates))
+    shared += sum(v * np.outer(alike[key], alike[key]) for key, v in zip(chosen, variances[1:], strict=True))
+    owner = np.repeat(np.arange(len(estimates)), [len(z) for z, _ in estimates])
+    return Split(parts, measured, rows, owner, shared)
 
 
 def _absence(columns: FloatArray, precision: FloatArray, values: FloatArray) -> float:
@@ -608,11 +661,13 @@ def attribute(
     places = places_of(files, pattern)
     skipped: dict[str, str] = {}
 
-    def diagnosed(index: int, recording: Recording, what: str) -> BoardRecording | None:
+    def diagnosed(
+        index: int, recording: Recording, what: str, known: Sequence[KnownEffect] = ()
+    ) -> BoardRecording | None:
         unit, session = places[index]
         report(f"unit {unit} in session {session}{what}, {index + 1} of {len(recordings)}")
         try:
-            diagnosis = diagnose(recording, gravity, level=level, **options)
+            diagnosis = diagnose(recording, gravity, level=level, known=known, **options)
         except NotPossibleError as error:
             skipped[files[index] + what] = str(error)
             return None
@@ -626,14 +681,21 @@ def attribute(
     drifts = [CommonDrift.of(of) for of in together.values()]
     common = [drift for drift in drifts if drift.p_value * len(drifts) < level]
     warm = {drift.session for drift in common}
+    steady: dict[int, Recording] = {}
     for index, part in parts.items():
         if part.session in warm:
             others = [other for other in together[part.session] if other is not part]
-            without = CommonDrift.of(others, 0).taken_off(recordings[index], part)
-            repeated = diagnosed(index, without, ", its common drift taken off")
+            steady[index] = CommonDrift.of(others, 0).taken_off(recordings[index], part)
+            repeated = diagnosed(index, steady[index], ", its common drift taken off")
             if repeated is not None:
                 parts[index] = min(replace(repeated, alone=part.alone, without_drift=True), part, key=_rank)
-    split_up, single = attributed(list(parts.values()), common, level)
+    for (index, part), known in zip(parts.items(), attributed(list(parts.values()), common, level)[2], strict=True):
+        if known and part.diagnosis["verdict"] == "unexplained":
+            repeated = diagnosed(index, steady.get(index, recordings[index]), ", with what the others tell", known)
+            if repeated is not None:
+                told = tuple(one.effect.name for one in known)
+                parts[index] = min(part.explained(repeated, told, index in steady), part, key=_rank)
+    split_up, single, _ = attributed(list(parts.values()), common, level)
     lines, apart = attributed_lines(list(parts.values()), level)
     findings, single = (*map(_of_drift, common), *split_up, *lines), single | apart
     return Attribution(tuple(parts.values()), findings, tuple(drifts), single, skipped, gravity.latitude)
@@ -651,15 +713,17 @@ def _of_drift(drift: CommonDrift) -> Attributed:
 
 def attributed(
     parts: Sequence[BoardRecording], common: Sequence[CommonDrift], level: float
-) -> tuple[list[Attributed], dict[str, list[str]]]:
+) -> tuple[list[Attributed], dict[str, list[str]], list[list[KnownEffect]]]:
     """Return what each effect that a recording names belongs to, and where those show that belong to nothing.
 
-    The most significant one comes first; others are estimated beside it, and all beside the common time courses.
+    The most significant one comes first; others are estimated beside it, and all beside the common time courses. With
+    it what of the units' own effects the other recordings tell of each.
     """
     named = sorted((effect for part in parts for effect in part.named), key=lambda effect: effect.p_value)
     strongest = {effect.name: effect for effect in reversed(named)}
     shared = {drift.session: np.stack([drift.times, drift.curve], axis=1) for drift in common}
     findings, single, beside = [], {}, {}
+    told: list[list[KnownEffect]] = [[] for _ in parts]
     for name, strong in sorted(strongest.items(), key=lambda entry: entry[1].p_value):
         inner, kind = _inner(strong), CATALOGUE[name]
         sizes = np.asarray(kind(np.zeros(kind.size), **inner).typical_sizes(1.0).coefficients)
@@ -669,8 +733,8 @@ def attributed(
             "unit": [part.unit for part in parts],
             "session": [part.session for part in parts],
         }
-        shares = split(estimates, owners["unit"], owners["session"], level / len(strongest))
-        for share in shares:
+        divided = split(estimates, owners["unit"], owners["session"], level / len(strongest))
+        for share in divided.parts:
             mine = [part for part, owner in zip(parts, owners[share.belongs_to], strict=True) if owner in share.values]
             findings.append(
                 Attributed(
@@ -684,11 +748,14 @@ def attributed(
                     kind.coefficient_unit(SENSOR_UNITS.get(strong.triad, "")),
                 )
             )
-        if shares:
+        if divided.parts:
             beside[name] = inner
         else:
             single[name] = [part.place for part in parts if name in [effect.name for effect in part.named]]
-    return findings, single
+        if divided.parts and kind.scope == "device":
+            for index, part in enumerate(parts):
+                told[index] += part.known(name, inner, *divided.told(index))
+    return findings, single, told
 
 
 def attributed_lines(parts: Sequence[BoardRecording], level: float) -> tuple[list[Attributed], dict[str, list[str]]]:

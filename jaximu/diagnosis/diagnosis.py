@@ -20,7 +20,7 @@ from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.choice import with_open_choice
 from jaximu.diagnosis.drift import DriftComponents, drifted, estimate_drift, hands_of
 from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS, LIMIT_POWER
-from jaximu.diagnosis.experiment import Experiment, State
+from jaximu.diagnosis.experiment import Experiment, KnownEffect, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.hidden import Hidden, hidden_causes
 from jaximu.diagnosis.improvement import Gain, cross_validated, on_held_out
@@ -352,6 +352,7 @@ def diagnose(
     level: float = 0.05,
     repair: bool = False,
     candidates: Sequence[str | type[Effect]] | None = None,
+    known: Sequence[KnownEffect] = (),
 ) -> Diagnosis:
     """Calibrate a unit, ask its recording for everything the model lacks, extend the model and measure the gain.
 
@@ -371,6 +372,7 @@ def diagnose(
       in any case.
     - `candidates`: the only effects to ask for, by name or class; a class that the catalogue lacks is registered. None
       asks for all of the catalogue. Noise, mistakes and shapes without a cause are asked for in any case.
+    - `known`: effects that other recordings of the unit tell. They are taken off recordings, and are no findings.
 
     No effect is named while a mistake in the recording stands that could imitate it. Raises `NotPossibleError` where
     the recording cannot be calibrated, has no gyroscope, or has too few poses to ask anything; `InputError` where a
@@ -379,8 +381,8 @@ def diagnose(
     gravity = as_gravity(gravity)
     names = None if candidates is None else tuple(map(_candidate, candidates))
     if isinstance(recordings, Data):
-        if heldout is not None or segmentation is not None or repair:
-            raise InputError("heldout, segmentation and repair are for recordings, and data were given.")
+        if heldout is not None or segmentation is not None or repair or known:
+            raise InputError("heldout, segmentation, repair and known are for recordings, and data were given.")
         return _of_data(recordings, gravity, start, noise_of(static), names, level)
     if start is not None:
         raise InputError("a start is for data: recordings by hand begin at the data sheet's values.")
@@ -415,6 +417,7 @@ def diagnose(
                         names,
                         findings=(*findings, *unusual),
                         notes=tuple(notes),
+                        known=tuple(known),
                         level=level,
                         naming=not spoiling,
                     )
@@ -496,11 +499,12 @@ def diagnose_data(
     """
 
     def examined(fitted: Calibration) -> Diagnosis:
-        setup = tuple(effect for effect in fitted.imu.all_effects().values() if effect.scope == "fixture")
+        setup = (effect for effect in fitted.imu.all_effects().values() if effect.scope == "fixture")
         start = jax.tree.map(np.asarray, calibration.imu.with_effects())
         excess = np.array([fitted.excess[name] for name in data.excess_names])
         names = None if candidates is None else tuple(candidates)
-        experiment = Experiment(data, start, None, names, setup, excess, reference=fitted.reference)
+        known = tuple(map(KnownEffect.of_setup, setup))
+        experiment = Experiment(data, start, None, names, known, excess, reference=fitted.reference)
         return examine(Examination(calibration, noise, lambda noise: experiment, trusted=True, **about))
 
     diagnosis = examined(calibration)
@@ -552,6 +556,7 @@ class Examination:
         held: Data | None = None,
         candidates: tuple[str, ...] | None = None,
         notes: tuple[str, ...] = (),
+        known: tuple[KnownEffect, ...] = (),
         **about: Any,
     ) -> Examination:
         """Return the examination of data whose covariance the noise of samples makes; None takes it from their rests.
@@ -560,8 +565,8 @@ class Examination:
         """
         start = jax.tree.map(np.asarray, calibration.imu.with_effects())
 
-        def remade(part: Data, known: NoiseModel) -> Experiment:
-            return Experiment(part.with_noise(known), start, candidates=candidates)
+        def remade(part: Data, model: NoiseModel) -> Experiment:
+            return Experiment(part.with_noise(model), start, candidates=candidates, known=known)
 
         if noise is None:
             plain = Experiment(data, start)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -95,6 +95,18 @@ class State:
         ]
 
 
+class KnownEffect(NamedTuple):
+    """An effect that is known beforehand: its most likely coefficients (q,), and a root (q, k) of their covariance."""
+
+    effect: Effect
+    root: FloatArray
+
+    @classmethod
+    def of_setup(cls, effect: Effect) -> KnownEffect:
+        """Return an effect of a set-up, as calibrated, whose numbers are known to what set-ups usually are."""
+        return cls(effect, np.diag(np.broadcast_to(np.asarray(effect.known, np.float64), effect.size)))
+
+
 class _Shifted(Conditions):
     """Conditions with something added to each."""
 
@@ -120,17 +132,17 @@ class Experiment(Data):
     """Data of one unit, to be asked for all that its calibration lacks.
 
     data: what was recorded. start: a calibration without effects. drift: what was estimated of it from this very
-    recording. candidates: names of the effects that are asked; None: all of the catalogue. setup: effects of a fixture,
-    as calibrated, whose numbers are known to what set-ups usually are, and no more: that is part of the covariance.
-    excess (k,): of the noise, where a calibration estimated it. shift (n,): added to the conditions. reference: what is
-    known of a measured attitude, as `calibration.json` has it.
+    recording. candidates: names of the effects that are asked; None: all of the catalogue. known: effects that are
+    taken off, of a fixture or as other recordings tell them; how well they are known is part of the covariance. excess
+    (k,): of the noise, where a calibration estimated it. shift (n,): added to the conditions. reference: what is known
+    of a measured attitude, as `calibration.json` has it.
     """
 
     data: Data
     start: Imu
     drift: DriftComponents | None = None
     candidates: tuple[str, ...] | None = None
-    setup: tuple[Effect, ...] = ()
+    known: tuple[KnownEffect, ...] = ()
     excess: FloatArray | None = None
     shift: FloatArray | float = 0.0
     reference: Json | None = None
@@ -166,18 +178,18 @@ class Experiment(Data):
         return replace(about, conditions=conditions, covariance=lifted, columns=about.columns[..., mine])
 
     def _evaluated(self, imu: Imu) -> tuple[About, FloatArray | None, FloatArray, BoolArray]:
-        """Return the data about a unit and its fixture, as a batch of one, and what of their covariance is noise.
+        """Return the data about a unit with what is known, as a batch of one, and what of their covariance is noise.
 
-        With it the covariance (n, n) of noise, None where nothing is beside what was measured; what the fixture may do
-        (n, q) at one standard deviation of each of its numbers; and which of the columns are the unit's own.
+        With it the covariance (n, n) of noise, None where nothing is beside what was measured; what known effects may
+        do beyond what is known of them (n, q), at one standard deviation; and which columns are the unit's own.
         """
         unit = imu.all_effects()
-        whole = imu.with_effects(*unit.values(), *self.setup)
+        whole = imu.with_effects(*unit.values(), *(known.effect for known in self.known))
         about = self.data.about(jax.tree.map(lambda leaf: np.asarray(leaf)[None], whole))
         names = effect_numbers(whole)[0]
         mine = np.array([(name.owner, name.effect) in unit for name in names], bool)
         unknown = np.zeros((about.covariance.used.shape[1], 0))
-        if self.drift is None and self.excess is None and not self.setup and not np.any(self.shift):
+        if self.drift is None and self.excess is None and not self.known and not np.any(self.shift):
             return about, None, unknown, mine
         covariance = jax.tree.map(lambda leaf: np.asarray(leaf)[0], about.covariance).dense()
         noise = np.array(covariance.measured)
@@ -185,11 +197,11 @@ class Experiment(Data):
             noise = np.asarray(covariance.total(self.excess)) - np.diag(1 - covariance.used)
         if self.drift is not None:
             noise += np.diag(self.drift.by_hand)
-        prior = Prior.of_effects(whole) if self.setup else None
-        if prior is not None:
-            known = dict(zip(prior.names, 1 / np.diag(prior.root), strict=True))
-            sizes = [known[name] for name, kept in zip(names, mine, strict=True) if not kept]
-            unknown = about.columns[0][:, ~mine] * sizes
+        for effect, root in self.known:
+            of_name = {place for place, other in whole.all_effects().items() if other.name == effect.name}
+            (place,) = of_name - set(unit)
+            numbers = [(name.owner, name.effect) == place and name.part == "coefficients" for name in names]
+            unknown = np.concatenate([unknown, about.columns[0][:, numbers] @ root], axis=1)
         return about, noise, unknown, mine
 
     # --- what was recorded ----------------------------------------------------------------------------------------
@@ -376,19 +388,19 @@ class Experiment(Data):
             model, linear.names, covariance, evidence, linear.conditions[used], weights, limits, blind, linear, prior
         )
 
-    def by_setup(self, state: State) -> FloatArray:
-        """Return what the set-up, and what may lie off beforehand, most likely add to the real conditions (m,).
+    def by_known(self, state: State) -> FloatArray:
+        """Return what known effects, and what may lie off beforehand, most likely add to the real conditions (m,).
 
         That is the mean of their numbers, given the conditions. Near the level a tilted reference looks like a bias of
         the accelerometer; which of both it is, nothing tells.
         """
-        parts = [self._evaluated(state.model)[2]] if self.setup else []
+        parts = [self._evaluated(state.model)[2]] if self.known else []
         unknown = np.concatenate([*parts, self.data.allowed(len(self.used))], axis=1)[self.used]
         return unknown @ ((state.weights @ unknown).T @ (state.weights @ state.conditions))
 
     def errors(self, state: State) -> list[FloatArray]:
         """Return the errors (v,) of each kind of condition that a fit leaves, in its unit."""
-        return self.real.errors(state.conditions - self.by_setup(state))
+        return self.real.errors(state.conditions - self.by_known(state))
 
     def beside(self, state: State) -> tuple[float, str]:
         """Return which shape, that a fit's effects may be taken for, stands out beside them, and its p-value."""

@@ -139,12 +139,12 @@ def _title(finding: Attributed) -> str:
 def _verdicts_table(attribution: Attribution) -> Table:
     """Return the verdict of each recording, units down and sessions across."""
     cells = {
-        (
-            part.unit,
-            part.session,
-        ): f"{_short(part.diagnosis)}\nχ² {number(part.chi2_heldout, 3)}{' *' * part.without_drift}"
+        (part.unit, part.session): f"{_short(part.diagnosis)}\nχ² {number(part.chi2_heldout, 3)}"
+        + " *" * part.without_drift
+        + " †" * bool(part.told)
         for part in attribution.recordings
     }
+    told = listed(list(dict.fromkeys(effect_title(name) for part in attribution.recordings for name in part.told)))
     return Table(
         ("", *(f"session {session}" for session in attribution.sessions)),
         [
@@ -152,7 +152,8 @@ def _verdicts_table(attribution: Attribution) -> Table:
             for unit in attribution.units
         ],
         "χ² per condition on parts left out: 1 is noise and drift alone."
-        + (" *: the common drift was taken off, as the other units show it." if attribution.common else ""),
+        + (" *: the common drift was taken off, as the other units show it." if attribution.common else "")
+        + (f" †: {told} was taken off, as the other recordings tell it." if told else ""),
     )
 
 
