@@ -31,6 +31,7 @@ from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import fit
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -98,7 +99,9 @@ class Named:
         return self.effect.scope
 
     def numbers(self) -> list[str]:
-        """Return coefficients and inner parameters, with half their 95 % intervals."""
+        """Return coefficients and inner parameters, with half their 95 % intervals; a curve is drawn instead."""
+        if not self.effect.cause:
+            return [f"a curve of {self.effect.size} coefficients, drawn in the report"]
         values = np.asarray(self.effect.coefficients)
         texts = [
             text + (" (not different from zero)" if abs(value) <= Z95 * sigma else "")
@@ -757,9 +760,10 @@ class _Course:
         if self.extension.complete:
             return
         shape = shape_of(base.evidence, self.examination.level)
-        learned = learn(experiment, state if self.chosen else base, self.other)
+        learned = learn(experiment, state if self.chosen else base, self.other, self.examination.level)
         if shape is not None and learned is not None and shape[1] > learned.gain.log_likelihood:
-            learned = None  # it would only imitate the shape
+            alike = learned.drift and shape[0].curved in learned.effect.needs
+            learned = learned if alike else None  # it would only imitate the shape
         if learned is not None and self.extension.found and not self.chosen:
             beside = learn(experiment, state, self.other)
             predicted = left_out_likelihood(experiment, state) if beside is None else beside.log_likelihood
@@ -769,11 +773,21 @@ class _Course:
                 learned = beside
             else:  # what was named in part was a guess at the same misfit
                 self._settle(found=[])
-        if learned is not None:
+        if learned is not None and learned.drift:
+            self._drifts(learned)
+        elif learned is not None:
             self._settle(state=learned.state)
         elif shape is not None:
             self.shape = shape[0].words
         self.learned = learned
+
+    def _drifts(self, curve: LearnedTerm) -> None:
+        """Take a curve over the time of the recording for what it is, drift of a bias, beside what stands."""
+        before, after = (float(np.sum(one.evidence.residual**2)) for one in (self.extension.base, curve.state))
+        size = curve.effect.size
+        found = Found(curve.effect.name, (), float(chi2_sf(before - after, size)), before - after, size)
+        self._settle(found=[*self.extension.found, found], state=curve.state, complete=True)
+        self.gain = curve.gain
 
     def _names(self) -> str:
         return ", ".join(effect_title(entry.name) for entry in self.extension.found)
@@ -976,6 +990,12 @@ def _suggestion(
         return (
             f"{sentence(weak[0].effect.title)} is below twice its detection limit: record again with more of what "
             f"excites it ({weak[0].effect.excited_by}), and twice as many poses, before relying on it."
+        )
+    if any(not CATALOGUE[effect.name].cause for effect in effects):
+        return (
+            "The drift belongs to this recording, and no calibration takes it off the next one. Let the unit warm up "
+            "before the first pose, record its temperature, which may be the cause, or follow the bias in use (`jaximu "
+            "filter LOG --online CALIBRATION`)."
         )
     if learned is not None:
         return (

@@ -17,6 +17,7 @@ import numpy as np
 
 from jaximu.diagnosis.experiment import LEAST_WARMING, Experiment, State
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
+from jaximu.diagnosis.selection import LEVEL, select
 from jaximu.estimation.fitting import Prior
 from jaximu.estimation.leave_out import leave_out
 from jaximu.estimation.problem import Name
@@ -40,7 +41,8 @@ class LearnedTerm:
     effect: the curve. gain: on data that was not fitted; where that is parts of the recording left out, the noise of
     either model is widened to fit what was left out, if it looks too small. x (101,): the covariate, in its unit; y
     (101, 3): what the axes of the triad put out by it, SI; half_width (101, 3): of its 95 % band. state: the fit with
-    the curve in it. log_likelihood: of all parts of the recording left out in turn.
+    the curve in it. log_likelihood: of all parts of the recording left out in turn. drift: whether it is a cause: the
+    curve belongs to the recording, makes errors left out smaller, and leaves nothing unexplained.
     """
 
     effect: Curve
@@ -50,6 +52,7 @@ class LearnedTerm:
     half_width: FloatArray
     state: State
     log_likelihood: float
+    drift: bool = False
 
     @property
     def covariate(self) -> str:
@@ -88,11 +91,13 @@ class LearnedTerm:
         }
 
 
-def learn(experiment: Experiment, state: State, held: Experiment | None = None) -> LearnedTerm | None:
+def learn(
+    experiment: Experiment, state: State, held: Experiment | None = None, level: float = LEVEL
+) -> LearnedTerm | None:
     """Return the smooth term of one covariate, on one triad, that predicts best what was left out; None if none pays.
 
     **Arguments:** `state`: a fit that leaves something unexplained; `held`: another recording of the unit, on which
-    the gain is measured (and must be one) where the curve belongs to the unit.
+    the gain is measured (and must be one) where the curve belongs to the unit; `level`: of what a curve leaves.
     """
     folds = _predicted_folds(experiment, state)
     if not folds:
@@ -105,9 +110,11 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
             gained = left[0] - base[0]
             if best is None or gained > best[0]:
                 best = gained, effect, strength, (left, root)
-    if best is None or best[0] < _PAYS:
+    if best is None:
         return None
-    _, effect, strength, (left, root) = best
+    gained, effect, strength, (left, root) = best
+    if gained < (0.0 if effect.scope == "session" else _PAYS):
+        return None
     try:
         fitted = _fitted(experiment, state, effect, root * np.sqrt(strength))
     except NotPossibleError:  # a curve that leads a fit to nothing explains nothing
@@ -118,7 +125,11 @@ def learn(experiment: Experiment, state: State, held: Experiment | None = None) 
         gain = on_held_out(held, state, fitted)
         if gain.log_likelihood <= 0:
             return None
-    return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, left[0])
+    before, after = (select(each.evidence, level).explained for each in (state, fitted))
+    drift = effect.scope == "session" and gain.smaller([effect]) and after and not before
+    if gained < _PAYS and not drift:
+        return None
+    return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, left[0], drift)
 
 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from jaximu.diagnosis.evidence import EffectBlock
@@ -22,7 +24,8 @@ def shapes_without_cause(observed: Observed) -> list[EffectBlock]:
     off.
     """
     waves = np.cos(np.pi * observed.share[:, None] * np.arange(1, 6))
-    blocks = [_block(observed, triad, f"slow change of the {triad}", waves) for triad in _SIZES]
+    slow = [_block(observed, triad, f"slow change of the {triad}", waves) for triad in _SIZES]
+    blocks = [replace(block, curved="time") for block in slow]
     if observed.up is not None:
         blocks += _orientations(observed, observed.up)
     if observed.duration is not None:

@@ -316,11 +316,15 @@ def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
     learned = diagnosis.learned
     if learned is None:
         return
+    name = learned.effect.name
     yield Section(
-        "What the misfit depends on",
+        "How the bias drifts" if learned.drift else "What the misfit depends on",
         [
-            f"No known effect explains it, but the {learned.triad}'s misfit depends on {learned.covariate}: a smooth "
-            f"curve ({learned.effect.name}) follows it, and the extended calibration contains the curve.",
+            f"The {learned.triad}'s bias drifts by more than its noise: the extended calibration takes this curve "
+            f"({name}) off. It belongs to this recording."
+            if learned.drift
+            else f"No known effect explains it, but the {learned.triad}'s misfit depends on {learned.covariate}: a "
+            f"smooth curve ({name}) follows it, and the extended calibration contains the curve.",
             Picture(
                 "learned",
                 partial(_learned, learned),
@@ -337,7 +341,7 @@ def _gains(diagnosis: Diagnosis) -> Iterator[Table]:
     """Yield the errors on data that was not fitted, with what was added to the model."""
     if diagnosis.gain is not None:
         yield _gain_table(diagnosis, "extended model", diagnosis.gain)
-    if diagnosis.learned is not None:
+    if diagnosis.learned is not None and not diagnosis.learned.drift:
         yield _gain_table(diagnosis, "with the smooth curve", diagnosis.learned.gain)
 
 
@@ -377,7 +381,7 @@ def _cost(diagnosis: Diagnosis) -> Iterator[Statement]:
         f"{effect.effect.title} changes the {effect.triad}'s output by up to {effect.size()}"
         for effect in diagnosis.named
     ]
-    if diagnosis.learned is not None:
+    if diagnosis.learned is not None and not diagnosis.learned.drift:
         learned = diagnosis.learned
         peak = np.unravel_index(np.argmax(np.abs(learned.y)), learned.y.shape)
         swing = with_interval(abs(learned.y[peak]), learned.half_width[peak] / Z95, SENSOR_UNITS[learned.triad])

@@ -49,10 +49,11 @@ class Learned(Effect):
     source = "P-splines: Eilers and Marx, Statistical Science 11, 1996, 89–121"
     words: ClassVar[str]  # what the curve depends on
     covariate_unit: ClassVar[str]
+    called: ClassVar[str] = ""  # where it has a name of its own
     first: ClassVar[int] = 1  # of the shapes that are used: without the constant; 2: and without the straight line
 
     def __init_subclass__(cls, **kwargs):
-        cls.common_name = f"curve over {getattr(cls, 'words', '')}"
+        cls.common_name = cls.called or f"curve over {getattr(cls, 'words', '')}"
         cls.size = 3 * (SPLINES - cls.first)
         cls.__doc__ = Learned.__doc__
         super().__init_subclass__(**kwargs)
@@ -129,7 +130,7 @@ class _LearnedTime(_Between):
     scope = "session"
     needs = ("time",)
     excited_by = "time"
-    words, covariate_unit = "time", "s"
+    words, covariate_unit, called = "time", "s", "bias drift along a curve"
     inner = MappingProxyType(
         {
             "low": Inner("s", 0.5, 0.0, 1e6, "time, from the reference time, before which the curve is constant"),
