@@ -243,7 +243,10 @@ class ReadOptions:
     check: refuse what is not plausible, see `jaximu.recordings.recording.plausibility`.
     alone: take a file of a gyroscope alone; its accelerometer then has no samples.
     device: whose rows to take of a table in which several units write in turn.
-    topic, instance, stamp: what to take from bags and flight logs, see `jaximu.recordings.columns.table.Selection`.
+    topic: of a file that holds more than one sensor of a kind, name of the message or topic; two of them,
+        "accelerometer,gyroscope", where they are apart.
+    instance: which of several sensors, from 0.
+    stamp: "header" (the sensor's own, default) or "receive" (the logger's).
     like: how the log of a calibration was read, which is used where options and file leave something open: columns
         where the header is the same, axes where the file's writer has not applied them, rate and scales where needed.
         Axes and scales that contradict it are refused.

@@ -216,7 +216,7 @@ def whole_stamps(table: LogTable) -> LogTable:
             names[at] = JOINED
             joined = table.with_column(at, written * 10**9 + table.columns[rest] * (10**9 // parts))
             note = f"time is {table.label(at)} and {table.label(rest)}."
-            return replace(joined, names=tuple(names), notes=(*table.notes, note))
+            return replace(joined, names=tuple(names)).noted(note)
     return table
 
 

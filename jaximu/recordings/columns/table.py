@@ -25,25 +25,6 @@ _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
 
 
 @dataclass(frozen=True)
-class MessageSelection:
-    """What to take from a file that holds more than one sensor of a kind, or more than one stamp of a sample.
-
-    topic: name of the message or topic; two of them, "accelerometer,gyroscope", where they are apart. instance: which
-    of several sensors, from 0. stamp: "header" (the sensor's own, default) or "receive" (the logger's).
-    """
-
-    topic: str | None = None
-    instance: int | None = None
-    stamp: str = "header"
-
-    def __post_init__(self) -> None:
-        if self.stamp not in ("header", "receive"):
-            raise InputError(f"--stamp: {self.stamp!r} is neither header nor receive.")
-        if self.instance is not None and self.instance < 0:
-            raise InputError(f"--instance: sensors count from 0, found {self.instance}.")
-
-
-@dataclass(frozen=True)
 class LogTable:
     """A file's columns.
 
@@ -98,6 +79,10 @@ class LogTable:
     def with_column(self, index: int, values: np.ndarray) -> "LogTable":
         """The table with other values in one column."""
         return replace(self, columns=(*self.columns[:index], values, *self.columns[index + 1 :]))
+
+    def noted(self, *notes: str) -> "LogTable":
+        """The table with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
 
     def label(self, index: int) -> str:
         """The column's name in the file, or its 1-based number."""

@@ -132,8 +132,10 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
                 title = f"{title} [{unit}]" if unit else title
             named[title] = values
         table = _table(named, source)
-        notes = ('units are those of Android\'s sensors, by "type" in each line.',) if android else ()
-        yield sensor, replace(table, notes=(*table.notes, *notes))
+        yield (
+            sensor,
+            table.noted('units are those of Android\'s sensors, by "type" in each line.') if android else table,
+        )
 
 
 def of_sensor(table: LogTable, sensor: str) -> LogTable:
@@ -176,8 +178,7 @@ def apart(table: LogTable) -> LogTable:
                 columns=tuple(part.columns[index] for index in kept),
             )
             parts.append((sensor, part))
-        joined = _joined(parts)
-        return replace(joined, notes=(*joined.notes, f"each row is one sensor's, by {table.label(at)}."))
+        return _joined(parts).noted(f"each row is one sensor's, by {table.label(at)}.")
     return table
 
 
@@ -214,9 +215,8 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
             )
         if device not in units:
             raise InputError(f"{table.path}: --device {device}: column {table.label(at)} holds {', '.join(units[:8])}.")
-        taken = table.take(np.flatnonzero(names == device))
         note = f"the rows are those of {device}, by column {table.label(at)}."
-        return replace(taken, device=device, notes=(*taken.notes, note))
+        return replace(table.take(np.flatnonzero(names == device)), device=device).noted(note)
     return _unnamed_device(table, device or usual)
 
 
@@ -248,8 +248,7 @@ def _unnamed_device(table: LogTable, device: str | None) -> LogTable:
             f"1 … --device {count} (as the first rows come). {_all_of(table, units)}"
         )
     taken = table.take(np.arange(int(device) - 1, len(table.columns[0]), count))
-    note = f"the rows are those of unit {device} of {count} that write in turn."
-    return replace(taken, device=device, notes=(*taken.notes, note))
+    return replace(taken, device=device).noted(f"the rows are those of unit {device} of {count} that write in turn.")
 
 
 _ORDINALS = ("", "", "second", "third", "fourth", "fifth", "sixth")
