@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol as Interface
 
 import numpy as np
 import scipy
@@ -18,10 +17,10 @@ from numpy.typing import NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.recordings.attitude import UNIT_LENGTH
-from jaximu.recordings.readers.schedule import ScheduleEntry
+from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.recording import Recording, Signal, runs_of
 
-__all__ = ["Entry", "Integral", "entries_of_columns", "match_reference", "means_over", "rest_rate"]
+__all__ = ["Integral", "entries_of_columns", "match_reference", "means_over", "rest_rate"]
 
 _MOVING = np.radians(2.0)  # rad/s, mean rate over a second that no pose has
 _OFF = 20.0  # degrees between a pose's "up" and what the accelerometer reads as its data sheet has it
@@ -31,26 +30,6 @@ _NOISY = 6.0  # times the usual rate of a reference at rest, which its noise alo
 _WINDOW = 0.25  # s, over which a reference's rate is taken
 _SHORTEST, _LONGEST_TURN = 1.0, 120.0  # s
 _SMALLEST_TURN = np.radians(5)
-
-
-class Entry(Interface):
-    """A pose or a turn on the recording's clock, as a schedule or a protocol has it.
-
-    kind: "pose" or "turn". vector (3,): unit, body frame, "up" or the axis. angle: rad. heading: rad or None.
-    """
-
-    @property
-    def start(self) -> float: ...
-    @property
-    def stop(self) -> float: ...
-    @property
-    def kind(self) -> str: ...
-    @property
-    def vector(self) -> FloatArray: ...
-    @property
-    def angle(self) -> float: ...
-    @property
-    def heading(self) -> float | None: ...
 
 
 class Integral:
@@ -74,7 +53,7 @@ def means_over(signal: Signal, span: FloatArray) -> FloatArray:
     return Integral(signal, signal.values).over(*span.T) / np.diff(span)
 
 
-def rest_rate(integral: Integral, entries: Sequence[Entry]) -> FloatArray:
+def rest_rate(integral: Integral, entries: Sequence[ScheduleEntry]) -> FloatArray:
     """The median of the mean outputs in poses: the gyroscope's bias, for purposes that do not ask for more."""
     rests = np.array([(entry.start, entry.stop) for entry in entries if entry.kind == "pose"])
     if not len(rests):
@@ -82,7 +61,9 @@ def rest_rate(integral: Integral, entries: Sequence[Entry]) -> FloatArray:
     return np.median(integral.over(*rests.T) / np.diff(rests), axis=0)
 
 
-def match_reference(recording: Recording, entries: Sequence[Entry]) -> tuple[list[Entry], tuple[str, ...]]:
+def match_reference(
+    recording: Recording, entries: Sequence[ScheduleEntry]
+) -> tuple[list[ScheduleEntry], tuple[str, ...]]:
     """Return the entries that can be used, turns without a stated sense given the gyroscope's, and notes.
 
     Raises `InputError` where the reference does not fit the recording, `NotPossibleError` where nothing is left.
@@ -105,11 +86,11 @@ def match_reference(recording: Recording, entries: Sequence[Entry]) -> tuple[lis
     return usable, tuple(notes)
 
 
-def _label(entry: Entry) -> str:
-    return f"{getattr(entry, 'label', 'the ' + entry.kind)} ({entry.start:.6g} to {entry.stop:.6g} s)"
+def _label(entry: ScheduleEntry) -> str:
+    return f"{entry.label or f'the {entry.kind}'} ({entry.start:.6g} to {entry.stop:.6g} s)"
 
 
-def _inside(recording: Recording, entry: Entry, notes: list[str]) -> bool:
+def _inside(recording: Recording, entry: ScheduleEntry, notes: list[str]) -> bool:
     """Whether the log holds an entry without a gap."""
     there = [signal for signal in recording.signals.values() if len(signal) > 1]
     first, last = min(signal.time[0] for signal in there), max(signal.time[-1] for signal in there)
@@ -130,21 +111,20 @@ def _inside(recording: Recording, entry: Entry, notes: list[str]) -> bool:
     return True
 
 
-def _turned(entry: Entry, rate: Integral, bias: FloatArray) -> FloatArray:
+def _turned(entry: ScheduleEntry, rate: Integral, bias: FloatArray) -> FloatArray:
     """The angle (3,), rad, that the gyroscope shows."""
     return rate.over(entry.start, entry.stop) - bias * (entry.stop - entry.start)
 
 
-def _with_sense(entry: Entry, rate: Integral, bias: FloatArray, notes: list[str]) -> Entry:
+def _with_sense(entry: ScheduleEntry, rate: Integral, bias: FloatArray, notes: list[str]) -> ScheduleEntry:
     if entry.kind == "pose" or not math.isnan(entry.angle):
         return entry
     sense = math.copysign(2 * math.pi, _turned(entry, rate, bias) @ entry.vector)
     notes.append("turns whose angle is not stated are taken as 360° in the sense that the gyroscope shows.")
-    assert isinstance(entry, ScheduleEntry)
     return replace(entry, angle=sense)
 
 
-def _require_units(turns: Sequence[tuple[Entry, FloatArray]], where: str) -> None:
+def _require_units(turns: Sequence[tuple[ScheduleEntry, FloatArray]], where: str) -> None:
     """Refuse angles in another unit than the gyroscope's; `turns`: with the angle (3,) that the gyroscope shows."""
     ratio = np.median([abs(turned @ entry.vector / entry.angle) for entry, turned in turns] or [1.0])
     for slip, unit, other in ((57.29578, "rad", "deg"), (1 / 57.29578, "deg", "rad")):
@@ -156,7 +136,7 @@ def _require_units(turns: Sequence[tuple[Entry, FloatArray]], where: str) -> Non
             )
 
 
-def _require_clock(entries: Sequence[Entry], rate: Integral, bias: FloatArray, where: str) -> None:
+def _require_clock(entries: Sequence[ScheduleEntry], rate: Integral, bias: FloatArray, where: str) -> None:
     """Refuse a reference whose poses hold motion, and say which shift would suit better."""
     moving = []
     for entry in entries:
@@ -189,7 +169,7 @@ def _require_clock(entries: Sequence[Entry], rate: Integral, bias: FloatArray, w
     raise InputError(f"{text}: the reference does not match the log in time, or belongs to another log.")
 
 
-def _require_turn(entry: Entry, turned: FloatArray, where: str) -> None:
+def _require_turn(entry: ScheduleEntry, turned: FloatArray, where: str) -> None:
     along = turned @ entry.vector
     across = np.linalg.norm(turned - along * entry.vector)
     if 0.7 < along / entry.angle < 1.4 and across < 0.3 * abs(entry.angle):
@@ -204,7 +184,7 @@ def _require_turn(entry: Entry, turned: FloatArray, where: str) -> None:
     raise InputError(f"{text}{shown} about x, y, z: the reference does not describe this turn, or not at this time.")
 
 
-def _require_poses(recording: Recording, poses: Sequence[Entry], where: str) -> None:
+def _require_poses(recording: Recording, poses: Sequence[ScheduleEntry], where: str) -> None:
     if not poses or not len(recording.accelerometer):
         return
     force = Integral(recording.accelerometer, recording.accelerometer.si())
@@ -238,7 +218,7 @@ def _require_poses(recording: Recording, poses: Sequence[Entry], where: str) -> 
 # --- reference columns ----------------------------------------------------------------------------------------------
 
 
-def entries_of_columns(recording: Recording) -> list[Entry]:
+def entries_of_columns(recording: Recording) -> list[ScheduleEntry]:
     """Return poses (the reference at rest for a second or more) and the turns between them from reference columns.
 
     An attitude tells all. A table's angle or rate tells turns about the table's axis, which then must be vertical and
@@ -279,7 +259,7 @@ def _neighbours(count: int, samples: float) -> tuple[NDArray[np.intp], NDArray[n
     return np.maximum(index - step, 0), np.minimum(index + step, count - 1)
 
 
-def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[Entry]:
+def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[ScheduleEntry]:
     length = np.linalg.norm(attitude.values, axis=1)
     if (np.abs(length - 1) > UNIT_LENGTH).any():
         worst = np.argmax(np.abs(length - 1))
@@ -292,21 +272,21 @@ def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[Entry]:
     before, after = _neighbours(len(attitude), _WINDOW * attitude.rate / 2)
     angle = (rotation[before].inv() * rotation[after]).magnitude()
     spans = _rests(attitude.time, angle / (attitude.time[after] - attitude.time[before]), recording.name)
-    entries: list[Entry] = []
+    entries: list[ScheduleEntry] = []
     for index, (start, stop) in enumerate(spans):
         inside = (attitude.time >= start) & (attitude.time <= stop)
         up = rotation[inside].inv().apply([0.0, 0.0, 1.0]).mean(axis=0)
-        entries.append(ScheduleEntry(start, stop, "pose", up / np.linalg.norm(up), label="the pose"))
+        entries.append(ScheduleEntry(start, stop, "pose", up / np.linalg.norm(up)))
         if index + 1 < len(spans) and (following := spans[index + 1, 0]) - stop < _LONGEST_TURN:
             during = rotation[(attitude.time >= stop) & (attitude.time <= following)]
             total = (during[:-1].inv() * during[1:]).as_rotvec().sum(axis=0)
             turned = float(np.linalg.norm(total))
             if turned > _SMALLEST_TURN:
-                entries.append(ScheduleEntry(stop, following, "turn", total / turned, turned, label="the turn"))
+                entries.append(ScheduleEntry(stop, following, "turn", total / turned, turned))
     return entries
 
 
-def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray) -> list[Entry]:
+def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray) -> list[ScheduleEntry]:
     before, after = _neighbours(len(time), _WINDOW / np.median(np.diff(time)) / 2)
     moved = np.abs(angle[after] - angle[before]) / (time[after] - time[before])
     if recording.gyroscope is not None:  # a unit is mounted again while the table stands
@@ -333,13 +313,13 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
             f"{recording.name}: from {start:.6g} to {stop:.6g} s no axis of the body is vertical ({off[first]:.0f}° "
             "off): table columns describe only turns about a vertical body axis; write a schedule for other poses."
         )
-    entries: list[Entry] = []
+    entries: list[ScheduleEntry] = []
     for index, ((start, stop), up) in enumerate(zip(spans, ups, strict=True)):
         heading = float(np.interp((start + stop) / 2, time, angle)) if recording.table_angle is not None else None
-        entries.append(ScheduleEntry(start, stop, "pose", up, heading=heading, label="the pose"))
+        entries.append(ScheduleEntry(start, stop, "pose", up, heading=heading))
         if index + 1 < len(spans) and up @ ups[index + 1] > 0.5:
             following = spans[index + 1, 0]
             turned = float(np.interp(following, time, angle) - np.interp(stop, time, angle))
             if abs(turned) > _SMALLEST_TURN and following - stop < _LONGEST_TURN:
-                entries.append(ScheduleEntry(stop, following, "turn", up, turned, label="the turn"))
+                entries.append(ScheduleEntry(stop, following, "turn", up, turned))
     return entries

@@ -29,10 +29,11 @@ from jaximu.model.sensor import Imu, Triad
 from jaximu.model.state_space import BLOCK
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings import write_recording
+from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.write import write_parts
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact, LoggedRows
-from jaximu.simulation.protocols import Environment, Interval, Motion, Plan, Protocol, block_length
+from jaximu.simulation.protocols import Environment, Motion, Plan, Protocol, block_length
 
 __all__ = ["Case", "Stream", "Truth", "simulate", "simulate_cases", "write_case"]
 
@@ -114,7 +115,7 @@ class Truth(Document):
         return self.case.imu
 
     @property
-    def schedule(self) -> list[Interval]:
+    def schedule(self) -> list[ScheduleEntry]:
         """Rests and turns, on the recording's clock."""
         half = 0.5 / self.case.rate
         return [
@@ -159,7 +160,17 @@ class Truth(Document):
             "gravity": float(motion.gravity),
             "earth_rotation": np.asarray(motion.earth).tolist(),
             "magnetic_field": np.asarray(motion.field).tolist(),
-            "schedule": [asdict(interval) | {"vector": interval.vector.tolist()} for interval in self.schedule],
+            "schedule": [
+                {
+                    "start": entry.start,
+                    "stop": entry.stop,
+                    "kind": entry.kind,
+                    "vector": entry.vector.tolist(),
+                    "angle": entry.angle,
+                    "heading": entry.heading or 0.0,
+                }
+                for entry in self.schedule
+            ],
             "artefacts": [
                 {"name": artefact.name} | {k: None if v == np.inf else v for k, v in asdict(artefact).items()}
                 for artefact in case.artefacts
@@ -177,7 +188,7 @@ class Truth(Document):
         lines = ["start [s],stop [s],kind,x,y,z,angle [deg],heading [deg]"]
         for interval in self.schedule:
             x, y, z = interval.vector
-            angle, heading = np.degrees(interval.angle), np.degrees(interval.heading)
+            angle, heading = np.degrees(interval.angle), np.degrees(interval.heading or 0.0)
             extra = f"{angle:.12g}," if interval.kind == "turn" else f",{heading:.12g}"
             times = f"{interval.start:.9g},{interval.stop:.9g}"
             lines.append(f"{times},{interval.kind},{x:.12g},{y:.12g},{z:.12g},{extra}")

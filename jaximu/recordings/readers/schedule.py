@@ -12,42 +12,25 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, readable
 from jaximu.ground.units import parse_column, unit
 from jaximu.recordings.columns.names import GROUPS, header_columns
+from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.readers.reader import extract, read_table
 from jaximu.recordings.recording import ReadOptions, Recording
 
-__all__ = ["ScheduleEntry", "read_reference", "read_schedule"]
+__all__ = ["read_reference", "read_schedule"]
 
 _FIELDS = ("start", "stop", "kind", "x", "y", "z", "angle", "heading")
 _QUANTITIES = {"start": "time", "stop": "time", "angle": "angle", "heading": "angle"}
 _REFERENCES = ("table_angle", "table_rate", "attitude")
-
-
-@dataclass(frozen=True)
-class ScheduleEntry:
-    """A pose or a turn from `start` to `stop` (s, on the log's clock).
-
-    kind: "pose" or "turn". vector (3,): unit, body frame, "up" or the axis. angle: rad, of a turn; NaN for a full turn
-    whose sense nobody wrote down. heading: rad, of a pose, or None. label: where it stands, for messages.
-    """
-
-    start: float
-    stop: float
-    kind: str
-    vector: FloatArray
-    angle: float = 0.0
-    heading: float | None = None
-    label: str = "entry"
 
 
 def read_reference(path: str | os.PathLike[str], recording: Recording) -> tuple[ScheduleEntry, ...] | Recording:

@@ -11,7 +11,8 @@ import numpy as np
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.model.stimulus import Stimulus
-from jaximu.simulation.protocols.course import Course, Environment, Interval
+from jaximu.recordings.entry import ScheduleEntry
+from jaximu.simulation.protocols.course import Course, Environment
 from jaximu.simulation.protocols.motion import Motion
 
 __all__ = ["Plan", "Protocol"]
@@ -22,7 +23,7 @@ class Plan:
     """A protocol made out: its motion, its rests and turns, and what a log of it holds beside the sensors."""
 
     motion: Motion
-    intervals: tuple[Interval, ...]
+    intervals: tuple[ScheduleEntry, ...]
     columns: tuple[str, ...] = ()  # of `Recording`: temperature, ambient_temperature, current, attitude, table_rate
 
 

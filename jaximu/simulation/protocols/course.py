@@ -13,28 +13,13 @@ from numpy.typing import ArrayLike
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.recordings.entry import ScheduleEntry
 from jaximu.simulation.protocols.motion import Motion, earth_rate, field_of
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-__all__ = ["Course", "Environment", "Interval", "Tone", "attitude_of"]
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A rest or a turn of a protocol, from `start` to `stop` (s).
-
-    kind: "pose" or "turn". vector (3,): in the body frame, "up" of a pose or the axis of a turn (right-hand rule).
-    angle: rad turned. heading: rad, of a pose, about "up" from an arbitrary zero.
-    """
-
-    start: float
-    stop: float
-    kind: str
-    vector: FloatArray
-    angle: float = 0.0
-    heading: float = 0.0
+__all__ = ["Course", "Environment", "Tone", "attitude_of"]
 
 
 @dataclass(frozen=True)
@@ -117,7 +102,7 @@ class Course:
     """A motion in the making: rests and turns one after the other, each exactly as long as said."""
 
     attitude: Rotation = field(default_factory=lambda: scipy.spatial.transform.Rotation.identity())
-    intervals: list[Interval] = field(default_factory=list)
+    intervals: list[ScheduleEntry] = field(default_factory=list)
     time: float = 0.0
     _segments: list[tuple] = field(default_factory=list)
 
@@ -129,7 +114,7 @@ class Course:
         if mark:
             up = self.attitude.inv().apply([0.0, 0.0, 1.0])
             heading = (self.attitude * attitude_of(up).inv()).as_rotvec()[2]
-            self.intervals.append(Interval(start, self.time, "pose", up, 0.0, float(heading)))
+            self.intervals.append(ScheduleEntry(start, self.time, "pose", up, 0.0, float(heading)))
 
     def turn(
         self,
@@ -148,7 +133,7 @@ class Course:
         start = self._add(duration, rotation, ramp, displacement, bend)
         self.attitude = self.attitude * scipy.spatial.transform.Rotation.from_rotvec(rotation)
         if mark and angle > 0:
-            self.intervals.append(Interval(start, self.time, "turn", rotation / angle, angle))
+            self.intervals.append(ScheduleEntry(start, self.time, "turn", rotation / angle, angle))
 
     def spin(self, axis: FloatArray, angle: float, rate: float, ramp_duration: float) -> None:
         """Turn by `angle` (rad) about `axis` at the constant `rate` (rad/s), reached in `ramp_duration` (s).
