@@ -353,9 +353,10 @@ def _tilt(signal: Signal, intervals: FloatArray) -> float:
     """Return the largest angle, degrees, of the force in a pose from its mean over all poses."""
     import numpy as np
 
+    from jaximu.ground.rotation import unit_vectors
+
     values = signal.si()
-    means = np.stack([values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in intervals])
-    up = means / np.linalg.norm(means, axis=1, keepdims=True)
+    up = unit_vectors(np.stack([values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in intervals]))
     middle = up.mean(axis=0)
     return float(np.degrees(np.arccos(np.clip(up @ middle / max(np.linalg.norm(middle), 1e-9), -1.0, 1.0))).max())
 

@@ -326,7 +326,7 @@ def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> IntA
     centred = smooth - (smooth.max(axis=0) + smooth.min(axis=0)) / 2
     every = max(1, round(_SMOOTHED * rate))
     path = np.linalg.norm(np.diff(centred[::every], axis=0), axis=1) / np.median(np.linalg.norm(centred, axis=1))
-    path = np.concatenate([[0.0], np.cumsum(path + _STEADY * np.diff(time[::every]))])
+    path = np.cumulative_sum(path + _STEADY * np.diff(time[::every]), include_initial=True)
     count = min(most, max(8, len(time) // every))
     edges = np.interp(np.linspace(0, path[-1], count + 1), path, np.arange(len(path)) * every)
     return np.unique(np.append(edges[:-1].astype(np.int64), len(time) - 1))

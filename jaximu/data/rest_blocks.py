@@ -421,7 +421,7 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
 def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
     """Return means between edges of the line through a signal's samples, which goes on as it ends."""
     time, values = signal.time, signal.values[:, 0]
-    whole = np.concatenate([[0.0], np.cumsum(np.diff(time) * midpoints(values))])
+    whole = np.cumulative_sum(np.diff(time) * midpoints(values), include_initial=True)
     inside = np.clip(edges, time[0], time[-1])
     k = np.clip(np.searchsorted(time, inside, side="right") - 1, 0, len(time) - 2)
     integral = whole[k] + (inside - time[k]) * (values[k] + np.interp(inside, time, values)) / 2

@@ -76,7 +76,7 @@ def _evidence(samples: Samples, lost: FloatArray, wanted: Rows, half: int) -> tu
     is seen there: (sensors, w) each. The step is that of a cubic through `half` samples on either side, on the times
     that the samples `lost` (n − 1,) already known give them.
     """
-    time = np.arange(len(lost) + 1) + np.concatenate([[0.0], np.cumsum(lost)])
+    time = np.arange(len(lost) + 1) + np.cumulative_sum(lost, include_initial=True)
     rows = wanted[:, None] + np.arange(1 - half, 1 + half)
     centre = (time[wanted] + time[wanted + 1]) / 2
     side = np.repeat([-0.5, 0.5], half)
@@ -247,7 +247,7 @@ def _singles(samples: Samples) -> list[Finding]:
     if max(between.sum(), against.sum()) > 0.34 * len(places):
         return []
     rate = len(places) / max(int(clear.sum()), 1)
-    later = np.concatenate([[0.0], np.cumsum(lost)]) * sensor.period
+    later = np.cumulative_sum(lost, include_initial=True) * sensor.period
     # what motion too slow to show a loss may still hide
     hidden = rate * float(np.sum(~clear & (power > _HARM)))
 

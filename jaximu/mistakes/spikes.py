@@ -6,6 +6,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.quantities import counted, size
 from jaximu.mistakes.base import BRIDGED, Samples, Sensor
 from jaximu.recordings.finding import Finding, Rows
@@ -145,7 +146,7 @@ def _turned(accelerometer: Sensor, gyroscope: Sensor, run: Rows) -> bool:
     inside, _ = _bridged(gyroscope.values, first, last)
     rows = np.arange(first - _NEAR, last + 1 + _NEAR)
     time = gyroscope.time[rows]
-    force = np.stack([np.interp(time, accelerometer.time, axis) for axis in accelerometer.values.T], axis=1)
+    force = interpolated(accelerometer.time, accelerometer.values, time)
     logged = gyroscope.values[rows] - np.median(gyroscope.values, axis=0)
     bridged = logged.copy()
     bridged[run - rows[0]] += inside - gyroscope.values[run]

@@ -34,6 +34,7 @@ import scipy
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.data.preintegration import preintegrate_samples
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import Gravity
@@ -119,7 +120,7 @@ class ModelledErrors:
         size = max(2, round(length * self.rate))
         first = _spread(np.arange(0, len(intervals) - size + 1, size))
         rows = first[:, None] + np.arange(size)
-        start = np.concatenate([[0.0], np.cumsum(intervals)])[first]
+        start = np.cumulative_sum(intervals, include_initial=True)[first]
         rates, forces = (np.asarray(samples)[rows] for samples in (stimulus.angular_rate, stimulus.specific_force))
         return Stretches(rates, forces, intervals[rows], start, rows)
 
@@ -189,7 +190,7 @@ class MeasuredErrors:
         whole = replace(known, quaternion=np.asarray(mounting.unit_attitude(known.quaternion))).rotation()
         velocity = known.velocities()
         stamp = np.asarray(mounting.on_log(known.time))
-        felt = np.stack([np.interp(stamp, middle, component) for component in np.asarray(force).T], axis=1)
+        felt = interpolated(middle, np.asarray(force), stamp)
         steady = np.ones(len(stamp), bool)
         notes: list[str] = []
         if velocity is not None:

@@ -262,7 +262,7 @@ def _mean_squares(
     """Mean squares (T,) of the differences of phase points (n + 1,), and of how many that miss nothing."""
     order = kind.order
     if kind.modified:  # a difference averaged over m places is one of the next order of the running sum, over m
-        points, order = np.concatenate([[0.0], np.cumsum(points - points.mean())]), order + 1
+        points, order = np.cumulative_sum(points - points.mean(), include_initial=True), order + 1
         lost = None if lost is None else np.append(lost, lost[-1])
     if kind.total:  # mirrored about both ends; differences are centred on every inner point
         mirrored = points[-2:0:-1]

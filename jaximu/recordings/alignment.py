@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.distributions import student_isf
 
 __all__ = [
@@ -124,7 +125,7 @@ class BlockMeans(NamedTuple):
     def turned(self, delay: FloatArray | float = 0.0) -> FloatArray:
         """Return the gyroscope's angle (n, 3) from each block to the next, its stamps (n + 1,) `delay` s late."""
         stamps = self.centre + delay
-        return np.diff(np.stack([np.interp(stamps, self.time, axis) for axis in self.angle.T], axis=1), axis=0)
+        return np.diff(interpolated(self.time, self.angle, stamps), axis=0)
 
 
 def gravity_turning(
@@ -141,7 +142,7 @@ def gravity_turning(
     centre = force_time[: count * span].reshape(count, span).mean(axis=1)
     rate = rate - np.median(rate, axis=0)
     steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(rate_time)[:, None]
-    angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    angle = np.cumulative_sum(steps, axis=0, include_initial=True)
     length = np.linalg.norm(mean, axis=1)
     usual = np.median(length)
     off = np.abs(length - usual) / max(usual, 1e-300)
@@ -278,8 +279,7 @@ def carried(
     from scipy.spatial.transform import Rotation
 
     edges = np.searchsorted(force_time, rests)
-    up = np.stack([force[a : max(b, a + 1)].mean(axis=0) for a, b in edges])
-    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-300)
+    up = _directions(np.stack([force[a : max(b, a + 1)].mean(axis=0) for a, b in edges]))
     interval = np.diff(rate_time)
     gap = 2.5 * np.median(interval)
     middle = rests.mean(axis=1)
@@ -300,9 +300,9 @@ def carried(
         return Carried(1.0, np.pi, 0)
     at_rest = np.concatenate([rate[a:b] for a, b in np.searchsorted(rate_time, rests)])
     rate = rate - np.median(at_rest, axis=0) if len(at_rest) else rate
-    angle = np.concatenate([np.zeros((1, 3)), np.cumsum((rate[1:] + rate[:-1]) / 2 * interval[:, None], axis=0)])
+    angle = np.cumulative_sum((rate[1:] + rate[:-1]) / 2 * interval[:, None], axis=0, include_initial=True)
     stamps = np.linspace(middle[used], middle[used + 1], _TURN_STEPS + 1)
-    passed = np.stack([np.interp(stamps, rate_time, axis) for axis in angle.T], axis=2)
+    passed = interpolated(rate_time, angle, stamps)
     steps = passed[1:] - passed[:-1]
     factors = np.concatenate([_FACTORS, -_FACTORS])
     turns = Rotation.from_rotvec((factors[:, None, None, None] * steps).reshape(-1, 3)).as_matrix()
@@ -321,9 +321,14 @@ def carried(
     return Carried(float(factor), float(best.min()), len(used))
 
 
+def _directions(vectors: FloatArray) -> FloatArray:
+    """Vectors (n, 3) scaled to length one; one of no length stays."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
 def _jumps(force: FloatArray, before: FloatArray, after: FloatArray) -> bool:
     """Whether gravity jumps from one direction (3,) to another within a step of the force (n, 3): rows were cut out."""
-    up = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-300)
+    up = _directions(force)
     near = _JUMP * np.linalg.norm(after - before)
     left, reached = (np.linalg.norm(up - direction, axis=1) < near for direction in (before, after))
     return bool(np.any(left[:-1] & reached[1:]))

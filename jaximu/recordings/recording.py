@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
@@ -106,7 +107,7 @@ class Signal(Comparable):
 
     def at(self, times: FloatArray) -> FloatArray:
         """(..., m) the output at times (...), along straight lines; the first and last value beyond the ends."""
-        return np.stack([np.interp(times, self.time, axis) for axis in self.values.T], axis=-1)
+        return interpolated(self.time, self.values, times)
 
     def samples(self, seconds: float) -> int:
         """Return how many samples so many seconds are; of a half, rounding of the rate does not decide."""
@@ -686,7 +687,7 @@ def smoothed_slope(time: FloatArray, values: FloatArray, window: float) -> Float
     last = np.maximum(np.searchsorted(time, time + window / 2, "right"), np.minimum(here + 2, len(time)))
 
     def total(terms: FloatArray) -> FloatArray:
-        running = np.concatenate([[0.0], np.cumsum(terms)])
+        running = np.cumulative_sum(terms, include_initial=True)
         return running[last] - running[first]
 
     count, sum_time = last - first, total(time)

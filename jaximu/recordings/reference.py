@@ -15,7 +15,9 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.rotation import unit_vectors
 from jaximu.recordings.attitude import UNIT_LENGTH
 from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.recording import Recording, Signal, runs_of
@@ -39,12 +41,12 @@ class Integral:
         self.edges = signal.edges
         self.origin = values.mean(axis=0)  # the sums of what is left lose fewer digits
         steps = (values - self.origin) * np.diff(self.edges)[:, None]
-        self.sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+        self.sums = np.cumulative_sum(steps, axis=0, include_initial=True)
 
     def over(self, start, stop) -> FloatArray:
         """Return the integral (..., 3) from `start` to `stop` (...)."""
         start, stop = np.asarray(start), np.asarray(stop)
-        ends = [np.stack([np.interp(t, self.edges, axis) for axis in self.sums.T], axis=-1) for t in (start, stop)]
+        ends = [interpolated(self.edges, self.sums, t) for t in (start, stop)]
         return ends[1] - ends[0] + self.origin * (stop - start)[..., None]
 
 
@@ -188,8 +190,7 @@ def _require_poses(recording: Recording, poses: Sequence[ScheduleEntry], where: 
     if not poses or not len(recording.accelerometer):
         return
     force = Integral(recording.accelerometer, recording.accelerometer.si())
-    read = force.over(*np.array([(pose.start, pose.stop) for pose in poses]).T)
-    read = read / np.linalg.norm(read, axis=1, keepdims=True)
+    read = unit_vectors(force.over(*np.array([(pose.start, pose.stop) for pose in poses]).T))
     stated = np.stack([pose.vector for pose in poses])
     off = np.degrees(np.arccos(np.clip(np.sum(read * stated, axis=1), -1, 1)))
     if not (off > _OFF).any():

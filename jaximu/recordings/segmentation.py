@@ -15,6 +15,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
+from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE
@@ -127,8 +128,7 @@ def _floor(variance: FloatArray, moments: _Moments) -> float:
 
 def _angles(vectors: FloatArray, others: FloatArray) -> FloatArray:
     """Angle (rad) between each vector and the other of its row."""
-    units, other_units = (rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (vectors, others))
-    return 2 * np.arcsin(np.clip(np.linalg.norm(other_units - units, axis=1) / 2, 0, 1))
+    return 2 * np.arcsin(np.clip(np.linalg.norm(unit_vectors(others) - unit_vectors(vectors), axis=1) / 2, 0, 1))
 
 
 def _samples(signal: Signal, start: float, stop: float) -> slice:

@@ -322,7 +322,7 @@ class _Guess:
         steps = np.diff(values)
         if (steps < 0).any():
             steps = np.where(steps < 0, np.median(steps[steps > 0]), steps)
-            self.numbers[self.time] = values[0] + np.concatenate([[0.0], np.cumsum(steps)])
+            self.numbers[self.time] = values[0] + np.cumulative_sum(steps, include_initial=True)
 
     def _named_triads(self) -> list[_Triad]:
         """The triads that names show, of whatever sensor."""
