@@ -35,8 +35,7 @@ class Attitude:
 
     def __post_init__(self) -> None:
         length = np.linalg.norm(self.quaternion, axis=1)
-        bad = ~np.isfinite(length) | (np.abs(length - 1) > UNIT_LENGTH)
-        if bad.mean() > 0.5:
+        if np.mean(np.abs(length - 1) <= UNIT_LENGTH) < 0.5:
             raise InputError(
                 f"{self.name}: its quaternions have the length {np.median(length):.4g} and not 1: the columns are "
                 "not a quaternion, or not in this order."
@@ -47,7 +46,7 @@ class Attitude:
     def usable(self) -> Attitude:
         """Return the rows whose quaternion is one, of length one and without jumps of sign."""
         length = np.linalg.norm(self.quaternion, axis=1)
-        kept = np.isfinite(length) & (np.abs(length - 1) < UNIT_LENGTH)
+        kept = np.abs(length - 1) < UNIT_LENGTH
         vectors = {"velocity": self.velocity, "position": self.position}
         vectors = {name: values[kept] for name, values in vectors.items() if values is not None}
         notes = self.notes

@@ -28,7 +28,7 @@ def without_flagged(recording: Recording, path: str | os.PathLike[str]) -> Recor
     except InputError:  # a format that is no table of columns
         return recording
     notes, bad = [], np.zeros(table.source.rows, bool)
-    for at, name in enumerate(table.names or ()):
+    for at, name in enumerate(table.header):
         if not _STATUS.search(name) or table.columns[at].dtype == object:
             continue
         values, counts = np.unique(table.columns[at], return_counts=True)

@@ -222,7 +222,7 @@ class _Guess:
     def __init__(self, table: LogTable, sensor: str | None):
         self.table, self.role = table, sensor
         self.width = len(table.columns)
-        self.fields = fields_of(table.names) if table.names else [Field((), None, None, None)] * self.width
+        self.fields = fields_of(table.header)
         self.numbers = [self._numbers(at) for at in range(self.width)]
         self.reasons: list[str] = []
         self.questions: list[OpenPoint] = []
@@ -820,7 +820,7 @@ class _Guess:
     def _quaternion(self) -> None:
         """An attitude by name, whose four numbers have norm 1."""
         named: dict[str, dict[str, int]] = {}
-        for at, name in enumerate(self.table.names or ()):
+        for at, name in enumerate(self.table.header):
             if match := re.fullmatch(r"(.*?)[\W_]*([wxyz])", parse_column(name)[0].strip().lower()):
                 named.setdefault(match[1], {})[match[2]] = at
         for head, places in named.items():

@@ -198,21 +198,21 @@ def whole_stamps(table: LogTable) -> LogTable:
     They belong together by their names (sec and nanosec), or because the one falls just where the other rises. The
     column of the seconds holds both then, in nanoseconds and called `JOINED`; the other stays.
     """
-    fields = fields_of(table.names or ())
-    for rest, title in enumerate(table.names or ()):
+    fields = fields_of(table.header)
+    for rest, title in enumerate(table.header):
         prefix, unit = last_of(title)
         parts = _PARTS.get(fields[rest].unit or unit or "")
         if parts is None or not _between(table.columns[rest], parts):
             continue
         for at, field in enumerate(fields):
-            head, seconds = last_of(table.names[at]) if table.names else ("", None)
+            head, seconds = last_of(table.header[at])
             written = _seconds(table.columns[at]) if at != rest else None
             alike = seconds == "s" and head == prefix
             if written is None or not (
                 alike or ((field.sensor == "time" or seconds == "s") and _in_step(written, table.columns[rest]))
             ):
                 continue
-            names = [*(table.names or ())]
+            names = [*table.header]
             names[at] = JOINED
             joined = table.with_column(at, written * 10**9 + table.columns[rest] * (10**9 // parts))
             note = f"time is {table.label(at)} and {table.label(rest)}."

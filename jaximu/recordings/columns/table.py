@@ -86,7 +86,7 @@ class LogTable:
 
     def label(self, index: int) -> str:
         """The column's name in the file, or its 1-based number."""
-        name = parse_name(self.names[index]) if self.names else ""
+        name = parse_name(self.header[index])
         return repr(name) if name else f"number {index + 1}"
 
     def numbers(self, index: int) -> np.ndarray:

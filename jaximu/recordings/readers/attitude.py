@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -66,19 +67,23 @@ def holds_attitude(path: str | os.PathLike[str]) -> bool:
 
 def _tables(path: str | os.PathLike[str]) -> list[tuple[LogTable, dict[str, dict[str, int]]]]:
     """Return the tables of a file that hold an attitude, and where their columns are."""
-    tables = [(table, _places(table)) for table in read_tables(path)]
+    tables = [(table, _places(table)) for table in map(_named, read_tables(path))]
     kinds = {"quaternion", "numbered", "euler", "rotation vector", "table angles"}
     return [(table, places) for table, places in tables if kinds & set(places)]
 
 
+def _named(table: LogTable) -> LogTable:
+    """Return the table, with TUM's names where it has none and as many columns."""
+    if table.names is not None or len(table.columns) != len(_TUM):
+        return table
+    note = f"{table.path}: eight columns without names are taken as time, position and quaternion with w last."
+    return replace(table, names=_TUM).noted(note)
+
+
 def _places(table: LogTable) -> dict[str, dict[str, int]]:
     """Return by kind the columns of each axis, complete kinds alone."""
-    if table.names is None:
-        if len(table.columns) != len(_TUM):
-            return {}
-        return {"time": {"": 0}, "position": {"x": 1, "y": 2, "z": 3}, "quaternion": {"x": 4, "y": 5, "z": 6, "w": 7}}
     kinds: dict[str, dict[str, int]] = {}
-    for at, name in enumerate(table.names):
+    for at, name in enumerate(table.header):
         plain = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*", "", name.lower())).strip("_")
         for kind, patterns in _HABITS.items():
             match = next(filter(None, (re.fullmatch(pattern, plain) for pattern in patterns)), None)
@@ -100,7 +105,7 @@ def _columns(table: LogTable, places: dict[str, int], axes: Sequence[str], quant
     columns = []
     for axis in axes:
         at = places[axis]
-        title = table.names[at] if table.names else ""
+        title = table.header[at]
         stated, factor = parse_column(title)[1], 1.0
         if stated and quantity == "angle":
             factor = unit(stated, (quantity,), file=table.path, column=title).factor
@@ -130,11 +135,7 @@ def _attitude(table: LogTable, places: dict[str, dict[str, int]], name: str) -> 
         vector = _columns(table, places["rotation vector"], "xyz", "angle")
         quaternion = _quaternion(scipy.spatial.transform.Rotation.from_rotvec(vector))
     vectors = {kind: _columns(table, places[kind], "xyz", kind) for kind in ("velocity", "position") if kind in places}
-    if table.names is None:
-        notes.append(f"{name}: eight columns without names are taken as time, position and quaternion with w last.")
-    kept = np.isfinite(time) & np.isfinite(quaternion).all(axis=1)
-    for values in vectors.values():
-        kept &= np.isfinite(values).all(axis=1)
+    kept = np.isfinite(np.column_stack([time, quaternion, *vectors.values()])).all(axis=1)
     if kept.sum() < 16:
         raise InputError(f"{name}: {int(kept.sum())} rows hold an attitude, too few to compare with.")
     if not kept.all():
@@ -145,8 +146,7 @@ def _attitude(table: LogTable, places: dict[str, dict[str, int]], name: str) -> 
 
 def _from_angles(table: LogTable, places: dict[str, int], axes: dict[str, str], name: str) -> FloatArray:
     """Return the quaternions (n, 4) of turns by the columns named, each about its axis as the ones before left it."""
-    titles = [table.names[places[column]] for column in axes] if table.names else []
-    for title in titles:
+    for title in (table.header[places[column]] for column in axes):
         if parse_column(title)[1] is None:
             raise InputError(f"{name}: {title} states no unit: name it {title} [deg] or {title} [rad].")
     angles = _columns(table, places, tuple(axes), "angle")
@@ -161,7 +161,7 @@ def _time(table: LogTable, places: dict[str, dict[str, int]], name: str, notes: 
         return np.arange(len(table.columns[0])) / table.rate, 0.0
     at = places["time"][""]
     stamps = table.numbers(at)
-    stated = parse_column(table.names[at])[1] if table.names else "s"
+    stated = parse_column(table.header[at])[1]
     if stated is None:
         factor, unit_name = next(
             ((factor, unit_name) for least, factor, unit_name in _EPOCHS if stamps[0] > least), (1.0, "s")

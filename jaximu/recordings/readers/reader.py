@@ -314,7 +314,7 @@ def read_means(path: str | os.PathLike[str], options: ReadOptions | None = None)
 
 def _sigma_of_means(table: LogTable, sensor: str, base: str) -> FloatArray | None:
     """The standard deviations (P, 3) of a triad's means, from those of its samples and their number."""
-    named = {name: (at, stated) for at, (name, stated) in enumerate(map(parse_column, table.names or ()))}
+    named = {name: (at, stated) for at, (name, stated) in enumerate(map(parse_column, table.header))}
     names = [f"{sensor}_sigma_{axis}" for axis in "xyz"]
     there = [name for name in names if name in named]
     if not there:

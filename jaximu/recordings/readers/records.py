@@ -157,16 +157,16 @@ def of_sensor(table: LogTable, sensor: str) -> LogTable:
 
 def apart(table: LogTable) -> LogTable:
     """A table whose rows name their sensor, as columns x, y, z, with columns for each sensor; any other as it is."""
-    for at, column in enumerate(table.columns if table.names else ()):
+    for at, column in enumerate(table.columns):
         if column.dtype != object or len(tags := dict.fromkeys(column[:10000].tolist())) > 40:
             continue
         sensors = {tag: sensor for tag in tags if (sensor := _sensor(tag))}
-        axes = {field.axis: index for index, field in enumerate(fields_of(table.names or ())) if not field.stem}
+        axes = {field.axis: index for index, field in enumerate(fields_of(table.header)) if not field.stem}
         if "accel" not in sensors.values() or not {"x", "y", "z"} <= set(axes):
             continue
         parts = []
         for tag, sensor in sensors.items():
-            part, names = table.take(np.flatnonzero(column == tag)), list(table.names or ())
+            part, names = table.take(np.flatnonzero(column == tag)), [*table.header]
             for axis in "xyz":
                 unit = parse_column(names[axes[axis]])[1]
                 names[axes[axis]] = f"{sensor}_{axis} [{unit}]" if unit else f"{sensor}_{axis}"
@@ -194,10 +194,10 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
     usual: the unit to take where none is chosen and it is there. Raises `InputError` where none of them, or one that is
     not there, was chosen.
     """
-    fields = fields_of(table.names or ())
+    fields = fields_of(table.header)
     triads = {field.sensor for field in fields if field.axis} & _TRIADS
     for at, field in enumerate(fields if triads else ()):
-        words = set(words_of(table.names[at])) if table.names else set()
+        words = set(words_of(table.header[at]))
         if field.canonical or not words or not words <= _DEVICE or (field.axis and field.sensor):
             continue
         names = np.array(list(map(str, table.columns[at].tolist())))
@@ -260,8 +260,8 @@ def _units_in_turn(table: LogTable) -> int:
     Biases of two units differ all along; whatever else swings as quickly drifts against the rows.
     """
     columns = []
-    for at, field in enumerate(fields_of(table.names) if table.names else [None] * len(table.columns)):
-        if field is not None and field.sensor not in _TRIADS:
+    for at, field in enumerate(fields_of(table.header)):
+        if table.names and field.sensor not in _TRIADS:
             continue
         try:
             values = np.asarray(table.numbers(at)[:_ROWS], np.float64)
@@ -311,8 +311,8 @@ def _joined(tables: list[tuple[str, LogTable]]) -> LogTable:
     """The sensors' tables as one, in the order of their stamps."""
     if len(tables) == 1:
         return tables[0][1]
-    names = list(dict.fromkeys(name for _, table in tables for name in table.names or ()))
-    held = [dict(zip(table.names or (), table.columns, strict=True)) for _, table in tables]
+    held = [dict(zip(table.header, table.columns, strict=True)) for _, table in tables]
+    names = list(dict.fromkeys(name for part in held for name in part))
     clock = next((name for name in names if all(name in part and rises(part[name]) for part in held)), None)
     if clock is None:
         raise InputError(f"{tables[0][1].path}: the rows of its sensors share no column of time.")
