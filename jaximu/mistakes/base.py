@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jaximu.ground.array_types import FloatArray
 from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turning
 from jaximu.recordings.finding import Rows
-from jaximu.recordings.recording import Recording, Signal, runs_of
+from jaximu.recordings.recording import Recording, Signal, runs_of, steps_of
 
 __all__ = [
     "BRIDGED",
@@ -24,7 +24,6 @@ __all__ = [
     "coarse_step",
     "scale_around",
     "spans_of",
-    "steps_of",
 ]
 
 TITLES = {
@@ -142,10 +141,10 @@ class Sensor:
                 axes.append((float(zero.mean()), least / float(np.abs(scale))))
         return max(axes) if axes else None
 
-    @cached_property
+    @property
     def step(self) -> FloatArray:
         """(3,) the least difference of two values of an axis."""
-        return np.array([np.min(steps) if len(steps) else 0.0 for steps in map(steps_of, self.values[:20000].T)])
+        return self.signal.step
 
     @cached_property
     def blocks(self) -> tuple[Rows, FloatArray, FloatArray]:
@@ -163,7 +162,7 @@ class Sensor:
         total = variance.sum(axis=1)
         lowest = max(float(np.percentile(total, 5)), 1e-30)
         floor = float(np.median(total[total <= 3 * lowest])) if (total <= 3 * lowest).any() else lowest
-        floor = max(floor, float(np.sum(self.step**2)) / 12)
+        floor = max(floor, self.signal.rounding_variance)
         calm = total <= _QUIET * floor
         if len(mean) > 2:  # slow, smooth motion varies little within a block, but from block to block
             leave_out_both(calm, np.sum(np.diff(mean, axis=0) ** 2, axis=1) > 36 * floor + 1e-24)
@@ -331,12 +330,6 @@ def scale_around(misfit: FloatArray, before: bool = True) -> FloatArray:
     if before:
         wide[1:-1] = np.maximum(wide[1:-1], scale[:-2])
     return wide[np.minimum(np.arange(len(misfit)) // size, blocks - 1)]
-
-
-def steps_of(values: FloatArray) -> FloatArray:
-    """Return the differences (k,) of neighbouring levels of an axis (n,), rounding apart."""
-    steps = np.diff(np.unique(values))
-    return steps[steps > 1e-9 * np.ptp(values)]
 
 
 def coarse_step(sensor: Sensor, axis: int, quiet: NDArray[np.bool_] | None = None) -> float | None:

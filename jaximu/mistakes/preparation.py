@@ -32,9 +32,9 @@ from jaximu.mistakes import (
     wrap,
     zeros,
 )
-from jaximu.mistakes.base import BRIDGED, Samples, steps_of
+from jaximu.mistakes.base import BRIDGED, Samples
 from jaximu.recordings.finding import Finding, Rows
-from jaximu.recordings.recording import Defect, Recording, Signal, recordings_of, runs_of
+from jaximu.recordings.recording import Defect, Recording, Signal, recordings_of, runs_of, steps_of
 
 __all__ = ["MISTAKES", "Prepared", "inspect", "one_or_several", "prepare", "prepared", "without_rows"]
 
@@ -99,10 +99,10 @@ def one_or_several(recordings: Any, *others: type) -> list[Any]:
 
     **Arguments:** `others`: what may stand among them.
     """
-    several = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
+    several = recordings_of(recordings, Prepared, *others)
     if not several:
         raise InputError("no recording was given.")
-    return [one if isinstance(one, (Prepared, *others)) else recordings_of(one)[0] for one in several]
+    return several
 
 
 def inspect(recording: Recording) -> list[Finding]:

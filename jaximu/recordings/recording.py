@@ -114,14 +114,14 @@ class Signal(Comparable):
         return int(seconds * self.rate + 0.5 + 1e-9)
 
     @cached_property
+    def step(self) -> FloatArray:
+        """(m,) the step that the output of each axis comes in, in SI: the least difference of two of its values."""
+        return np.array([np.min(steps) if len(steps) else 0.0 for steps in map(steps_of, self.si()[:20000].T)])
+
+    @property
     def rounding_variance(self) -> float:
         """Variance, summed over the axes (SI units squared), of rounding to the steps that the output comes in."""
-        steps = []
-        for axis in self.si()[:20000].T:
-            difference = np.asarray(np.diff(np.unique(axis)), np.float64)
-            difference = difference[difference > 1e-10 * np.ptp(axis)]  # rounding of the computer's
-            steps.append(difference.min() ** 2 / 12 if len(difference) else 0.0)
-        return max(float(np.sum(steps)), 1e-24)
+        return max(float(np.sum(self.step**2)) / 12, 1e-24)
 
 
 class Defect(str):
@@ -362,11 +362,14 @@ class Recording(Result, Comparable, page="recording"):
         return later("report.figures", "signals_figure")(self)
 
 
-def recordings_of(recordings: "Recording | Sequence[Any]") -> list[Recording]:
-    """Return one recording or several as a list. Raises InputError for anything else, saying how to read a file."""
-    several: list[Any] = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
+def recordings_of(recordings: Any, *others: type) -> list[Any]:
+    """Return one recording or several as a list. Raises InputError for anything else, saying how to read a file.
+
+    **Arguments:** `others`: what may stand among them.
+    """
+    several = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
     for value in several:
-        if isinstance(value, Recording):
+        if isinstance(value, (Recording, *others)):
             continue
         is_path = isinstance(value, (str, PathLike))
         what = f"the path {str(value)!r}" if is_path else f"a value of type {type(value).__name__}"
@@ -668,6 +671,12 @@ def _unit_advice(ratio: float, slips: dict[float, str]) -> str:
     if abs(np.log(ratio / nearest)) > np.log(1.6):
         return "check the unit in the column name or in --columns"
     return f"these columns look like {slips[nearest]}: change the unit in the header or with --columns"
+
+
+def steps_of(values: FloatArray) -> FloatArray:
+    """Return the differences (k,) of neighbouring levels of an axis (n,), rounding apart."""
+    steps = np.diff(np.unique(values))
+    return steps[steps > 1e-9 * np.ptp(values)]
 
 
 def runs_of(flags: NDArray[np.bool_]) -> NDArray[np.intp]:

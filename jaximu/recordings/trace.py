@@ -41,8 +41,6 @@ from jaximu.ground.errors import InputError, only
 
 __all__ = ["NEEDED", "missing", "read_trace", "sidecar"]
 
-_TEXT = ("serial", "model", "lot", "operator", "station", "fixture")
-_DATES = ("date", "received")
 _REFERENCE = ("name", "certificate", "expires", "file", "value", "uncertainty")
 _CERTIFICATE = ("number", "laboratory", "address", "customer", "authorised_by")
 NEEDED = (
@@ -68,20 +66,16 @@ def read_trace(path: str | os.PathLike[str] | None, stated: Mapping[str, str | N
     trace: dict[str, Any] = {}
     for key, value in document.items():
         where = f"{name}, {key}"
-        if key in _TEXT:
-            trace[key] = _text(value, where)
-        elif key in _DATES:
-            trace[key] = _date(value, where).isoformat()
+        if key in _SAID:
+            trace[key] = _SAID[key](value, where)
         elif key in ("environment", "certificate") and isinstance(value, dict):
             only(value, _CERTIFICATE if key == "certificate" else value, where)
             trace[key] = {name: _text(text, f"{where}.{name}") for name, text in value.items()}
         elif key == "reference" and isinstance(value, list):
             trace[key] = [_reference(reference, f"{where} {number}", name) for number, reference in enumerate(value, 1)]
         else:
-            only({key: value}, (*_TEXT, *_DATES, "[environment]", "[[reference]]", "[certificate]"), name)
-    for key, value in (stated or {}).items():
-        if value is not None:
-            trace[key] = _date(value, f"--{key}").isoformat() if key in _DATES else _text(value, f"--{key}")
+            only({key: value}, (*_SAID, "[environment]", "[[reference]]", "[certificate]"), name)
+    trace |= {key: _SAID[key](value, f"--{key}") for key, value in (stated or {}).items() if value is not None}
     _refuse_expired(trace, name)
     return trace
 
@@ -99,11 +93,17 @@ def _text(value: Any, where: str) -> str:
     return str(value).strip()
 
 
-def _date(value: Any, where: str) -> date:
+def _date(value: Any, where: str) -> str:
     try:
-        return date.fromisoformat(str(value)[:10])
+        return date.fromisoformat(str(value)[:10]).isoformat()
     except ValueError:
         raise InputError(f'{where}: a date such as "2026-03-04" is needed, found {value!r}.') from None
+
+
+_SAID = dict.fromkeys(("serial", "model", "lot", "operator", "station", "fixture"), _text) | dict.fromkeys(
+    ("date", "received"), _date
+)
+"""What a file's first part and options say, and what makes it out."""
 
 
 def _reference(entry: Any, where: str, name: str) -> dict[str, str]:
@@ -113,9 +113,8 @@ def _reference(entry: Any, where: str, name: str) -> dict[str, str]:
     for key in ("name", "certificate"):
         if key not in entry:
             raise InputError(f"{where}: the {key} is missing.")
-    reference = {key: _text(value, f"{where}.{key}") for key, value in entry.items() if key != "expires"}
-    if "expires" in entry:
-        reference["expires"] = _date(entry["expires"], f"{where}.expires").isoformat()
+    made_out = {"expires": _date}
+    reference = {key: made_out.get(key, _text)(value, f"{where}.{key}") for key, value in entry.items()}
     if "file" in entry:
         path = Path(name).parent / reference["file"]
         reference |= {"file": str(path), "sha256": file_digest(path)}
