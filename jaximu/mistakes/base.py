@@ -93,7 +93,7 @@ class Sensor:
     @cached_property
     def even(self) -> NDArray[np.bool_]:
         """(n − 1,) whether an interval is no gap."""
-        return np.asarray(self.interval, np.float64) < 1.6 * max(self.period, float(np.mean(self.interval)))
+        return np.asarray(self.interval, np.float64) < 1.6 * max(self.period, np.mean(self.interval))
 
     @cached_property
     def curvature(self) -> FloatArray:
@@ -134,11 +134,11 @@ class Sensor:
             if not _ZEROS <= zero.mean() < 1.0:
                 continue
             sizes = np.abs(values[~zero])
-            least = float(sizes.min())
+            least = sizes.min()
             near = values[~zero][sizes < 2 * least] / least
             both = min(np.mean(near > 0), np.mean(near < 0)) > _EITHER
             if len(near) >= _BESIDE and both and len(np.unique(np.round(np.abs(near) * _FINER))) >= _FINER // 2:
-                axes.append((float(zero.mean()), least / float(np.abs(scale))))
+                axes.append((float(zero.mean()), least / np.abs(scale)))
         return max(axes) if axes else None
 
     @property
@@ -160,8 +160,8 @@ class Sensor:
         """(n,) whether a sample lies in a block that varies no more than the quietest do."""
         _, mean, variance = self.blocks
         total = variance.sum(axis=1)
-        lowest = max(float(np.percentile(total, 5)), 1e-30)
-        floor = float(np.median(total[total <= 3 * lowest])) if (total <= 3 * lowest).any() else lowest
+        lowest = max(np.percentile(total, 5), 1e-30)
+        floor = np.median(total[total <= 3 * lowest]) if (total <= 3 * lowest).any() else lowest
         floor = max(floor, self.signal.rounding_variance)
         calm = total <= _QUIET * floor
         if len(mean) > 2:  # slow, smooth motion varies little within a block, but from block to block
@@ -337,15 +337,15 @@ def coarse_step(sensor: Sensor, axis: int, quiet: NDArray[np.bool_] | None = Non
     values, change = sensor.values[:, axis], sensor.difference[:, axis]
     # at rest most neighbours are equal, and those that are not differ by whole steps
     same = change == 0
-    equal = float(np.mean(same))
+    equal = np.mean(same)
     if quiet is not None and quiet[1:].sum() > 100:
-        equal = max(equal, float(np.mean(same[quiet[1:]])))
+        equal = max(equal, np.mean(same[quiet[1:]]))
     if equal < 0.4:
         return None
     steps = steps_of(values)
     if len(steps) < 2:
         return None
-    step, moved = float(steps.min()), np.abs(change[~same])
+    step, moved = steps.min(), np.abs(change[~same])
     if np.mean(np.abs(moved / step - np.round(moved / step)) < 0.01) < 0.99:
         return None
     # an axis that is held, at a limit say, repeats itself as well: elsewhere its differences are many steps of its text

@@ -134,18 +134,18 @@ def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
     hard = crowd.sum() >= 3 and elsewhere.sum() <= 0.34 * crowd.sum() and np.median(flat[crowd]) < 0.92
     hard = hard and np.ptp(flat[crowd]) > _ALIKE
     # soft: many come near it, and are the flatter the nearer they come; of a smooth motion the largest are the sharpest
-    typical = float(np.median(flat[upper])) if upper.any() else 0.0
+    typical = np.median(flat[upper]) if upper.any() else 0.0
     soft = (
         upper.sum() >= max(_FEWEST, 0.25 * middle.sum())
         and lower.sum() > 2
         and _FLAT < typical < 0.9
         and np.quantile(flat[upper], 0.2) > 0.8 * _FLAT
-        and typical > float(np.median(flat[lower])) - 0.005
+        and typical > np.median(flat[lower]) - 0.005
     )
     if not hard and not soft:
         return []
     # behind a hard limit the tops lie at it; a soft one spreads them
-    hard = hard and (not soft or float(np.mean(tops[upper] > 0.965)) > 0.75)
+    hard = hard and (not soft or np.mean(tops[upper] > 0.965) > 0.75)
     rows = np.flatnonzero((size > 0.9 * limit).any(axis=1))
     shown = f"{np.degrees(limit):.4g} °/s"
     first = sensor.rows(np.sort(np.array(places)[crowd if hard else upper]))

@@ -89,5 +89,5 @@ def _repeated(values: np.ndarray) -> Rows:
 def _by_chance(codes: np.ndarray, length: int, count: int) -> bool:
     """Whether a run of rows as alike as those around it would repeat by chance somewhere among so many rows."""
     _, often = np.unique(codes, return_counts=True)
-    alike = float(np.sum(often * (often - 1.0))) / max(len(codes) * (len(codes) - 1.0), 1.0)  # of two rows
+    alike = np.sum(often * (often - 1.0)) / max(len(codes) * (len(codes) - 1.0), 1.0)  # of two rows
     return length * -np.log(max(alike, 1e-12)) < np.log(count**2 / _CHANCE)

@@ -33,7 +33,7 @@ def zeroed_at_rest(samples: Samples) -> float | None:
     zero = (sensor.signal.values == 0.0).all(axis=1)
     if rest.sum() < 50 or rest.mean() > 0.98 or zero.sum() < 50:
         return None
-    share = float(zero[rest].mean())
+    share = zero[rest].mean()
     if share < 0.5 or zero[~rest].mean() > 0.5 * share:
         return None
     # coarse steps round a small bias to zero as well: what moves comes in the same steps, or they are larger than noise
@@ -91,7 +91,7 @@ def _held(samples: Samples, sensor: Sensor, rest: NDArray[np.bool_]) -> float | 
         return None
     at_rest, moving = (np.median(np.abs(sensor.curvature[which]), axis=0) for which in (rest, ~rest))
     # in fast turns at a low rate the motion itself is not smooth: what differs a thousandfold is no motion
-    ratio = float(np.max(at_rest / np.maximum(moving, 1e-300)))
+    ratio = np.max(at_rest / np.maximum(moving, 1e-300))
     return ratio if ratio < 1e-3 and np.all(moving > 1e-5) and np.all(at_rest < 1e-7) else None
 
 
@@ -112,10 +112,10 @@ def _high_passed(samples: Samples, sensor: Sensor) -> list[Finding]:
         return []
     rate, turned = (np.stack([values[a:b].mean(axis=0) for a, b in edges]) for values in (sensor.values, angle))
     rate, turned = rate - rate.mean(axis=0), turned - turned.mean(axis=0)
-    power = float(np.sum(turned**2))
+    power = np.sum(turned**2)
     if not power > 0:
         return []
-    slope = float(np.sum(rate * turned)) / power
+    slope = np.sum(rate * turned) / power
     unexplained = np.sum((rate - slope * turned) ** 2)
     slopes = np.sum(rate * turned, axis=0) / np.maximum(np.sum(turned**2, axis=0), 1e-300)
     # one time constant for all axes, and nearly all of what the means do at rest

@@ -109,7 +109,7 @@ def _dead_rate(samples: Samples) -> list[Finding]:
         return []
     moved = np.sqrt(np.mean((sensor.values - np.median(sensor.values, axis=0)) ** 2, axis=0))
     axis = int(np.argmin(moved))
-    others = float(np.min(np.delete(moved, axis)))
+    others = np.min(np.delete(moved, axis))
     if others < 0.05 or moved[axis] > 0.02 * others or abs(np.median(sensor.values[:, axis])) > _NO_BIAS:
         return []
     unexplained = blocks.change + np.cross(blocks.turned(), blocks.force)

@@ -222,8 +222,8 @@ def _losses(samples: Samples, wanted: Rows, half: int) -> _Losses | None:
             if np.sum(lost > 0) < _FEWEST + 4 * against:
                 return None
         # where losses are known to be frequent, less evidence will do for one more: the odds are (1 − r) : r before
-        often = float(np.sum(lost[wanted] > 0)) / max(int(clear.sum()), 1)
-        sure = float(np.clip(np.log((1 - often) / max(often, 1e-6)) + 5.0, 7.0, _SURE))
+        often = np.sum(lost[wanted] > 0) / max(int(clear.sum()), 1)
+        sure = np.clip(np.log((1 - often) / max(often, 1e-6)) + 5.0, 7.0, _SURE)
         least = 2.6 * sure
     return _Losses(lost, clear, power, step) if np.sum(lost > 0) >= _FEWEST else None
 
@@ -249,7 +249,7 @@ def _singles(samples: Samples) -> list[Finding]:
     rate = len(places) / max(int(clear.sum()), 1)
     later = np.cumulative_sum(lost, include_initial=True) * sensor.period
     # what motion too slow to show a loss may still hide
-    hidden = rate * float(np.sum(~clear & (power > _HARM)))
+    hidden = rate * np.sum(~clear & (power > _HARM))
 
     def apply(recording: Recording) -> Recording:
         changed = {}

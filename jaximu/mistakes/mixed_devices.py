@@ -119,7 +119,7 @@ def _changed(samples: Samples) -> list[Finding]:
     norm = np.log(np.maximum(np.linalg.norm(means[0], axis=1), 1e-9))[:, None]
     rate, noise = means[1], np.hstack(noises)
     distance, rest = _furthest(norm, 3, len(rests) - 2)
-    factor = float(np.exp(np.median(norm[rest:]) - np.median(norm[:rest])))
+    factor = np.exp(np.median(norm[rest:]) - np.median(norm[:rest]))
     if not 0.6 < factor < 1.6 and distance > _SHIFT:
         return [
             Finding(
@@ -141,7 +141,7 @@ def _changed(samples: Samples) -> list[Finding]:
     sudden = False
     if samples.shared:
         both = np.minimum(steps(accelerometer), steps(gyroscope))[window]
-        sudden = len(both) > 0 and float(both.max()) > 8.0
+        sudden = len(both) > 0 and both.max() > 8.0
         row = window.start + int(np.argmax(both)) + 1 if sudden else row
     if not sudden and noisier < 5.0:
         return []

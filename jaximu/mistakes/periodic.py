@@ -106,11 +106,11 @@ def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) 
     half = sensor.rate / 2
     corners = []
     for axis, density in enumerate(power.T):
-        low = float(np.max(_running_median(density[2 : len(density) // 2], 5)[2:-2], initial=0.0))
+        low = np.max(_running_median(density[2 : len(density) // 2], 5)[2:-2], initial=0.0)
         if not low > 30 * max(floor[axis], 1e-30):
             continue
         upper = (frequency > 0.3 * half) & (frequency < 0.95 * half)
-        top = float(np.median(density[frequency > 0.85 * half]))
+        top = np.median(density[frequency > 0.85 * half])
         if top > _FALL * low:
             continue
         slope = np.polyfit(np.log(frequency[upper]), np.log(np.maximum(density[upper], floor[axis] + 1e-30)), 1)[0]

@@ -242,7 +242,7 @@ def _on_steps(signal: Signal, values: np.ndarray) -> np.ndarray:
     for axis, known in enumerate(signal.values[:20000].T):
         steps = steps_of(known)
         if 0 < len(steps) < 0.8 * len(known):
-            step = float(steps.min())
+            step = steps.min()
             offset = known[0] - step * np.round(known[0] / step)
             rounded[:, axis] = step * np.round((values[:, axis] - offset) / step) + offset
     return rounded

@@ -78,7 +78,7 @@ def _wild(celsius: FloatArray) -> Rows:
     values = celsius[change]
     middle = np.median(sliding_window_view(np.pad(values, _WINDOW // 2, "edge"), _WINDOW), axis=1)
     off = np.abs(values - middle)
-    wild = off > max(_JUMP, _TIMES * 1.4826 * float(np.median(off)))
+    wild = off > max(_JUMP, _TIMES * 1.4826 * np.median(off))
     return np.flatnonzero(np.repeat(wild, np.diff(change, append=len(celsius))))
 
 
@@ -116,7 +116,7 @@ def _shortest(values: FloatArray, scale: FloatArray, start: int, stop: int, rate
             inside, misfit = _bridged(values, first, last)
             left = np.abs(misfit) / scale[first]
             off = np.max(np.abs(values[first : last + 1] - inside) / scale[first], axis=1)
-            worst = float(np.max(left))
+            worst = np.max(left)
             if np.min(off) > max(_TIMES, times * worst) and (best is None or worst < best[0]):
                 best = worst, list(range(first, last + 1))
         if best is not None:

@@ -99,7 +99,7 @@ def _repeated_rows(sensor: Sensor, change: NDArray[np.bool_]) -> list[Finding]:
             )
         )
         same[rows - 1] = False
-    alone = float(np.min(np.mean(~change, axis=0)))
+    alone = np.min(np.mean(~change, axis=0))
     if max(0.02, 0.6 * alone) < np.mean(same) < 1 and not any(coarse):
         rows = np.flatnonzero(same) + 1
         findings.append(

@@ -43,10 +43,10 @@ def find(samples: Samples) -> list[Finding]:
 def _timing(name: str, sensor: Sensor) -> list[Finding]:
     interval = sensor.interval
     usual = sensor.period
-    mean = float(np.mean(interval))
+    mean = np.mean(interval)
     findings = []
     if in_bursts(interval):
-        rate, lag = 1 / _clock(sensor.time)[1], float(np.quantile(interval, 0.99))
+        rate, lag = 1 / _clock(sensor.time)[1], np.quantile(interval, 0.99)
         return [
             Finding(
                 "data.bursts",
@@ -67,7 +67,7 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
                 spoils=True,
             )
         )
-    spread = float(np.std(interval[interval < 1.5 * usual]))
+    spread = np.std(interval[interval < 1.5 * usual])
     uneven = spread > 0.1 * usual
     gaps = np.flatnonzero(interval > (2.5 if uneven else 1.6) * usual)
     if len(gaps):
@@ -111,7 +111,7 @@ def _numbered(time: FloatArray) -> FloatArray | None:
     slopes = [np.polyfit(number[a:b], time[a:b], 1)[0] for a, b in pairwise(edges) if b - a > 100]
     if not slopes:
         return None
-    period = float(np.median(slopes))
+    period = np.median(slopes)
     for row in breaks:
         delay = time - period * number
         missing = np.round((np.mean(delay[row : row + 20]) - np.mean(delay[max(0, row - 20) : row])) / period)
@@ -141,7 +141,7 @@ def _smoother_evenly(sensor: Sensor) -> bool:
     for time in (number * sensor.period, sensor.time):
         slope = sensor.difference / np.diff(time)[:, None]
         bend = np.abs(np.diff(slope, axis=0)).sum(axis=1) * sensor.period
-        moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * float(np.sum(sensor.noise))
+        moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * np.sum(sensor.noise)
         bends.append(float(np.median(bend[moving])) if moving.sum() > 50 else np.inf)
     return bends[0] < 0.8 * bends[1]
 
@@ -150,14 +150,14 @@ def in_bursts(interval: FloatArray) -> bool:
     """Return whether many samples share nearly one time of arrival, with pauses between."""
     if len(interval) < 32:
         return False
-    mean = float(np.mean(interval))
+    mean = np.mean(interval)
     # gaps are few and long; pauses between bursts hold most of the time
-    mean = min(mean, float(np.mean(np.minimum(interval, 20 * mean))))
+    mean = min(mean, np.mean(np.minimum(interval, 20 * mean)))
     together = interval < _SUDDEN * mean
     pause = interval > 1.5 * mean
     if together.mean() < 0.3 or pause.sum() < 8:
         return False
-    return float(interval[pause].sum()) > 0.6 * float(interval.sum())
+    return bool(interval[pause].sum() > 0.6 * interval.sum())
 
 
 def _clock(time: FloatArray) -> tuple[FloatArray, float]:
@@ -178,7 +178,7 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
         edges = np.concatenate([[0], breaks + 1, [len(time)]])
         parts = [np.polyfit(index[a:b], time[a:b], 1) for a, b in pairwise(edges) if b - a > width]
         if parts:
-            slope = float(np.median([part[0] for part in parts]))
+            slope = np.median([part[0] for part in parts])
             fitted = np.concatenate(
                 [np.median(time[a:b] - slope * index[a:b]) + slope * index[a:b] for a, b in pairwise(edges)]
             )
@@ -186,7 +186,7 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
                 slope, start = np.polyfit(index, time, 1)
                 fitted = start + slope * index
     early = [part.min() for part in np.array_split(time - fitted, max(1, len(time) // width))]
-    return fitted + float(np.median(early)), float(slope)
+    return fitted + np.median(early), float(slope)
 
 
 def steady_clock(recording: Recording) -> Recording:

@@ -58,7 +58,7 @@ def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None
     A range differs from a jump of the motion: both ends of it lie at the ends of the range.
     """
     values = sensor.values[:, axis]
-    low, high = float(values.min()), float(values.max())
+    low, high = values.min(), values.max()
     span = high - low
     jump = sensor.difference[:, axis]
     places = np.flatnonzero(np.abs(jump) > 0.6 * span)
@@ -76,7 +76,7 @@ def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None
     known = ~(np.isnan(before) & np.isnan(after))
     slope = np.where(known, np.nanmean(np.where(known, [before, after], 0.0), axis=0), 0.0)
     ranges = np.abs(jump[places] - slope)
-    full = float(np.median(ranges))
+    full = np.median(ranges)
     off = np.abs(ranges - full) / full
     if not known.any() or np.quantile(off, 0.8) > 0.12 or np.max(off) > 0.4 or full < 0.95 * span:
         return None

@@ -81,7 +81,7 @@ def signed_permutation(matrix: FloatArray) -> FloatArray:
     best, nearest = -np.inf, np.eye(3)
     for order in permutations(range(3)):
         entries = columns[order, range(3)]
-        total = float(np.sum(np.abs(entries)))
+        total = np.sum(np.abs(entries))
         if total > best + 1e-12:
             best, nearest = total, np.zeros((3, 3))
             nearest[order, range(3)] = np.where(entries < 0, -1.0, 1.0)
@@ -185,14 +185,14 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     kept = values > 1e-6 * values[-1]
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     matrix = inverse @ (columns.T @ changes)
-    left = float(np.sum((changes - columns @ matrix) ** 2))
+    left = np.sum((changes - columns @ matrix) ** 2)
     variance = np.where(kept.all(), np.diag(inverse), np.inf) * left / max(len(changes) - 9, 1)
     return Turning(
         matrix.reshape(3, 3),
         np.sqrt(variance).reshape(3, 3),
         1 - left / total,
         product / power,
-        product / float(np.sqrt(power * total)),
+        product / np.sqrt(power * total),
     )
 
 
@@ -388,7 +388,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     off = np.linalg.norm(blocks.force - np.median(blocks.force, axis=0), axis=1)
     if np.quantile(off, 0.99) < _TURNED * np.median(np.linalg.norm(blocks.force, axis=1)):
         return None
-    middle = float(blocks.centre.mean())
+    middle = blocks.centre.mean()
     edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)
     places = np.array([blocks.centre[a:b].mean() for a, b in pairwise(edges)]) - middle
     changes, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
@@ -407,7 +407,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
 
     line = np.zeros(2)  # of the lag: at the middle, and by time
     power = np.add.reduceat(np.sum(changes**2, axis=1), edges[:-1])
-    whole = float(power.sum())
+    whole = power.sum()
     enough = (1 - _WELL) * whole
     normal, product = sums(0.0)
     if left(normal.sum(axis=0), product.sum(axis=0), whole) > enough:
@@ -442,9 +442,9 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         missed = shifts[good] - design @ change
         line = line + change
     freedom = int(good.sum()) - 2
-    spread = float(np.sum(weight * missed**2)) / freedom
+    spread = np.sum(weight * missed**2) / freedom
     # parts that agree by chance are no surer than the noise of their samples lets them be
-    spread = max(spread * float(student_isf(0.025, freedom) / 1.96) ** 2, float(np.mean(rest**2)))
+    spread = max(spread * float(student_isf(0.025, freedom) / 1.96) ** 2, np.mean(rest**2))
     sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))
     columns = _columns(levers, blocks.turned(line[0] + line[1] * (blocks.centre - middle)))
     explained = 1 - float(left(columns.T @ columns, columns.T @ changes.ravel(), whole)) / max(whole, 1e-300)

@@ -121,7 +121,7 @@ class Signal(Comparable):
     @property
     def rounding_variance(self) -> float:
         """Variance, summed over the axes (SI units squared), of rounding to the steps that the output comes in."""
-        return max(float(np.sum(self.step**2)) / 12, 1e-24)
+        return max(np.sum(self.step**2) / 12, 1e-24)
 
 
 class Defect(str):

@@ -316,7 +316,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
         )
     entries: list[ScheduleEntry] = []
     for index, ((start, stop), up) in enumerate(zip(spans, ups, strict=True)):
-        heading = float(np.interp((start + stop) / 2, time, angle)) if recording.table_angle is not None else None
+        heading = np.interp((start + stop) / 2, time, angle) if recording.table_angle is not None else None
         entries.append(ScheduleEntry(start, stop, "pose", up, heading=heading))
         if index + 1 < len(spans) and up @ ups[index + 1] > 0.5:
             following = spans[index + 1, 0]

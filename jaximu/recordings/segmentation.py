@@ -121,7 +121,7 @@ def _floor(variance: FloatArray, moments: _Moments) -> float:
     floor = np.median(finite[finite <= 3 * lowest])
     # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
     # simulated output without noise is constant but for the rounding of the running sums.
-    total = float(moments.between(np.array([-np.inf]), np.array([np.inf]))[1].sum())
+    total = moments.between(np.array([-np.inf]), np.array([np.inf]))[1].sum()
     rounding = np.finfo(np.float64).eps * len(moments.signal) * total
     return max(floor, moments.signal.rounding_variance, rounding)
 

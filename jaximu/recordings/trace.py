@@ -31,7 +31,7 @@ Beside LOG, such a file called LOG.trace.toml is read without being named.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -100,9 +100,9 @@ def _date(value: Any, where: str) -> str:
         raise InputError(f'{where}: a date such as "2026-03-04" is needed, found {value!r}.') from None
 
 
-_SAID = dict.fromkeys(("serial", "model", "lot", "operator", "station", "fixture"), _text) | dict.fromkeys(
-    ("date", "received"), _date
-)
+_SAID: dict[str, Callable[[Any, str], str]] = dict.fromkeys(
+    ("serial", "model", "lot", "operator", "station", "fixture"), _text
+) | dict.fromkeys(("date", "received"), _date)
 """What a file's first part and options say, and what makes it out."""
 
 

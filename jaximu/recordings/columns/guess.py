@@ -554,7 +554,7 @@ class _Guess:
         """How far the time column rises a row."""
         values = np.asarray(self.numbers[self.time or 0])
         steps = np.diff(values[np.isfinite(values)])
-        return float(np.sum(steps)) / max(int(np.sum(steps > 0)), 1)
+        return np.sum(steps) / max(int(np.sum(steps > 0)), 1)
 
     def _time_units(self) -> list[tuple[str, float]]:
         """The units in which the stamps mean a plausible rate, or the stated one; by name and factor."""

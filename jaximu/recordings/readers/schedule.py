@@ -132,7 +132,7 @@ def _entry(cells: Sequence[str], columns: dict[str, tuple[int, float]], where: s
     if stop <= start:
         raise InputError(f"{where}: stop ({stop:g} s) is not after start ({start:g} s).")
     vector = np.array([number(axis) for axis in "xyz"])
-    length = float(np.linalg.norm(vector))
+    length = np.linalg.norm(vector)
     if abs(length - 1) > 0.01:
         raise InputError(f"{where}: x, y, z has the length {length:.4g}; a direction has the length 1.")
     angle, heading = (number(title, optional=True) for title in ("angle", "heading"))
