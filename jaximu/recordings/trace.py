@@ -100,9 +100,10 @@ def _date(value: Any, where: str) -> str:
         raise InputError(f'{where}: a date such as "2026-03-04" is needed, found {value!r}.') from None
 
 
-_SAID: dict[str, Callable[[Any, str], str]] = dict.fromkeys(
-    ("serial", "model", "lot", "operator", "station", "fixture"), _text
-) | dict.fromkeys(("date", "received"), _date)
+_SAID: dict[str, Callable[[Any, str], str]] = {
+    **{key: _text for key in ("serial", "model", "lot", "operator", "station", "fixture")},
+    **{"date": _date, "received": _date},
+}
 """What a file's first part and options say, and what makes it out."""
 
 
