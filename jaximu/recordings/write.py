@@ -11,6 +11,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.errors import InputError
+from jaximu.ground.units import column_title
 from jaximu.recordings.columns.names import GROUPS
 from jaximu.recordings.recording import Recording
 
@@ -102,7 +103,8 @@ def _columns(recording: Recording) -> dict[str, np.ndarray]:
     named: dict[str, np.ndarray] = {}
     for key, (unit, values) in _blocks(recording).items():
         names = GROUPS[key].columns if key in GROUPS else (key,)
-        named |= {name if unit == "1" else f"{name} [{unit}]": values[:, at] for at, name in enumerate(names)}
+        stated = None if unit == "1" else unit
+        named |= {column_title(name, stated): values[:, at] for at, name in enumerate(names)}
     return named
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import listed, unit_text
-from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit, parse_column
+from jaximu.ground.units import STANDARD_GRAVITY, Unit, column_title, find_unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.alignment import CORRELATED, Turning, turning
 from jaximu.recordings.columns.habits import Field, fields_of, last_of, measures, sensor_of, words_of
@@ -905,13 +905,12 @@ def column_text(columns: Sequence[Column]) -> str:
     names, at = [column.name for column in columns], 0
     triads: dict[tuple, str] = {group.columns: key for key, group in GROUPS.items() if len(group.columns) == 3}
     while at < len(columns):
-        unit = f" [{columns[at].unit}]" if columns[at].unit else ""
         triad = triads.get(tuple(names[at : at + 3]))
         skipped = len(list(takewhile(lambda name: name is None, names[at:])))
         if skipped:
             entries += [f"_*{skipped}"] if skipped > 3 else ["_"] * skipped
         else:
-            entries.append(f"{triad or names[at]}{unit}")
+            entries.append(column_title(triad or names[at] or "", columns[at].unit))
         at += skipped or (3 if triad else 1)
     return ",".join(entries)
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.ground.units import parse_column
+from jaximu.ground.units import column_title, parse_column
 from jaximu.recordings.columns.habits import fields_of, sensor_of, words_of
 from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.table import LogTable
@@ -60,10 +60,7 @@ def _records(document: Any) -> list[dict[str, Any]] | None:
     rows, sensors = document.get("values"), document.get("sensors")
     if isinstance(rows, list) and isinstance(sensors, list) and rows and isinstance(rows[0], list):
         columns = [sensor for sensor in sensors if isinstance(sensor, Mapping) and "name" in sensor]
-        names = [
-            f"{column['name']} [{column['units']}]" if column.get("units") else str(column["name"])
-            for column in columns
-        ]
+        names = [column_title(column["name"], column.get("units")) for column in columns]
         return [dict(zip(names, row, strict=False)) for row in rows]
     lists = [records for value in document.values() if (records := _records(value))]
     return max(lists, key=len) if lists else None
@@ -129,7 +126,7 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
             title = f"{sensor}_{last}" if last in ("x", "y", "z") else name
             if android:
                 unit = "ns" if name == "timestamp" else _ANDROID[sensor] if last in ("x", "y", "z") else ""
-                title = f"{title} [{unit}]" if unit else title
+                title = column_title(title, unit)
             named[title] = values
         table = _table(named, source)
         yield (
@@ -151,7 +148,7 @@ def of_sensor(table: LogTable, sensor: str) -> LogTable:
         raise InputError(f"{table.path}: columns {', '.join(sorted(missing))} are missing; it has {table.header}.")
     places = {column.name: at for at, column in enumerate(columns)}
     kept = {name: columns[places[name]].unit for name in wanted if name in places}
-    names = tuple(f"{name} [{unit}]" if unit else name for name, unit in kept.items())
+    names = tuple(column_title(name, unit) for name, unit in kept.items())
     return replace(table, names=names, columns=tuple(table.columns[places[name]] for name in kept))
 
 
@@ -168,8 +165,7 @@ def apart(table: LogTable) -> LogTable:
         for tag, sensor in sensors.items():
             part, names = table.take(np.flatnonzero(column == tag)), [*table.header]
             for axis in "xyz":
-                unit = parse_column(names[axes[axis]])[1]
-                names[axes[axis]] = f"{sensor}_{axis} [{unit}]" if unit else f"{sensor}_{axis}"
+                names[axes[axis]] = column_title(f"{sensor}_{axis}", parse_column(names[axes[axis]])[1])
             kept = [index for index in range(len(names)) if index != at and part.columns[index].dtype != object]
             part = replace(
                 part,
