@@ -182,7 +182,7 @@ class Sensor:
         """Return the first few rows concerned as a person counts them in the recording as it was given."""
         return tuple(int(row) + 1 for row in self.origin[list(indices)[:_SHOWN]])
 
-    def at(self, index: int) -> str:
+    def at(self, index: int | np.integer) -> str:
         """Return the time of a row."""
         return f"{self.time[index]:.1f} s"
 

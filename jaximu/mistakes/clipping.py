@@ -69,8 +69,8 @@ def _clipped(sensor: Sensor) -> list[Finding]:
         Finding(
             "data.clipping",
             sensor.rows(np.sort(every[:, 0])),
-            f"{sensor.name} {', '.join(dict.fromkeys(axes))}: {int(np.sum(lengths))} samples stop at "
-            f"{' or '.join(dict.fromkeys(limits))}, up to {int(np.max(lengths))} in a row: its range is too small "
+            f"{sensor.name} {', '.join(dict.fromkeys(axes))}: {np.sum(lengths)} samples stop at "
+            f"{' or '.join(dict.fromkeys(limits))}, up to {np.max(lengths)} in a row: its range is too small "
             + _CURE[sensor.name == "magnetometer"],
             without={sensor.name: np.flatnonzero(rows)},
         )

@@ -38,7 +38,7 @@ def find(samples: Samples) -> list[Finding]:
             "data.duplicate",
             first.rows(blocks[:, 0]),
             f"{counted(len(rows), 'row')} in {counted(len(blocks), 'block')} repeat earlier rows value by value, first "
-            f"from {first.at(int(rows[0]))}: they were pasted twice, or the logger wrote a buffer twice. "
+            f"from {first.at(rows[0])}: they were pasted twice, or the logger wrote a buffer twice. "
             "The second copy is left out.",
             without=dict.fromkeys(samples.sensors, rows),
         )

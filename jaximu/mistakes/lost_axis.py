@@ -108,7 +108,7 @@ def _dead_rate(samples: Samples) -> list[Finding]:
     if sensor is None or blocks is None:
         return []
     moved = np.sqrt(np.mean((sensor.values - np.median(sensor.values, axis=0)) ** 2, axis=0))
-    axis = int(np.argmin(moved))
+    axis = np.argmin(moved)
     others = np.min(np.delete(moved, axis))
     if others < 0.05 or moved[axis] > 0.02 * others or abs(np.median(sensor.values[:, axis])) > _NO_BIAS:
         return []

@@ -151,7 +151,7 @@ def _pairs(samples: Samples, lost: FloatArray, intervals: Rows, half: int, sure:
             values = (sensor.values[rows] - sensor.values[rows].mean(axis=0)) / np.maximum(sensor.noise, 1e-300)
             inside = np.einsum("tjk,jm->tkm", basis, values)
             cost += (np.sum(values**2) - np.sum(inside**2, axis=(1, 2))) / 2
-        best = int(np.argmin(cost))
+        best = np.argmin(cost)
         if best and cost[0] - cost[best] > 2 * sure and cost[best] < 0.25 * cost[0]:
             pairs += trials[best]
     return np.unique(np.array(pairs, np.int64))
@@ -328,7 +328,7 @@ def _clean(sensor: Sensor, index: int) -> bool:
     basis, _ = np.linalg.qr(np.vander(np.arange(8) / 8, 3))
     bend = np.max(np.abs(parts - basis @ (basis.T @ parts)), axis=(0, 1))
     jump = np.abs(after[0] - before[-1] - ((before[-1] - before[-2]) + (after[1] - after[0])) / 2)
-    axis = int(np.argmax(jump / np.maximum(sensor.noise, 1e-300)))
+    axis = np.argmax(jump / np.maximum(sensor.noise, 1e-300))
     least = 0.02 if sensor.name == "gyroscope" else 0.15
     slope = np.abs((before[-1] - before[-3]) + (after[2] - after[0])) / 4
     if jump[axis] < 2.7 * slope[axis]:  # one or two samples

@@ -42,7 +42,7 @@ def _lines(sensor: Sensor, parts: FloatArray, power: FloatArray) -> list[Finding
         if sensor.coarse[axis] is not None or not noisy:
             continue  # rounding makes lines, too
         ratios = density / _beside(density)
-        peak = int(np.argmax(ratios))
+        peak = np.argmax(ratios)
         ratio = ratios[peak]
         # a bin's mean over k blocks is gamma with shape k (windowed blocks do not overlap)
         if ratio > 4 and gamma_mean_sf(ratio, len(parts)) * len(power) < 1e-6:

@@ -53,7 +53,7 @@ def find(samples: Samples) -> list[Finding]:
                 "data.spikes",
                 sensor.rows(rows),
                 f"{name}: {counted(len(rows), 'outlier')} of up to {largest} against the neighbours, first "
-                f"after {sensor.at(int(rows[0]))}: knocks, or errors of transfer. They are left out; up to "
+                f"after {sensor.at(rows[0])}: knocks, or errors of transfer. They are left out; up to "
                 f"{BRIDGED} in a row are bridged by interpolation.",
                 without={name: rows},
             )

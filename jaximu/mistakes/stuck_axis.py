@@ -69,7 +69,7 @@ def _stuck_axis(sensor: Sensor, change: NDArray[np.bool_], axis: int) -> Finding
     noisy = float(np.mean(~change[:, axis])) < 1.5 * len(rows) / len(sensor) + 0.2
     text = (
         f"{sensor.name} {'xyz'[axis]}: it repeats one value for {len(rows) / sensor.rate:.3g} s in all, first after "
-        f"{sensor.at(int(first[0]))}, while the other axes move on."
+        f"{sensor.at(first[0])}, while the other axes move on."
     )
     if most:
         text += " The axis is dead for most of the recording: check its wiring, and record again."
@@ -93,7 +93,7 @@ def _repeated_rows(sensor: Sensor, change: NDArray[np.bool_]) -> list[Finding]:
                 "data.stuck_axis",
                 sensor.rows(first),
                 f"{sensor.name}: all axes repeat one row for {len(rows) / sensor.rate:.3g} s in all, first after "
-                f"{sensor.at(int(first[0]))}: the sensor or its driver hung, or samples were lost and filled in. These "
+                f"{sensor.at(first[0])}: the sensor or its driver hung, or samples were lost and filled in. These "
                 "rows are left out.",
                 without={sensor.name: rows},
             )

@@ -42,7 +42,7 @@ def find(samples: Samples) -> list[Finding]:
                     "data.wrap",
                     sensor.rows(rows),
                     f"{name} {'xyz'[axis]}: {counted(len(rows), 'sample')} jumped by the whole range of {shown} and "
-                    f"back, first after {sensor.at(int(rows[0]))}: the integer overflowed. --repair adds the range "
+                    f"back, first after {sensor.at(rows[0])}: the integer overflowed. --repair adds the range "
                     "back; without it these rows are left out.",
                     repair="--repair",
                     apply=apply,

@@ -46,7 +46,7 @@ def find(samples: Samples) -> list[Finding]:
         Finding(
             "data.zeros",
             first.rows(rows),
-            f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(int(rows[0]))}: a "
+            f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(rows[0])}: a "
             "transfer failed, or the logger filled them in. They are left out.",
             without=without,
         )

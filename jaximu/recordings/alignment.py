@@ -11,6 +11,7 @@ from itertools import pairwise, permutations, product
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.differences import interpolated
@@ -419,7 +420,8 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
             best = np.argmin(residuals, axis=0)
             trusted = residuals.min(axis=0) < (1 - _WELL) * power
             if trusted.sum() >= 3:
-                line = _robust_line(places[trusted], _LAGS[best[trusted]])
+                robust = scipy.stats.theilslopes(_LAGS[best[trusted]], places[trusted], method="joint")
+                line = np.array([robust.intercept, robust.slope])
     for step in _STEPS:
         lag = line[0] + line[1] * (blocks.centre - middle)
         turned = blocks.turned(lag)
@@ -449,10 +451,3 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     columns = _columns(levers, blocks.turned(line[0] + line[1] * (blocks.centre - middle)))
     explained = 1 - float(left(columns.T @ columns, columns.T @ changes.ravel(), whole)) / max(whole, 1e-300)
     return Clocks(float(line[0]), max(float(sigma), 1e-4), float(line[1]), float(drift_sigma), middle, explained)
-
-
-def _robust_line(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return offset and slope (2,) by the median of all pairs' slopes (Theil and Sen)."""
-    first, second = np.triu_indices(len(x), 1)
-    slope = np.median((y[second] - y[first]) / (x[second] - x[first]))
-    return np.array([np.median(y - slope * x), slope])

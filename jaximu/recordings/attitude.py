@@ -51,7 +51,7 @@ class Attitude:
         vectors = {name: values[kept] for name, values in vectors.items() if values is not None}
         notes = self.notes
         if not kept.all():
-            notes += (f"{self.name}: {int(np.sum(~kept))} of {len(kept)} rows hold no attitude and are left out.",)
+            notes += (f"{self.name}: {np.sum(~kept)} of {len(kept)} rows hold no attitude and are left out.",)
         unit = self.quaternion[kept] / length[kept, None]
         flips = np.concatenate([[1.0], np.cumprod(np.sign(np.sum(unit[1:] * unit[:-1], axis=1) + 1e-12))])
         return replace(self, time=self.time[kept], quaternion=unit * flips[:, None], notes=notes, **vectors)

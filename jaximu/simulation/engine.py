@@ -76,8 +76,6 @@ class Case:
                 "a unit that is traced cannot be simulated, which draws noise and cuts logs on the host: what it puts "
                 "out along a path is jaximu.Imu.respond."
             )
-        if not (np.isfinite(rate) and rate > 0):
-            raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
         seeds = tuple(seed) if isinstance(seed, Sequence) else (seed,)
         plan = protocol.plan(_generator(seeds, "motion", power_on), environment)
         noise = dict(noise or {})

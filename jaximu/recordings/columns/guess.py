@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -264,6 +264,10 @@ class _Guess:
     def _has(self, name: str) -> bool:
         return any(column.name == name for column in self.chosen.values())
 
+    def _looked_at(self) -> Iterable[tuple[int, Field, FloatArray | None]]:
+        """The number of each column, what its name says, and its numbers."""
+        return zip(range(self.width), self.fields, self.numbers, strict=True)
+
     @property
     def columns(self) -> list[Column]:
         return [self.chosen.get(at, Column(None)) for at in range(self.width)]
@@ -295,12 +299,12 @@ class _Guess:
     def _time_column(self) -> int | None:
         named = [
             at
-            for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True))
+            for at, field, values in self._looked_at()
             if field.sensor == TIME and values is not None and rises(self.table.columns[at])
         ]
         if named:
             return min(named, key=lambda at: find_unit(self.fields[at].unit or "", "time") is None)
-        for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
+        for at, field, values in self._looked_at():
             if values is None or field.sensor or not rises(values):
                 continue
             named = find_unit(field.unit or "", "time") or {"time", "date"} & set(field.stem) or _ends_in_time(field)
@@ -402,7 +406,7 @@ class _Guess:
         unknown = self.unknown = [triad for triad in triads if triad.sensor is None]
         taken = {at for triad in triads for at in triad.places} | {self.time}
         free: list[int] = []
-        for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
+        for at, field, values in self._looked_at():
             if at in taken or values is None or field.sensor or field.why_not or set(field.stem) & _COUNTERS:
                 continue
             finite = values[np.isfinite(values)]
@@ -790,7 +794,7 @@ class _Guess:
                 if unit:
                     self._take(triad, "mag", unit)
         self._quaternion()
-        for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
+        for at, field, values in self._looked_at():
             name = field.sensor or ""
             if name.startswith("attitude_"):
                 self.chosen[at] = Column(name, field.unit)

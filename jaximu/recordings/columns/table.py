@@ -164,8 +164,10 @@ def from_arrow(column: pa.ChunkedArray) -> np.ndarray:
     else:
         return np.array(column.to_pylist(), dtype=object)
     column = column if kind == wanted else column.cast(wanted)
-    parts = [_chunk(chunk) for chunk in column.chunks if len(chunk)]
-    return np.concatenate(parts) if parts else np.empty(0, np.int64 if wanted == pa.int64() else np.float64)
+    if column.null_count:
+        column = column.cast(pa.float64(), safe=False).fill_null(np.nan)
+    parts = [np.from_dlpack(chunk) for chunk in column.chunks if len(chunk)]
+    return np.concatenate(parts) if parts else np.empty(0, wanted.to_pandas_dtype())
 
 
 def to_arrow(values: np.ndarray, nulls: bool = True) -> pa.Array:
@@ -181,15 +183,6 @@ def _looked_up(chunk: Any) -> np.ndarray:
     words = np.array([*chunk.dictionary.to_pylist(), None], dtype=object)
     places = from_arrow(pa.chunked_array([chunk.indices]))
     return words[np.where(np.isnan(places), len(words) - 1, places).astype(np.int64)]
-
-
-def _chunk(chunk: Any) -> np.ndarray:
-    validity, data = chunk.buffers()
-    values = np.from_dlpack(pa.Array.from_buffers(chunk.type, len(chunk), [None, data], offset=chunk.offset))
-    if chunk.null_count == 0:
-        return values
-    valid = np.unpackbits(np.frombuffer(validity, np.uint8), bitorder="little")[chunk.offset :][: len(chunk)]
-    return np.where(valid, values, np.nan)
 
 
 def named_with_units(fields: Sequence[Any]) -> tuple[str, ...]:

@@ -139,7 +139,7 @@ def _attitude(table: LogTable, places: dict[str, dict[str, int]], name: str) -> 
     if kept.sum() < 16:
         raise InputError(f"{name}: {int(kept.sum())} rows hold an attitude, too few to compare with.")
     if not kept.all():
-        notes.append(f"{name}: {int(np.sum(~kept))} of {kept.size} rows hold no attitude and are left out.")
+        notes.append(f"{name}: {np.sum(~kept)} of {kept.size} rows hold no attitude and are left out.")
     vectors = {kind: values[kept] for kind, values in vectors.items()}
     return Attitude(time[kept], quaternion[kept], **vectors, start=start, name=name, notes=tuple(notes))
 

@@ -71,8 +71,6 @@ class Protocol:
     def stimulus(self, rate: float = 100.0, seed: int = 0, environment: Environment | None = None) -> Stimulus:
         """Return what the sensors go through, at `rate` (Hz); see `Stimulus` for its fields."""
         require_float64()
-        if not (np.isfinite(rate) and rate > 0):
-            raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
         return self.plan(np.random.default_rng(seed), environment).motion.stimulus(rate)
 
     def _own(self, environment: Environment, **values) -> Environment:
