@@ -91,6 +91,11 @@ class Sensor:
         return np.diff(self.values, axis=0)
 
     @cached_property
+    def extremes(self) -> FloatArray:
+        """(2, 3) the largest and the smallest value of each axis."""
+        return np.stack([self.values.max(axis=0), self.values.min(axis=0)])
+
+    @cached_property
     def even(self) -> NDArray[np.bool_]:
         """(n − 1,) whether an interval is no gap."""
         return np.asarray(self.interval, np.float64) < 1.6 * max(self.period, np.mean(self.interval))
@@ -102,8 +107,7 @@ class Sensor:
         misfit = np.zeros_like(values)
         misfit[2:-2] = values[2:-2] - (4 * (values[1:-3] + values[3:-1]) - values[:-4] - values[4:]) / 6
         broken = np.flatnonzero(~self.even)
-        for shift in (-1, 0, 1, 2):
-            misfit[np.clip(broken + shift, 0, len(values) - 1)] = 0.0
+        misfit[np.clip(broken[:, None] + np.arange(-1, 3), 0, len(values) - 1)] = 0.0
         return misfit
 
     @cached_property

@@ -40,7 +40,7 @@ def find(samples: Samples) -> list[Finding]:
 
 def _clipped(sensor: Sensor) -> list[Finding]:
     """Return the ends of the range at which a sensor's axes stop."""
-    extremes = np.stack([sensor.values.max(axis=0), sensor.values.min(axis=0)])
+    extremes = sensor.extremes
     axes: list[str] = []
     ends: list[Rows] = []
     limits, rows, all_out = [], np.zeros(len(sensor), bool), at_limits(sensor)
@@ -79,8 +79,7 @@ def _clipped(sensor: Sensor) -> list[Finding]:
 
 def at_limits(sensor: Sensor) -> NDArray[np.bool_]:
     """Return the rows (n,) in which every axis is at an end of what it reads in the recording."""
-    extremes = np.stack([sensor.values.max(axis=0), sensor.values.min(axis=0)])
-    return np.all((extremes[:, None] == sensor.values).any(axis=0), axis=1)
+    return np.all((sensor.extremes[:, None] == sensor.values).any(axis=0), axis=1)
 
 
 def stops(values: FloatArray, extreme: float) -> Rows:

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaximu.ground.quantities import counted
 from jaximu.mistakes.base import Samples
-from jaximu.recordings.finding import Finding, Rows
+from jaximu.recordings.finding import NO_ROWS, Finding, Rows
 from jaximu.recordings.recording import runs_of
 
 __all__ = ["TITLES", "find"]
@@ -56,7 +56,7 @@ def _repeated(values: np.ndarray) -> Rows:
     near = max(float(np.mean(code[lag:] == code[:-lag])) for lag in (1, 2, 3, 5, 8))
     length = int(np.clip(np.ceil(np.log(count**2 / _CHANCE) / -np.log(max(near, 1e-9))), 8, 2000)) if near < 1 else 0
     if length == 0 or 2 * length > count:
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     block, size = code.copy(), 1
     with np.errstate(over="ignore"):
         while size < length:  # the code of a block of `size` rows, doubled
@@ -66,11 +66,9 @@ def _repeated(values: np.ndarray) -> Rows:
     distinct = max(_DISTINCT[0], _DISTINCT[1] * (1 - near) * length)
     alike = np.sort(block)  # many times quicker than the order, and most recordings repeat nothing
     if not np.any(alike[1:] == alike[:-1]):
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     order = np.argsort(block, kind="stable")
     same = np.flatnonzero(block[order][1:] == block[order][:-1])
-    if not len(same):
-        return np.zeros(0, np.int64)
     earlier, later = order[same], order[same + 1]
     good = later - earlier >= length  # copies do not overlap
     earlier, later = earlier[good], later[good]

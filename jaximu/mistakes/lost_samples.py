@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.mistakes.base import Samples, Sensor, scale_around
-from jaximu.recordings.finding import Finding, Rows
+from jaximu.recordings.finding import NO_ROWS, Finding, Rows
 from jaximu.recordings.recording import Recording
 
 __all__ = ["TITLES", "find", "steps"]
@@ -101,8 +101,7 @@ def _evidence(samples: Samples, lost: FloatArray, wanted: Rows, half: int) -> tu
 def _quickly(samples: Samples, wanted: Rows, half: int) -> tuple[FloatArray, FloatArray]:
     """The same for evenly sampled sensors, by filters over what is near the intervals: nothing is known lost yet."""
     near = np.zeros(len(samples.first), bool)
-    for shift in range(1 - half, 1 + half):
-        near[wanted + shift] = True
+    near[wanted[:, None] + np.arange(1 - half, 1 + half)] = True
     index = np.cumsum(near)[wanted] - half  # of the filters' outputs
     offset = (np.arange(2 * half) - half + 0.5) / half
     design = np.column_stack([np.vander(offset, 4, increasing=True), np.sign(offset) / 2])
@@ -130,7 +129,7 @@ def _pairs(samples: Samples, lost: FloatArray, intervals: Rows, half: int, sure:
     pairs: list[int] = []
     groups = np.split(intervals, np.flatnonzero(np.diff(intervals) > half) + 1) if len(intervals) else []
     if len(groups) > _MOST_PAIRS:
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     for group in groups:
         centre, width = int(np.mean(group)), half + 3
         if centre - width < 1 or centre + width + 1 >= len(lost) or group[-1] - group[0] > 2 * half:
@@ -240,8 +239,7 @@ def _singles(samples: Samples) -> list[Finding]:
     places = np.flatnonzero(lost)
     # where motion is not smooth enough, intervals are off by any share of a sample, not by whole ones alone
     alone = np.ones(len(lost), bool)
-    for shift in range(-half, half + 1):
-        alone[np.clip(places + shift, 0, len(lost) - 1)] = False
+    alone[np.clip(places[:, None] + np.arange(-half, half + 1), 0, len(lost) - 1)] = False
     alone = alone[wanted] & (power > 4 * _CLEAR)
     between, against = alone & (np.abs(step - 0.5) < 0.2), alone & (step < -0.7)
     if max(between.sum(), against.sum()) > 0.34 * len(places):
@@ -287,8 +285,7 @@ def steps(sensor: Sensor) -> FloatArray:
     miss = np.zeros_like(sensor.difference)
     miss[3:-3] = windows[4:] @ weight[::-1] - windows[:-4] @ weight
     broken = np.flatnonzero(~sensor.even)
-    for shift in range(-4, 5):
-        miss[np.clip(broken + shift, 0, len(miss) - 1)] = 0.0
+    miss[np.clip(broken[:, None] + np.arange(-4, 5), 0, len(miss) - 1)] = 0.0
     scale = np.maximum(scale_around(miss, before=False), 1.8 * sensor.noise)
     return np.max(np.abs(miss) / np.maximum(scale, 1e-300), axis=1)
 

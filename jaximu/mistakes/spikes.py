@@ -9,7 +9,8 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.differences import interpolated
 from jaximu.ground.quantities import counted, size
 from jaximu.mistakes.base import BRIDGED, Samples, Sensor
-from jaximu.recordings.finding import Finding, Rows
+from jaximu.recordings.alignment import turned_between
+from jaximu.recordings.finding import NO_ROWS, Finding, Rows
 from jaximu.recordings.recording import runs_of
 
 __all__ = ["TITLES", "find"]
@@ -74,7 +75,7 @@ def _wild(celsius: FloatArray) -> Rows:
     """The rows of temperatures (n,) that leave for a few readings and come back; one reading may be held for rows."""
     change = np.flatnonzero(np.diff(celsius, prepend=np.nan) != 0)
     if len(change) < _WINDOW:
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     values = celsius[change]
     middle = np.median(sliding_window_view(np.pad(values, _WINDOW // 2, "edge"), _WINDOW), axis=1)
     off = np.abs(values - middle)
@@ -84,17 +85,17 @@ def _wild(celsius: FloatArray) -> Rows:
 
 def _outliers(sensor: Sensor) -> Rows:
     if len(sensor) < 64:
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     scale = np.maximum(sensor.local, 1.4 * sensor.noise + 0.5 * sensor.step)
     scale = np.maximum(scale, 1e-9 * np.ptp(sensor.values, axis=0))
     ratio = np.max(np.abs(sensor.curvature) / np.maximum(scale, 1e-300), axis=1)
     flagged = ratio > _TIMES
     if not flagged.any():
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     flagged[1:-1] |= flagged[:-2] & flagged[2:]
     clusters = runs_of(flagged)
     if len(clusters) > _MOST:
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     rows: list[int] = []
     for start, stop in clusters:
         if stop - start <= 2 * BRIDGED + 3:
@@ -155,7 +156,7 @@ def _turned(accelerometer: Sensor, gyroscope: Sensor, run: Rows) -> bool:
     estimate = np.linalg.pinv(np.stack([offset > 0, offset, np.ones(len(offset))], axis=1))[0]
     steps = []
     for rate in (logged, bridged):
-        turns = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None])
+        turns = Rotation.from_rotvec(turned_between(time, rate))
         attitude, carried = Rotation.identity(), [force[0]]
         for turn, later in zip(turns, force[1:], strict=True):
             attitude = attitude * turn

@@ -28,7 +28,7 @@ def find(samples: Samples) -> list[Finding]:
     without: dict[str, Rows] = {}
     for name, sensor in samples.sensors.items():
         zero = nothing[name]
-        if not zero.any() or zero.mean() > _MOST or not len(sensor):
+        if not zero.any() or zero.mean() > _MOST:
             continue
         if name == "gyroscope" and zeroed_at_rest(samples) is not None:
             continue

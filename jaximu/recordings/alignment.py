@@ -31,6 +31,7 @@ __all__ = [
     "gravity_turning",
     "rotation_of",
     "signed_permutation",
+    "turned_between",
     "turning",
     "turning_best",
     "turns_backwards",
@@ -109,6 +110,11 @@ def angle_of(rotation: FloatArray) -> float:
     return float(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1.0, 1.0)))
 
 
+def turned_between(time: FloatArray, rate: FloatArray) -> FloatArray:
+    """Return the angle (m - 1, 3) by which rates (m, 3) turn from each stamp to the next, by the trapezoid."""
+    return 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None]
+
+
 class BlockMeans(NamedTuple):
     """Means over n + 1 blocks of the specific force, and the angle (m, 3) that the gyroscope has turned by `time` (m,).
 
@@ -142,8 +148,7 @@ def gravity_turning(
     mean = force[: count * span].reshape(count, span, 3).mean(axis=1)
     centre = force_time[: count * span].reshape(count, span).mean(axis=1)
     rate = rate - np.median(rate, axis=0)
-    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(rate_time)[:, None]
-    angle = np.cumulative_sum(steps, axis=0, include_initial=True)
+    angle = np.cumulative_sum(turned_between(rate_time, rate), axis=0, include_initial=True)
     length = np.linalg.norm(mean, axis=1)
     usual = np.median(length)
     off = np.abs(length - usual) / max(usual, 1e-300)
@@ -301,7 +306,7 @@ def carried(
         return Carried(1.0, np.pi, 0)
     at_rest = np.concatenate([rate[a:b] for a, b in np.searchsorted(rate_time, rests)])
     rate = rate - np.median(at_rest, axis=0) if len(at_rest) else rate
-    angle = np.cumulative_sum((rate[1:] + rate[:-1]) / 2 * interval[:, None], axis=0, include_initial=True)
+    angle = np.cumulative_sum(turned_between(rate_time, rate), axis=0, include_initial=True)
     stamps = np.linspace(middle[used], middle[used + 1], _TURN_STEPS + 1)
     passed = interpolated(rate_time, angle, stamps)
     steps = passed[1:] - passed[:-1]

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from jaximu.recordings.recording import Recording
 
-__all__ = ["Finding", "Rows"]
+__all__ = ["NO_ROWS", "Finding", "Rows"]
 
 Rows = NDArray[np.int64]
+NO_ROWS: Rows = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)

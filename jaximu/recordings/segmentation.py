@@ -580,10 +580,16 @@ def _with_noise(
     def of_poses(covariance: FloatArray) -> FloatArray:
         return np.diagonal(covariance, axis1=1, axis2=2)[:, :padded].T[:, :, None] * np.eye(3)
 
+    def by_model(
+        name: str, signal: Signal, start: FloatArray, stop: FloatArray, same: NDArray[np.bool_]
+    ) -> tuple[FloatArray, FloatArray]:
+        """White density and covariance over intervals of which the first are the poses, white noise in theirs."""
+        white, slow = noise_by_model(signal, require_model(signal, getattr(noise, name), name), start, stop, same)
+        slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)[:count]
+        return white, slow
+
     accelerometer, gyroscope = parts[0].recording.accelerometer, parts[0].recording.gyroscope
-    model = require_model(accelerometer, noise.accelerometer, "accelerometer")
-    white, slow = noise_by_model(accelerometer, model, start, stop, together)
-    slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
+    _, slow = by_model("accelerometer", accelerometer, start, stop, together)
     slow[:, at_rest, at_rest] += np.concatenate([_rounding(part.recording.accelerometer, part) for part in parts], 1)
     forces = among(at_rest, slow, padded)
     poses = replace(poses, accelerometer_covariance=of_poses(forces))
@@ -591,7 +597,6 @@ def _with_noise(
     rates = np.tile(np.eye(intervals), (3, 1, 1))
     part_of_turn = np.zeros(turns.interval.shape, np.int64)
     if gyroscope is not None:
-        model = require_model(gyroscope, noise.gyroscope, "gyroscope")
         used = np.flatnonzero(turns.mask[: count - 1])
         elapsed = np.cumsum(turns.interval, axis=1) - turns.interval / 2
         total = np.maximum(np.sum(turns.interval, axis=1, keepdims=True), 1e-9)
@@ -601,10 +606,9 @@ def _with_noise(
         last = np.concatenate([stop, edges[:, 1:].ravel()])
         owner = np.concatenate([power_on, np.repeat(power_on[used], _PARTS)])
         alike = owner[:, None] == owner
-        white, slow = noise_by_model(gyroscope, model, first, last, alike)
+        white, slow = by_model("gyroscope", gyroscope, first, last, alike)
         # a later power-on has another bias: what its means at rest have in common tells nothing of the first one's
         slow += (alike & (owner > 0)) * np.square(POWER_ON["gyroscope"] * gyroscope.nominal_scale)[:, None, None]
-        slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
         shift = np.sqrt(np.concatenate([_rounding(part.recording.gyroscope or gyroscope, part) for part in parts], 1))
         # every pose of a recording reads the same rate, and rounds it the same way
         slow[:, :count, :count] += shift[:, :, None] * shift[:, None, :] * together

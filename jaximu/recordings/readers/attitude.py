@@ -39,6 +39,8 @@ _FACTORS = {
     **{"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048},
 }
 """Units of velocity and position in SI."""
+_Places = dict[str, dict[str, int]]
+"""By kind the column of each axis."""
 _EPOCHS = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "µs"), (1e11, 1e-3, "ms"))
 """Stamps above these count since 1970 in the unit named."""
 
@@ -65,7 +67,7 @@ def holds_attitude(path: str | os.PathLike[str]) -> bool:
     return bool(_tables(path))
 
 
-def _tables(path: str | os.PathLike[str]) -> list[tuple[LogTable, dict[str, dict[str, int]]]]:
+def _tables(path: str | os.PathLike[str]) -> list[tuple[LogTable, _Places]]:
     """Return the tables of a file that hold an attitude, and where their columns are."""
     tables = [(table, _places(table)) for table in map(_named, read_tables(path))]
     kinds = {"quaternion", "numbered", "euler", "rotation vector", "table angles"}
@@ -80,9 +82,9 @@ def _named(table: LogTable) -> LogTable:
     return replace(table, names=_TUM).noted(note)
 
 
-def _places(table: LogTable) -> dict[str, dict[str, int]]:
+def _places(table: LogTable) -> _Places:
     """Return by kind the columns of each axis, complete kinds alone."""
-    kinds: dict[str, dict[str, int]] = {}
+    kinds: _Places = {}
     for at, name in enumerate(table.header):
         plain = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*", "", name.lower())).strip("_")
         for kind, patterns in _HABITS.items():
@@ -117,7 +119,7 @@ def _columns(table: LogTable, places: dict[str, int], axes: Sequence[str], quant
     return np.stack(columns, axis=1)
 
 
-def _attitude(table: LogTable, places: dict[str, dict[str, int]], name: str) -> Attitude:
+def _attitude(table: LogTable, places: _Places, name: str) -> Attitude:
     notes = list(table.notes)
     time, start = _time(table, places, name, notes)
     if "quaternion" in places:
@@ -153,7 +155,7 @@ def _from_angles(table: LogTable, places: dict[str, int], axes: dict[str, str], 
     return _quaternion(scipy.spatial.transform.Rotation.from_euler("".join(axes.values()).upper(), angles))
 
 
-def _time(table: LogTable, places: dict[str, dict[str, int]], name: str, notes: list[str]) -> tuple[FloatArray, float]:
+def _time(table: LogTable, places: _Places, name: str, notes: list[str]) -> tuple[FloatArray, float]:
     """Return stamps (n,) in s since the first, and the first one's absolute stamp, s; zero where there is none."""
     if "time" not in places:
         if table.rate is None:
