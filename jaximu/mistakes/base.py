@@ -15,17 +15,6 @@ from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turn
 from jaximu.recordings.finding import Rows
 from jaximu.recordings.recording import Recording, Signal, runs_of, steps_of
 
-__all__ = [
-    "BRIDGED",
-    "HUNG",
-    "TITLES",
-    "Samples",
-    "Sensor",
-    "coarse_step",
-    "scale_around",
-    "spans_of",
-]
-
 TITLES = {
     "data.bumped_pose": "bumped pose",
     "data.moving_line": "line that moves",

@@ -11,8 +11,6 @@ from jaximu.mistakes.base import HUNG, Samples, Sensor
 from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import runs_of
 
-__all__ = ["TITLES", "at_limits", "find", "stops"]
-
 TITLES = {"data.clipping": "clipped output", "data.saturation": "saturated turns"}
 
 _FLAT = 0.36

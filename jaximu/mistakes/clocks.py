@@ -8,8 +8,6 @@ from jaximu.mistakes.base import Samples, with_signal
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.clocks": "clocks apart"}
 
 _SURE = 5.0

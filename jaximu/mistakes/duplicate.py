@@ -9,8 +9,6 @@ from jaximu.mistakes.base import Samples
 from jaximu.recordings.finding import NO_ROWS, Finding, Rows
 from jaximu.recordings.recording import runs_of
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.duplicate": "repeated rows"}
 
 _CHANCE = 1e-6

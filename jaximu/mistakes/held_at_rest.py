@@ -10,8 +10,6 @@ from jaximu.mistakes.base import Samples, Sensor, with_signal
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
-__all__ = ["TITLES", "find", "zeroed_at_rest"]
-
 TITLES = {"data.auto_zero": "automatic zero at rest"}
 
 _COARSE = np.radians(0.2)

@@ -8,8 +8,6 @@ from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import runs_of
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.knock": "knocked at rest"}
 
 _TIMES = 5.5

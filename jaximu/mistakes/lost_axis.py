@@ -11,8 +11,6 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.copied_axis": "copied axis", "data.dead_axis": "dead axis"}
 
 _SLOW = 0.15

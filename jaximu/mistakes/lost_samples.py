@@ -13,8 +13,6 @@ from jaximu.mistakes.base import Samples, Sensor, scale_around
 from jaximu.recordings.finding import NO_ROWS, Finding, Rows
 from jaximu.recordings.recording import Recording
 
-__all__ = ["TITLES", "find", "steps"]
-
 TITLES = {"data.lost_samples": "lost samples"}
 
 _HARM = 4.0

@@ -10,8 +10,6 @@ from jaximu.mistakes.lost_samples import steps
 from jaximu.recordings.alignment import carried, turning
 from jaximu.recordings.finding import Finding
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {
     "data.mixed_devices": "sensors of different devices",
     "data.range": "another range",

@@ -8,8 +8,6 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.mistakes.base import Samples
 from jaximu.recordings.finding import Finding
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.gravity_free": "gravity taken out", "data.normalised": "directions without size"}
 
 _CONSTANT = 0.3

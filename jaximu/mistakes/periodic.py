@@ -13,8 +13,6 @@ from jaximu.mistakes.resampled import held_at, interpolated_at
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import runs_of
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.periodic": "periodic disturbance", "data.bandwidth": "low-pass filter"}
 
 

@@ -36,8 +36,6 @@ from jaximu.mistakes.base import BRIDGED, Samples
 from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import Defect, Recording, Signal, recordings_of, runs_of, steps_of
 
-__all__ = ["MISTAKES", "Prepared", "inspect", "one_or_several", "prepare", "prepared", "without_rows"]
-
 _ROUNDS = 4
 _MUCH = 0.01  # share of a sensor's rows left out that may be why a calibration is not possible
 _REPAIRED = "This was repaired."

@@ -7,8 +7,6 @@ import numpy as np
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding, Rows
 
-__all__ = ["TITLES", "find", "held_at", "interpolated_at"]
-
 TITLES = {"data.resampled": "resampled output"}
 
 

@@ -13,8 +13,6 @@ from jaximu.recordings.alignment import turned_between
 from jaximu.recordings.finding import NO_ROWS, Finding, Rows
 from jaximu.recordings.recording import runs_of
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.spikes": "outliers"}
 
 _TIMES = 10.0

@@ -11,8 +11,6 @@ from jaximu.mistakes.resampled import held_at
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import runs_of
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.stuck_axis": "stuck output"}
 
 _STUCK = 0.5

@@ -13,8 +13,6 @@ from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
-__all__ = ["TITLES", "find", "in_bursts", "steady_clock"]
-
 TITLES = {
     "data.bursts": "stamps in bursts",
     "data.time_scale": "time scale",

@@ -10,8 +10,6 @@ from jaximu.mistakes.base import Samples, Sensor, with_signal
 from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import Recording
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.wrap": "integer overflow"}
 
 _AT_THE_OTHER_END = 0.8

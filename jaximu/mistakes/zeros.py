@@ -10,8 +10,6 @@ from jaximu.mistakes.held_at_rest import zeroed_at_rest
 from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import runs_of
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.zeros": "rows of zeros"}
 
 _MOST = 0.3

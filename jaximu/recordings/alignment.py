@@ -17,26 +17,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.differences import interpolated
 from jaximu.ground.distributions import student_isf
 
-__all__ = [
-    "ARRANGEMENTS",
-    "CORRELATED",
-    "EXPLAINED",
-    "BlockMeans",
-    "Carried",
-    "Clocks",
-    "Turning",
-    "angle_of",
-    "carried",
-    "clocks",
-    "gravity_turning",
-    "rotation_of",
-    "signed_permutation",
-    "turned_between",
-    "turning",
-    "turning_best",
-    "turns_backwards",
-]
-
 _BLOCK = 0.2
 """Seconds over which the specific force is averaged."""
 _MOVED = 0.03

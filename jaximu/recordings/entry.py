@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from jaximu.ground.array_types import FloatArray
 
-__all__ = ["ScheduleEntry"]
-
 
 @dataclass(frozen=True)
 class ScheduleEntry:

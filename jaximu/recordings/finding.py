@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from jaximu.recordings.recording import Recording
 
-__all__ = ["NO_ROWS", "Finding", "Rows"]
-
 Rows = NDArray[np.int64]
 NO_ROWS: Rows = np.zeros(0, np.int64)
 

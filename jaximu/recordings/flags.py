@@ -12,8 +12,6 @@ from jaximu.ground.errors import InputError
 from jaximu.recordings.readers.reader import read_table
 from jaximu.recordings.recording import Recording
 
-__all__ = ["without_flagged"]
-
 _STATUS = re.compile(r"(?:^|[^a-z])(?:status|flags?|errors?|faults?)(?:$|[^a-z])", re.IGNORECASE)
 
 

@@ -22,8 +22,6 @@ from jaximu.recordings.attitude import UNIT_LENGTH
 from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.recording import Recording, Signal, runs_of
 
-__all__ = ["Integral", "entries_of_columns", "match_reference", "means_over", "rest_rate"]
-
 _MOVING = np.radians(2.0)  # rad/s, mean rate over a second that no pose has
 _OFF = 20.0  # degrees between a pose's "up" and what the accelerometer reads as its data sheet has it
 _SHIFTS = np.arange(-60.0, 60.01, 0.05)  # s, in which another clock is sought

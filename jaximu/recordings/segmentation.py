@@ -22,19 +22,6 @@ from jaximu.model.stimulus import REFERENCE_TEMPERATURE
 from jaximu.recordings.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
 from jaximu.recordings.recording import PoseMeans, Recording, Signal, runs_of
 
-__all__ = [
-    "Segmentation",
-    "SegmentationOptions",
-    "find_stops",
-    "noise_by_model",
-    "observe_means",
-    "observed_poses",
-    "require_model",
-    "rest_statistics",
-    "segment",
-]
-
-
 THRESHOLDS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 200, 400)
 _DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one that broke in two
 _PARTS = 4  # of a turn, over each of which slow bias is taken as constant

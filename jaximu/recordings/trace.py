@@ -39,8 +39,6 @@ from typing import Any
 from jaximu.ground.document import file_digest, read_toml
 from jaximu.ground.errors import InputError, only
 
-__all__ = ["NEEDED", "missing", "read_trace", "sidecar"]
-
 _REFERENCE = ("name", "certificate", "expires", "file", "value", "uncertainty")
 _CERTIFICATE = ("number", "laboratory", "address", "customer", "authorised_by")
 NEEDED = (

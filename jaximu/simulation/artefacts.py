@@ -17,8 +17,6 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES
 from jaximu.recordings.recording import axis_matrix
 
-__all__ = ["ARTEFACTS", "Artefact", "LoggedRows"]
-
 _SENSORS = tuple(INERTIAL_QUANTITIES)
 _COLUMNS = {f"{PREFIXES[sensor]}_{axis}": (sensor, index) for sensor in _SENSORS for index, axis in enumerate("xyz")}
 

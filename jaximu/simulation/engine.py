@@ -35,8 +35,6 @@ from jaximu.recordings.write import write_parts
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact, LoggedRows
 from jaximu.simulation.protocols import Environment, Motion, Plan, Protocol, block_length
 
-__all__ = ["Case", "Stream", "Truth", "simulate", "simulate_cases", "write_case"]
-
 TRUTH_SCHEMA = "jaximu.truth/1"
 
 

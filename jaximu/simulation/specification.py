@@ -61,8 +61,6 @@ from jaximu.simulation.artefacts import ARTEFACTS, Artefact
 from jaximu.simulation.engine import Case
 from jaximu.simulation.protocols import PROTOCOLS, Environment, Protocol, Tone
 
-__all__ = ["Draw", "Specification", "read_specification"]
-
 _TRIAD_KEYS = ("output_unit", "counts", "gain", "scale", "misalignment", "bias", "temperature_reference", "noise")
 _NOISE_KEYS = inspect.getfullargspec(Noise.from_datasheet).kwonlyargs
 _TOP_KEYS = ("seed", "units", "recordings", "rate", "protocol", "environment", *SENSOR_UNITS, "effects", "artefacts")

@@ -8,8 +8,6 @@ from jaximu.recordings.columns.guess import advise
 from jaximu.recordings.columns.names import GROUPS, QUANTITIES, TIME, Column, header_columns, parse_columns
 from jaximu.recordings.columns.table import LogTable
 
-__all__ = ["choose_columns", "choose_pair", "column_units"]
-
 _LISTED = 30
 
 

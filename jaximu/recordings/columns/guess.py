@@ -29,8 +29,6 @@ from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import FASTEST, SLOWEST, Signal
 
-__all__ = ["ASSUMED_RATE", "Advice", "OpenPoint", "advise", "left_open", "without_gravity"]
-
 ASSUMED_RATE = 100.0  # Hz, of a log that does not say it
 
 _GRAVITY_IN = {name: STANDARD_GRAVITY / unit_named(name).factor for name in ("m/s^2", "g", "mg", "cm/s^2")}

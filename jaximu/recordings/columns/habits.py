@@ -13,8 +13,6 @@ from unicodedata import combining, normalize
 
 from jaximu.ground.units import STANDARD_GRAVITY, find_unit, parse_column
 
-__all__ = ["QUANTITIES", "Field", "fields_of", "last_of", "measures", "sensor_of", "stated_rate", "words_of"]
-
 _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
     "beschleunigung accelerazione aceleracion aceleracao versnelling przyspieszenie ускорение 加速度 가속도 "

@@ -13,8 +13,6 @@ from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, last_of
 from jaximu.recordings.columns.table import LogTable
 
-__all__ = ["EPOCH", "JOINED", "known_names", "sentence_names", "whole_stamps"]
-
 
 @dataclass(frozen=True)
 class _KnownLayout:

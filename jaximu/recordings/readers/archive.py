@@ -15,8 +15,6 @@ from jaximu.recordings.columns.habits import sensor_of, words_of
 from jaximu.recordings.columns.table import Unpacking
 from jaximu.recordings.recording import Source
 
-__all__ = ["SUFFIXES", "by_sensor", "is_archive", "is_log", "logs_below", "opened"]
-
 _MOST = 1000  # files of a recording
 _LETTERS = 3  # of a word that names a file's sensor
 _SENSORS = "accel", "gyro", "mag"

@@ -17,8 +17,6 @@ from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.readers.reader import read_tables
 
-__all__ = ["holds_attitude", "read_attitude"]
-
 _HABITS = {
     "time": (r".*(?:time|stamp).*|t|sec(?:onds)?",),
     "quaternion": (

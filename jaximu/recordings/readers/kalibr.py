@@ -15,8 +15,6 @@ from pathlib import Path
 
 from jaximu.ground.errors import InputError, readable
 
-__all__ = ["KALIBR_UNITS", "kalibr_yaml", "read_noise"]
-
 KALIBR_UNITS = {
     "accelerometer_noise_density": "m/s^2/sqrt(Hz)",
     "accelerometer_random_walk": "m/s^3/sqrt(Hz)",

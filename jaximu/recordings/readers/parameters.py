@@ -20,8 +20,6 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, name_of, readable
 from jaximu.recordings.readers import dataflash, ulog
 
-__all__ = ["ParameterFile", "read_parameters"]
-
 _ROW = re.compile(r"^(?:\d+\s+\d+\s+)?([A-Z]\w*)[\s,=]+(\S+?)(?:[\s,@#].*)?$")
 
 

@@ -18,8 +18,6 @@ from jaximu.recordings.columns.table import HEAD, LogTable
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
-__all__ = ["explained", "prints", "read"]
-
 _LOOKED_AT = 400  # lines in which a shape is looked for
 _LONGEST = 40  # lines of a sample
 _MOST = 0.6  # of the lines that must have the shape

@@ -26,8 +26,6 @@ from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.readers.reader import extract, read_table
 from jaximu.recordings.recording import ReadOptions, Recording
 
-__all__ = ["read_reference", "read_schedule"]
-
 _FIELDS = ("start", "stop", "kind", "x", "y", "z", "angle", "heading")
 _QUANTITIES = {"start": "time", "stop": "time", "angle": "angle", "heading": "angle"}
 _REFERENCES = ("table_angle", "table_rate", "attitude")

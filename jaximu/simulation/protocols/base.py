@@ -15,8 +15,6 @@ from jaximu.recordings.entry import ScheduleEntry
 from jaximu.simulation.protocols.course import Course, Environment
 from jaximu.simulation.protocols.motion import Motion
 
-__all__ = ["Plan", "Protocol"]
-
 
 @dataclass(frozen=True)
 class Plan:

@@ -19,8 +19,6 @@ from jaximu.simulation.protocols.motion import Motion, earth_rate, field_of
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-__all__ = ["Course", "Environment", "Tone", "attitude_of"]
-
 
 @dataclass(frozen=True)
 class Tone:

@@ -15,8 +15,6 @@ from jaximu.simulation.protocols.positions import spiral
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-__all__ = ["HandHeld"]
-
 
 @dataclass(frozen=True)
 class HandHeld(Protocol):

@@ -22,8 +22,6 @@ from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, 
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["BLOCKS", "Motion", "block_length", "earth_rate", "field_of", "smooth_course"]
-
 BLOCKS = (4096, 16384, 65536)
 
 

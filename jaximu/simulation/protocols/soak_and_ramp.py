@@ -10,8 +10,6 @@ from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course, attitude_of
 from jaximu.simulation.protocols.positions import directions
 
-__all__ = ["SoakAndRamp"]
-
 
 @dataclass(frozen=True)
 class SoakAndRamp(Protocol):

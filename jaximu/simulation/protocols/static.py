@@ -6,8 +6,6 @@ from jaximu.ground.errors import InputError
 from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course, attitude_of
 
-__all__ = ["Static"]
-
 
 @dataclass(frozen=True)
 class Static(Protocol):

@@ -9,8 +9,6 @@ from jaximu.ground.errors import InputError
 from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course, Tone, attitude_of
 
-__all__ = ["Vibration"]
-
 
 @dataclass(frozen=True)
 class Vibration(Protocol):
