@@ -8,9 +8,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turning
 from jaximu.recordings.finding import Rows
 from jaximu.recordings.recording import Recording, Signal, runs_of, steps_of
@@ -85,7 +84,7 @@ class Sensor:
         return np.stack([self.values.max(axis=0), self.values.min(axis=0)])
 
     @cached_property
-    def even(self) -> NDArray[np.bool_]:
+    def even(self) -> BoolArray:
         """(n − 1,) whether an interval is no gap."""
         return np.asarray(self.interval, np.float64) < 1.6 * max(self.period, np.mean(self.interval))
 
@@ -149,7 +148,7 @@ class Sensor:
         return np.arange(count) * size, parts.mean(axis=1), parts.var(axis=1)
 
     @cached_property
-    def quiet(self) -> NDArray[np.bool_]:
+    def quiet(self) -> BoolArray:
         """(n,) whether a sample lies in a block that varies no more than the quietest do."""
         _, mean, variance = self.blocks
         total = variance.sum(axis=1)
@@ -167,7 +166,7 @@ class Sensor:
         first = self.blocks[0]
         return int(first[1]) if len(first) > 1 else len(self)
 
-    def by_sample(self, by_block: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def by_sample(self, by_block: BoolArray) -> BoolArray:
         """Return for each sample (n,) what holds for its block (b,); those behind the last one belong to it."""
         return by_block[np.minimum(np.arange(len(self)) // self.block_size, len(by_block) - 1)]
 
@@ -228,7 +227,7 @@ class Samples:
         """Whether both sensors have one row for each stamp."""
         return self.both is not None and np.array_equal(self.both[0].time, self.both[1].time)
 
-    def quiet_at(self, sensor: Sensor) -> NDArray[np.bool_]:
+    def quiet_at(self, sensor: Sensor) -> BoolArray:
         """(n,) whether the *other* sensor, or the sensor itself where it is alone, is at rest at a sensor's samples."""
         other = self.gyroscope if sensor is self.accelerometer else self.accelerometer
         if other is None or self.shared:
@@ -298,13 +297,13 @@ class Samples:
         return int(np.sum(cosine < np.cos(_TURN)))
 
 
-def spans_of(flags: NDArray[np.bool_], time: FloatArray, shortest: float) -> FloatArray:
+def spans_of(flags: BoolArray, time: FloatArray, shortest: float) -> FloatArray:
     """Return start and stop (k, 2), s, of the runs of True at stamps (n,) that take so many seconds or more."""
     spans = time[np.minimum(runs_of(flags), len(time) - 1)]
     return spans[spans[:, 1] - spans[:, 0] >= shortest]
 
 
-def leave_out_both(calm: NDArray[np.bool_], moved: NDArray[np.bool_]) -> None:
+def leave_out_both(calm: BoolArray, moved: BoolArray) -> None:
     """Mark as not calm, in place, the blocks (b,) on both sides of each step (b - 1,) that moved."""
     calm[1:] &= ~moved
     calm[:-1] &= ~moved
@@ -325,7 +324,7 @@ def scale_around(misfit: FloatArray, before: bool = True) -> FloatArray:
     return wide[np.minimum(np.arange(len(misfit)) // size, blocks - 1)]
 
 
-def coarse_step(sensor: Sensor, axis: int, quiet: NDArray[np.bool_] | None = None) -> float | None:
+def coarse_step(sensor: Sensor, axis: int, quiet: BoolArray | None = None) -> float | None:
     """Return the step of an axis whose noise is finer than it, else None."""
     values, change = sensor.values[:, axis], sensor.difference[:, axis]
     # at rest most neighbours are equal, and those that are not differ by whole steps

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.quantities import size
 from jaximu.mistakes.base import HUNG, Samples, Sensor
 from jaximu.recordings.finding import Finding, Rows
@@ -75,7 +74,7 @@ def _clipped(sensor: Sensor) -> list[Finding]:
     ]
 
 
-def at_limits(sensor: Sensor) -> NDArray[np.bool_]:
+def at_limits(sensor: Sensor) -> BoolArray:
     """Return the rows (n,) in which every axis is at an end of what it reads in the recording."""
     return np.all((sensor.extremes[:, None] == sensor.values).any(axis=0), axis=1)
 

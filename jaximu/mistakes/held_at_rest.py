@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu.ground.array_types import BoolArray
 from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Samples, Sensor, with_signal
 from jaximu.recordings.finding import Finding
@@ -76,11 +76,11 @@ def find(samples: Samples) -> list[Finding]:
     return _high_passed(samples, sensor)
 
 
-def _finding(sensor: Sensor, concerned: NDArray[np.bool_], text: str, refuses: str = "") -> Finding:
+def _finding(sensor: Sensor, concerned: BoolArray, text: str, refuses: str = "") -> Finding:
     return Finding("data.auto_zero", sensor.rows([np.argmax(concerned)]), text, spoils=True, refuses=refuses)
 
 
-def _held(samples: Samples, sensor: Sensor, rest: NDArray[np.bool_]) -> float | None:
+def _held(samples: Samples, sensor: Sensor, rest: BoolArray) -> float | None:
     """Return the noise at rest as a share of that in motion, where it is hardly any."""
     if rest.sum() < 100 or (~rest).sum() < 100 or any(sensor.coarse):
         return None

@@ -6,9 +6,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.mistakes.base import Samples, Sensor, scale_around
 from jaximu.recordings.finding import NO_ROWS, Finding, Rows
 from jaximu.recordings.recording import Recording
@@ -174,7 +173,7 @@ class _Losses(NamedTuple):
     """
 
     lost: FloatArray
-    clear: NDArray[np.bool_]
+    clear: BoolArray
     power: FloatArray
     step: FloatArray
 

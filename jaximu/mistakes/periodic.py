@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.distributions import gamma_mean_sf
 from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Samples, Sensor
@@ -156,7 +155,7 @@ _SHAKEN = {"accelerometer": 1.5, "gyroscope": 0.3}
 """m/s² and rad/s: rms of quiet stretches beyond which they are motion, a walk's quieter part, and no rest."""
 
 
-def _rest(samples: Samples, still: NDArray[np.bool_]) -> bool:
+def _rest(samples: Samples, still: BoolArray) -> bool:
     """Whether the quiet stretches of a recording are rest, and not merely quieter than the others."""
     for name, sensor in samples.sensors.items():
         if len(sensor) == len(still):

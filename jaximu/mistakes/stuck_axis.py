@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu.ground.array_types import BoolArray
 from jaximu.mistakes.base import HUNG, Samples, Sensor
 from jaximu.mistakes.clipping import at_limits, stops
 from jaximu.mistakes.resampled import held_at
@@ -45,7 +45,7 @@ def _stuck(sensor: Sensor) -> list[Finding]:
     return findings + _repeated_rows(sensor, change)
 
 
-def _stuck_axis(sensor: Sensor, change: NDArray[np.bool_], axis: int) -> Finding | None:
+def _stuck_axis(sensor: Sensor, change: BoolArray, axis: int) -> Finding | None:
     """Return where an axis repeats itself, not at an end of its range, while the others move; `change` (n − 1, 3)."""
     values, length = sensor.values[:, axis], max(20, round(_STUCK * sensor.rate))
     others = np.any(change[:, [k for k in range(3) if k != axis]], axis=1)
@@ -77,7 +77,7 @@ def _stuck_axis(sensor: Sensor, change: NDArray[np.bool_], axis: int) -> Finding
     return Finding("data.stuck_axis", sensor.rows(first), text, spoils=most and noisy, without=without)
 
 
-def _repeated_rows(sensor: Sensor, change: NDArray[np.bool_]) -> list[Finding]:
+def _repeated_rows(sensor: Sensor, change: BoolArray) -> list[Finding]:
     """Return where all axes repeat a row: for long, so that the sensor hung, and now and then; `change` (n − 1, 3)."""
     findings = []
     same = ~change.any(axis=1) & ~at_limits(sensor)[1:]
@@ -111,7 +111,7 @@ def _repeated_rows(sensor: Sensor, change: NDArray[np.bool_]) -> list[Finding]:
     return findings
 
 
-def _hung(sensor: Sensor, same: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def _hung(sensor: Sensor, same: BoolArray) -> list[tuple[int, int]]:
     """Return the long runs of rows that repeat the row before them, where few others do."""
     long = [
         (int(start), int(stop)) for start, stop in runs_of(same) if stop - start >= max(HUNG, _SHORTEST * sensor.rate)

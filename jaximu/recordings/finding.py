@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu.ground.array_types import IntArray
 from jaximu.recordings.recording import Recording
 
-Rows = NDArray[np.int64]
+Rows = IntArray
 NO_ROWS: Rows = np.zeros(0, np.int64)
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.differences import interpolated
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError
@@ -679,7 +679,7 @@ def steps_of(values: FloatArray) -> FloatArray:
     return steps[steps > 1e-9 * np.ptp(values)]
 
 
-def runs_of(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
+def runs_of(flags: BoolArray) -> NDArray[np.intp]:
     """(k, 2) first and last + 1 of every run of True."""
     return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
@@ -404,7 +404,7 @@ def require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoi
 
 
 def noise_by_model(
-    signal: Signal, noise: AxisNoise, start: FloatArray, stop: FloatArray, same: NDArray[np.bool_]
+    signal: Signal, noise: AxisNoise, start: FloatArray, stop: FloatArray, same: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """White density (3, 3) and covariance (3, n, n) of slow bias over intervals, in output units; `same` (n, n) tells
     which intervals belong to one recording: between power-ons nothing is carried over.
@@ -558,7 +558,7 @@ def _with_noise(
     power_on = np.repeat(np.arange(len(parts)), [len(part.intervals) for part in parts])
     together = power_on[:, None] == power_on
 
-    def among(rows: NDArray[np.int64], covariance: FloatArray, size: int) -> FloatArray:
+    def among(rows: IntArray, covariance: FloatArray, size: int) -> FloatArray:
         """The covariance of these rows among so many, each of which has a variance of one else."""
         whole = np.tile(np.eye(size), (3, 1, 1))
         whole[:, rows[:, None], rows] = covariance
@@ -568,7 +568,7 @@ def _with_noise(
         return np.diagonal(covariance, axis1=1, axis2=2)[:, :padded].T[:, :, None] * np.eye(3)
 
     def by_model(
-        name: str, signal: Signal, start: FloatArray, stop: FloatArray, same: NDArray[np.bool_]
+        name: str, signal: Signal, start: FloatArray, stop: FloatArray, same: BoolArray
     ) -> tuple[FloatArray, FloatArray]:
         """White density and covariance over intervals of which the first are the poses, white noise in theirs."""
         white, slow = noise_by_model(signal, require_model(signal, getattr(noise, name), name), start, stop, same)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES
 from jaximu.recordings.recording import axis_matrix
@@ -25,11 +25,11 @@ _COLUMNS = {f"{PREFIXES[sensor]}_{axis}": (sensor, index) for sensor in _SENSORS
 class LoggedRows:
     """A block of rows: number (n,) of each row in the whole recording, time (n,) s, values by signal (n, m)."""
 
-    row: NDArray[np.int64]
-    time: NDArray[np.float64]
-    values: dict[str, NDArray[np.float64]]
+    row: IntArray
+    time: FloatArray
+    values: dict[str, FloatArray]
 
-    def keep(self, mask: NDArray[np.bool_]) -> None:
+    def keep(self, mask: BoolArray) -> None:
         """Drop the rows where the mask is false."""
         self.row, self.time = self.row[mask], self.time[mask]
         self.values = {name: value[mask] for name, value in self.values.items()}
@@ -66,7 +66,7 @@ class _OfAnAxis(Artefact):
         if self.axis not in _COLUMNS:
             raise InputError(f"artefact {self.name}: axis must be one of {', '.join(_COLUMNS)}, found {self.axis!r}.")
 
-    def values(self, samples: LoggedRows) -> NDArray[np.float64]:
+    def values(self, samples: LoggedRows) -> FloatArray:
         """The axis's values (n,), a view."""
         sensor, index = _COLUMNS[self.axis]
         return samples.values[sensor][:, index]

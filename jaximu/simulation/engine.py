@@ -12,10 +12,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.ground import stored
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.document import SOFTWARE, Document
 from jaximu.ground.errors import InputError
@@ -292,7 +291,7 @@ class _Logger:
         ]
         self.kept: list[Any] = [None] * len(case.artefacts)
 
-    def logged(self, rows: NDArray[np.int64], columns: Mapping[str, FloatArray]) -> LoggedRows:
+    def logged(self, rows: IntArray, columns: Mapping[str, FloatArray]) -> LoggedRows:
         """Return what is logged in the rows of a block where these are the outputs."""
         values = {name: np.array(column)[: len(rows)] for name, column in columns.items()}
         for name, (scale, stream) in self.noise.items():

@@ -19,7 +19,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import listed, unit_text
-from jaximu.ground.units import STANDARD_GRAVITY, Unit, column_title, find_unit, parse_column
+from jaximu.ground.units import SENSORS, STANDARD_GRAVITY, Unit, column_title, find_unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.alignment import CORRELATED, Turning, turning
 from jaximu.recordings.columns.habits import Field, fields_of, last_of, measures, sensor_of, words_of
@@ -345,7 +345,7 @@ class _Guess:
             if len(axes) != 3 or (*stem, "w") in quaternions:
                 continue
             named = sensor is not None and bool(stem)
-            if sensor is None and not stem and self.file in ("accel", "gyro", "mag"):
+            if sensor is None and not stem and self.file in SENSORS:
                 sensor = self.file
             if sensor is None and not measures(unit) and not stem and self.file_not:
                 self._ask(f"Does this file hold an accelerometer? By its name it is {self.file_not}.")

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from unicodedata import combining, normalize
 
-from jaximu.ground.units import STANDARD_GRAVITY, find_unit, parse_column
+from jaximu.ground.units import SENSORS, STANDARD_GRAVITY, find_unit, parse_column
 
 _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
@@ -153,7 +153,7 @@ class Field:
     @property
     def canonical(self) -> str | None:
         """The column in our words, None where the name does not say it all."""
-        if self.sensor in ("accel", "gyro", "mag"):
+        if self.sensor in SENSORS:
             return f"{self.sensor}_{self.axis}" if self.axis and self.axis in "xyz" else None
         return self.sensor
 

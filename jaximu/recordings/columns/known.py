@@ -81,6 +81,8 @@ _LAYOUTS = [
         ),
     )
 ]
+_Named = tuple[tuple[str, ...], str]
+"""Names in our words, and a note of whose they are."""
 JOINED = "whole time [ns]"
 """Name of a column of stamps that was joined from two."""
 _LATEST = 2**33  # s
@@ -89,7 +91,7 @@ _GAPS = 0.1  # of the seconds may begin with a row whose rest does not fall, as 
 _SENSOR_LOGGER = {"time": "time [ns]", "seconds_elapsed": "", "x": "", "y": "", "z": ""}
 
 
-def known_names(table: LogTable) -> tuple[tuple[str, ...], str] | None:
+def known_names(table: LogTable) -> _Named | None:
     """The names in our words, with units, for a table whose names show what wrote it, and a note; None for any other.
 
     What is not used keeps its name.
@@ -137,7 +139,7 @@ _MESSAGE = re.compile(r"(?:.*[./_])?(angular_velocity|linear_acceleration)[./_](
 EPOCH = 1e9, 2.2e9  # s since 1970 that a log's stamps lie between
 
 
-def _of_message(table: LogTable, names: tuple[str, ...]) -> tuple[tuple[str, ...], str] | None:
+def _of_message(table: LogTable, names: tuple[str, ...]) -> _Named | None:
     """The names of a table of sensor_msgs/Imu, whatever stands before them: a topic, a message's name."""
     titles = {"angular_velocity": "gyro_{} [rad/s]", "linear_acceleration": "accel_{} [m/s^2]"}
     matches = [_MESSAGE.fullmatch(name.strip().lower()) for name in names]
@@ -165,7 +167,7 @@ def sentence_names(name: str, count: int) -> list[str] | None:
     return list(names[1:]) if names is not None and len(names) == count + 1 else None
 
 
-def _without_header(table: LogTable) -> tuple[tuple[str, ...], str] | None:
+def _without_header(table: LogTable) -> _Named | None:
     """The names of rows without a header that show what wrote them: VectorNav's sentences, ROS's own CSV."""
     first = table.columns[0]
     if len(table.columns) == len(_ECHOED) and [column.dtype.kind for column in table.columns[:3]] == ["i", "i", "O"]:

@@ -6,7 +6,6 @@ Records that name their sensor (`"sensor": "Accelerometer"`) become tables of th
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.ground.units import column_title, parse_column
+from jaximu.ground.units import SENSORS, column_title, parse_column
 from jaximu.recordings.columns.habits import fields_of, sensor_of, words_of
 from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.table import LogTable
@@ -24,7 +23,6 @@ from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
 _TAGS = ("sensor", "sensorname", "sensor_name", "type", "name", "topic")
-_TRIADS = {"accel", "gyro", "mag"}
 _ANDROID = {"accel": "m/s^2", "gyro": "rad/s", "mag": "uT"}
 
 
@@ -108,7 +106,7 @@ def _table(columns: Mapping[str, Any], source: Source) -> LogTable:
     return table_of(arrays, source)
 
 
-def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[str, LogTable]]:
+def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[LogTable]:
     """A table for each sensor that the records name."""
     tag = next((key for key in records[0] if key.lower() in _TAGS and isinstance(records[0][key], str)), None)
     if tag is None:
@@ -129,10 +127,7 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
                 title = column_title(title, unit)
             named[title] = values
         table = _table(named, source)
-        yield (
-            sensor,
-            table.noted('units are those of Android\'s sensors, by "type" in each line.') if android else table,
-        )
+        yield table.noted('units are those of Android\'s sensors, by "type" in each line.') if android else table
 
 
 def of_sensor(table: LogTable, sensor: str) -> LogTable:
@@ -167,13 +162,8 @@ def apart(table: LogTable) -> LogTable:
             for axis in "xyz":
                 names[axes[axis]] = column_title(f"{sensor}_{axis}", parse_column(names[axes[axis]])[1])
             kept = [index for index in range(len(names)) if index != at and part.columns[index].dtype != object]
-            part = replace(
-                part,
-                names=tuple(names[index] for index in kept),
-                rows=1,
-                columns=tuple(part.columns[index] for index in kept),
-            )
-            parts.append((sensor, part))
+            columns = tuple(part.columns[index] for index in kept)
+            parts.append(replace(part, names=tuple(names[index] for index in kept), rows=1, columns=columns))
         return _joined(parts).noted(f"each row is one sensor's, by {table.label(at)}.")
     return table
 
@@ -191,7 +181,7 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
     not there, was chosen.
     """
     fields = fields_of(table.header)
-    triads = {field.sensor for field in fields if field.axis} & _TRIADS
+    triads = {field.sensor for field in fields if field.axis} & SENSORS.keys()
     for at, field in enumerate(fields if triads else ()):
         words = set(words_of(table.header[at]))
         if field.canonical or not words or not words <= _DEVICE or (field.axis and field.sensor):
@@ -257,7 +247,7 @@ def _units_in_turn(table: LogTable) -> int:
     """
     columns = []
     for at, field in enumerate(fields_of(table.header)):
-        if table.names and field.sensor not in _TRIADS:
+        if table.names and field.sensor not in SENSORS:
             continue
         try:
             values = np.asarray(table.numbers(at)[:_ROWS], np.float64)
@@ -299,19 +289,19 @@ def _alike(table: LogTable, groups: Sequence[np.ndarray]) -> bool:
 
 def _sensor(tag: Any) -> str | None:
     """The sensor of three axes that a row's tag names."""
-    words = re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", str(tag)).lower())
-    return sensor if (sensor := sensor_of(tuple(words))[0]) in _TRIADS else None
+    return sensor if (sensor := sensor_of(tuple(words_of(str(tag))))[0]) in SENSORS else None
 
 
-def _joined(tables: list[tuple[str, LogTable]]) -> LogTable:
+def _joined(tables: list[LogTable]) -> LogTable:
     """The sensors' tables as one, in the order of their stamps."""
+    first = tables[0]
     if len(tables) == 1:
-        return tables[0][1]
-    held = [dict(zip(table.header, table.columns, strict=True)) for _, table in tables]
+        return first
+    held = [dict(zip(table.header, table.columns, strict=True)) for table in tables]
     names = list(dict.fromkeys(name for part in held for name in part))
     clock = next((name for name in names if all(name in part and rises(part[name]) for part in held)), None)
     if clock is None:
-        raise InputError(f"{tables[0][1].path}: the rows of its sensors share no column of time.")
+        raise InputError(f"{first.path}: the rows of its sensors share no column of time.")
     stamps = np.unique(np.concatenate([part[clock] for part in held]))
     columns = {name: np.full(len(stamps), np.nan) for name in names}
     for part in held:
@@ -319,5 +309,4 @@ def _joined(tables: list[tuple[str, LogTable]]) -> LogTable:
         for name, values in part.items():
             columns[name][places] = values
     columns[clock] = stamps
-    first = tables[0][1]
     return LogTable(replace(first.source, rows=len(stamps)), tuple(names), tuple(columns.values()), notes=first.notes)

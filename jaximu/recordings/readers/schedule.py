@@ -28,6 +28,8 @@ from jaximu.recordings.recording import ReadOptions, Recording
 
 _FIELDS = ("start", "stop", "kind", "x", "y", "z", "angle", "heading")
 _QUANTITIES = {"start": "time", "stop": "time", "angle": "angle", "heading": "angle"}
+_Columns = dict[str, tuple[int, float]]
+"""The place of each column, and the factor that takes it to SI."""
 _REFERENCES = ("table_angle", "table_rate", "attitude")
 
 
@@ -84,9 +86,9 @@ def read_schedule(path: str | os.PathLike[str]) -> tuple[ScheduleEntry, ...]:
     return tuple(entries)
 
 
-def _columns(header: Sequence[str], name: str) -> dict[str, tuple[int, float]]:
+def _columns(header: Sequence[str], name: str) -> _Columns:
     """The place of each column and the factor that takes it to SI."""
-    columns: dict[str, tuple[int, float]] = {}
+    columns: _Columns = {}
     for at, cell in enumerate(header):
         title, stated = parse_column(cell)
         title = title.strip().lower()
@@ -106,7 +108,7 @@ def _columns(header: Sequence[str], name: str) -> dict[str, tuple[int, float]]:
     return columns
 
 
-def _entry(cells: Sequence[str], columns: dict[str, tuple[int, float]], where: str) -> ScheduleEntry:
+def _entry(cells: Sequence[str], columns: _Columns, where: str) -> ScheduleEntry:
     def number(title: str, optional: bool = False) -> float:
         """NaN for an optional cell that is empty."""
         at, factor = columns.get(title, (len(cells), 1.0))
