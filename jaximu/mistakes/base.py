@@ -12,7 +12,7 @@ import numpy as np
 from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turning
 from jaximu.recordings.finding import Rows
-from jaximu.recordings.recording import Recording, Signal, runs_of, steps_of
+from jaximu.recordings.recording import Recording, Signal, floor_of, runs_of, steps_of
 
 TITLES = {
     "data.bumped_pose": "bumped pose",
@@ -152,9 +152,7 @@ class Sensor:
         """(n,) whether a sample lies in a block that varies no more than the quietest do."""
         _, mean, variance = self.blocks
         total = variance.sum(axis=1)
-        lowest = max(np.percentile(total, 5), 1e-30)
-        floor = np.median(total[total <= 3 * lowest]) if (total <= 3 * lowest).any() else lowest
-        floor = max(floor, self.signal.rounding_variance)
+        floor = max(floor_of(total), self.signal.rounding_variance)
         calm = total <= _QUIET * floor
         if len(mean) > 2:  # slow, smooth motion varies little within a block, but from block to block
             leave_out_both(calm, np.sum(np.diff(mean, axis=0) ** 2, axis=1) > 36 * floor + 1e-24)

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
@@ -100,8 +101,10 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
     return findings
 
 
-def _numbered(time: FloatArray) -> FloatArray | None:
-    """Numbers (n,) of the samples on a steady clock, gaps counted; None where stamps are off by more."""
+def _even(time: FloatArray) -> FloatArray | None:
+    """Stamps (n,) of the samples on a steady clock, gaps counted; None for few, or where they are off by more."""
+    if len(time) < 200:
+        return None
     interval = np.diff(time)
     breaks = np.flatnonzero(interval > 2.5 * np.median(interval)) + 1
     number = np.arange(len(time), dtype=np.float64)
@@ -115,28 +118,27 @@ def _numbered(time: FloatArray) -> FloatArray | None:
         missing = np.round((np.mean(delay[row : row + 20]) - np.mean(delay[max(0, row - 20) : row])) / period)
         number[row:] += max(0.0, missing)
     slope, start = np.polyfit(number, time, 1)
-    return number if np.max(np.abs((time - start) / slope - number)) < 0.75 else None
+    even = start + slope * number
+    return even if np.max(np.abs(time - even)) < 0.75 * slope else None
 
 
 def _evenly(recording: Recording) -> Recording:
     """Return the recording with jittering stamps of its triads replaced by those of a steady clock."""
-    changed = {}
-    for name in ("accelerometer", "gyroscope", "magnetometer"):
-        signal = recording.signals.get(name)
-        number = None if signal is None or len(signal) < 200 else _numbered(signal.time)
-        if signal is not None and number is not None:
-            slope, start = np.polyfit(number, signal.time, 1)
-            changed[name] = replace(signal, time=start + slope * number)
+    changed = {
+        name: replace(signal, time=even)
+        for name, signal in recording.signals.items()
+        if name in SENSOR_UNITS and (even := _even(signal.time)) is not None
+    }
     return replace(recording, **changed)
 
 
 def _smoother_evenly(sensor: Sensor) -> bool:
     """Whether the samples in motion lie on smoother curves by their number than by their stamps."""
-    number = _numbered(sensor.time)
-    if number is None or len(sensor) < 200:
+    even = _even(sensor.time)
+    if even is None:
         return False
     bends = []
-    for time in (number * sensor.period, sensor.time):
+    for time in (even, sensor.time):
         slope = sensor.difference / np.diff(time)[:, None]
         bend = np.abs(np.diff(slope, axis=0)).sum(axis=1) * sensor.period
         moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * np.sum(sensor.noise)
@@ -189,8 +191,9 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
 
 def steady_clock(recording: Recording) -> Recording:
     """Return the recording with the stamps of sensors that arrive in bursts replaced by those of a steady clock."""
-    changed = {}
-    for name, signal in recording.signals.items():
-        if len(signal) > 32 and in_bursts(np.diff(signal.time)):
-            changed[name] = replace(signal, time=_clock(signal.time)[0])
+    changed = {
+        name: replace(signal, time=_clock(signal.time)[0])
+        for name, signal in recording.signals.items()
+        if in_bursts(np.diff(signal.time))
+    }
     return replace(recording, **changed)

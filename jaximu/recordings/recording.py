@@ -679,6 +679,11 @@ def steps_of(values: FloatArray) -> FloatArray:
     return steps[steps > 1e-9 * np.ptp(values)]
 
 
+def floor_of(values: FloatArray) -> float:
+    """Return what values (n,) are where they are lowest: the median of those up to thrice the lowest twentieth's."""
+    return float(np.median(values[values <= 3 * np.percentile(values, 5)]))
+
+
 def runs_of(flags: BoolArray) -> NDArray[np.intp]:
     """(k, 2) first and last + 1 of every run of True."""
     return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)

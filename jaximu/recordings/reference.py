@@ -20,7 +20,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.rotation import unit_vectors
 from jaximu.recordings.attitude import UNIT_LENGTH
 from jaximu.recordings.entry import ScheduleEntry
-from jaximu.recordings.recording import Recording, Signal, runs_of
+from jaximu.recordings.recording import Recording, Signal, floor_of, runs_of
 
 _MOVING = np.radians(2.0)  # rad/s, mean rate over a second that no pose has
 _OFF = 20.0  # degrees between a pose's "up" and what the accelerometer reads as its data sheet has it
@@ -242,8 +242,7 @@ def entries_of_columns(recording: Recording) -> list[ScheduleEntry]:
 
 def _rests(time: FloatArray, moved: FloatArray, where: str) -> FloatArray:
     """Intervals (n, 2) over which the reference rests; `moved` (n,) is its rate at each stamp, its noise included."""
-    lowest = np.percentile(moved, 5)
-    limit = np.clip(_NOISY * np.median(moved[moved <= 3 * lowest]), _STILL, _MOVING)
+    limit = np.clip(_NOISY * floor_of(moved), _STILL, _MOVING)
     runs = runs_of(moved < limit)
     spans = np.stack([time[runs[:, 0]] + _WINDOW, time[runs[:, 1] - 1] - _WINDOW], axis=1)
     spans = spans[spans[:, 1] - spans[:, 0] >= _SHORTEST]

@@ -20,7 +20,7 @@ from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE
 from jaximu.recordings.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
-from jaximu.recordings.recording import PoseMeans, Recording, Signal, runs_of
+from jaximu.recordings.recording import PoseMeans, Recording, Signal, floor_of, runs_of
 
 THRESHOLDS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 200, 400)
 _DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one that broke in two
@@ -103,9 +103,7 @@ def _windows(moments: _Moments, centres: FloatArray, width: float) -> tuple[Floa
 
 def _floor(variance: FloatArray, moments: _Moments) -> float:
     """The variance of windows at rest: the median of those near the lowest."""
-    finite = variance[np.isfinite(variance)]
-    lowest = np.percentile(finite, 5)
-    floor = np.median(finite[finite <= 3 * lowest])
+    floor = floor_of(variance[np.isfinite(variance)])
     # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
     # simulated output without noise is constant but for the rounding of the running sums.
     total = moments.between(np.array([-np.inf]), np.array([np.inf]))[1].sum()

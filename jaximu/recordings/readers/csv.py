@@ -141,7 +141,7 @@ def _read_straight(path: Path, layout: _Layout) -> tuple[list[np.ndarray], pa.Sc
         for _ in range(layout.first):
             file.readline()
         while piece := file.read(_PIECE):
-            table = _parse(pa.BufferReader(piece + file.readline()), layout, 1 << 20)
+            table = _parse(piece + file.readline(), layout, 1 << 20)
             schemas.append(table.schema)
             parts.append([from_arrow(column) for column in table.columns])
         fields = [_common(kinds) for kinds in zip(*schemas, strict=True)]
@@ -171,16 +171,13 @@ def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np
     A column may be of any types.
     """
     body, rows = _body(data, layout)
-    notes: tuple[str, ...] = ()
-    for attempt in (1, 2):
-        try:
-            return _parse(pa.BufferReader(body), layout, block=min(len(body) + 1, _SINGLE_BLOCK)), rows, notes
-        except pa.ArrowInvalid as error:
-            if attempt == 1:
-                body, rows, notes = _without_remarks(body, layout, rows, path)
-                continue
-            raise InputError(f"{path}: cannot be read as a table: {str(error).splitlines()[0][:200]}") from None
-    raise AssertionError("the second attempt returns or raises")
+    with suppress(pa.ArrowInvalid):
+        return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, ()
+    body, rows, notes = _without_remarks(body, layout, rows, path)
+    try:
+        return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, notes
+    except pa.ArrowInvalid as error:
+        raise InputError(f"{path}: cannot be read as a table: {str(error).splitlines()[0][:200]}") from None
 
 
 def _text(line: bytes) -> str:
@@ -310,9 +307,9 @@ def _body(data: bytes, layout: _Layout) -> tuple[bytes, np.ndarray]:
     return data, np.array(kept) + 1
 
 
-def _parse(file: pa.NativeFile, layout: _Layout, block: int) -> pa.Table:
+def _parse(data: bytes, layout: _Layout, block: int) -> pa.Table:
     return pc.read_csv(
-        file,
+        pa.BufferReader(data),
         read_options=pc.ReadOptions(
             column_names=[f"c{at}" for at in range(layout.width)],
             block_size=block,

@@ -22,7 +22,7 @@ from jaximu.ground.quantities import counted
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.columns import nominal
-from jaximu.recordings.columns.choose import choose_columns, choose_pair, column_units
+from jaximu.recordings.columns.choose import Used, choose_columns, choose_pair, column_units
 from jaximu.recordings.columns.guess import Advice, advise, without_gravity
 from jaximu.recordings.columns.known import JOINED, known_names, whole_stamps
 from jaximu.recordings.columns.names import (
@@ -785,9 +785,7 @@ def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
     return stamps[0] + (np.round(even).astype(stamps.dtype) if whole else even)
 
 
-def _stamps(
-    table: LogTable, used: dict[str, tuple[int, Unit]], options: ReadOptions
-) -> tuple[FloatArray, Fraction | float, list[str]]:
+def _stamps(table: LogTable, used: Used, options: ReadOptions) -> tuple[FloatArray, Fraction | float, list[str]]:
     """(rows,) seconds since the first stamp (NaN where it is missing), that stamp in seconds, notes.
 
     Integer stamps (nanoseconds since 1970 do not fit a float64) are subtracted before they become floats.

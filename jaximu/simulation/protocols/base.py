@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import ClassVar
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -23,6 +23,16 @@ class Plan:
     motion: Motion
     intervals: tuple[ScheduleEntry, ...]
     columns: tuple[str, ...] = ()  # of `Recording`: temperature, ambient_temperature, current, attitude, table_rate
+
+
+def may_be_zero(default: float = 0.0) -> Any:
+    """Return a field of a protocol that may be zero, as others may not."""
+    return field(default=default, metadata={"zero": True})
+
+
+def signed(default: float | tuple[float, float, float]) -> Any:
+    """Return a field of a protocol that may have any sign."""
+    return field(default=default, metadata={"signed": True})
 
 
 @dataclass(frozen=True)
