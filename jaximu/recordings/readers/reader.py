@@ -469,12 +469,13 @@ def _tables_of(path: str | os.PathLike[str], options: ReadOptions) -> tuple[LogT
 
 def _of_sensors(tables: Mapping[str, LogTable]) -> list[LogTable]:
     """The sensors of a recording of several files; what cannot be used beside the accelerometer is left out."""
-    first, *others = tables.items()
-    whole, notes = [of_sensor(table, sensor) for sensor, table in [first]], []
-    for sensor, table in others:
+    whole, notes = [], []
+    for sensor, table in tables.items():
         try:
             whole.append(of_sensor(table, sensor))
         except InputError as error:
+            if not whole:
+                raise
             notes.append(f"not used: {error.args[0]}")
     return [whole[0].noted(*notes), *whole[1:]]
 
