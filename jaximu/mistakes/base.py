@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.array_types import BoolArray, FloatArray
-from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turning
+from jaximu.ground.distributions import robust_sigma
+from jaximu.recordings.alignment import TURN_ANGLE, BlockMeans, Clocks, clocks, gravity_turning
 from jaximu.recordings.finding import Rows
 from jaximu.recordings.recording import Recording, Signal, floor_of, runs_of, steps_of
 
@@ -40,7 +41,6 @@ _FEW_STEPS = 3.5
 _BLOCK = 0.25  # s, over which scatter is taken to tell rest from motion
 _QUIET = 6.0  # times the floor of the variance up to which a block counts as rest
 _SHORTEST_REST = 0.75  # s
-_TURN = np.radians(20)  # from one rest to the next, that makes another pose of it
 _RESTED = 0.9  # share of a recording that is quiet where it was made of a unit at rest
 _UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 _CURVATURE_NOISE = float(np.sqrt(1 + 34 / 36))  # of a sample's difference from the cubic through its neighbours
@@ -269,7 +269,7 @@ class Samples:
             angle = np.cumsum((rate.values - np.median(rate.values, axis=0)) * rate.period, axis=0)
             runs = runs_of(~rate.quiet)
             far = np.linalg.norm(angle[runs[:, 1] - 1] - angle[runs[:, 0]], axis=1)
-            if np.max(far, initial=0.0) > _TURN:
+            if np.max(far, initial=0.0) > TURN_ANGLE:
                 return True
         return self._reversals is None or self._reversals > 0
 
@@ -292,7 +292,7 @@ class Samples:
         if np.ptp(size) > 0.5 * np.median(size):
             return None
         cosine = np.sum(means[1:] * means[:-1], axis=1) / np.maximum(size[1:] * size[:-1], 1e-300)
-        return int(np.sum(cosine < np.cos(_TURN)))
+        return int(np.sum(cosine < np.cos(TURN_ANGLE)))
 
 
 def spans_of(flags: BoolArray, time: FloatArray, shortest: float) -> FloatArray:
@@ -314,8 +314,8 @@ def scale_around(misfit: FloatArray, before: bool = True) -> FloatArray:
     """
     size = 16
     blocks = max(1, len(misfit) // size)
-    columns = np.abs(np.ascontiguousarray(misfit[: blocks * size].T))
-    scale = 1.4826 * np.stack([np.median(axis.reshape(blocks, -1), axis=1) for axis in columns], axis=1)
+    columns = np.ascontiguousarray(misfit[: blocks * size].T)
+    scale = np.stack([robust_sigma(axis.reshape(blocks, -1), axis=1) for axis in columns], axis=1)
     wide = np.maximum(scale, np.concatenate([scale[1:], scale[-2:][:1]]))  # the last one has none after it
     if before:
         wide[1:-1] = np.maximum(wide[1:-1], scale[:-2])

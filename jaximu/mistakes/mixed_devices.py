@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import robust_sigma
 from jaximu.mistakes.base import Samples, Sensor, leave_out_both, spans_of
 from jaximu.mistakes.lost_samples import steps
 from jaximu.recordings.alignment import carried, turning
@@ -165,6 +166,6 @@ def _furthest(values: FloatArray, first: int, stop: int) -> tuple[float, int]:
 def _apart(before: FloatArray, after: FloatArray) -> float:
     """How far the medians of rests before and after lie apart, in robust standard deviations of one rest."""
     middle = np.median(before, axis=0), np.median(after, axis=0)
-    spread = [1.4826 * np.median(np.abs(part - m), axis=0) for part, m in zip((before, after), middle, strict=True)]
+    spread = [robust_sigma(part - m, axis=0) for part, m in zip((before, after), middle, strict=True)]
     scale = np.maximum(np.maximum(*spread), 1e-9 * np.maximum(np.max(np.abs([*before, *after]), axis=0), 1e-300))
     return float(np.max(np.abs(middle[1] - middle[0]) / scale))

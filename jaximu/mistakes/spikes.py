@@ -7,6 +7,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.differences import interpolated
+from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.quantities import counted, size
 from jaximu.mistakes.base import BRIDGED, Samples, Sensor
 from jaximu.recordings.alignment import turned_between
@@ -76,8 +77,8 @@ def _wild(celsius: FloatArray) -> Rows:
         return NO_ROWS
     values = celsius[change]
     middle = np.median(sliding_window_view(np.pad(values, _WINDOW // 2, "edge"), _WINDOW), axis=1)
-    off = np.abs(values - middle)
-    wild = off > max(_JUMP, _TIMES * 1.4826 * np.median(off))
+    off = values - middle
+    wild = np.abs(off) > max(_JUMP, _TIMES * robust_sigma(off))
     return np.flatnonzero(np.repeat(wild, np.diff(change, append=len(celsius))))
 
 

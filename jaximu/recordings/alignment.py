@@ -223,7 +223,7 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
 
 _TURN_SECONDS, _TURN_STEPS, _MOST = 10.0, 128, 24
 """Longest turn from rest to rest, s, the steps in which its rotation is put together, and turns that are enough."""
-_TURN_ANGLE = np.radians(20)
+TURN_ANGLE = np.radians(20)
 """Angle by which gravity must turn from rest to rest to show anything."""
 _JUMP = 0.15
 """Share of the way from one rest's gravity to the next's that may lie before and behind a jump."""
@@ -276,7 +276,7 @@ def carried(
         and interval[slice(*np.searchsorted(rate_time, (start, stop)))].max(initial=0.0) < gap
         for (_, start), (stop, _), a, b in zip(rests, rests[1:], middle, middle[1:], strict=False)
     ]
-    turned = np.sum(up[1:] * up[:-1], axis=1) < np.cos(_TURN_ANGLE)
+    turned = np.sum(up[1:] * up[:-1], axis=1) < np.cos(TURN_ANGLE)
     kept = [
         not _jumps(force[stop:start], *up[[at, at + 1]]) for at, ((_, stop), (start, _)) in enumerate(pairwise(edges))
     ]

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSORS, column_title, parse_column
 from jaximu.recordings.columns.habits import fields_of, sensor_of, words_of
@@ -271,8 +272,7 @@ def _differ_in_turn(values: np.ndarray, count: int) -> bool:
     fourth = parts.shape[1] // 4
     pattern = np.sort(parts, axis=1)[:, fourth : parts.shape[1] - fourth].mean(axis=1)
     middle = np.median(pattern, axis=0)
-    scatter = 1.4826 * np.median(np.abs(pattern - middle), axis=0).max()
-    usual = 1.4826 * np.median(np.abs(parts - pattern[:, None]))
+    scatter, usual = robust_sigma(pattern - middle, axis=0).max(), robust_sigma(parts - pattern[:, None])
     apart = np.ptp(middle)  # rows that repeat themselves to the last digit were made
     return bool(apart > max(_DISTINCT * scatter, _PLAIN * usual) and scatter > 1e-9 * apart)
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError, readable
 from jaximu.ground.units import parse_column, unit
+from jaximu.recordings.attitude import UNIT_LENGTH
 from jaximu.recordings.columns.names import GROUPS, header_columns
 from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.readers.reader import extract, read_table
@@ -133,7 +134,7 @@ def _entry(cells: Sequence[str], columns: _Columns, where: str) -> ScheduleEntry
         raise InputError(f"{where}: stop ({stop:g} s) is not after start ({start:g} s).")
     vector = np.array([number(axis) for axis in "xyz"])
     length = np.linalg.norm(vector)
-    if abs(length - 1) > 0.01:
+    if abs(length - 1) > UNIT_LENGTH:
         raise InputError(f"{where}: x, y, z has the length {length:.4g}; a direction has the length 1.")
     angle, heading = (number(title, optional=True) for title in ("angle", "heading"))
     angle = 0.0 if math.isnan(angle) else angle
