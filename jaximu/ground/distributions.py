@@ -1,4 +1,4 @@
-"""Root mean squares, medians; tails of distributions by SciPy's special functions: `scipy.stats` takes longer to load."""
+"""Root mean squares, medians, tails of distributions: by SciPy's functions, as `scipy.stats` takes longer to load."""
 
 import numpy as np
 import scipy

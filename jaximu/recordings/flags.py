@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import replace
 
 import numpy as np
 
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import FilePath, InputError
 from jaximu.recordings.readers.reader import read_table
 from jaximu.recordings.recording import Recording
 
 _STATUS = re.compile(r"(?:^|[^a-z])(?:status|flags?|errors?|faults?)(?:$|[^a-z])", re.IGNORECASE)
 
 
-def without_flagged(recording: Recording, path: str | os.PathLike[str]) -> Recording:
+def without_flagged(recording: Recording, path: FilePath) -> Recording:
     """Return a recording without the rows of its file in which a status column is not as usual, and say so.
 
     A column whose name holds status, flag, error or fault counts. Only rows of sensors that share the file's stamps are

@@ -12,9 +12,8 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import interpolated
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError
@@ -684,7 +683,7 @@ def floor_of(values: FloatArray) -> float:
     return float(np.median(values[values <= 3 * np.percentile(values, 5)]))
 
 
-def runs_of(flags: BoolArray) -> NDArray[np.intp]:
+def runs_of(flags: BoolArray) -> IntArray:
     """(k, 2) first and last + 1 of every run of True."""
     return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
 

@@ -12,9 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.differences import interpolated
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.rotation import unit_vectors
@@ -251,7 +250,7 @@ def _rests(time: FloatArray, moved: FloatArray, where: str) -> FloatArray:
     return spans
 
 
-def _neighbours(count: int, samples: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _neighbours(count: int, samples: float) -> tuple[IntArray, IntArray]:
     """The samples so many before and after each of `count`, as far as there are any."""
     step, index = max(1, round(samples)), np.arange(count)
     return np.maximum(index - step, 0), np.minimum(index + step, count - 1)

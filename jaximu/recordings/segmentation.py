@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.equality import Comparable
@@ -84,7 +83,7 @@ class _Moments:
         np.cumsum(values, axis=1, out=self._sums[:, 1:])
         np.cumsum(np.square(values, out=values), axis=1, out=self._squares[:, 1:])
 
-    def between(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+    def between(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
         """Mean (W, 3) and unbiased variance (W, 3) of the samples from `start` to before `stop`, and their number."""
         first, last = np.searchsorted(self.signal.time, start), np.searchsorted(self.signal.time, stop)
         count = last - first

@@ -36,8 +36,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from jaximu.ground.document import file_digest, read_toml
-from jaximu.ground.errors import InputError, only
+from jaximu.ground.document import Json, file_digest, read_toml
+from jaximu.ground.errors import FilePath, InputError, only
 
 _REFERENCE = ("name", "certificate", "expires", "file", "value", "uncertainty")
 _CERTIFICATE = ("number", "laboratory", "address", "customer", "authorised_by")
@@ -48,20 +48,20 @@ NEEDED = (
 """What ISO/IEC 17025, 7.8.2 and 7.8.4, asks of a certificate and the recording does not say."""
 
 
-def sidecar(log: str | os.PathLike[str]) -> Path | None:
+def sidecar(log: FilePath) -> Path | None:
     """Return the file beside a log that says what it is traced by; None where there is none."""
     path = Path(f"{os.fspath(log)}.trace.toml")
     return path if path.is_file() else None
 
 
-def read_trace(path: str | os.PathLike[str] | None, stated: Mapping[str, str | None] | None = None) -> dict[str, Any]:
+def read_trace(path: FilePath | None, stated: Mapping[str, str | None] | None = None) -> Json:
     """Return what a file, if any, and options say; options go first.
 
     Raises `InputError` naming file and key: what is not known, has no text, or a reference whose certificate had
     expired on the day of the calibration.
     """
     name, document = ("the options", {}) if path is None else (os.fspath(path), read_toml(path))
-    trace: dict[str, Any] = {}
+    trace: Json = {}
     for key, value in document.items():
         where = f"{name}, {key}"
         if key in _SAID:

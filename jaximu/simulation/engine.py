@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -16,8 +15,8 @@ import numpy as np
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
-from jaximu.ground.document import SOFTWARE, Document
-from jaximu.ground.errors import InputError
+from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
 from jaximu.ground.tracing import is_traced
@@ -124,11 +123,11 @@ class Truth(Document):
         poses = [interval for interval in self.schedule if interval.kind == "pose"]
         return np.array([(pose.start, pose.stop) for pose in poses]).reshape(-1, 2)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the truth as the JSON document of schema `jaximu.truth/1`."""
         case, motion = self.case, self.case.plan.motion
 
-        def documents(effects: Iterable[Effect], output_unit: str = "") -> dict[str, Any]:
+        def documents(effects: Iterable[Effect], output_unit: str = "") -> Json:
             return {effect.name: effect.document(output_unit) for effect in effects}
 
         triads = {
@@ -178,7 +177,7 @@ class Truth(Document):
             "software": SOFTWARE,
         }
 
-    def save_schedule(self, path: str | os.PathLike[str]) -> None:
+    def save_schedule(self, path: FilePath) -> None:
         """Write rests and turns as a turntable schedule (CSV, angles in degrees), as `--reference` reads it."""
         lines = ["start [s],stop [s],kind,x,y,z,angle [deg],heading [deg]"]
         for interval in self.schedule:
@@ -370,7 +369,7 @@ def simulate_cases(cases: Sequence[Case]) -> list[tuple[Recording, Truth]]:
     return [(_recording(case, parts), Truth(case, notes)) for case, parts, notes in units]
 
 
-def write_case(case: Case, path: str | os.PathLike[str]) -> Truth:
+def write_case(case: Case, path: FilePath) -> Truth:
     """Simulate a case into a file, by its suffix; Parquet in bounded memory, whole or not at all. Return the truth."""
     if Path(path).suffix.lower() == ".parquet":
         source = Stream([case])

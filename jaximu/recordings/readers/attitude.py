@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.units import parse_column, unit
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.columns.table import LogTable
@@ -43,7 +43,7 @@ _EPOCHS = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "µs"), (1e11, 1e-3, "ms"))
 """Stamps above these count since 1970 in the unit named."""
 
 
-def read_attitude(path: str | os.PathLike[str]) -> Attitude:
+def read_attitude(path: FilePath) -> Attitude:
     """Read what a reference says of a body's attitude, from the body to a frame whose z points up.
 
     A table (CSV, Parquet, MAT, …) with a column for each of: time; a quaternion (qw … qz, attitude_w …, or q0 … q3 with
@@ -60,12 +60,12 @@ def read_attitude(path: str | os.PathLike[str]) -> Attitude:
     )
 
 
-def holds_attitude(path: str | os.PathLike[str]) -> bool:
+def holds_attitude(path: FilePath) -> bool:
     """Return whether a file has columns of an attitude. Raises `InputError` where it cannot be read."""
     return bool(_tables(path))
 
 
-def _tables(path: str | os.PathLike[str]) -> list[tuple[LogTable, _Places]]:
+def _tables(path: FilePath) -> list[tuple[LogTable, _Places]]:
     """Return the tables of a file that hold an attitude, and where their columns are."""
     tables = [(table, _places(table)) for table in map(_named, read_tables(path))]
     kinds = {"quaternion", "numbered", "euler", "rotation vector", "table angles"}

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError, name_of, readable
+from jaximu.ground.errors import FilePath, InputError, name_of, readable
 from jaximu.ground.quantities import counted
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, parse_column
 from jaximu.ground.units import unit as unit_named
@@ -85,8 +85,8 @@ def _noted(notes: Sequence[str]) -> Iterator[None]:
 
 
 def read_recording(
-    path: str | os.PathLike[str],
-    gyro_log: str | os.PathLike[str] | None = None,
+    path: FilePath,
+    gyro_log: FilePath | None = None,
     options: ReadOptions | None = None,
     require_gyroscope: bool = False,
 ) -> Recording:
@@ -127,7 +127,7 @@ def read_recording(
     return recording
 
 
-def _read(path: str | os.PathLike[str], options: ReadOptions) -> list[LogTable]:
+def _read(path: FilePath, options: ReadOptions) -> list[LogTable]:
     """The tables of a file, with the rows of one unit where several write into it in turn."""
     tables = read_tables(path, options)
     usual = (options.like or Reading()).device
@@ -260,7 +260,7 @@ def _finished(parts: "Sequence[_FilePart]", table: LogTable, options: ReadOption
     return replace(recording, notes=(*recording.notes, *notes))
 
 
-def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None = None) -> tuple[Signal, float, Source]:
+def read_magnetometer(path: FilePath, options: ReadOptions | None = None) -> tuple[Signal, float, Source]:
     """Return the magnetometer of a file that may hold nothing else, the absolute stamp of its t = 0, and its source.
 
     A field needs no clock: where neither stamps nor a rate are known, a row counts as a second. Raises InputError
@@ -285,7 +285,7 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     return signal, float(part.origin), part.source
 
 
-def read_means(path: str | os.PathLike[str], options: ReadOptions | None = None) -> PoseMeans:
+def read_means(path: FilePath, options: ReadOptions | None = None) -> PoseMeans:
     """Return the poses of a table with a row of mean outputs a pose, as papers print them.
 
     Columns `accel_x [m/s^2]`, … and perhaps `gyro_x [deg/s]`, … hold the means; `accel_sigma_x [m/s^2]`, … the samples'
@@ -411,7 +411,7 @@ def _of_text(head: bytes, name: str) -> _Format:
     return _PRINTED if prints(head) else _TEXT
 
 
-def read_table(path: str | os.PathLike[str]) -> LogTable:
+def read_table(path: FilePath) -> LogTable:
     """The columns of a file that is one table. Raises InputError naming the file."""
     first, *others = read_tables(path)
     if others:
@@ -433,7 +433,7 @@ def tables_kept() -> Iterator[None]:
         _KEPT.reset(token)
 
 
-def read_tables(path: str | os.PathLike[str], options: ReadOptions = _ANY) -> tuple[LogTable, ...]:
+def read_tables(path: FilePath, options: ReadOptions = _ANY) -> tuple[LogTable, ...]:
     """The tables of a file, the accelerometer's first; the format is found from the content.
 
     Of `options` topic, instance and stamp count. Raises InputError naming the file, and the package to install where
@@ -447,7 +447,7 @@ def read_tables(path: str | os.PathLike[str], options: ReadOptions = _ANY) -> tu
     return kept[key]
 
 
-def _tables_of(path: str | os.PathLike[str], options: ReadOptions) -> tuple[LogTable, ...]:
+def _tables_of(path: FilePath, options: ReadOptions) -> tuple[LogTable, ...]:
     name, file = name_of(path), Path(path)
     with readable(file):
         archive = is_archive(file)
@@ -515,7 +515,7 @@ def _tables_of_file(file: Path, name: str, options: ReadOptions) -> tuple[LogTab
     return tuple(_checked(table, source) for table in (tables if isinstance(tables, tuple) else (tables,)))
 
 
-def advise_reading(path: str | os.PathLike[str], rate: float | None = None) -> Advice | None:
+def advise_reading(path: FilePath, rate: float | None = None) -> Advice | None:
     """How to read a table whose header does not say it all; None for a log that names its columns itself.
 
     `rate`: Hz, where it is known. Raises InputError as `read_tables` does.

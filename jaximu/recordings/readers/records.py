@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.distributions import robust_sigma
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSORS, column_title, parse_column
 from jaximu.recordings.columns.habits import fields_of, sensor_of, words_of
@@ -50,7 +51,7 @@ def read(data: bytes, source: Source) -> LogTable | tuple[LogTable, ...]:
     raise InputError(f"{source.path}: holds no columns of numbers.")
 
 
-def _records(document: Any) -> list[dict[str, Any]] | None:
+def _records(document: Any) -> list[Json] | None:
     """The longest list of records, or of rows under a list of names, in a document."""
     if isinstance(document, list):
         return [record for record in document if isinstance(record, dict)] if any(map(_is_record, document)) else None
@@ -80,7 +81,7 @@ def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield prefix + name, item
 
 
-def _columns(records: list[dict[str, Any]]) -> dict[str, list[Any]]:
+def _columns(records: list[Json]) -> dict[str, list[Any]]:
     flat = [dict(_leaves(record)) for record in records]
     names = dict.fromkeys(name for record in flat for name in record)
     return {name: [record.get(name) for record in flat] for name in names}
@@ -107,12 +108,12 @@ def _table(columns: Mapping[str, Any], source: Source) -> LogTable:
     return table_of(arrays, source)
 
 
-def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[LogTable]:
+def _by_sensor(records: list[Json], source: Source) -> Iterator[LogTable]:
     """A table for each sensor that the records name."""
     tag = next((key for key in records[0] if key.lower() in _TAGS and isinstance(records[0][key], str)), None)
     if tag is None:
         return
-    parts: dict[str, list[dict[str, Any]]] = {}
+    parts: dict[str, list[Json]] = {}
     for record in records:
         if (sensor := _sensor(record.get(tag, ""))) and len(record) > 3:
             parts.setdefault(sensor, []).append(record)

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.ground.errors import InputError, readable
+from jaximu.ground.errors import FilePath, InputError, readable
 from jaximu.ground.units import parse_column, unit
 from jaximu.recordings.attitude import UNIT_LENGTH
 from jaximu.recordings.columns.names import GROUPS, header_columns
@@ -34,7 +34,7 @@ _Columns = dict[str, tuple[int, float]]
 _REFERENCES = ("table_angle", "table_rate", "attitude")
 
 
-def read_reference(path: str | os.PathLike[str], recording: Recording) -> tuple[ScheduleEntry, ...] | Recording:
+def read_reference(path: FilePath, recording: Recording) -> tuple[ScheduleEntry, ...] | Recording:
     """Return the entries of a schedule or of named sections; or the recording with the reference columns of the file.
 
     Entries are on the recording's own clock, seconds since `recording.start`. Raises InputError naming file and row.
@@ -70,7 +70,7 @@ def _text(name: str) -> str:
         return Path(name).read_bytes().decode("utf-8-sig", errors="replace")
 
 
-def read_schedule(path: str | os.PathLike[str]) -> tuple[ScheduleEntry, ...]:
+def read_schedule(path: FilePath) -> tuple[ScheduleEntry, ...]:
     """Return the entries of a turntable schedule, on the log's clock, in order of time.
 
     Raises InputError naming the row for a cell that is missing or not understood, entries that overlap, and a header
