@@ -376,7 +376,7 @@ def _still_seconds(recording: Recording) -> tuple[float, BoolArray, FloatArray]:
         edges = np.searchsorted(signal.time, start + np.arange(seconds + 1))
         middle = np.median(signal.si(), axis=0)
         values = signal.si() - middle
-        sums, squares = (np.vstack([np.zeros(3), np.cumsum(values**power, axis=0)]) for power in (1, 2))
+        sums, squares = (np.cumulative_sum(values**power, axis=0, include_initial=True) for power in (1, 2))
         count = np.diff(edges)
         safe = np.maximum(count, 1)[:, None]
         mean = np.diff(sums[edges], axis=0) / safe

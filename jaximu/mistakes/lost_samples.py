@@ -138,7 +138,7 @@ def _pairs(samples: Samples, lost: FloatArray, intervals: Rows, half: int, sure:
         for trial, loss in zip(trials, losses, strict=True):
             for interval in trial:
                 loss[interval - rows[0]] += 1
-        time = np.arange(len(rows)) + np.hstack([np.zeros((len(trials), 1)), np.cumsum(losses, axis=1)])
+        time = np.arange(len(rows)) + np.cumulative_sum(losses, axis=1, include_initial=True)
         time = (time - time[:, width : width + 1]) / width
         design = np.stack([time**power for power in range(5)], axis=2)
         basis, _ = np.linalg.qr(design)

@@ -164,7 +164,7 @@ def _rest(samples: Samples, still: BoolArray) -> bool:
             if not len(runs):
                 continue
             values = sensor.values - sensor.values.mean(axis=0)
-            sums, squares = (np.cumsum(np.pad(part, ((1, 0), (0, 0))), axis=0) for part in (values, values**2))
+            sums, squares = (np.cumulative_sum(part, axis=0, include_initial=True) for part in (values, values**2))
             length = np.diff(runs)
             mean, square = ((total[runs[:, 1]] - total[runs[:, 0]]) / length for total in (sums, squares))
             if np.median(np.sum(square - mean**2, axis=1)) > _SHAKEN[name] ** 2:

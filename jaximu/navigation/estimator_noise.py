@@ -270,7 +270,7 @@ class MeasuredErrors:
         if self.position is not None:
             away = self.position[last] - self.position[first] - self.velocity[first] * time[:, None]
             errors.append(np.asarray(integrated[2]) - at_start.inv().apply(away + up * time[:, None] ** 2 / 2))
-        edges = self.stamp[first][:, None] + np.concatenate([np.zeros((len(held), 1)), np.cumsum(held, axis=1)], axis=1)
+        edges = self.stamp[first][:, None] + np.cumulative_sum(held, axis=1, include_initial=True)
         edges = np.clip(edges, self.stamp[0], self.stamp[-1])
         path = scipy.spatial.transform.Slerp(self.stamp, known)(edges.ravel()).as_quat()
         before, after = (
@@ -294,7 +294,7 @@ def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatAr
 def _without_gaps(since: FloatArray, until: FloatArray, start: FloatArray, stop: FloatArray) -> BoolArray:
     """Whether no sample between two times holds far longer than others do."""
     lengths = until - since
-    long = np.concatenate([[0], np.cumsum(lengths > 2.5 * np.median(lengths))])
+    long = np.cumulative_sum(lengths > 2.5 * np.median(lengths), include_initial=True)
     return long[np.searchsorted(since, stop)] == long[np.searchsorted(until, start)]
 
 

@@ -253,7 +253,7 @@ def _integrated(row: FloatArray) -> tuple[FloatArray, NDArray[np.int32] | None]:
     mean = np.nansum(row) / max(1, len(row) - lost.sum())
     points = np.zeros(len(row) + 1)
     np.cumsum(np.where(lost, 0.0, row - mean), out=points[1:])
-    return points, np.concatenate([[0], np.cumsum(lost)]).astype(np.int32) if lost.any() else None
+    return points, np.cumulative_sum(lost, dtype=np.int32, include_initial=True) if lost.any() else None
 
 
 def _mean_squares(

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.differences import interpolated
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.distributions import student_isf
 
 _BLOCK = 0.2
@@ -92,7 +92,7 @@ def angle_of(rotation: FloatArray) -> float:
 
 def turned_between(time: FloatArray, rate: FloatArray) -> FloatArray:
     """Return the angle (m - 1, 3) by which rates (m, 3) turn from each stamp to the next, by the trapezoid."""
-    return 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None]
+    return midpoints(rate) * np.diff(time)[:, None]
 
 
 class BlockMeans(NamedTuple):
@@ -143,7 +143,7 @@ def gravity_turning(
     for gap in np.flatnonzero(step > max(_BLOCK, 2.5 * np.median(step))):
         first, last = np.searchsorted(centre, rate_time[gap : gap + 2])
         weight[max(first - 1, 0) : last] = 0.0
-    return BlockMeans(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
+    return BlockMeans(centre, midpoints(mean), change, weight, rate_time, angle)
 
 
 _TURNED = 0.1
@@ -204,7 +204,7 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     if len(starts) < _CLEAR:
         return False
     rows = starts[:, None] + np.arange(span)
-    turn = np.stack([np.interp(force_time[rows], rate_time, axis) for axis in (rate - np.median(rate, axis=0)).T], 2)
+    turn = interpolated(rate_time, rate - np.median(rate, axis=0), force_time[rows])
     steps = turn * np.gradient(force_time)[rows][:, :, None]
     turning = np.linalg.norm(steps, axis=2).sum(axis=1) > 0.5
     if turning.sum() < _CLEAR:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
-from jaximu.ground.differences import interpolated
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
@@ -101,8 +101,8 @@ class Signal(Comparable):
     @property
     def edges(self) -> FloatArray:
         """(n + 1,) where samples begin and end: half way between neighbours, half a period beyond the outer two."""
-        middle, half = (self.time[1:] + self.time[:-1]) / 2, 0.5 / self.rate
-        return np.concatenate([[self.time[0] - half], middle, [self.time[-1] + half]])
+        half = 0.5 / self.rate
+        return np.concatenate([[self.time[0] - half], midpoints(self.time), [self.time[-1] + half]])
 
     def at(self, times: FloatArray) -> FloatArray:
         """(..., m) the output at times (...), along straight lines; the first and last value beyond the ends."""

@@ -172,7 +172,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     gyroscope, scan = recording.gyroscope, _Scan.of(recording, options.window)
     width, centres, moments, means, ratio = scan.width, scan.centres, scan.moments, scan.means, scan.ratio
     turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
-    sums = np.vstack([np.zeros(3), np.cumsum(means[0], axis=0)])
+    sums = np.cumulative_sum(means[0], axis=0, include_initial=True)
 
     def runs(factor: float) -> tuple[FloatArray, int]:
         # A unit held by hand trembles: where much variance must pass as still, so must the mean rate it brings along.

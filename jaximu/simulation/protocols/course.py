@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
+from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.recordings.entry import ScheduleEntry
 from jaximu.simulation.protocols.motion import Motion, earth_rate, field_of
@@ -88,7 +89,7 @@ def attitude_of(up: ArrayLike, heading: ArrayLike = 0.0) -> Rotation:
     (rad) about it.
     """
     up = np.asarray(up, float)
-    x, y, z = np.moveaxis(up / np.linalg.norm(up, axis=-1, keepdims=True), -1, 0)
+    x, y, z = np.moveaxis(unit_vectors(up), -1, 0)
     azimuth = np.where(np.hypot(x, y) < 1e-9, 0.0, np.arctan2(y, x))  # where z is up or down, rounding has none
     angles = [np.broadcast_to(heading, z.shape), -np.arccos(np.clip(z, -1, 1)), -azimuth]
     # Rz(heading) Ry(−polar angle) Rz(−azimuth)
