@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.distributions import robust_sigma
-from jaximu.recordings.alignment import TURN_ANGLE, BlockMeans, Clocks, clocks, gravity_turning
+from jaximu.recordings.alignment import TURN_ANGLE, BlockMeans, Clocks, clocks, gravity_turning, of_each
 from jaximu.recordings.finding import Rows
-from jaximu.recordings.recording import Recording, Signal, floor_of, runs_of, steps_of
+from jaximu.recordings.recording import GAP, Recording, Signal, floor_of, runs_of, steps_of
 
 TITLES = {
     "data.bumped_pose": "bumped pose",
@@ -86,7 +86,7 @@ class Sensor:
     @cached_property
     def even(self) -> BoolArray:
         """(n − 1,) whether an interval is no gap."""
-        return np.asarray(self.interval, np.float64) < 1.6 * max(self.period, np.mean(self.interval))
+        return np.asarray(self.interval, np.float64) < GAP * max(self.period, np.mean(self.interval))
 
     @cached_property
     def curvature(self) -> FloatArray:
@@ -168,6 +168,10 @@ class Sensor:
         """Return for each sample (n,) what holds for its block (b,); those behind the last one belong to it."""
         return by_block[np.minimum(np.arange(len(self)) // self.block_size, len(by_block) - 1)]
 
+    def next_to(self, times: FloatArray) -> IntArray:
+        """Return the row (k,) of the first sample at or after each time (k,), or of the last one."""
+        return np.minimum(np.searchsorted(self.time, times), len(self) - 1)
+
     def rows(self, indices: Any) -> tuple[int, ...]:
         """Return the first few rows concerned as a person counts them in the recording as it was given."""
         return tuple(int(row) + 1 for row in self.origin[list(indices)[:_SHOWN]])
@@ -230,8 +234,7 @@ class Samples:
         other = self.gyroscope if sensor is self.accelerometer else self.accelerometer
         if other is None or self.shared:
             return (other or sensor).quiet
-        nearest = np.clip(np.searchsorted(other.time, sensor.time), 0, len(other) - 1)
-        return other.quiet[nearest]
+        return other.quiet[other.next_to(sensor.time)]
 
     @cached_property
     def turning(self) -> BlockMeans | None:
@@ -287,7 +290,7 @@ class Samples:
         if sensor is None or not len(rests):
             return 0
         edges = np.searchsorted(sensor.time, rests)
-        means = np.stack([np.median(sensor.values[a : max(b, a + 1)], axis=0) for a, b in edges])
+        means = of_each(np.median, sensor.values, edges)
         size = np.linalg.norm(means, axis=1)
         if np.ptp(size) > 0.5 * np.median(size):
             return None

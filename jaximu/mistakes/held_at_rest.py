@@ -7,6 +7,7 @@ import numpy as np
 from jaximu.ground.array_types import BoolArray
 from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Samples, Sensor, with_signal
+from jaximu.recordings.alignment import of_each
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
 
@@ -108,7 +109,7 @@ def _high_passed(samples: Samples, sensor: Sensor) -> list[Finding]:
     edges = edges[edges[:, 1] - edges[:, 0] > 5]
     if len(edges) < 2 * _FEWEST:
         return []
-    rate, turned = (np.stack([values[a:b].mean(axis=0) for a, b in edges]) for values in (sensor.values, angle))
+    rate, turned = (of_each(np.mean, values, edges) for values in (sensor.values, angle))
     rate, turned = rate - rate.mean(axis=0), turned - turned.mean(axis=0)
     power = np.sum(turned**2)
     if not power > 0:

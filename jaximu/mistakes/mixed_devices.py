@@ -8,7 +8,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import robust_sigma
 from jaximu.mistakes.base import Samples, Sensor, leave_out_both, spans_of
 from jaximu.mistakes.lost_samples import steps
-from jaximu.recordings.alignment import carried, turning
+from jaximu.recordings.alignment import carried, of_each, turning
 from jaximu.recordings.finding import Finding
 
 TITLES = {
@@ -94,8 +94,7 @@ def _rests(accelerometer: Sensor, gyroscope: Sensor) -> FloatArray:
         calm = total <= 5 * floor
         moved = np.linalg.norm(np.diff(mean, axis=0), axis=1) > 6 * np.sqrt(np.minimum(floor[1:], floor[:-1]))
         leave_out_both(calm, moved)
-        nearest = np.clip(np.searchsorted(sensor.time, accelerometer.time), 0, len(sensor) - 1)
-        still &= sensor.by_sample(calm)[nearest]
+        still &= sensor.by_sample(calm)[sensor.next_to(accelerometer.time)]
     return spans_of(still, accelerometer.time, 0.7)
 
 
@@ -112,8 +111,8 @@ def _changed(samples: Samples) -> list[Finding]:
     means, noises = [], []
     for sensor in (accelerometer, gyroscope):
         edges = np.searchsorted(sensor.time, rests + [[0.1, -0.1]])
-        means.append(np.stack([sensor.values[a : max(b, a + 1)].mean(axis=0) for a, b in edges]))
-        size = np.stack([np.sqrt(np.mean(sensor.curvature[a : max(b, a + 1)] ** 2, axis=0)) for a, b in edges])
+        means.append(of_each(np.mean, sensor.values, edges))
+        size = np.sqrt(of_each(np.mean, sensor.curvature**2, edges))
         noises.append(np.log(np.maximum(size, 1e-12)))
     norm = np.log(np.maximum(np.linalg.norm(means[0], axis=1), 1e-9))[:, None]
     rate, noise = means[1], np.hstack(noises)

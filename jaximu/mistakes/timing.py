@@ -12,7 +12,7 @@ from jaximu.ground.quantities import counted
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
-from jaximu.recordings.recording import Recording
+from jaximu.recordings.recording import FASTEST, GAP, Recording
 
 TITLES = {
     "data.bursts": "stamps in bursts",
@@ -21,8 +21,8 @@ TITLES = {
     "data.jitter": "jittering stamps",
 }
 
-_SLOWEST, _FASTEST = 1.0, 50e3
-"""Hz: no log of poses and turns has a rate outside."""
+_SLOWEST = 1.0
+"""Hz: no log of poses and turns has a lower rate."""
 _SUDDEN = 0.3
 """Share of the mean interval below which two samples arrived together."""
 
@@ -56,7 +56,7 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
                 apply=steady_clock,
             )
         ]
-    if not _SLOWEST <= 1 / mean <= _FASTEST:
+    if not _SLOWEST <= 1 / mean <= FASTEST:
         findings.append(
             Finding(
                 "data.time_scale",
@@ -68,7 +68,7 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
         )
     spread = np.std(interval[interval < 1.5 * usual])
     uneven = spread > 0.1 * usual
-    gaps = np.flatnonzero(interval > (2.5 if uneven else 1.6) * usual)
+    gaps = np.flatnonzero(interval > (2.5 if uneven else GAP) * usual)
     if len(gaps):
         lost = int(np.sum(np.round(interval[gaps] / usual) - 1))
         findings.append(
@@ -117,9 +117,14 @@ def _even(time: FloatArray) -> FloatArray | None:
         delay = time - period * number
         missing = np.round((np.mean(delay[row : row + 20]) - np.mean(delay[max(0, row - 20) : row])) / period)
         number[row:] += max(0.0, missing)
-    slope, start = np.polyfit(number, time, 1)
-    even = start + slope * number
+    even, slope = _line(number, time)
     return even if np.max(np.abs(time - even)) < 0.75 * slope else None
+
+
+def _line(number: FloatArray, time: FloatArray) -> tuple[FloatArray, float]:
+    """Stamps (n,) on the straight line fitted to those of numbered samples, and its slope."""
+    slope, start = np.polyfit(number, time, 1)
+    return start + slope * number, slope
 
 
 def _evenly(recording: Recording) -> Recording:
@@ -167,8 +172,7 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
     bursts and another not.
     """
     index = np.arange(len(time), dtype=float)
-    slope, start = np.polyfit(index, time, 1)
-    fitted = start + slope * index
+    fitted, slope = _line(index, time)
     delay = time - fitted
     # what stays off the line from one sample on is a gap in the log, not a delay
     width = max(8, round(1.0 / max(slope, 1e-9)))
@@ -183,8 +187,7 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
                 [np.median(time[a:b] - slope * index[a:b]) + slope * index[a:b] for a, b in pairwise(edges)]
             )
             if np.any(np.diff(fitted) <= 0):
-                slope, start = np.polyfit(index, time, 1)
-                fitted = start + slope * index
+                fitted, slope = _line(index, time)
     early = [part.min() for part in np.array_split(time - fitted, max(1, len(time) // width))]
     return fitted + np.median(early), float(slope)
 

@@ -7,13 +7,14 @@ in M, which is the identity for right axes, signs and scales.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise, permutations, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.distributions import student_isf
 
@@ -265,7 +266,7 @@ def carried(
     from scipy.spatial.transform import Rotation
 
     edges = np.searchsorted(force_time, rests)
-    up = _directions(np.stack([force[a : max(b, a + 1)].mean(axis=0) for a, b in edges]))
+    up = _directions(of_each(np.mean, force, edges))
     interval = np.diff(rate_time)
     gap = 2.5 * np.median(interval)
     middle = rests.mean(axis=1)
@@ -305,6 +306,14 @@ def carried(
     alike = np.flatnonzero(best < best.min() + _ROUGH_ANGLE)
     factor = factors[alike[np.argmin(np.abs(np.log(np.abs(factors[alike]))) + 1e-9 * best[alike])]]
     return Carried(float(factor), float(best.min()), len(used))
+
+
+def of_each(statistic: Callable[..., Any], values: FloatArray, edges: IntArray) -> FloatArray:
+    """Return a statistic, of NumPy's signature, of the rows of values (n, m) in each of k stretches: (k, m).
+
+    edges: (k, 2) the first row of each stretch and the one after its last; an empty one has one row.
+    """
+    return np.stack([statistic(values[first : max(last, first + 1)], axis=0) for first, last in edges])
 
 
 def _directions(vectors: FloatArray) -> FloatArray:

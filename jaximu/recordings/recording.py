@@ -4,6 +4,7 @@ Frames: body axes are right-handed and belong to the sensor's case; specific for
 rest; angular rate follows the right-hand rule.
 """
 
+import math
 import re
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -35,7 +36,7 @@ def _unset() -> FloatArray:
     return np.empty(0)
 
 
-_GAP = 1.6
+GAP = 1.6
 """Times the usual interval from which on a longer one is a gap."""
 
 
@@ -95,7 +96,7 @@ class Signal(Comparable):
         """
         interval = np.diff(self.time)
         usual = np.median(interval)
-        longest = _GAP * max(usual, np.mean(np.minimum(interval, 3 * usual)))
+        longest = GAP * max(usual, np.mean(np.minimum(interval, 3 * usual)))
         return float(1.0 / np.mean(interval[interval <= longest]))
 
     @property
@@ -268,6 +269,11 @@ class ReadOptions:
     instance: int | None = None
     stamp: str = "header"
     like: Reading | None = None
+
+    @property
+    def known(self) -> Reading:
+        """How the calibrated log was read; without one a reading that says nothing."""
+        return self.like or Reading()
 
 
 _SAME_RANGE = 0.05
@@ -557,12 +563,12 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
 
 
 _ACCEL_SLIPS = {
-    STANDARD_GRAVITY: "g",
-    STANDARD_GRAVITY * 1e-3: "mg",
-    1 / STANDARD_GRAVITY: "m/s², stated as g",
-    1e-3: "mg, stated as g",
+    "g": STANDARD_GRAVITY,
+    "mg": STANDARD_GRAVITY * 1e-3,
+    "m/s², stated as g": 1 / STANDARD_GRAVITY,
+    "mg, stated as g": 1e-3,
 }
-_GYRO_SLIPS = {1 / 57.29578: "deg/s", 57.29578: "rad/s, stated as deg/s", 1 / 57295.78: "mdeg/s", 1e-3: "mdeg/s"}
+_GYRO_SLIPS = {"deg/s": 1 / 57.29578, "rad/s, stated as deg/s": 57.29578, "mdeg/s": 1 / 57295.78, "mrad/s": 1e-3}
 
 
 def _require_own_columns(recording: Recording, gravity: LocalGravity) -> None:
@@ -664,12 +670,19 @@ def _gyro_advice(gyroscope: Signal, ratio: float) -> str:
     return "check --gyro-scale" if gyroscope.unit == "count" else _unit_advice(ratio, _GYRO_SLIPS)
 
 
-def _unit_advice(ratio: float, slips: dict[float, str]) -> str:
+def _unit_advice(ratio: float, slips: Mapping[str, float]) -> str:
     """What the column is likely to be in, when true = ratio · stated."""
-    nearest = min(slips, key=lambda slip: abs(np.log(ratio / slip)))
-    if abs(np.log(ratio / nearest)) > np.log(1.6):
+    nearest, off = likeliest(ratio, slips)
+    if off > np.log(1.6):
         return "check the unit in the column name or in --columns"
-    return f"these columns look like {slips[nearest]}: change the unit in the header or with --columns"
+    return f"these columns look like {nearest}: change the unit in the header or with --columns"
+
+
+def likeliest(size: float, known: Mapping[str, float]) -> tuple[str, float]:
+    """Return the name of the known size that is nearest to a size by their ratio, and the logarithm it is off by."""
+    off = {name: abs(math.log(size / value)) for name, value in known.items()}
+    nearest = min(off, key=off.__getitem__)
+    return nearest, off[nearest]
 
 
 def steps_of(values: FloatArray) -> FloatArray:

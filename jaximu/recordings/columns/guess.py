@@ -27,7 +27,7 @@ from jaximu.recordings.columns.known import EPOCH
 from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import LogTable
-from jaximu.recordings.recording import FASTEST, SLOWEST, Signal
+from jaximu.recordings.recording import FASTEST, SLOWEST, Signal, likeliest
 
 ASSUMED_RATE = 100.0  # Hz, of a log that does not say it
 
@@ -175,9 +175,8 @@ class _Triad:
         """The unit in which it holds 1 g at rest, "?" where several fit; "count": something else in whole numbers."""
         if not self.steady:
             return None
-        near = {unit: abs(math.log(self.level / one)) for unit, one in _GRAVITY_IN.items()}
-        best = min(near, key=lambda unit: near[unit])
-        if near[best] > math.log(1.15):
+        best, off = likeliest(self.level, _GRAVITY_IN)
+        if off > math.log(1.15):
             return "count" if self.whole and self.level > 50 else None
         if best in ("mg", "cm/s^2"):  # 1000 mg, 981 cm/s² and 1024 counts are close together
             if not self.still:
@@ -706,14 +705,13 @@ class _Guess:
         resting = accel is not None and accel.still and not accel.posed and not gyro.turns
         accel_unit = next((column.unit for column in self.chosen.values() if column.name == "accel_x"), None)
         if unit is None and slope is not None:
-            near = {name: abs(math.log(slope / factor)) for name, factor in _ANGLES.items()}
-            best = min(near, key=lambda name: near[name])
+            best, off = likeliest(slope, _ANGLES)
             close = 0.25
             if gyro.whole:  # counts may be anything: 16.4 to 1 deg/s are 1.06 mrad/s
                 close = 0.1 if best in ("rad/s", "deg/s") else 0.025
             if accel_unit == "m/s":
                 unit = self._angle_increment(slope)
-            elif near[best] < close:
+            elif off < close:
                 unit = best
                 self.reasons.append(f"in {unit} the integrated rates {_TURN} (factor {slope / _ANGLES[best]:.3f})")
         if unit is None and per_sample is not None and not gyro.whole:

@@ -57,10 +57,8 @@ def read(path: Path, source: Source, options: ReadOptions) -> tuple[LogTable, ..
     tables = []
     for kind in ("IMU",) if topic == "IMU" else ("ACC", "GYR"):
         if (kind, instance) in rows:
-            time, values = (
-                rows[kind, instance][:, 0 if options.stamp == "receive" else 1],
-                rows[kind, instance][:, 2:].T,
-            )
+            received, sampled, *values = rows[kind, instance].T
+            time = received if options.stamp == "receive" else sampled
             tables.append(_table(source, time, dict(zip(_KINDS[kind].values(), values, strict=True))))
     if topic != "IMU" and ("IMU", instance) in rows:  # the temperature is there alone
         heat = rows["IMU", instance]

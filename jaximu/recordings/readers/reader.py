@@ -130,7 +130,7 @@ def read_recording(
 def _read(path: FilePath, options: ReadOptions) -> list[LogTable]:
     """The tables of a file, with the rows of one unit where several write into it in turn."""
     tables = read_tables(path, options)
-    usual = (options.like or Reading()).device
+    usual = options.known.device
     return [table if table.messages else of_device(table, options.device, usual) for table in tables]
 
 
@@ -164,7 +164,7 @@ def _sound(options: ReadOptions | None) -> ReadOptions:
         parse_axes(options.axes)
     if options.rate is not None and not 0.0 < options.rate < 1e6:
         raise InputError(f"--rate: {options.rate:g} is no sample rate in Hz.")
-    like = options.like or Reading()
+    like = options.known
     options = replace(
         options,
         topic=options.topic or like.topic,
@@ -180,7 +180,7 @@ def _sound(options: ReadOptions | None) -> ReadOptions:
 
 def _alike(options: ReadOptions, table: LogTable) -> ReadOptions:
     """Return the options, with what `like` knows of a file of this header and options leave open."""
-    like = options.like or Reading()
+    like = options.known
     if options.columns is None and options.gyro_columns is None and table.header == tuple(like.header):
         options = replace(options, columns=like.columns, gyro_columns=like.gyro_columns)
     options = replace(options, axes=like.axes if options.axes is None and table.axes is None else options.axes)
@@ -197,7 +197,7 @@ def _of_two_files(options: ReadOptions, table: LogTable) -> bool:
 
 def _counts(options: ReadOptions, name: str) -> tuple[Stated | None, Stated | None]:
     """Return scale and offset of a triad in counts, as options or else the calibrated log state them."""
-    like = options.like or Reading()
+    like = options.known
     scale, offset = (getattr(options, f"{PREFIXES[name]}_{part}") for part in ("scale", "offset"))
     return like.scales.get(name) if scale is None else scale, like.offsets.get(name) if offset is None else offset
 
@@ -217,7 +217,7 @@ def _read_as(
         columns=columns,
         gyro_columns=of_gyroscope,
         header=table.header if columns or of_gyroscope else (),
-        rate=options.rate or (options.like or Reading()).rate,
+        rate=options.rate or options.known.rate,
         axes=table.axes,
         frame=table.frame,
         units={name: unit for part in parts for name, unit in part.units.items()},
@@ -248,8 +248,7 @@ def _finished(parts: "Sequence[_FilePart]", table: LogTable, options: ReadOption
     recording = _assemble(parts, table, options)
     if options.axes:
         recording = apply_axes(recording, options.axes)
-    if options.like is not None:
-        options.like.require_alike(recording.reading, recording.name, options.like.units)
+    options.known.require_alike(recording.reading, recording.name, options.known.units)
     try:
         notes = plausibility(recording, options.gravity) if options.check else ()
     except InputError as error:
@@ -792,7 +791,7 @@ def _stamps(table: LogTable, used: Used, options: ReadOptions) -> tuple[FloatArr
     Integer stamps (nanoseconds since 1970 do not fit a float64) are subtracted before they become floats.
     """
     if TIME not in used:
-        alike = (options.like or Reading()).rate
+        alike = options.known.rate
         rates = ((options.rate, "--rate"), (table.rate, "the file's sampling rate"), (alike, "the calibrated log"))
         rate, origin = next((pair for pair in rates if pair[0]), (None, ""))
         if not rate:
