@@ -26,7 +26,7 @@ from jaximu.ground.rotation import unit_vectors
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
-from jaximu.recordings.entry import ScheduleEntry
+from jaximu.recordings.entry import ScheduleEntry, times_of
 from jaximu.recordings.observations import POWER_ON, Stations
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.reference import Integral, match_reference, means_over, rest_rate
@@ -104,7 +104,7 @@ def observe_stations(
     known = all(None not in attitudes(entries) for recording, entries in parts if recording.attitude is None)
     stimuli, means, covariances, spans, turns = [], [], [], [], []
     for recording, entries in parts:
-        span = np.array([(entry.start, entry.stop) for entry in entries])
+        span = times_of(entries)
         turn = np.array([entry.kind == "turn" for entry in entries])
         stimulus = _recorded_stimulus(recording, entries, span, gravity, temperature_reference)
         stimuli.append(stimulus if known else replace(stimulus, attitude=None))
@@ -182,7 +182,7 @@ def _recorded_stimulus(
     else:
         course = np.tile(np.linspace(0.0, 1.0, 2 * NODES + 1), (len(entries), 1))
         if recording.gyroscope is not None:
-            integral = Integral(recording.gyroscope, recording.gyroscope.si())
+            integral = Integral(recording.gyroscope)
             bias = rest_rate(integral, entries)
             for k, entry in enumerate(entries):
                 if entry.kind == "turn":
@@ -232,7 +232,7 @@ def scheme_stations(
     imu = Imu.nominal() if imu is None else imu
     plan = protocol.plan(np.random.default_rng(0), replace(environment or Environment(), latitude=None))
     entries, motion = plan.intervals, plan.motion
-    span = np.array([(entry.start, entry.stop) for entry in entries])
+    span = times_of(entries)
     segment = np.searchsorted(motion.start, span[:, 0] + 1e-9, side="right") - 1
     begin = [
         scipy.spatial.transform.Rotation.from_quat(attitude, scalar_first=True) for attitude in motion.attitude[segment]

@@ -32,7 +32,7 @@ from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.planning.information import root_of
-from jaximu.recordings.entry import ScheduleEntry
+from jaximu.recordings.entry import ScheduleEntry, times_of
 from jaximu.recordings.observations import Stations
 from jaximu.simulation import Case, Specification
 from jaximu.simulation.protocols import Environment, Motion
@@ -450,7 +450,7 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[ScheduleEntr
     """The stations with the covariances of the noise that is stated; those (6, S, S) of its white part and of its slow
     bias, zero where not used; rate ramps (3,), SI, by triad; notes.
     """
-    span = np.array([(interval.start, interval.stop) for interval in intervals])
+    span = times_of(intervals)
     count, size = len(span), stations.turn.shape[0]
     notes, ramps, fast, slow = [], {}, np.zeros((6, size, size)), np.zeros((6, size, size))
     used = {"accelerometer": stations.accelerometer_used, "gyroscope": stations.gyroscope_used}

@@ -60,7 +60,7 @@ class Turning(NamedTuple):
 
 def signed_permutation(matrix: FloatArray) -> FloatArray:
     """Return the signed permutation (3, 3) that is nearest to a matrix whose columns may have any length."""
-    columns = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    columns = _directions(matrix.T).T
     best, nearest = -np.inf, np.eye(3)
     for order in permutations(range(3)):
         entries = columns[order, range(3)]
@@ -82,7 +82,7 @@ def turning_best(products: FloatArray) -> FloatArray:
 
 def rotation_of(matrix: FloatArray) -> FloatArray:
     """Return the orthogonal matrix (3, 3) nearest to one whose columns may have any length."""
-    u, _, v = np.linalg.svd(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
+    u, _, v = np.linalg.svd(_directions(matrix.T).T)
     return u @ v
 
 

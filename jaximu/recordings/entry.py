@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 
@@ -23,3 +26,8 @@ class ScheduleEntry:
     angle: float = 0.0
     heading: float | None = None
     label: str = ""
+
+
+def times_of(entries: Sequence[ScheduleEntry]) -> FloatArray:
+    """Return when entries start and stop, (n, 2) s."""
+    return np.array([(entry.start, entry.stop) for entry in entries], float).reshape(-1, 2)

@@ -18,7 +18,7 @@ from jaximu.ground.differences import interpolated
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.rotation import unit_vectors
 from jaximu.recordings.attitude import UNIT_LENGTH
-from jaximu.recordings.entry import ScheduleEntry
+from jaximu.recordings.entry import ScheduleEntry, times_of
 from jaximu.recordings.recording import Recording, Signal, floor_of, runs_of
 
 _MOVING = np.radians(2.0)  # rad/s, mean rate over a second that no pose has
@@ -32,9 +32,13 @@ _SMALLEST_TURN = np.radians(5)
 
 
 class Integral:
-    """The running integral of a signal, each sample holding from half way to the one before to half way to the next."""
+    """The running integral of a signal, each sample holding from half way to the one before to half way to the next.
 
-    def __init__(self, signal: Signal, values: FloatArray):
+    values: (n, m) of its samples; its output in SI by default.
+    """
+
+    def __init__(self, signal: Signal, values: FloatArray | None = None):
+        values = signal.si() if values is None else values
         self.edges = signal.edges
         self.origin = values.mean(axis=0)  # the sums of what is left lose fewer digits
         steps = (values - self.origin) * np.diff(self.edges)[:, None]
@@ -54,7 +58,7 @@ def means_over(signal: Signal, span: FloatArray) -> FloatArray:
 
 def rest_rate(integral: Integral, entries: Sequence[ScheduleEntry]) -> FloatArray:
     """The median of the mean outputs in poses: the gyroscope's bias, for purposes that do not ask for more."""
-    rests = np.array([(entry.start, entry.stop) for entry in entries if entry.kind == "pose"])
+    rests = times_of([entry for entry in entries if entry.kind == "pose"])
     if not len(rests):
         return np.zeros(3)
     return np.median(integral.over(*rests.T) / np.diff(rests), axis=0)
@@ -73,7 +77,7 @@ def match_reference(
     if not usable:
         raise NotPossibleError(f"{where}: the reference names no pose or turn that can be used.")
     if gyroscope is not None:
-        rate = Integral(gyroscope, gyroscope.si())
+        rate = Integral(gyroscope)
         bias = rest_rate(rate, usable)
         usable = [_with_sense(entry, rate, bias, notes) for entry in usable]
         turns = [(entry, _turned(entry, rate, bias)) for entry in usable if entry.kind == "turn"]
@@ -146,7 +150,7 @@ def _require_clock(entries: Sequence[ScheduleEntry], rate: Integral, bias: Float
                 moving.append(entry)
     if not moving:
         return
-    span = np.array([(entry.start, entry.stop) for entry in entries])
+    span = times_of(entries)
     stated = np.array([entry.angle * entry.vector if entry.kind == "turn" else np.zeros(3) for entry in entries])
     rest = ~stated.any(axis=1)
     weight = np.where(rest, 100.0, 1.0)  # turns are off by the scale's error, rests by next to nothing
@@ -186,8 +190,8 @@ def _require_turn(entry: ScheduleEntry, turned: FloatArray, where: str) -> None:
 def _require_poses(recording: Recording, poses: Sequence[ScheduleEntry], where: str) -> None:
     if not poses or not len(recording.accelerometer):
         return
-    force = Integral(recording.accelerometer, recording.accelerometer.si())
-    read = unit_vectors(force.over(*np.array([(pose.start, pose.stop) for pose in poses]).T))
+    force = Integral(recording.accelerometer)
+    read = unit_vectors(force.over(*times_of(poses).T))
     stated = np.stack([pose.vector for pose in poses])
     off = np.degrees(np.arccos(np.clip(np.sum(read * stated, axis=1), -1, 1)))
     if not (off > _OFF).any():
@@ -234,7 +238,7 @@ def entries_of_columns(recording: Recording) -> list[ScheduleEntry]:
     if recording.table_angle is not None:
         angle = np.unwrap(signal.values[:, 0])
     else:
-        integral = Integral(signal, signal.values)
+        integral = Integral(signal)
         angle = integral.over(np.full(len(signal), integral.edges[0]), signal.time)[:, 0]
     return _entries_of_table(recording, signal.time, angle)
 
@@ -287,7 +291,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
     before, after = _neighbours(len(time), _WINDOW / np.median(np.diff(time)) / 2)
     moved = np.abs(angle[after] - angle[before]) / (time[after] - time[before])
     if recording.gyroscope is not None:  # a unit is mounted again while the table stands
-        rate = Integral(recording.gyroscope, recording.gyroscope.si())
+        rate = Integral(recording.gyroscope)
         mean = rate.over(time[before], time[after]) / (time[after] - time[before])[:, None]
         off = np.linalg.norm(mean - np.median(mean[moved < _STILL], axis=0), axis=1)
         moved = np.where(off > _MOVING, np.inf, moved)
@@ -297,7 +301,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
             f"{recording.name}: holds a gyroscope alone, and table columns do not say about which of its axes the "
             "table turns; write a schedule."
         )
-    force = Integral(recording.accelerometer, recording.accelerometer.si())
+    force = Integral(recording.accelerometer)
     read = force.over(*spans.T)
     size = np.abs(read)
     axis = np.argmax(size, axis=1)

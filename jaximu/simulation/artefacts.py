@@ -73,6 +73,15 @@ class _OfAnAxis(Artefact):
 
 
 @dataclass(frozen=True)
+class _OfAShare(Artefact):
+    share: float
+
+    def __post_init__(self):
+        if not 0 <= self.share < 1:
+            raise InputError(f"artefact {self.name}: share must be at least 0 and below 1, found {self.share}.")
+
+
+@dataclass(frozen=True)
 class Periodic(_OfAnAxis):
     """A line in the spectrum of one axis: amplitude (output unit) and frequency (Hz)."""
 
@@ -197,16 +206,11 @@ class StuckAxis(_OfAnAxis):
 
 
 @dataclass(frozen=True)
-class Repeated(Artefact):
+class Repeated(_OfAShare):
     """A `share` of the samples repeat all values of the sample before (the logger was quicker than the sensor)."""
-
-    share: float
 
     name = "repeated"
     catalogue = "data.stuck_axis"
-
-    def __post_init__(self):
-        _share(self)
 
     def apply(self, samples, rng, kept):
         repeat = rng.random(len(samples.time)) < self.share
@@ -220,16 +224,11 @@ class Repeated(Artefact):
 
 
 @dataclass(frozen=True)
-class Dropped(Artefact):
+class Dropped(_OfAShare):
     """A `share` of the samples are lost."""
-
-    share: float
 
     name = "dropped"
     catalogue = "data.gap"
-
-    def __post_init__(self):
-        _share(self)
 
     def apply(self, samples, rng, kept):
         samples.keep(rng.random(len(samples.time)) >= self.share)
@@ -280,11 +279,6 @@ def _in_order(artefact: StuckAxis | Gap) -> None:
         raise InputError(
             f"artefact {artefact.name}: start must be before stop, found {artefact.start} and {artefact.stop}."
         )
-
-
-def _share(artefact: Repeated | Dropped) -> None:
-    if not 0 <= artefact.share < 1:
-        raise InputError(f"artefact {artefact.name}: share must be at least 0 and below 1, found {artefact.share}.")
 
 
 ARTEFACTS: dict[str, type[Artefact]] = {

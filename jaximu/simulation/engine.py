@@ -27,7 +27,7 @@ from jaximu.model.sensor import Imu, Triad
 from jaximu.model.state_space import BLOCK
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings import write_recording
-from jaximu.recordings.entry import ScheduleEntry
+from jaximu.recordings.entry import ScheduleEntry, times_of
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.write import write_parts
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact, LoggedRows
@@ -120,8 +120,7 @@ class Truth(Document):
     @property
     def intervals(self) -> FloatArray:
         """(P, 2) start and stop of each rest (s, on the recording's clock), at the edges of samples."""
-        poses = [interval for interval in self.schedule if interval.kind == "pose"]
-        return np.array([(pose.start, pose.stop) for pose in poses]).reshape(-1, 2)
+        return times_of([interval for interval in self.schedule if interval.kind == "pose"])
 
     def document(self) -> Json:
         """Return the truth as the JSON document of schema `jaximu.truth/1`."""
