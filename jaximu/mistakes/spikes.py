@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+import scipy
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.differences import interpolated
@@ -76,7 +76,7 @@ def _wild(celsius: FloatArray) -> Rows:
     if len(change) < _WINDOW:
         return NO_ROWS
     values = celsius[change]
-    middle = np.median(sliding_window_view(np.pad(values, _WINDOW // 2, "edge"), _WINDOW), axis=1)
+    middle = scipy.ndimage.median_filter(values, _WINDOW, mode="nearest")
     off = values - middle
     wild = np.abs(off) > max(_JUMP, _TIMES * robust_sigma(off))
     return np.flatnonzero(np.repeat(wild, np.diff(change, append=len(celsius))))
