@@ -9,11 +9,11 @@ from jaximu.calibration import calibrate_array, calibrate_turntable
 from jaximu.cli import main
 from jaximu.ground.errors import InputError
 from jaximu.noise.analysis import analyse_noise
+from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.readers import ReadOptions, advise_reading, read_magnetometer, read_recording
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld
-from jaximu.simulation.protocols.course import Interval
 
 G = 9.80665
 EPOCH = 1_700_000_000
@@ -381,7 +381,7 @@ def test_a_unit_that_sits_turned_in_its_fixture_is_said():
     time = np.arange(0, 60, 0.02)
     force = G * seat.apply(faces[np.minimum((time / 10).astype(int), 5)]) + 2e-3 * random.normal(size=(len(time), 3))
     recording = Recording(Signal(time, force, "m/s^2"))
-    entries = [Interval(10.0 * k + 1, 10.0 * k + 9, "pose", face) for k, face in enumerate(faces)]
+    entries = [ScheduleEntry(10.0 * k + 1, 10.0 * k + 9, "pose", face) for k, face in enumerate(faces)]
     notes = " ".join(calibrate_turntable(recording, entries).notes)
     assert "turned as a whole by 1.6°" in notes
     assert "turned as a whole" not in " ".join(calibrate_turntable(

@@ -346,7 +346,7 @@ def _right_handed(recording: Recording, start: _Start) -> Attitude:
         return attitude
     rows = np.arange(0, len(attitude.time), max(1, round(0.5 / attitude.period)))
     inside = attitude.time[rows] - start.delay
-    force = Integral(recording.accelerometer, recording.accelerometer.si())
+    force = Integral(recording.accelerometer)
     rows = rows[(inside > force.edges[0]) & (inside < force.edges[-1])]
     inner = np.linspace(attitude.time[rows[:-1]], attitude.time[rows[1:]], 9, axis=1)
     stood = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(inner[:, 1:].ravel())
@@ -414,7 +414,7 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
     length = np.diff(stamps)[:, None]
     turned = thin.turned() / length
     good &= ~np.isnan(turned).any(axis=1)
-    unit = Integral(gyroscope, gyroscope.si()).over(stamps[:-1], stamps[1:]) / length
+    unit = Integral(gyroscope).over(stamps[:-1], stamps[1:]) / length
     return unit[good], turned[good], midpoints(stamps)[good]
 
 

@@ -19,7 +19,7 @@ from jaximu.estimation.fitting import Fit, Prior, fit, informed
 from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import UNDETERMINED, allowing_for_neighbours
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
-from jaximu.ground.distributions import rms
+from jaximu.ground.distributions import rms, robust_sigma
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -587,7 +587,7 @@ def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> BoolArra
         usual = known & windows.used
         if usual.any():
             off = np.where(known, np.abs(values - np.median(values[usual])), 0.0)
-            size = np.maximum(size, off / max(1.4826 * np.median(off[usual]), least))
+            size = np.maximum(size, off / max(robust_sigma(off[usual]), least))
     far = scipy.ndimage.binary_propagation(size > _DISTURBED, mask=size > _BESIDE)
     return far | scipy.ndimage.binary_closing(far, np.ones(_BETWEEN))
 
@@ -745,7 +745,7 @@ def _dip(windows: FieldWindows, fit: Fit) -> tuple[float | None, float]:
     field = windows.field(fit.imu)
     sine = -np.sum(windows.up * field, axis=1)[calm] / np.linalg.norm(field, axis=1)[calm]
     dip = float(np.arcsin(np.clip(np.median(sine), -1, 1)))
-    spread = 1.4826 * float(np.median(np.abs(sine - np.median(sine)))) / max(np.cos(dip), 0.05)
+    spread = robust_sigma(sine - np.median(sine)) / max(np.cos(dip), 0.05)
     bent = windows.bent(field)[calm].mean(axis=0)
     common = np.sqrt(bent @ windows.vertical @ bent) / max(np.cos(dip), 0.05)
     return dip, float(np.hypot(spread / np.sqrt(max(calm.sum() / 4, 1)), common))  # neighbours share their errors

@@ -32,9 +32,10 @@ from jaximu.model.effects.earth_rotation import GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.noise.at_rest import noise_of
+from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording, recordings_of, same_outputs
-from jaximu.recordings.reference import Entry, entries_of_columns
+from jaximu.recordings.reference import entries_of_columns
 from jaximu.simulation.protocols import earth_rate
 
 _TURNED, _ARRANGED = 0.3, 45.0
@@ -78,7 +79,7 @@ def free_on_table(imu: Imu, free: Sequence[str] = ()) -> Callable[[Name], bool]:
 
 def calibrate_turntable(
     recordings: Recording | Sequence[Recording],
-    references: Sequence[Entry] | Sequence[Sequence[Entry]] | None = None,
+    references: Sequence[ScheduleEntry] | Sequence[Sequence[ScheduleEntry]] | None = None,
     gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
@@ -126,7 +127,7 @@ def calibrate_turntable(
 
 def calibrate_table_ready(
     ready: Sequence[Prepared],
-    references: Sequence[Sequence[Entry]],
+    references: Sequence[Sequence[ScheduleEntry]],
     gravity: LocalGravity,
     noise: NoiseModel | None = None,
     effects: Sequence[str | Effect] = (),
@@ -226,7 +227,7 @@ def _at_rest_where_open(fitted: Fit, start: Imu) -> Fit:
     return replace(fitted, imu=model, values=values + fitted.sizes * back)
 
 
-def _require_headings(recordings: Sequence[Recording], references: Sequence[Sequence[Entry]]) -> None:
+def _require_headings(recordings: Sequence[Recording], references: Sequence[Sequence[ScheduleEntry]]) -> None:
     for recording, entries in zip(recordings, references, strict=True):
         if recording.attitude is None and any(e.kind == "pose" and e.heading is None for e in entries):
             raise NotPossibleError(

@@ -353,9 +353,10 @@ def _tilt(signal: Signal, intervals: FloatArray) -> float:
     """Return the largest angle, degrees, of the force in a pose from its mean over all poses."""
     import numpy as np
 
+    from jaximu.ground.rotation import unit_vectors
+
     values = signal.si()
-    means = np.stack([values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in intervals])
-    up = means / np.linalg.norm(means, axis=1, keepdims=True)
+    up = unit_vectors(np.stack([values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in intervals]))
     middle = up.mean(axis=0)
     return float(np.degrees(np.arccos(np.clip(up @ middle / max(np.linalg.norm(middle), 1e-9), -1.0, 1.0))).max())
 
@@ -375,7 +376,7 @@ def _still_seconds(recording: Recording) -> tuple[float, BoolArray, FloatArray]:
         edges = np.searchsorted(signal.time, start + np.arange(seconds + 1))
         middle = np.median(signal.si(), axis=0)
         values = signal.si() - middle
-        sums, squares = (np.vstack([np.zeros(3), np.cumsum(values**power, axis=0)]) for power in (1, 2))
+        sums, squares = (np.cumulative_sum(values**power, axis=0, include_initial=True) for power in (1, 2))
         count = np.diff(edges)
         safe = np.maximum(count, 1)[:, None]
         mean = np.diff(sums[edges], axis=0) / safe

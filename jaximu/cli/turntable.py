@@ -15,8 +15,8 @@ from jaximu.cli.options import option
 from jaximu.ground.errors import InputError
 
 if TYPE_CHECKING:
+    from jaximu.recordings.entry import ScheduleEntry
     from jaximu.recordings.recording import Recording
-    from jaximu.recordings.reference import Entry
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class TurntableCommand(options.Fits):
         self.results.present(calibration.summary, calibration=calibration)
 
 
-def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Sequence[Entry]]:
+def references_of(recordings: list[Recording], paths: Sequence[Path]) -> list[Sequence[ScheduleEntry]]:
     """Return the entries of each recording; a file of reference columns is put beside its recording's signals."""
     from jaximu.recordings.readers import read_reference
     from jaximu.recordings.recording import Recording

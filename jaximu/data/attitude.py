@@ -310,9 +310,9 @@ class AgainstAttitude(OfOneUnit):
         knots, group = self._knots
         count = len(knots) - 1
         size = -(-count // (_WINDOWS * group)) * _WINDOWS * group
-        gaps = np.concatenate([[0], np.cumsum(np.diff(time) > 2.5 / gyroscope.rate)])
+        gaps = np.cumulative_sum(np.diff(time) > 2.5 / gyroscope.rate, include_initial=True)
         missing = (np.diff(attitude.time) > 2.5 * attitude.period) | np.isnan(attitude.turned()).any(axis=1)
-        holes = np.concatenate([[0], np.cumsum(missing)])
+        holes = np.cumulative_sum(missing, include_initial=True)
         used = (np.diff(np.interp(stamps[knots], time, gaps)) == 0) & (np.diff(holes[knots]) == 0)
         used &= ~np.isin(np.arange(count) // group, self.left_out)
         velocity = attitude.velocities()

@@ -28,7 +28,7 @@ from jaximu.estimation.rows import TIME, ResidualKind, Rows
 from jaximu.estimation.track import Track, added
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
-from jaximu.ground.distributions import rms
+from jaximu.ground.distributions import rms, robust_sigma
 from jaximu.ground.rotation import Number, exponential, inverse_matrix, rotate, unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
@@ -231,7 +231,7 @@ class FieldWindows:
 def white_noise(signal: Signal) -> float:
     """Return the standard deviation of a sample (output units) that differences of neighbours tell, and rounding."""
     third = np.diff(signal.values, n=3, axis=0)
-    spread = 1.4826 * np.median(np.abs(third - np.median(third, axis=0)), axis=0) / np.sqrt(20.0)
+    spread = robust_sigma(third - np.median(third, axis=0), axis=0) / np.sqrt(20.0)
     levels = [np.unique(axis[:20000]).tolist() for axis in signal.values.T]
     rounding = [min(np.diff(values).tolist(), default=0.0) / np.sqrt(12.0) for values in levels]
     return rms(np.maximum(spread, rounding))
@@ -326,7 +326,7 @@ def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> IntA
     centred = smooth - (smooth.max(axis=0) + smooth.min(axis=0)) / 2
     every = max(1, round(_SMOOTHED * rate))
     path = np.linalg.norm(np.diff(centred[::every], axis=0), axis=1) / np.median(np.linalg.norm(centred, axis=1))
-    path = np.concatenate([[0.0], np.cumsum(path + _STEADY * np.diff(time[::every]))])
+    path = np.cumulative_sum(path + _STEADY * np.diff(time[::every]), include_initial=True)
     count = min(most, max(8, len(time) // every))
     edges = np.interp(np.linspace(0, path[-1], count + 1), path, np.arange(len(path)) * every)
     return np.unique(np.append(edges[:-1].astype(np.int64), len(time) - 1))
@@ -342,7 +342,7 @@ def _carried(gyroscope: Signal):
     rates, held = np.pad(gyroscope.values, (padding, (0, 0))), np.pad(np.diff(edges), padding)
     running, sweep = (leaf[:count] for leaf in stored.call(turned_by_rates, "carried attitude", rates, held))
     frames = scipy.spatial.transform.Rotation.from_quat(np.vstack([[1.0, 0.0, 0.0, 0.0], running]), scalar_first=True)
-    swept = np.vstack([np.zeros(9), np.cumsum(sweep.reshape(-1, 9), axis=0)])
+    swept = np.cumulative_sum(sweep.reshape(-1, 9), axis=0, include_initial=True)
     reached = scipy.interpolate.make_interp_spline(edges, swept, k=1)
     return scipy.spatial.transform.Slerp(edges, frames), lambda times: reached(times).reshape(-1, 3, 3)
 
@@ -460,7 +460,7 @@ class MagneticField(OfOneUnit):
         if not windows.alone:
             bent = windows.bent(field) * windows.level[:, None]
             # what the hand and the accelerometer's errors do to its length, they do across it, where nothing shows it
-            shaken_up = 1.4826 * np.median(windows.off) * np.linalg.norm(bent[:, 9:], axis=1)
+            shaken_up = robust_sigma(windows.off) * np.linalg.norm(bent[:, 9:], axis=1)
             measured[3 * n :, 3 * n :] += bent @ windows.vertical @ bent.T + np.diag(shaken_up**2)
         return Covariance(measured, tuple(factors), used, group)  # pyright: ignore
 

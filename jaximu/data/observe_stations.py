@@ -26,9 +26,10 @@ from jaximu.ground.rotation import unit_vectors
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
+from jaximu.recordings.entry import ScheduleEntry, times_of
 from jaximu.recordings.observations import POWER_ON, Stations
 from jaximu.recordings.recording import Recording, Signal
-from jaximu.recordings.reference import Entry, Integral, match_reference, means_over, rest_rate
+from jaximu.recordings.reference import Integral, match_reference, means_over, rest_rate
 from jaximu.recordings.segmentation import noise_by_model, require_model, rest_statistics
 from jaximu.simulation.protocols import Environment, Protocol, attitude_of
 from jaximu.simulation.protocols.motion import smooth_course
@@ -44,7 +45,7 @@ _FEWEST = 32  # stations, padding included: with powers of two above it few shap
 _STILL = 1.0  # s; between entries closer than this nothing happens
 
 
-def attitudes(entries: Sequence[Entry]) -> list[Rotation | None]:
+def attitudes(entries: Sequence[ScheduleEntry]) -> list[Rotation | None]:
     """Return the attitude (body to level frame) in which each entry begins, None where nothing tells its heading.
 
     A pose's heading is stated, or follows through the turns from a neighbour that has one. Without any stated heading
@@ -75,7 +76,7 @@ def attitudes(entries: Sequence[Entry]) -> list[Rotation | None]:
 
 def observe_stations(
     recordings: Recording | Sequence[Recording],
-    references: Sequence[Entry] | Sequence[Sequence[Entry]],
+    references: Sequence[ScheduleEntry] | Sequence[Sequence[ScheduleEntry]],
     gravity: float,
     noise: NoiseModel | None = None,
     temperature_reference: float = REFERENCE_TEMPERATURE,
@@ -103,7 +104,7 @@ def observe_stations(
     known = all(None not in attitudes(entries) for recording, entries in parts if recording.attitude is None)
     stimuli, means, covariances, spans, turns = [], [], [], [], []
     for recording, entries in parts:
-        span = np.array([(entry.start, entry.stop) for entry in entries])
+        span = times_of(entries)
         turn = np.array([entry.kind == "turn" for entry in entries])
         stimulus = _recorded_stimulus(recording, entries, span, gravity, temperature_reference)
         stimuli.append(stimulus if known else replace(stimulus, attitude=None))
@@ -168,7 +169,11 @@ def _known_covariance(
 
 
 def _recorded_stimulus(
-    recording: Recording, entries: Sequence[Entry], span: FloatArray, gravity: float, temperature_reference: float
+    recording: Recording,
+    entries: Sequence[ScheduleEntry],
+    span: FloatArray,
+    gravity: float,
+    temperature_reference: float,
 ) -> Stimulus:
     nodes = span[:, :1] + np.diff(span) * np.linspace(0.0, 1.0, 2 * NODES + 1)
     time = nodes[:, 1::2]
@@ -177,7 +182,7 @@ def _recorded_stimulus(
     else:
         course = np.tile(np.linspace(0.0, 1.0, 2 * NODES + 1), (len(entries), 1))
         if recording.gyroscope is not None:
-            integral = Integral(recording.gyroscope, recording.gyroscope.si())
+            integral = Integral(recording.gyroscope)
             bias = rest_rate(integral, entries)
             for k, entry in enumerate(entries):
                 if entry.kind == "turn":
@@ -227,7 +232,7 @@ def scheme_stations(
     imu = Imu.nominal() if imu is None else imu
     plan = protocol.plan(np.random.default_rng(0), replace(environment or Environment(), latitude=None))
     entries, motion = plan.intervals, plan.motion
-    span = np.array([(entry.start, entry.stop) for entry in entries])
+    span = times_of(entries)
     segment = np.searchsorted(motion.start, span[:, 0] + 1e-9, side="right") - 1
     begin = [
         scipy.spatial.transform.Rotation.from_quat(attitude, scalar_first=True) for attitude in motion.attitude[segment]
@@ -261,7 +266,7 @@ def _mean_outputs(imu: Imu, stations: Stations):
 
 
 def _stimulus(
-    entries: Sequence[Entry], begin: Sequence[Rotation | None], course: FloatArray, gravity: float
+    entries: Sequence[ScheduleEntry], begin: Sequence[Rotation | None], course: FloatArray, gravity: float
 ) -> Stimulus:
     """Return force, rate and attitude at the nodes, from how much of each turn is done at their edges and middles
     (S, 2Q + 1). Where an attitude is not known there is none, and the force in turns is that of the turn's begin.

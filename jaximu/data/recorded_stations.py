@@ -25,9 +25,10 @@ from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.tracing import first, lifted, on_host
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
+from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.observations import Stations
 from jaximu.recordings.recording import Recording
-from jaximu.recordings.reference import Entry, entries_of_columns
+from jaximu.recordings.reference import entries_of_columns
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class RecordedStations(OfOneUnit):
 
     recording: Recording
     stations: Stations
-    entries: Sequence[Entry] = ()
+    entries: Sequence[ScheduleEntry] = ()
 
     excess_names = EXCESS_NAMES
     coarse = KnownStations.coarse
@@ -61,7 +62,7 @@ class RecordedStations(OfOneUnit):
     def of(
         cls,
         recording: Recording,
-        references: Sequence[Entry] | None = None,
+        references: Sequence[ScheduleEntry] | None = None,
         gravity: Gravity = STANDARD,
         noise: NoiseModel | None = None,
     ) -> RecordedStations:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from jaximu.estimation.track import TEMPERATURE_WINDOW, TRIADS, Track
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import midpoints
+from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import sentence
 from jaximu.mistakes import prepared
@@ -421,7 +422,7 @@ def _cut(recording: Recording, block: float) -> RestBlocks:
 def _cells(signal: Signal, edges: NDArray[np.floating]) -> FloatArray:
     """Return means between edges of the line through a signal's samples, which goes on as it ends."""
     time, values = signal.time, signal.values[:, 0]
-    whole = np.concatenate([[0.0], np.cumsum(np.diff(time) * midpoints(values))])
+    whole = np.cumulative_sum(np.diff(time) * midpoints(values), include_initial=True)
     inside = np.clip(edges, time[0], time[-1])
     k = np.clip(np.searchsorted(time, inside, side="right") - 1, 0, len(time) - 2)
     integral = whole[k] + (inside - time[k]) * (values[k] + np.interp(inside, time, values)) / 2
@@ -495,7 +496,7 @@ def _startup(signal: Signal) -> int:
     weights = 1 / ahead - (x - x.mean()) * x.mean() / np.sum((x - x.mean()) ** 2)
     windows = np.lib.stride_tricks.sliding_window_view(values[1:], ahead, axis=0)  # (count, axes, ahead)
     miss = np.abs(values[:count] - windows[:count] @ weights)
-    usual = 1.4826 * np.median(miss, axis=0)
+    usual = robust_sigma(miss, axis=0)
     bad = np.flatnonzero((miss > _STARTUP * np.maximum(usual, 1e-12)).any(axis=1))
     end = 0
     for row in bad:

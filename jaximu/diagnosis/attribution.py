@@ -30,6 +30,7 @@ from jaximu.diagnosis.lines import MOVING_LINE, MovingLine, coincident
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -344,7 +345,7 @@ class CommonDrift:
         random = np.random.default_rng(20260101)
         rates = np.concatenate([_rates(part, times, random, draws) for part in parts], axis=2)
         rests = parts[0].rests
-        up = np.stack([np.interp(times, rests.times, axis) for axis in rests.up.T], axis=1)
+        up = interpolated(rests.times, rests.up, times)
         if draws:
             rates[1:] = _as_slow(rates, times, up, random)
         courses, shares = _principal(rates)
@@ -411,7 +412,7 @@ def _rates(part: BoardRecording, times: FloatArray, random: np.random.Generator,
     evidence, rests = part.evidence, part.rests
     noise = evidence.draws(random, draws)
     values = rests.off_orientation(rests.rates(np.concatenate([evidence.residual[:, None], noise], axis=1)))
-    onto = np.stack([np.interp(times, rests.times, pose) for pose in np.eye(len(values))], axis=1)
+    onto = interpolated(rests.times, np.eye(len(values)), times)
     values = np.einsum("to,oik->kti", onto, values)
     return values - values.mean(axis=1, keepdims=True)
 

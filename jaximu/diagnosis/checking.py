@@ -27,6 +27,7 @@ from jaximu.estimation.data import Data
 from jaximu.estimation.rows import TEMPERATURE
 from jaximu.estimation.uncertainty import describe, label
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.distributions import chi2_sf, holm, normal_sf
 from jaximu.ground.errors import InputError, JaximuError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
@@ -388,9 +389,7 @@ def _upright(old: Old, recording: Recording, history: History, gravity: LocalGra
     """Raise `InputError` where gravity is far off in rests, which no calibration's age makes."""
     signal = recording.accelerometer
     force = np.asarray(old.imu.with_effects().accelerometer.recover(signal.values))
-    size = np.linalg.norm(
-        np.stack([np.interp(history.time[history.rest] - INTERVAL / 2, signal.time, axis) for axis in force.T]), axis=0
-    )
+    size = np.linalg.norm(interpolated(signal.time, force, history.time[history.rest] - INTERVAL / 2), axis=1)
     off = float(np.median(np.abs(size - gravity.value)))
     if off > _FAR_OFF[0]:
         raise InputError(

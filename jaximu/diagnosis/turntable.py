@@ -13,17 +13,18 @@ from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.mistakes import Prepared, prepare, prepared
 from jaximu.model.noise_model import NoiseModel
 from jaximu.noise.at_rest import noise_of
+from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.recording import Recording
-from jaximu.recordings.reference import Entry, entries_of_columns
+from jaximu.recordings.reference import entries_of_columns
 
 
 def diagnose_turntable(
     recording: Recording,
-    reference: Sequence[Entry] | None = None,
+    reference: Sequence[ScheduleEntry] | None = None,
     gravity: Gravity = STANDARD,
     *,
     static: Recording | NoiseModel | None = None,
-    heldout: tuple[Recording, Sequence[Entry] | None] | None = None,
+    heldout: tuple[Recording, Sequence[ScheduleEntry] | None] | None = None,
     level: float = 0.05,
     repair: bool = False,
 ) -> Diagnosis:
@@ -41,10 +42,10 @@ def diagnose_turntable(
 
 def _of_ready(
     ready: Prepared,
-    reference: Sequence[Entry] | None,
+    reference: Sequence[ScheduleEntry] | None,
     gravity: LocalGravity,
     noise: NoiseModel | None,
-    heldout: tuple[Recording, Sequence[Entry] | None] | None,
+    heldout: tuple[Recording, Sequence[ScheduleEntry] | None] | None,
     level: float,
     repair: bool,
 ) -> Diagnosis:
@@ -64,7 +65,7 @@ def _of_ready(
 
 
 def _on_table(
-    ready: Prepared, reference: Sequence[Entry] | None, gravity: LocalGravity
+    ready: Prepared, reference: Sequence[ScheduleEntry] | None, gravity: LocalGravity
 ) -> tuple[Calibration, RecordedStations]:
     """Return the calibration at known poses and turns, and what it was fitted to."""
     entries = entries_of_columns(ready.recording) if reference is None else reference

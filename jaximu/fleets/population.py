@@ -25,6 +25,7 @@ from jaximu.estimation.problem import Name
 from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, SCHEMA, covariances, free_places, require_table
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
+from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.document import Document, Json
 from jaximu.ground.errors import FilePath, NotPossibleError
 from jaximu.ground.page import Result
@@ -226,7 +227,7 @@ def estimate_population(names: Sequence[Name], values: FloatArray, covariances: 
         raise NotPossibleError(f"{count} calibrated units are too few for a population: it takes {FEWEST} or more.")
     mean = np.median(values, axis=0)
     noise = np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0)
-    scatter = np.square(1.4826 * np.median(np.abs(values - mean), axis=0))
+    scatter = np.square(robust_sigma(values - mean, axis=0))
     covariance = np.diag(np.maximum(scatter - noise, 0.01 * scatter + 1e-18))
     limit = float(scipy.stats.chi2.isf(LEVEL / count, size))
     kept = np.zeros(count, bool)

@@ -1,16 +1,14 @@
-"""Rates of change from samples, values between them, and derivatives with the value."""
+"""Rates of change from samples, values between them, and derivatives with the value; on the host JAX is not loaded."""
 
 from collections.abc import Callable
 from typing import Any
 
 from jaxtyping import Float
 
-from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import Numbers
 from jaximu.ground.tracing import array_module
 
 
-def slopes(values: Float[Array, "... n m"], time: Float[Array, "... n"]) -> Float[Array, "... n m"]:
+def slopes(values: Float[Any, "... n m"], time: Float[Any, "... n"]) -> Float[Any, "... n m"]:
     """Return dv/dt at every sample: of the parabola through it and its neighbours, one-sided at the ends.
 
     Second order in the interval, also where stamps are uneven; for even ones the central difference. Zero where stamps
@@ -29,18 +27,18 @@ def slopes(values: Float[Array, "... n m"], time: Float[Array, "... n"]) -> Floa
     return numerics.concatenate([chord[..., :1, :], inner, chord[..., -1:, :]], axis=-2)
 
 
-def midpoints(values: Float[Array, "n ..."]) -> Float[Array, "n-1 ..."]:
+def midpoints(values: Float[Any, "n ..."]) -> Float[Any, "n-1 ..."]:
     """Return the means of neighbours along the first axis."""
     return (values[1:] + values[:-1]) / 2
 
 
-def interpolated(time: Float[Array, " n"], values: Float[Array, "n k"], wanted: Numbers) -> Float[Array, "... k"]:
+def interpolated(time: Float[Any, " n"], values: Float[Any, "n k"], wanted: Float[Any, "..."]) -> Float[Any, "... k"]:
     """Return values at other times, along straight lines; the first and last value beyond the ends."""
     numerics = array_module(time, values, wanted)
     return numerics.stack([numerics.interp(wanted, time, column) for column in values.T], axis=-1)
 
 
-def value_and_jacobian(function: Callable[[Array], Any], at: Array) -> tuple[Any, Any]:
+def value_and_jacobian(function: Callable[[Any], Any], at: Any) -> tuple[Any, Any]:
     """Return what a function of a vector makes of it, and its derivatives there (forward mode), traced once."""
     import jax
 

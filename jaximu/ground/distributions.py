@@ -1,4 +1,4 @@
-"""Root mean squares; tails of distributions by SciPy's special functions: `scipy.stats` takes far longer to load."""
+"""Root mean squares, medians, tails of distributions: by SciPy's functions, as `scipy.stats` takes longer to load."""
 
 import numpy as np
 import scipy
@@ -7,6 +7,11 @@ import scipy
 def rms(values) -> float:
     """Return the root mean square of numbers of any shape."""
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+def robust_sigma(errors, axis=None):
+    """Return the standard deviation that normal errors (n, …) of their median size have."""
+    return 1.4826 * np.median(np.abs(errors), axis=axis)
 
 
 def chi2_sf(value, freedom):

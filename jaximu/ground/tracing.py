@@ -21,10 +21,13 @@ def is_traced(*trees: Any) -> bool:
 
 def array_module(*trees: Any) -> Any:
     """Return `jax.numpy` where any array of these is being traced, else NumPy: eager JAX compiles every operation."""
-    import jax.numpy
+    if is_traced(*trees):
+        import jax.numpy
+
+        return jax.numpy
     import numpy
 
-    return jax.numpy if is_traced(*trees) else numpy
+    return numpy
 
 
 def first(tree: Tree) -> Tree:

@@ -214,3 +214,8 @@ def parse_column(text: str) -> tuple[str, str | None]:
     if _NO_UNIT.fullmatch(stated):
         return match[1], None
     return match[1], stated or None
+
+
+def column_title(name: str, unit: str | None) -> str:
+    """A column's name with its unit in brackets, where it has one: what `parse_column` reads."""
+    return f"{name} [{unit}]" if unit else name

@@ -8,24 +8,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
-from jaximu.recordings.alignment import BlockMeans, Clocks, clocks, gravity_turning
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.distributions import robust_sigma
+from jaximu.recordings.alignment import TURN_ANGLE, BlockMeans, Clocks, clocks, gravity_turning, of_each
 from jaximu.recordings.finding import Rows
-from jaximu.recordings.recording import Recording, Signal, runs_of
-
-__all__ = [
-    "BRIDGED",
-    "HUNG",
-    "TITLES",
-    "Samples",
-    "Sensor",
-    "coarse_step",
-    "scale_around",
-    "spans_of",
-    "steps_of",
-]
+from jaximu.recordings.recording import GAP, Recording, Signal, floor_of, runs_of, steps_of
 
 TITLES = {
     "data.bumped_pose": "bumped pose",
@@ -53,7 +41,6 @@ _FEW_STEPS = 3.5
 _BLOCK = 0.25  # s, over which scatter is taken to tell rest from motion
 _QUIET = 6.0  # times the floor of the variance up to which a block counts as rest
 _SHORTEST_REST = 0.75  # s
-_TURN = np.radians(20)  # from one rest to the next, that makes another pose of it
 _RESTED = 0.9  # share of a recording that is quiet where it was made of a unit at rest
 _UNITS = {"accelerometer": "m/s^2", "gyroscope": "rad/s"}
 _CURVATURE_NOISE = float(np.sqrt(1 + 34 / 36))  # of a sample's difference from the cubic through its neighbours
@@ -92,9 +79,14 @@ class Sensor:
         return np.diff(self.values, axis=0)
 
     @cached_property
-    def even(self) -> NDArray[np.bool_]:
+    def extremes(self) -> FloatArray:
+        """(2, 3) the largest and the smallest value of each axis."""
+        return np.stack([self.values.max(axis=0), self.values.min(axis=0)])
+
+    @cached_property
+    def even(self) -> BoolArray:
         """(n − 1,) whether an interval is no gap."""
-        return np.asarray(self.interval, np.float64) < 1.6 * max(self.period, float(np.mean(self.interval)))
+        return np.asarray(self.interval, np.float64) < GAP * max(self.period, np.mean(self.interval))
 
     @cached_property
     def curvature(self) -> FloatArray:
@@ -103,8 +95,7 @@ class Sensor:
         misfit = np.zeros_like(values)
         misfit[2:-2] = values[2:-2] - (4 * (values[1:-3] + values[3:-1]) - values[:-4] - values[4:]) / 6
         broken = np.flatnonzero(~self.even)
-        for shift in (-1, 0, 1, 2):
-            misfit[np.clip(broken + shift, 0, len(values) - 1)] = 0.0
+        misfit[np.clip(broken[:, None] + np.arange(-1, 3), 0, len(values) - 1)] = 0.0
         return misfit
 
     @cached_property
@@ -135,17 +126,17 @@ class Sensor:
             if not _ZEROS <= zero.mean() < 1.0:
                 continue
             sizes = np.abs(values[~zero])
-            least = float(sizes.min())
+            least = sizes.min()
             near = values[~zero][sizes < 2 * least] / least
             both = min(np.mean(near > 0), np.mean(near < 0)) > _EITHER
             if len(near) >= _BESIDE and both and len(np.unique(np.round(np.abs(near) * _FINER))) >= _FINER // 2:
-                axes.append((float(zero.mean()), least / float(np.abs(scale))))
+                axes.append((float(zero.mean()), least / np.abs(scale)))
         return max(axes) if axes else None
 
-    @cached_property
+    @property
     def step(self) -> FloatArray:
         """(3,) the least difference of two values of an axis."""
-        return np.array([np.min(steps) if len(steps) else 0.0 for steps in map(steps_of, self.values[:20000].T)])
+        return self.signal.step
 
     @cached_property
     def blocks(self) -> tuple[Rows, FloatArray, FloatArray]:
@@ -157,13 +148,11 @@ class Sensor:
         return np.arange(count) * size, parts.mean(axis=1), parts.var(axis=1)
 
     @cached_property
-    def quiet(self) -> NDArray[np.bool_]:
+    def quiet(self) -> BoolArray:
         """(n,) whether a sample lies in a block that varies no more than the quietest do."""
         _, mean, variance = self.blocks
         total = variance.sum(axis=1)
-        lowest = max(float(np.percentile(total, 5)), 1e-30)
-        floor = float(np.median(total[total <= 3 * lowest])) if (total <= 3 * lowest).any() else lowest
-        floor = max(floor, float(np.sum(self.step**2)) / 12)
+        floor = max(floor_of(total), self.signal.rounding_variance)
         calm = total <= _QUIET * floor
         if len(mean) > 2:  # slow, smooth motion varies little within a block, but from block to block
             leave_out_both(calm, np.sum(np.diff(mean, axis=0) ** 2, axis=1) > 36 * floor + 1e-24)
@@ -175,15 +164,19 @@ class Sensor:
         first = self.blocks[0]
         return int(first[1]) if len(first) > 1 else len(self)
 
-    def by_sample(self, by_block: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def by_sample(self, by_block: BoolArray) -> BoolArray:
         """Return for each sample (n,) what holds for its block (b,); those behind the last one belong to it."""
         return by_block[np.minimum(np.arange(len(self)) // self.block_size, len(by_block) - 1)]
+
+    def next_to(self, times: FloatArray) -> IntArray:
+        """Return the row (k,) of the first sample at or after each time (k,), or of the last one."""
+        return np.minimum(np.searchsorted(self.time, times), len(self) - 1)
 
     def rows(self, indices: Any) -> tuple[int, ...]:
         """Return the first few rows concerned as a person counts them in the recording as it was given."""
         return tuple(int(row) + 1 for row in self.origin[list(indices)[:_SHOWN]])
 
-    def at(self, index: int) -> str:
+    def at(self, index: int | np.integer) -> str:
         """Return the time of a row."""
         return f"{self.time[index]:.1f} s"
 
@@ -236,13 +229,12 @@ class Samples:
         """Whether both sensors have one row for each stamp."""
         return self.both is not None and np.array_equal(self.both[0].time, self.both[1].time)
 
-    def quiet_at(self, sensor: Sensor) -> NDArray[np.bool_]:
+    def quiet_at(self, sensor: Sensor) -> BoolArray:
         """(n,) whether the *other* sensor, or the sensor itself where it is alone, is at rest at a sensor's samples."""
         other = self.gyroscope if sensor is self.accelerometer else self.accelerometer
         if other is None or self.shared:
             return (other or sensor).quiet
-        nearest = np.clip(np.searchsorted(other.time, sensor.time), 0, len(other) - 1)
-        return other.quiet[nearest]
+        return other.quiet[other.next_to(sensor.time)]
 
     @cached_property
     def turning(self) -> BlockMeans | None:
@@ -280,7 +272,7 @@ class Samples:
             angle = np.cumsum((rate.values - np.median(rate.values, axis=0)) * rate.period, axis=0)
             runs = runs_of(~rate.quiet)
             far = np.linalg.norm(angle[runs[:, 1] - 1] - angle[runs[:, 0]], axis=1)
-            if np.max(far, initial=0.0) > _TURN:
+            if np.max(far, initial=0.0) > TURN_ANGLE:
                 return True
         return self._reversals is None or self._reversals > 0
 
@@ -298,21 +290,21 @@ class Samples:
         if sensor is None or not len(rests):
             return 0
         edges = np.searchsorted(sensor.time, rests)
-        means = np.stack([np.median(sensor.values[a : max(b, a + 1)], axis=0) for a, b in edges])
+        means = of_each(np.median, sensor.values, edges)
         size = np.linalg.norm(means, axis=1)
         if np.ptp(size) > 0.5 * np.median(size):
             return None
         cosine = np.sum(means[1:] * means[:-1], axis=1) / np.maximum(size[1:] * size[:-1], 1e-300)
-        return int(np.sum(cosine < np.cos(_TURN)))
+        return int(np.sum(cosine < np.cos(TURN_ANGLE)))
 
 
-def spans_of(flags: NDArray[np.bool_], time: FloatArray, shortest: float) -> FloatArray:
+def spans_of(flags: BoolArray, time: FloatArray, shortest: float) -> FloatArray:
     """Return start and stop (k, 2), s, of the runs of True at stamps (n,) that take so many seconds or more."""
     spans = time[np.minimum(runs_of(flags), len(time) - 1)]
     return spans[spans[:, 1] - spans[:, 0] >= shortest]
 
 
-def leave_out_both(calm: NDArray[np.bool_], moved: NDArray[np.bool_]) -> None:
+def leave_out_both(calm: BoolArray, moved: BoolArray) -> None:
     """Mark as not calm, in place, the blocks (b,) on both sides of each step (b - 1,) that moved."""
     calm[1:] &= ~moved
     calm[:-1] &= ~moved
@@ -325,34 +317,28 @@ def scale_around(misfit: FloatArray, before: bool = True) -> FloatArray:
     """
     size = 16
     blocks = max(1, len(misfit) // size)
-    columns = np.abs(np.ascontiguousarray(misfit[: blocks * size].T))
-    scale = 1.4826 * np.stack([np.median(axis.reshape(blocks, -1), axis=1) for axis in columns], axis=1)
+    columns = np.ascontiguousarray(misfit[: blocks * size].T)
+    scale = np.stack([robust_sigma(axis.reshape(blocks, -1), axis=1) for axis in columns], axis=1)
     wide = np.maximum(scale, np.concatenate([scale[1:], scale[-2:][:1]]))  # the last one has none after it
     if before:
         wide[1:-1] = np.maximum(wide[1:-1], scale[:-2])
     return wide[np.minimum(np.arange(len(misfit)) // size, blocks - 1)]
 
 
-def steps_of(values: FloatArray) -> FloatArray:
-    """Return the differences (k,) of neighbouring levels of an axis (n,), rounding apart."""
-    steps = np.diff(np.unique(values))
-    return steps[steps > 1e-9 * np.ptp(values)]
-
-
-def coarse_step(sensor: Sensor, axis: int, quiet: NDArray[np.bool_] | None = None) -> float | None:
+def coarse_step(sensor: Sensor, axis: int, quiet: BoolArray | None = None) -> float | None:
     """Return the step of an axis whose noise is finer than it, else None."""
     values, change = sensor.values[:, axis], sensor.difference[:, axis]
     # at rest most neighbours are equal, and those that are not differ by whole steps
     same = change == 0
-    equal = float(np.mean(same))
+    equal = np.mean(same)
     if quiet is not None and quiet[1:].sum() > 100:
-        equal = max(equal, float(np.mean(same[quiet[1:]])))
+        equal = max(equal, np.mean(same[quiet[1:]]))
     if equal < 0.4:
         return None
     steps = steps_of(values)
     if len(steps) < 2:
         return None
-    step, moved = float(steps.min()), np.abs(change[~same])
+    step, moved = steps.min(), np.abs(change[~same])
     if np.mean(np.abs(moved / step - np.round(moved / step)) < 0.01) < 0.99:
         return None
     # an axis that is held, at a limit say, repeats itself as well: elsewhere its differences are many steps of its text

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.quantities import size
 from jaximu.mistakes.base import HUNG, Samples, Sensor
 from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import runs_of
-
-__all__ = ["TITLES", "at_limits", "find", "stops"]
 
 TITLES = {"data.clipping": "clipped output", "data.saturation": "saturated turns"}
 
@@ -40,7 +37,7 @@ def find(samples: Samples) -> list[Finding]:
 
 def _clipped(sensor: Sensor) -> list[Finding]:
     """Return the ends of the range at which a sensor's axes stop."""
-    extremes = np.stack([sensor.values.max(axis=0), sensor.values.min(axis=0)])
+    extremes = sensor.extremes
     axes: list[str] = []
     ends: list[Rows] = []
     limits, rows, all_out = [], np.zeros(len(sensor), bool), at_limits(sensor)
@@ -69,18 +66,17 @@ def _clipped(sensor: Sensor) -> list[Finding]:
         Finding(
             "data.clipping",
             sensor.rows(np.sort(every[:, 0])),
-            f"{sensor.name} {', '.join(dict.fromkeys(axes))}: {int(np.sum(lengths))} samples stop at "
-            f"{' or '.join(dict.fromkeys(limits))}, up to {int(np.max(lengths))} in a row: its range is too small "
+            f"{sensor.name} {', '.join(dict.fromkeys(axes))}: {np.sum(lengths)} samples stop at "
+            f"{' or '.join(dict.fromkeys(limits))}, up to {np.max(lengths)} in a row: its range is too small "
             + _CURE[sensor.name == "magnetometer"],
             without={sensor.name: np.flatnonzero(rows)},
         )
     ]
 
 
-def at_limits(sensor: Sensor) -> NDArray[np.bool_]:
+def at_limits(sensor: Sensor) -> BoolArray:
     """Return the rows (n,) in which every axis is at an end of what it reads in the recording."""
-    extremes = np.stack([sensor.values.max(axis=0), sensor.values.min(axis=0)])
-    return np.all((extremes[:, None] == sensor.values).any(axis=0), axis=1)
+    return np.all((sensor.extremes[:, None] == sensor.values).any(axis=0), axis=1)
 
 
 def stops(values: FloatArray, extreme: float) -> Rows:
@@ -134,18 +130,18 @@ def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
     hard = crowd.sum() >= 3 and elsewhere.sum() <= 0.34 * crowd.sum() and np.median(flat[crowd]) < 0.92
     hard = hard and np.ptp(flat[crowd]) > _ALIKE
     # soft: many come near it, and are the flatter the nearer they come; of a smooth motion the largest are the sharpest
-    typical = float(np.median(flat[upper])) if upper.any() else 0.0
+    typical = np.median(flat[upper]) if upper.any() else 0.0
     soft = (
         upper.sum() >= max(_FEWEST, 0.25 * middle.sum())
         and lower.sum() > 2
         and _FLAT < typical < 0.9
         and np.quantile(flat[upper], 0.2) > 0.8 * _FLAT
-        and typical > float(np.median(flat[lower])) - 0.005
+        and typical > np.median(flat[lower]) - 0.005
     )
     if not hard and not soft:
         return []
     # behind a hard limit the tops lie at it; a soft one spreads them
-    hard = hard and (not soft or float(np.mean(tops[upper] > 0.965)) > 0.75)
+    hard = hard and (not soft or np.mean(tops[upper] > 0.965) > 0.75)
     rows = np.flatnonzero((size > 0.9 * limit).any(axis=1))
     shown = f"{np.degrees(limit):.4g} °/s"
     first = sensor.rows(np.sort(np.array(places)[crowd if hard else upper]))

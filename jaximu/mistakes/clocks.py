@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.mistakes.base import Samples, with_signal
+from jaximu.recordings.alignment import EXPLAINED
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
-
-__all__ = ["TITLES", "find"]
 
 TITLES = {"data.clocks": "clocks apart"}
 
@@ -17,13 +16,12 @@ _LEAST = 0.04
 """Seconds from which on it is said: a hand's accelerations can imitate less, and poses and turns do not feel it."""
 _HARMFUL = 0.3
 """Seconds from which on parts of turns pass for poses."""
-_EXPLAINED = 0.5
 
 
 def find(samples: Samples) -> list[Finding]:
     """Return whether the gyroscope's stamps are late against the accelerometer's, or its clock runs otherwise."""
     clocks, gyroscope = samples.clocks, samples.gyroscope
-    if clocks is None or gyroscope is None or clocks.explained < _EXPLAINED:
+    if clocks is None or gyroscope is None or clocks.explained < EXPLAINED:
         return []
     ends = clocks.late(gyroscope.time[[0, -1]])
     drifts = abs(clocks.drift) > _SURE * clocks.drift_sigma

@@ -6,10 +6,8 @@ import numpy as np
 
 from jaximu.ground.quantities import counted
 from jaximu.mistakes.base import Samples
-from jaximu.recordings.finding import Finding, Rows
+from jaximu.recordings.finding import NO_ROWS, Finding, Rows
 from jaximu.recordings.recording import runs_of
-
-__all__ = ["TITLES", "find"]
 
 TITLES = {"data.duplicate": "repeated rows"}
 
@@ -38,7 +36,7 @@ def find(samples: Samples) -> list[Finding]:
             "data.duplicate",
             first.rows(blocks[:, 0]),
             f"{counted(len(rows), 'row')} in {counted(len(blocks), 'block')} repeat earlier rows value by value, first "
-            f"from {first.at(int(rows[0]))}: they were pasted twice, or the logger wrote a buffer twice. "
+            f"from {first.at(rows[0])}: they were pasted twice, or the logger wrote a buffer twice. "
             "The second copy is left out.",
             without=dict.fromkeys(samples.sensors, rows),
         )
@@ -56,7 +54,7 @@ def _repeated(values: np.ndarray) -> Rows:
     near = max(float(np.mean(code[lag:] == code[:-lag])) for lag in (1, 2, 3, 5, 8))
     length = int(np.clip(np.ceil(np.log(count**2 / _CHANCE) / -np.log(max(near, 1e-9))), 8, 2000)) if near < 1 else 0
     if length == 0 or 2 * length > count:
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     block, size = code.copy(), 1
     with np.errstate(over="ignore"):
         while size < length:  # the code of a block of `size` rows, doubled
@@ -66,11 +64,9 @@ def _repeated(values: np.ndarray) -> Rows:
     distinct = max(_DISTINCT[0], _DISTINCT[1] * (1 - near) * length)
     alike = np.sort(block)  # many times quicker than the order, and most recordings repeat nothing
     if not np.any(alike[1:] == alike[:-1]):
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     order = np.argsort(block, kind="stable")
     same = np.flatnonzero(block[order][1:] == block[order][:-1])
-    if not len(same):
-        return np.zeros(0, np.int64)
     earlier, later = order[same], order[same + 1]
     good = later - earlier >= length  # copies do not overlap
     earlier, later = earlier[good], later[good]
@@ -89,5 +85,5 @@ def _repeated(values: np.ndarray) -> Rows:
 def _by_chance(codes: np.ndarray, length: int, count: int) -> bool:
     """Whether a run of rows as alike as those around it would repeat by chance somewhere among so many rows."""
     _, often = np.unique(codes, return_counts=True)
-    alike = float(np.sum(often * (often - 1.0))) / max(len(codes) * (len(codes) - 1.0), 1.0)  # of two rows
+    alike = np.sum(often * (often - 1.0)) / max(len(codes) * (len(codes) - 1.0), 1.0)  # of two rows
     return length * -np.log(max(alike, 1e-12)) < np.log(count**2 / _CHANCE)

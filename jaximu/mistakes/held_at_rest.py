@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu.ground.array_types import BoolArray
 from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Samples, Sensor, with_signal
+from jaximu.recordings.alignment import of_each
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording
-
-__all__ = ["TITLES", "find", "zeroed_at_rest"]
 
 TITLES = {"data.auto_zero": "automatic zero at rest"}
 
@@ -33,7 +32,7 @@ def zeroed_at_rest(samples: Samples) -> float | None:
     zero = (sensor.signal.values == 0.0).all(axis=1)
     if rest.sum() < 50 or rest.mean() > 0.98 or zero.sum() < 50:
         return None
-    share = float(zero[rest].mean())
+    share = zero[rest].mean()
     if share < 0.5 or zero[~rest].mean() > 0.5 * share:
         return None
     # coarse steps round a small bias to zero as well: what moves comes in the same steps, or they are larger than noise
@@ -78,11 +77,11 @@ def find(samples: Samples) -> list[Finding]:
     return _high_passed(samples, sensor)
 
 
-def _finding(sensor: Sensor, concerned: NDArray[np.bool_], text: str, refuses: str = "") -> Finding:
+def _finding(sensor: Sensor, concerned: BoolArray, text: str, refuses: str = "") -> Finding:
     return Finding("data.auto_zero", sensor.rows([np.argmax(concerned)]), text, spoils=True, refuses=refuses)
 
 
-def _held(samples: Samples, sensor: Sensor, rest: NDArray[np.bool_]) -> float | None:
+def _held(samples: Samples, sensor: Sensor, rest: BoolArray) -> float | None:
     """Return the noise at rest as a share of that in motion, where it is hardly any."""
     if rest.sum() < 100 or (~rest).sum() < 100 or any(sensor.coarse):
         return None
@@ -91,7 +90,7 @@ def _held(samples: Samples, sensor: Sensor, rest: NDArray[np.bool_]) -> float | 
         return None
     at_rest, moving = (np.median(np.abs(sensor.curvature[which]), axis=0) for which in (rest, ~rest))
     # in fast turns at a low rate the motion itself is not smooth: what differs a thousandfold is no motion
-    ratio = float(np.max(at_rest / np.maximum(moving, 1e-300)))
+    ratio = np.max(at_rest / np.maximum(moving, 1e-300))
     return ratio if ratio < 1e-3 and np.all(moving > 1e-5) and np.all(at_rest < 1e-7) else None
 
 
@@ -110,12 +109,12 @@ def _high_passed(samples: Samples, sensor: Sensor) -> list[Finding]:
     edges = edges[edges[:, 1] - edges[:, 0] > 5]
     if len(edges) < 2 * _FEWEST:
         return []
-    rate, turned = (np.stack([values[a:b].mean(axis=0) for a, b in edges]) for values in (sensor.values, angle))
+    rate, turned = (of_each(np.mean, values, edges) for values in (sensor.values, angle))
     rate, turned = rate - rate.mean(axis=0), turned - turned.mean(axis=0)
-    power = float(np.sum(turned**2))
+    power = np.sum(turned**2)
     if not power > 0:
         return []
-    slope = float(np.sum(rate * turned)) / power
+    slope = np.sum(rate * turned) / power
     unexplained = np.sum((rate - slope * turned) ** 2)
     slopes = np.sum(rate * turned, axis=0) / np.maximum(np.sum(turned**2, axis=0), 1e-300)
     # one time constant for all axes, and nearly all of what the means do at rest

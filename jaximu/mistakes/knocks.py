@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaximu.ground.distributions import robust_sigma
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import runs_of
-
-__all__ = ["TITLES", "find"]
 
 TITLES = {"data.knock": "knocked at rest"}
 
@@ -59,7 +58,7 @@ def _knocks(sensor: Sensor) -> np.ndarray:
     scatter = np.median(np.abs(parts - np.median(parts, axis=1, keepdims=True)), axis=1)
     excess = np.log(np.maximum(scatter, np.maximum(sensor.step, 1e-300) / 2))
     excess -= np.median(excess, axis=0)
-    spread = 1.4826 * np.median(np.abs(excess), axis=0)  # of filtered noise it is larger than of white
+    spread = robust_sigma(excess, axis=0)  # of filtered noise it is larger than of white
     runs = runs_of(np.any(excess > np.maximum(np.log(_TIMES), _STANDS_OUT * spread), axis=1))
     stop = np.minimum(runs[:, 1] * size, len(sensor) - 1)
     return np.stack([sensor.time[first[runs[:, 0]]], sensor.time[stop]], axis=1)

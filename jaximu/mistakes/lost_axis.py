@@ -11,8 +11,6 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.copied_axis": "copied axis", "data.dead_axis": "dead axis"}
 
 _SLOW = 0.15
@@ -108,8 +106,8 @@ def _dead_rate(samples: Samples) -> list[Finding]:
     if sensor is None or blocks is None:
         return []
     moved = np.sqrt(np.mean((sensor.values - np.median(sensor.values, axis=0)) ** 2, axis=0))
-    axis = int(np.argmin(moved))
-    others = float(np.min(np.delete(moved, axis)))
+    axis = np.argmin(moved)
+    others = np.min(np.delete(moved, axis))
     if others < 0.05 or moved[axis] > 0.02 * others or abs(np.median(sensor.values[:, axis])) > _NO_BIAS:
         return []
     unexplained = blocks.change + np.cross(blocks.turned(), blocks.force)

@@ -6,14 +6,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.mistakes.base import Samples, Sensor, scale_around
-from jaximu.recordings.finding import Finding, Rows
+from jaximu.recordings.finding import NO_ROWS, Finding, Rows
 from jaximu.recordings.recording import Recording
-
-__all__ = ["TITLES", "find", "steps"]
 
 TITLES = {"data.lost_samples": "lost samples"}
 
@@ -76,7 +73,7 @@ def _evidence(samples: Samples, lost: FloatArray, wanted: Rows, half: int) -> tu
     is seen there: (sensors, w) each. The step is that of a cubic through `half` samples on either side, on the times
     that the samples `lost` (n − 1,) already known give them.
     """
-    time = np.arange(len(lost) + 1) + np.concatenate([[0.0], np.cumsum(lost)])
+    time = np.arange(len(lost) + 1) + np.cumulative_sum(lost, include_initial=True)
     rows = wanted[:, None] + np.arange(1 - half, 1 + half)
     centre = (time[wanted] + time[wanted + 1]) / 2
     side = np.repeat([-0.5, 0.5], half)
@@ -101,8 +98,7 @@ def _evidence(samples: Samples, lost: FloatArray, wanted: Rows, half: int) -> tu
 def _quickly(samples: Samples, wanted: Rows, half: int) -> tuple[FloatArray, FloatArray]:
     """The same for evenly sampled sensors, by filters over what is near the intervals: nothing is known lost yet."""
     near = np.zeros(len(samples.first), bool)
-    for shift in range(1 - half, 1 + half):
-        near[wanted + shift] = True
+    near[wanted[:, None] + np.arange(1 - half, 1 + half)] = True
     index = np.cumsum(near)[wanted] - half  # of the filters' outputs
     offset = (np.arange(2 * half) - half + 0.5) / half
     design = np.column_stack([np.vander(offset, 4, increasing=True), np.sign(offset) / 2])
@@ -130,7 +126,7 @@ def _pairs(samples: Samples, lost: FloatArray, intervals: Rows, half: int, sure:
     pairs: list[int] = []
     groups = np.split(intervals, np.flatnonzero(np.diff(intervals) > half) + 1) if len(intervals) else []
     if len(groups) > _MOST_PAIRS:
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     for group in groups:
         centre, width = int(np.mean(group)), half + 3
         if centre - width < 1 or centre + width + 1 >= len(lost) or group[-1] - group[0] > 2 * half:
@@ -142,7 +138,7 @@ def _pairs(samples: Samples, lost: FloatArray, intervals: Rows, half: int, sure:
         for trial, loss in zip(trials, losses, strict=True):
             for interval in trial:
                 loss[interval - rows[0]] += 1
-        time = np.arange(len(rows)) + np.hstack([np.zeros((len(trials), 1)), np.cumsum(losses, axis=1)])
+        time = np.arange(len(rows)) + np.cumulative_sum(losses, axis=1, include_initial=True)
         time = (time - time[:, width : width + 1]) / width
         design = np.stack([time**power for power in range(5)], axis=2)
         basis, _ = np.linalg.qr(design)
@@ -151,7 +147,7 @@ def _pairs(samples: Samples, lost: FloatArray, intervals: Rows, half: int, sure:
             values = (sensor.values[rows] - sensor.values[rows].mean(axis=0)) / np.maximum(sensor.noise, 1e-300)
             inside = np.einsum("tjk,jm->tkm", basis, values)
             cost += (np.sum(values**2) - np.sum(inside**2, axis=(1, 2))) / 2
-        best = int(np.argmin(cost))
+        best = np.argmin(cost)
         if best and cost[0] - cost[best] > 2 * sure and cost[best] < 0.25 * cost[0]:
             pairs += trials[best]
     return np.unique(np.array(pairs, np.int64))
@@ -177,7 +173,7 @@ class _Losses(NamedTuple):
     """
 
     lost: FloatArray
-    clear: NDArray[np.bool_]
+    clear: BoolArray
     power: FloatArray
     step: FloatArray
 
@@ -222,8 +218,8 @@ def _losses(samples: Samples, wanted: Rows, half: int) -> _Losses | None:
             if np.sum(lost > 0) < _FEWEST + 4 * against:
                 return None
         # where losses are known to be frequent, less evidence will do for one more: the odds are (1 − r) : r before
-        often = float(np.sum(lost[wanted] > 0)) / max(int(clear.sum()), 1)
-        sure = float(np.clip(np.log((1 - often) / max(often, 1e-6)) + 5.0, 7.0, _SURE))
+        often = np.sum(lost[wanted] > 0) / max(int(clear.sum()), 1)
+        sure = np.clip(np.log((1 - often) / max(often, 1e-6)) + 5.0, 7.0, _SURE)
         least = 2.6 * sure
     return _Losses(lost, clear, power, step) if np.sum(lost > 0) >= _FEWEST else None
 
@@ -240,16 +236,15 @@ def _singles(samples: Samples) -> list[Finding]:
     places = np.flatnonzero(lost)
     # where motion is not smooth enough, intervals are off by any share of a sample, not by whole ones alone
     alone = np.ones(len(lost), bool)
-    for shift in range(-half, half + 1):
-        alone[np.clip(places + shift, 0, len(lost) - 1)] = False
+    alone[np.clip(places[:, None] + np.arange(-half, half + 1), 0, len(lost) - 1)] = False
     alone = alone[wanted] & (power > 4 * _CLEAR)
     between, against = alone & (np.abs(step - 0.5) < 0.2), alone & (step < -0.7)
     if max(between.sum(), against.sum()) > 0.34 * len(places):
         return []
     rate = len(places) / max(int(clear.sum()), 1)
-    later = np.concatenate([[0.0], np.cumsum(lost)]) * sensor.period
+    later = np.cumulative_sum(lost, include_initial=True) * sensor.period
     # what motion too slow to show a loss may still hide
-    hidden = rate * float(np.sum(~clear & (power > _HARM)))
+    hidden = rate * np.sum(~clear & (power > _HARM))
 
     def apply(recording: Recording) -> Recording:
         changed = {}
@@ -287,8 +282,7 @@ def steps(sensor: Sensor) -> FloatArray:
     miss = np.zeros_like(sensor.difference)
     miss[3:-3] = windows[4:] @ weight[::-1] - windows[:-4] @ weight
     broken = np.flatnonzero(~sensor.even)
-    for shift in range(-4, 5):
-        miss[np.clip(broken + shift, 0, len(miss) - 1)] = 0.0
+    miss[np.clip(broken[:, None] + np.arange(-4, 5), 0, len(miss) - 1)] = 0.0
     scale = np.maximum(scale_around(miss, before=False), 1.8 * sensor.noise)
     return np.max(np.abs(miss) / np.maximum(scale, 1e-300), axis=1)
 
@@ -328,7 +322,7 @@ def _clean(sensor: Sensor, index: int) -> bool:
     basis, _ = np.linalg.qr(np.vander(np.arange(8) / 8, 3))
     bend = np.max(np.abs(parts - basis @ (basis.T @ parts)), axis=(0, 1))
     jump = np.abs(after[0] - before[-1] - ((before[-1] - before[-2]) + (after[1] - after[0])) / 2)
-    axis = int(np.argmax(jump / np.maximum(sensor.noise, 1e-300)))
+    axis = np.argmax(jump / np.maximum(sensor.noise, 1e-300))
     least = 0.02 if sensor.name == "gyroscope" else 0.15
     slope = np.abs((before[-1] - before[-3]) + (after[2] - after[0])) / 4
     if jump[axis] < 2.7 * slope[axis]:  # one or two samples

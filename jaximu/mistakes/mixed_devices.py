@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import robust_sigma
 from jaximu.mistakes.base import Samples, Sensor, leave_out_both, spans_of
 from jaximu.mistakes.lost_samples import steps
-from jaximu.recordings.alignment import carried, turning
+from jaximu.recordings.alignment import carried, of_each, turning
 from jaximu.recordings.finding import Finding
-
-__all__ = ["TITLES", "find"]
 
 TITLES = {
     "data.mixed_devices": "sensors of different devices",
@@ -95,8 +94,7 @@ def _rests(accelerometer: Sensor, gyroscope: Sensor) -> FloatArray:
         calm = total <= 5 * floor
         moved = np.linalg.norm(np.diff(mean, axis=0), axis=1) > 6 * np.sqrt(np.minimum(floor[1:], floor[:-1]))
         leave_out_both(calm, moved)
-        nearest = np.clip(np.searchsorted(sensor.time, accelerometer.time), 0, len(sensor) - 1)
-        still &= sensor.by_sample(calm)[nearest]
+        still &= sensor.by_sample(calm)[sensor.next_to(accelerometer.time)]
     return spans_of(still, accelerometer.time, 0.7)
 
 
@@ -113,13 +111,13 @@ def _changed(samples: Samples) -> list[Finding]:
     means, noises = [], []
     for sensor in (accelerometer, gyroscope):
         edges = np.searchsorted(sensor.time, rests + [[0.1, -0.1]])
-        means.append(np.stack([sensor.values[a : max(b, a + 1)].mean(axis=0) for a, b in edges]))
-        size = np.stack([np.sqrt(np.mean(sensor.curvature[a : max(b, a + 1)] ** 2, axis=0)) for a, b in edges])
+        means.append(of_each(np.mean, sensor.values, edges))
+        size = np.sqrt(of_each(np.mean, sensor.curvature**2, edges))
         noises.append(np.log(np.maximum(size, 1e-12)))
     norm = np.log(np.maximum(np.linalg.norm(means[0], axis=1), 1e-9))[:, None]
     rate, noise = means[1], np.hstack(noises)
     distance, rest = _furthest(norm, 3, len(rests) - 2)
-    factor = float(np.exp(np.median(norm[rest:]) - np.median(norm[:rest])))
+    factor = np.exp(np.median(norm[rest:]) - np.median(norm[:rest]))
     if not 0.6 < factor < 1.6 and distance > _SHIFT:
         return [
             Finding(
@@ -141,7 +139,7 @@ def _changed(samples: Samples) -> list[Finding]:
     sudden = False
     if samples.shared:
         both = np.minimum(steps(accelerometer), steps(gyroscope))[window]
-        sudden = len(both) > 0 and float(both.max()) > 8.0
+        sudden = len(both) > 0 and both.max() > 8.0
         row = window.start + int(np.argmax(both)) + 1 if sudden else row
     if not sudden and noisier < 5.0:
         return []
@@ -167,6 +165,6 @@ def _furthest(values: FloatArray, first: int, stop: int) -> tuple[float, int]:
 def _apart(before: FloatArray, after: FloatArray) -> float:
     """How far the medians of rests before and after lie apart, in robust standard deviations of one rest."""
     middle = np.median(before, axis=0), np.median(after, axis=0)
-    spread = [1.4826 * np.median(np.abs(part - m), axis=0) for part, m in zip((before, after), middle, strict=True)]
+    spread = [robust_sigma(part - m, axis=0) for part, m in zip((before, after), middle, strict=True)]
     scale = np.maximum(np.maximum(*spread), 1e-9 * np.maximum(np.max(np.abs([*before, *after]), axis=0), 1e-300))
     return float(np.max(np.abs(middle[1] - middle[0]) / scale))

@@ -8,8 +8,6 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.mistakes.base import Samples
 from jaximu.recordings.finding import Finding
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.gravity_free": "gravity taken out", "data.normalised": "directions without size"}
 
 _CONSTANT = 0.3
@@ -24,7 +22,7 @@ def find(samples: Samples) -> list[Finding]:
     if sensor is None or len(sensor) < 100:
         return []
     norm = np.linalg.norm(sensor.values, axis=1)
-    middle = float(np.median(norm))
+    middle = np.median(norm)
     low, high = np.quantile(norm, [0.1, 0.5])
     # in units of g gravity is one everywhere at rest; what is left without it varies as much as it is large
     scattered = middle < 0.11 * STANDARD_GRAVITY and high > 1.5 * low
@@ -39,10 +37,10 @@ def find(samples: Samples) -> list[Finding]:
                 refuses="gravity",
             )
         ]
-    noise = float(np.min(sensor.noise))
-    scatter = float(np.quantile(np.abs(norm - middle), 0.995)) / 2.8
-    rounding = float(np.max(sensor.step))
-    turned = float(np.max(np.ptp(sensor.values, axis=0)))
+    noise = np.min(sensor.noise)
+    scatter = np.quantile(np.abs(norm - middle), 0.995) / 2.8
+    rounding = np.max(sensor.step)
+    turned = np.max(np.ptp(sensor.values, axis=0))
     if noise > 1e-9 * middle and turned > 0.5 * middle and scatter < max(_CONSTANT * noise, 1e-9 * middle):
         if scatter > 0.5 * noise - rounding and noise < 2 * rounding:
             return []

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+import scipy
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.distributions import gamma_mean_sf
 from jaximu.ground.quantities import size
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.mistakes.resampled import held_at, interpolated_at
+from jaximu.recordings.alignment import of_each
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import runs_of
-
-__all__ = ["TITLES", "find"]
 
 TITLES = {"data.periodic": "periodic disturbance", "data.bandwidth": "low-pass filter"}
 
@@ -42,7 +41,7 @@ def _lines(sensor: Sensor, parts: FloatArray, power: FloatArray) -> list[Finding
         if sensor.coarse[axis] is not None or not noisy:
             continue  # rounding makes lines, too
         ratios = density / _beside(density)
-        peak = int(np.argmax(ratios))
+        peak = np.argmax(ratios)
         ratio = ratios[peak]
         # a bin's mean over k blocks is gamma with shape k (windowed blocks do not overlap)
         if ratio > 4 and gamma_mean_sf(ratio, len(parts)) * len(power) < 1e-6:
@@ -106,15 +105,15 @@ def _bandwidth(samples: Samples, sensor: Sensor, power: FloatArray, width: int) 
     half = sensor.rate / 2
     corners = []
     for axis, density in enumerate(power.T):
-        low = float(np.max(_running_median(density[2 : len(density) // 2], 5)[2:-2], initial=0.0))
+        low = np.max(scipy.ndimage.median_filter(density[2 : len(density) // 2], 5)[2:-2], initial=0.0)
         if not low > 30 * max(floor[axis], 1e-30):
             continue
         upper = (frequency > 0.3 * half) & (frequency < 0.95 * half)
-        top = float(np.median(density[frequency > 0.85 * half]))
+        top = np.median(density[frequency > 0.85 * half])
         if top > _FALL * low:
             continue
         slope = np.polyfit(np.log(frequency[upper]), np.log(np.maximum(density[upper], floor[axis] + 1e-30)), 1)[0]
-        below = np.flatnonzero(_running_median(density, 3)[2:] < low / 2) + 2
+        below = np.flatnonzero(scipy.ndimage.median_filter(density, 3, mode="constant")[2:] < low / 2) + 2
         corner = float(frequency[below[0]]) if len(below) else half
         # a corner far below: what is left above may be flat again, by rounding or by an imperfect filter
         deep = top < 1e-3 * low and top < 30 * floor[axis]
@@ -158,7 +157,7 @@ _SHAKEN = {"accelerometer": 1.5, "gyroscope": 0.3}
 """m/s² and rad/s: rms of quiet stretches beyond which they are motion, a walk's quieter part, and no rest."""
 
 
-def _rest(samples: Samples, still: NDArray[np.bool_]) -> bool:
+def _rest(samples: Samples, still: BoolArray) -> bool:
     """Whether the quiet stretches of a recording are rest, and not merely quieter than the others."""
     for name, sensor in samples.sensors.items():
         if len(sensor) == len(still):
@@ -166,11 +165,7 @@ def _rest(samples: Samples, still: NDArray[np.bool_]) -> bool:
             runs = runs[runs[:, 1] - runs[:, 0] > 7]
             if not len(runs):
                 continue
-            values = sensor.values - sensor.values.mean(axis=0)
-            sums, squares = (np.cumsum(np.pad(part, ((1, 0), (0, 0))), axis=0) for part in (values, values**2))
-            length = np.diff(runs)
-            mean, square = ((total[runs[:, 1]] - total[runs[:, 0]]) / length for total in (sums, squares))
-            if np.median(np.sum(square - mean**2, axis=1)) > _SHAKEN[name] ** 2:
+            if np.median(np.sum(of_each(np.var, sensor.values, runs), axis=1)) > _SHAKEN[name] ** 2:
                 return False
     return True
 
@@ -180,9 +175,3 @@ def _detrended(parts: FloatArray) -> FloatArray:
     time = np.linspace(-1.0, 1.0, parts.shape[1])[:, None]
     centred = parts - parts.mean(axis=1, keepdims=True)
     return centred - time * (np.sum(time * centred, axis=1, keepdims=True) / np.sum(time**2))
-
-
-def _running_median(values: FloatArray, width: int) -> FloatArray:
-    """The median over so many neighbours, zeros beyond the ends."""
-    padded = np.pad(values, width // 2)
-    return np.median(np.lib.stride_tricks.sliding_window_view(padded, width), axis=1)

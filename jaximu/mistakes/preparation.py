@@ -32,11 +32,9 @@ from jaximu.mistakes import (
     wrap,
     zeros,
 )
-from jaximu.mistakes.base import BRIDGED, Samples, steps_of
+from jaximu.mistakes.base import BRIDGED, Samples
 from jaximu.recordings.finding import Finding, Rows
-from jaximu.recordings.recording import Defect, Recording, Signal, recordings_of, runs_of
-
-__all__ = ["MISTAKES", "Prepared", "inspect", "one_or_several", "prepare", "prepared", "without_rows"]
+from jaximu.recordings.recording import Defect, Recording, Signal, recordings_of, runs_of, steps_of
 
 _ROUNDS = 4
 _MUCH = 0.01  # share of a sensor's rows left out that may be why a calibration is not possible
@@ -99,10 +97,10 @@ def one_or_several(recordings: Any, *others: type) -> list[Any]:
 
     **Arguments:** `others`: what may stand among them.
     """
-    several = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
+    several = recordings_of(recordings, Prepared, *others)
     if not several:
         raise InputError("no recording was given.")
-    return [one if isinstance(one, (Prepared, *others)) else recordings_of(one)[0] for one in several]
+    return several
 
 
 def inspect(recording: Recording) -> list[Finding]:
@@ -242,7 +240,7 @@ def _on_steps(signal: Signal, values: np.ndarray) -> np.ndarray:
     for axis, known in enumerate(signal.values[:20000].T):
         steps = steps_of(known)
         if 0 < len(steps) < 0.8 * len(known):
-            step = float(steps.min())
+            step = steps.min()
             offset = known[0] - step * np.round(known[0] / step)
             rounded[:, axis] = step * np.round((values[:, axis] - offset) / step) + offset
     return rounded

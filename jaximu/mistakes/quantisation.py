@@ -8,8 +8,6 @@ from jaximu.mistakes.held_at_rest import zeroed_at_rest
 from jaximu.mistakes.resampled import held_at
 from jaximu.recordings.finding import Finding
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.quantisation": "coarse steps"}
 
 

@@ -7,8 +7,6 @@ import numpy as np
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding, Rows
 
-__all__ = ["TITLES", "find", "held_at", "interpolated_at"]
-
 TITLES = {"data.resampled": "resampled output"}
 
 
@@ -66,7 +64,7 @@ def interpolated_at(sensor: Sensor) -> Rows | None:
         return None
     tolerance = np.maximum(1.01 * np.minimum(sensor.step, 0.1 * scale), 1e-3 * scale)
     bent = (bend > tolerance).any(axis=1)
-    share = float(bent.mean())
+    share = bent.mean()
     if not 0.01 < share < 0.6:
         return None
     knots = np.flatnonzero(bent) + 1

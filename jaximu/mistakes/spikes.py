@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+import scipy
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.differences import interpolated
+from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.quantities import counted, size
 from jaximu.mistakes.base import BRIDGED, Samples, Sensor
-from jaximu.recordings.finding import Finding, Rows
+from jaximu.recordings.alignment import turned_between
+from jaximu.recordings.finding import NO_ROWS, Finding, Rows
 from jaximu.recordings.recording import runs_of
-
-__all__ = ["TITLES", "find"]
 
 TITLES = {"data.spikes": "outliers"}
 
@@ -52,7 +53,7 @@ def find(samples: Samples) -> list[Finding]:
                 "data.spikes",
                 sensor.rows(rows),
                 f"{name}: {counted(len(rows), 'outlier')} of up to {largest} against the neighbours, first "
-                f"after {sensor.at(int(rows[0]))}: knocks, or errors of transfer. They are left out; up to "
+                f"after {sensor.at(rows[0])}: knocks, or errors of transfer. They are left out; up to "
                 f"{BRIDGED} in a row are bridged by interpolation.",
                 without={name: rows},
             )
@@ -73,27 +74,27 @@ def _wild(celsius: FloatArray) -> Rows:
     """The rows of temperatures (n,) that leave for a few readings and come back; one reading may be held for rows."""
     change = np.flatnonzero(np.diff(celsius, prepend=np.nan) != 0)
     if len(change) < _WINDOW:
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     values = celsius[change]
-    middle = np.median(sliding_window_view(np.pad(values, _WINDOW // 2, "edge"), _WINDOW), axis=1)
-    off = np.abs(values - middle)
-    wild = off > max(_JUMP, _TIMES * 1.4826 * float(np.median(off)))
+    middle = scipy.ndimage.median_filter(values, _WINDOW, mode="nearest")
+    off = values - middle
+    wild = np.abs(off) > max(_JUMP, _TIMES * robust_sigma(off))
     return np.flatnonzero(np.repeat(wild, np.diff(change, append=len(celsius))))
 
 
 def _outliers(sensor: Sensor) -> Rows:
     if len(sensor) < 64:
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     scale = np.maximum(sensor.local, 1.4 * sensor.noise + 0.5 * sensor.step)
     scale = np.maximum(scale, 1e-9 * np.ptp(sensor.values, axis=0))
     ratio = np.max(np.abs(sensor.curvature) / np.maximum(scale, 1e-300), axis=1)
     flagged = ratio > _TIMES
     if not flagged.any():
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     flagged[1:-1] |= flagged[:-2] & flagged[2:]
     clusters = runs_of(flagged)
     if len(clusters) > _MOST:
-        return np.zeros(0, np.int64)
+        return NO_ROWS
     rows: list[int] = []
     for start, stop in clusters:
         if stop - start <= 2 * BRIDGED + 3:
@@ -115,7 +116,7 @@ def _shortest(values: FloatArray, scale: FloatArray, start: int, stop: int, rate
             inside, misfit = _bridged(values, first, last)
             left = np.abs(misfit) / scale[first]
             off = np.max(np.abs(values[first : last + 1] - inside) / scale[first], axis=1)
-            worst = float(np.max(left))
+            worst = np.max(left)
             if np.min(off) > max(_TIMES, times * worst) and (best is None or worst < best[0]):
                 best = worst, list(range(first, last + 1))
         if best is not None:
@@ -145,7 +146,7 @@ def _turned(accelerometer: Sensor, gyroscope: Sensor, run: Rows) -> bool:
     inside, _ = _bridged(gyroscope.values, first, last)
     rows = np.arange(first - _NEAR, last + 1 + _NEAR)
     time = gyroscope.time[rows]
-    force = np.stack([np.interp(time, accelerometer.time, axis) for axis in accelerometer.values.T], axis=1)
+    force = interpolated(accelerometer.time, accelerometer.values, time)
     logged = gyroscope.values[rows] - np.median(gyroscope.values, axis=0)
     bridged = logged.copy()
     bridged[run - rows[0]] += inside - gyroscope.values[run]
@@ -154,7 +155,7 @@ def _turned(accelerometer: Sensor, gyroscope: Sensor, run: Rows) -> bool:
     estimate = np.linalg.pinv(np.stack([offset > 0, offset, np.ones(len(offset))], axis=1))[0]
     steps = []
     for rate in (logged, bridged):
-        turns = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * np.diff(time)[:, None])
+        turns = Rotation.from_rotvec(turned_between(time, rate))
         attitude, carried = Rotation.identity(), [force[0]]
         for turn, later in zip(turns, force[1:], strict=True):
             attitude = attitude * turn

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu.ground.array_types import BoolArray
 from jaximu.mistakes.base import HUNG, Samples, Sensor
 from jaximu.mistakes.clipping import at_limits, stops
 from jaximu.mistakes.resampled import held_at
-from jaximu.recordings.finding import Finding
+from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import runs_of
-
-__all__ = ["TITLES", "find"]
 
 TITLES = {"data.stuck_axis": "stuck output"}
 
@@ -47,29 +45,29 @@ def _stuck(sensor: Sensor) -> list[Finding]:
     return findings + _repeated_rows(sensor, change)
 
 
-def _stuck_axis(sensor: Sensor, change: NDArray[np.bool_], axis: int) -> Finding | None:
+def _stuck_axis(sensor: Sensor, change: BoolArray, axis: int) -> Finding | None:
     """Return where an axis repeats itself, not at an end of its range, while the others move; `change` (n − 1, 3)."""
-    values, length = sensor.values[:, axis], max(20, round(_STUCK * sensor.rate))
+    values = sensor.values[:, axis]
     others = np.any(change[:, [k for k in range(3) if k != axis]], axis=1)
-    candidates = [run for run in runs_of(~change[:, axis]) if run[1] - run[0] >= length]
-    if not candidates:
+    candidates = _long(~change[:, axis], max(20, round(_STUCK * sensor.rate)))
+    if not len(candidates):
         return None
-    limits = [tuple(run) for extreme in (values.max(), values.min()) for run in stops(values, extreme)]
-    long = [
-        run
-        for run in candidates
-        if np.mean(others[slice(*run)]) > 0.5 and not any(a <= run[0] and run[1] < b for a, b in limits)
+    limits = np.concatenate([stops(values, extreme) for extreme in (values.max(), values.min())])
+    long = candidates[
+        [
+            np.mean(others[start:stop]) > 0.5 and not any(a <= start and stop < b for a, b in limits)
+            for start, stop in candidates
+        ]
     ]
-    if not long:
+    if not len(long):
         return None
-    first = np.array([run[0] for run in long])
-    rows = np.concatenate([np.arange(run[0] + 1, run[1] + 1) for run in long])
+    first, rows = long[:, 0], _repeating(long)
     most = len(rows) > 0.5 * len(sensor)
     # without noise every axis repeats itself at rest, and nothing is wrong with that
     noisy = float(np.mean(~change[:, axis])) < 1.5 * len(rows) / len(sensor) + 0.2
     text = (
         f"{sensor.name} {'xyz'[axis]}: it repeats one value for {len(rows) / sensor.rate:.3g} s in all, first after "
-        f"{sensor.at(int(first[0]))}, while the other axes move on."
+        f"{sensor.at(first[0])}, while the other axes move on."
     )
     if most:
         text += " The axis is dead for most of the recording: check its wiring, and record again."
@@ -79,27 +77,26 @@ def _stuck_axis(sensor: Sensor, change: NDArray[np.bool_], axis: int) -> Finding
     return Finding("data.stuck_axis", sensor.rows(first), text, spoils=most and noisy, without=without)
 
 
-def _repeated_rows(sensor: Sensor, change: NDArray[np.bool_]) -> list[Finding]:
+def _repeated_rows(sensor: Sensor, change: BoolArray) -> list[Finding]:
     """Return where all axes repeat a row: for long, so that the sensor hung, and now and then; `change` (n − 1, 3)."""
     findings = []
     same = ~change.any(axis=1) & ~at_limits(sensor)[1:]
     coarse = [step is not None for step in sensor.coarse]
-    hung = [] if all(coarse) else _hung(sensor, same)
-    if hung:
-        rows = np.concatenate([np.arange(start + 1, stop + 1) for start, stop in hung])
-        first = np.array([start for start, _ in hung])
+    hung = _hung(sensor, same)
+    if len(hung) and not all(coarse):
+        first, rows = hung[:, 0], _repeating(hung)
         findings.append(
             Finding(
                 "data.stuck_axis",
                 sensor.rows(first),
                 f"{sensor.name}: all axes repeat one row for {len(rows) / sensor.rate:.3g} s in all, first after "
-                f"{sensor.at(int(first[0]))}: the sensor or its driver hung, or samples were lost and filled in. These "
+                f"{sensor.at(first[0])}: the sensor or its driver hung, or samples were lost and filled in. These "
                 "rows are left out.",
                 without={sensor.name: rows},
             )
         )
         same[rows - 1] = False
-    alone = float(np.min(np.mean(~change, axis=0)))
+    alone = np.min(np.mean(~change, axis=0))
     if max(0.02, 0.6 * alone) < np.mean(same) < 1 and not any(coarse):
         rows = np.flatnonzero(same) + 1
         findings.append(
@@ -113,11 +110,20 @@ def _repeated_rows(sensor: Sensor, change: NDArray[np.bool_]) -> list[Finding]:
     return findings
 
 
-def _hung(sensor: Sensor, same: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the long runs of rows that repeat the row before them, where few others do."""
-    long = [
-        (int(start), int(stop)) for start, stop in runs_of(same) if stop - start >= max(HUNG, _SHORTEST * sensor.rate)
-    ]
-    rows = sum(stop - start for start, stop in long)
+def _hung(sensor: Sensor, same: BoolArray) -> Rows:
+    """Return the long runs (k, 2) of rows that repeat the row before them, where few others do."""
+    long = _long(same, max(HUNG, _SHORTEST * sensor.rate))
+    rows = np.sum(np.diff(long))
     others = (same.sum() - rows) / max(len(same) - rows, 1)
-    return long if rows < 0.3 * len(same) and others < 0.1 else []
+    return long if rows < 0.3 * len(same) and others < 0.1 else long[:0]
+
+
+def _long(same: BoolArray, least: float) -> Rows:
+    """Return the runs (k, 2) of True that are so long."""
+    runs = runs_of(same)
+    return runs[np.diff(runs)[:, 0] >= least]
+
+
+def _repeating(runs: Rows) -> Rows:
+    """Return the rows that repeat the one before, of runs (k, 2) of differences that are zero."""
+    return np.concatenate([np.arange(start + 1, stop + 1) for start, stop in runs])

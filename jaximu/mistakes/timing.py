@@ -9,11 +9,10 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import counted
+from jaximu.ground.units import SENSOR_UNITS
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
-from jaximu.recordings.recording import Recording
-
-__all__ = ["TITLES", "find", "in_bursts", "steady_clock"]
+from jaximu.recordings.recording import FASTEST, GAP, Recording
 
 TITLES = {
     "data.bursts": "stamps in bursts",
@@ -22,8 +21,8 @@ TITLES = {
     "data.jitter": "jittering stamps",
 }
 
-_SLOWEST, _FASTEST = 1.0, 50e3
-"""Hz: no log of poses and turns has a rate outside."""
+_SLOWEST = 1.0
+"""Hz: no log of poses and turns has a lower rate."""
 _SUDDEN = 0.3
 """Share of the mean interval below which two samples arrived together."""
 
@@ -43,10 +42,10 @@ def find(samples: Samples) -> list[Finding]:
 def _timing(name: str, sensor: Sensor) -> list[Finding]:
     interval = sensor.interval
     usual = sensor.period
-    mean = float(np.mean(interval))
+    mean = np.mean(interval)
     findings = []
     if in_bursts(interval):
-        rate, lag = 1 / _clock(sensor.time)[1], float(np.quantile(interval, 0.99))
+        rate, lag = 1 / _clock(sensor.time)[1], np.quantile(interval, 0.99)
         return [
             Finding(
                 "data.bursts",
@@ -57,7 +56,7 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
                 apply=steady_clock,
             )
         ]
-    if not _SLOWEST <= 1 / mean <= _FASTEST:
+    if not _SLOWEST <= 1 / mean <= FASTEST:
         findings.append(
             Finding(
                 "data.time_scale",
@@ -67,9 +66,9 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
                 spoils=True,
             )
         )
-    spread = float(np.std(interval[interval < 1.5 * usual]))
+    spread = np.std(interval[interval < 1.5 * usual])
     uneven = spread > 0.1 * usual
-    gaps = np.flatnonzero(interval > (2.5 if uneven else 1.6) * usual)
+    gaps = np.flatnonzero(interval > (2.5 if uneven else GAP) * usual)
     if len(gaps):
         lost = int(np.sum(np.round(interval[gaps] / usual) - 1))
         findings.append(
@@ -102,8 +101,10 @@ def _timing(name: str, sensor: Sensor) -> list[Finding]:
     return findings
 
 
-def _numbered(time: FloatArray) -> FloatArray | None:
-    """Numbers (n,) of the samples on a steady clock, gaps counted; None where stamps are off by more."""
+def _even(time: FloatArray) -> FloatArray | None:
+    """Stamps (n,) of the samples on a steady clock, gaps counted; None for few, or where they are off by more."""
+    if len(time) < 200:
+        return None
     interval = np.diff(time)
     breaks = np.flatnonzero(interval > 2.5 * np.median(interval)) + 1
     number = np.arange(len(time), dtype=np.float64)
@@ -111,37 +112,41 @@ def _numbered(time: FloatArray) -> FloatArray | None:
     slopes = [np.polyfit(number[a:b], time[a:b], 1)[0] for a, b in pairwise(edges) if b - a > 100]
     if not slopes:
         return None
-    period = float(np.median(slopes))
+    period = np.median(slopes)
     for row in breaks:
         delay = time - period * number
         missing = np.round((np.mean(delay[row : row + 20]) - np.mean(delay[max(0, row - 20) : row])) / period)
         number[row:] += max(0.0, missing)
+    even, slope = _line(number, time)
+    return even if np.max(np.abs(time - even)) < 0.75 * slope else None
+
+
+def _line(number: FloatArray, time: FloatArray) -> tuple[FloatArray, float]:
+    """Stamps (n,) on the straight line fitted to those of numbered samples, and its slope."""
     slope, start = np.polyfit(number, time, 1)
-    return number if np.max(np.abs((time - start) / slope - number)) < 0.75 else None
+    return start + slope * number, slope
 
 
 def _evenly(recording: Recording) -> Recording:
     """Return the recording with jittering stamps of its triads replaced by those of a steady clock."""
-    changed = {}
-    for name in ("accelerometer", "gyroscope", "magnetometer"):
-        signal = recording.signals.get(name)
-        number = None if signal is None or len(signal) < 200 else _numbered(signal.time)
-        if signal is not None and number is not None:
-            slope, start = np.polyfit(number, signal.time, 1)
-            changed[name] = replace(signal, time=start + slope * number)
+    changed = {
+        name: replace(signal, time=even)
+        for name, signal in recording.signals.items()
+        if name in SENSOR_UNITS and (even := _even(signal.time)) is not None
+    }
     return replace(recording, **changed)
 
 
 def _smoother_evenly(sensor: Sensor) -> bool:
     """Whether the samples in motion lie on smoother curves by their number than by their stamps."""
-    number = _numbered(sensor.time)
-    if number is None or len(sensor) < 200:
+    even = _even(sensor.time)
+    if even is None:
         return False
     bends = []
-    for time in (number * sensor.period, sensor.time):
+    for time in (even, sensor.time):
         slope = sensor.difference / np.diff(time)[:, None]
         bend = np.abs(np.diff(slope, axis=0)).sum(axis=1) * sensor.period
-        moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * float(np.sum(sensor.noise))
+        moving = np.abs(sensor.difference[1:]).sum(axis=1) > 6 * np.sum(sensor.noise)
         bends.append(float(np.median(bend[moving])) if moving.sum() > 50 else np.inf)
     return bends[0] < 0.8 * bends[1]
 
@@ -150,14 +155,14 @@ def in_bursts(interval: FloatArray) -> bool:
     """Return whether many samples share nearly one time of arrival, with pauses between."""
     if len(interval) < 32:
         return False
-    mean = float(np.mean(interval))
+    mean = np.mean(interval)
     # gaps are few and long; pauses between bursts hold most of the time
-    mean = min(mean, float(np.mean(np.minimum(interval, 20 * mean))))
+    mean = min(mean, np.mean(np.minimum(interval, 20 * mean)))
     together = interval < _SUDDEN * mean
     pause = interval > 1.5 * mean
     if together.mean() < 0.3 or pause.sum() < 8:
         return False
-    return float(interval[pause].sum()) > 0.6 * float(interval.sum())
+    return bool(interval[pause].sum() > 0.6 * interval.sum())
 
 
 def _clock(time: FloatArray) -> tuple[FloatArray, float]:
@@ -167,8 +172,7 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
     bursts and another not.
     """
     index = np.arange(len(time), dtype=float)
-    slope, start = np.polyfit(index, time, 1)
-    fitted = start + slope * index
+    fitted, slope = _line(index, time)
     delay = time - fitted
     # what stays off the line from one sample on is a gap in the log, not a delay
     width = max(8, round(1.0 / max(slope, 1e-9)))
@@ -178,21 +182,21 @@ def _clock(time: FloatArray) -> tuple[FloatArray, float]:
         edges = np.concatenate([[0], breaks + 1, [len(time)]])
         parts = [np.polyfit(index[a:b], time[a:b], 1) for a, b in pairwise(edges) if b - a > width]
         if parts:
-            slope = float(np.median([part[0] for part in parts]))
+            slope = np.median([part[0] for part in parts])
             fitted = np.concatenate(
                 [np.median(time[a:b] - slope * index[a:b]) + slope * index[a:b] for a, b in pairwise(edges)]
             )
             if np.any(np.diff(fitted) <= 0):
-                slope, start = np.polyfit(index, time, 1)
-                fitted = start + slope * index
+                fitted, slope = _line(index, time)
     early = [part.min() for part in np.array_split(time - fitted, max(1, len(time) // width))]
-    return fitted + float(np.median(early)), float(slope)
+    return fitted + np.median(early), float(slope)
 
 
 def steady_clock(recording: Recording) -> Recording:
     """Return the recording with the stamps of sensors that arrive in bursts replaced by those of a steady clock."""
-    changed = {}
-    for name, signal in recording.signals.items():
-        if len(signal) > 32 and in_bursts(np.diff(signal.time)):
-            changed[name] = replace(signal, time=_clock(signal.time)[0])
+    changed = {
+        name: replace(signal, time=_clock(signal.time)[0])
+        for name, signal in recording.signals.items()
+        if in_bursts(np.diff(signal.time))
+    }
     return replace(recording, **changed)

@@ -4,8 +4,6 @@ from jaximu.mistakes.preparation import MISTAKES
 from jaximu.model.data_sheet import NOISE_KINDS
 from jaximu.model.effects import CATALOGUE
 
-__all__ = ["effect_title"]
-
 
 def effect_title(name: str) -> str:
     """Return an effect, a mistake in the data or a kind of noise in English, with its name after it."""

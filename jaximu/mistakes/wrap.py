@@ -10,8 +10,6 @@ from jaximu.mistakes.base import Samples, Sensor, with_signal
 from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import Recording
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.wrap": "integer overflow"}
 
 _AT_THE_OTHER_END = 0.8
@@ -42,7 +40,7 @@ def find(samples: Samples) -> list[Finding]:
                     "data.wrap",
                     sensor.rows(rows),
                     f"{name} {'xyz'[axis]}: {counted(len(rows), 'sample')} jumped by the whole range of {shown} and "
-                    f"back, first after {sensor.at(int(rows[0]))}: the integer overflowed. --repair adds the range "
+                    f"back, first after {sensor.at(rows[0])}: the integer overflowed. --repair adds the range "
                     "back; without it these rows are left out.",
                     repair="--repair",
                     apply=apply,
@@ -58,7 +56,7 @@ def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None
     A range differs from a jump of the motion: both ends of it lie at the ends of the range.
     """
     values = sensor.values[:, axis]
-    low, high = float(values.min()), float(values.max())
+    low, high = values.min(), values.max()
     span = high - low
     jump = sensor.difference[:, axis]
     places = np.flatnonzero(np.abs(jump) > 0.6 * span)
@@ -76,7 +74,7 @@ def _wrapped(sensor: Sensor, axis: int) -> tuple[FloatArray, float, Rows] | None
     known = ~(np.isnan(before) & np.isnan(after))
     slope = np.where(known, np.nanmean(np.where(known, [before, after], 0.0), axis=0), 0.0)
     ranges = np.abs(jump[places] - slope)
-    full = float(np.median(ranges))
+    full = np.median(ranges)
     off = np.abs(ranges - full) / full
     if not known.any() or np.quantile(off, 0.8) > 0.12 or np.max(off) > 0.4 or full < 0.95 * span:
         return None

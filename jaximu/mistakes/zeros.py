@@ -10,8 +10,6 @@ from jaximu.mistakes.held_at_rest import zeroed_at_rest
 from jaximu.recordings.finding import Finding, Rows
 from jaximu.recordings.recording import runs_of
 
-__all__ = ["TITLES", "find"]
-
 TITLES = {"data.zeros": "rows of zeros"}
 
 _MOST = 0.3
@@ -28,7 +26,7 @@ def find(samples: Samples) -> list[Finding]:
     without: dict[str, Rows] = {}
     for name, sensor in samples.sensors.items():
         zero = nothing[name]
-        if not zero.any() or zero.mean() > _MOST or not len(sensor):
+        if not zero.any() or zero.mean() > _MOST:
             continue
         if name == "gyroscope" and zeroed_at_rest(samples) is not None:
             continue
@@ -46,7 +44,7 @@ def find(samples: Samples) -> list[Finding]:
         Finding(
             "data.zeros",
             first.rows(rows),
-            f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(int(rows[0]))}: a "
+            f"{which}: {counted(len(rows), 'row')} read zero on all axes, first after {first.at(rows[0])}: a "
             "transfer failed, or the logger filled them in. They are left out.",
             without=without,
         )

@@ -34,6 +34,7 @@ import scipy
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.data.preintegration import preintegrate_samples
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import Gravity
@@ -119,7 +120,7 @@ class ModelledErrors:
         size = max(2, round(length * self.rate))
         first = _spread(np.arange(0, len(intervals) - size + 1, size))
         rows = first[:, None] + np.arange(size)
-        start = np.concatenate([[0.0], np.cumsum(intervals)])[first]
+        start = np.cumulative_sum(intervals, include_initial=True)[first]
         rates, forces = (np.asarray(samples)[rows] for samples in (stimulus.angular_rate, stimulus.specific_force))
         return Stretches(rates, forces, intervals[rows], start, rows)
 
@@ -189,7 +190,7 @@ class MeasuredErrors:
         whole = replace(known, quaternion=np.asarray(mounting.unit_attitude(known.quaternion))).rotation()
         velocity = known.velocities()
         stamp = np.asarray(mounting.on_log(known.time))
-        felt = np.stack([np.interp(stamp, middle, component) for component in np.asarray(force).T], axis=1)
+        felt = interpolated(middle, np.asarray(force), stamp)
         steady = np.ones(len(stamp), bool)
         notes: list[str] = []
         if velocity is not None:
@@ -269,7 +270,7 @@ class MeasuredErrors:
         if self.position is not None:
             away = self.position[last] - self.position[first] - self.velocity[first] * time[:, None]
             errors.append(np.asarray(integrated[2]) - at_start.inv().apply(away + up * time[:, None] ** 2 / 2))
-        edges = self.stamp[first][:, None] + np.concatenate([np.zeros((len(held), 1)), np.cumsum(held, axis=1)], axis=1)
+        edges = self.stamp[first][:, None] + np.cumulative_sum(held, axis=1, include_initial=True)
         edges = np.clip(edges, self.stamp[0], self.stamp[-1])
         path = scipy.spatial.transform.Slerp(self.stamp, known)(edges.ravel()).as_quat()
         before, after = (
@@ -293,7 +294,7 @@ def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatAr
 def _without_gaps(since: FloatArray, until: FloatArray, start: FloatArray, stop: FloatArray) -> BoolArray:
     """Whether no sample between two times holds far longer than others do."""
     lengths = until - since
-    long = np.concatenate([[0], np.cumsum(lengths > 2.5 * np.median(lengths))])
+    long = np.cumulative_sum(lengths > 2.5 * np.median(lengths), include_initial=True)
     return long[np.searchsorted(since, stop)] == long[np.searchsorted(until, start)]
 
 

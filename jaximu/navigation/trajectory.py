@@ -236,7 +236,7 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
     gyroscope, accelerometer = ready.gyroscope, ready.accelerometer
     assert gyroscope is not None
     time, rate = gyroscope.time, gyroscope.values
-    force = np.stack([np.interp(time, accelerometer.time, column) for column in accelerometer.values.T], axis=1)
+    force = accelerometer.at(time)
     notes: list[str] = []
     if recording.attitude is not None:
         first = float(recording.attitude.time[0])

@@ -221,7 +221,7 @@ def evenly_sampled(signal: Signal, what: str = "the signal") -> tuple[FloatArray
         raise NotPossibleError(f"{what} has only {len(signal)} samples.")
     interval = np.diff(signal.time)
     steps = np.maximum(1, np.round(interval / np.median(interval))).astype(np.int64)
-    index = np.concatenate([[0], np.cumsum(steps)])
+    index = np.cumulative_sum(steps, include_initial=True)
     slope, start = np.polyfit(index, signal.time, 1)
     off = np.abs(signal.time - start - slope * index) / slope
     if np.mean(off > _UNEVEN) > 0.01:

@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 
 from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.distributions import robust_sigma
 from jaximu.recordings.recording import runs_of
 
 BRIDGED = 5
@@ -42,7 +43,7 @@ def without_outliers(values: FloatArray) -> tuple[FloatArray, int]:
     sizes = np.abs(middle[~np.isnan(middle)])
     if not len(sizes):
         return values, 0
-    scale = 1.4826 * np.median(sizes)
+    scale = robust_sigma(sizes)
     steps = sizes[sizes > 1e-12 * sizes.max()]
     if not len(steps):
         return values, 0

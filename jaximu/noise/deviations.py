@@ -253,7 +253,7 @@ def _integrated(row: FloatArray) -> tuple[FloatArray, NDArray[np.int32] | None]:
     mean = np.nansum(row) / max(1, len(row) - lost.sum())
     points = np.zeros(len(row) + 1)
     np.cumsum(np.where(lost, 0.0, row - mean), out=points[1:])
-    return points, np.concatenate([[0], np.cumsum(lost)]).astype(np.int32) if lost.any() else None
+    return points, np.cumulative_sum(lost, dtype=np.int32, include_initial=True) if lost.any() else None
 
 
 def _mean_squares(
@@ -262,7 +262,7 @@ def _mean_squares(
     """Mean squares (T,) of the differences of phase points (n + 1,), and of how many that miss nothing."""
     order = kind.order
     if kind.modified:  # a difference averaged over m places is one of the next order of the running sum, over m
-        points, order = np.concatenate([[0.0], np.cumsum(points - points.mean())]), order + 1
+        points, order = np.cumulative_sum(points - points.mean(), include_initial=True), order + 1
         lost = None if lost is None else np.append(lost, lost[-1])
     if kind.total:  # mirrored about both ends; differences are centred on every inner point
         mirrored = points[-2:0:-1]

@@ -32,9 +32,10 @@ from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.planning.information import root_of
+from jaximu.recordings.entry import ScheduleEntry, times_of
 from jaximu.recordings.observations import Stations
 from jaximu.simulation import Case, Specification
-from jaximu.simulation.protocols import Environment, Interval, Motion
+from jaximu.simulation.protocols import Environment, Motion
 from jaximu.simulation.specification import Draw
 
 _TURN_ONLY = ("rate-table", "single-axis-table")  # their angle about the vertical is all that is set
@@ -289,7 +290,7 @@ class _Stops:
     ends: IntArray
 
 
-def _stops(intervals: tuple[Interval, ...], motion: Motion) -> _Stops:
+def _stops(intervals: tuple[ScheduleEntry, ...], motion: Motion) -> _Stops:
     segment = np.searchsorted(motion.start, [interval.start + 1e-9 for interval in intervals], side="right") - 1
     begin = [Rotation.from_quat(motion.attitude[row], scalar_first=True) for row in segment]
     up: list[FloatArray] = []
@@ -445,11 +446,11 @@ def white_density(case: Case, triad: str) -> FloatArray | None:
     return np.broadcast_to(np.sum(white, axis=0), (3,)) if white else None
 
 
-def _with_noise(case: Case, stations: Stations, intervals: Sequence[Interval]):
+def _with_noise(case: Case, stations: Stations, intervals: Sequence[ScheduleEntry]):
     """The stations with the covariances of the noise that is stated; those (6, S, S) of its white part and of its slow
     bias, zero where not used; rate ramps (3,), SI, by triad; notes.
     """
-    span = np.array([(interval.start, interval.stop) for interval in intervals])
+    span = times_of(intervals)
     count, size = len(span), stations.turn.shape[0]
     notes, ramps, fast, slow = [], {}, np.zeros((6, size, size)), np.zeros((6, size, size))
     used = {"accelerometer": stations.accelerometer_used, "gyroscope": stations.gyroscope_used}
@@ -515,7 +516,7 @@ def _scheme(
     motion: Motion,
     effects: tuple[Effect, ...],
     stations: Stations,
-    intervals: Sequence[Interval],
+    intervals: Sequence[ScheduleEntry],
     stops: _Stops,
     errors: Mapping[str, tuple[Any, str]],
 ) -> ErrorScheme:

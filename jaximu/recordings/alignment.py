@@ -7,32 +7,16 @@ in M, which is the identity for right axes, signs and scales.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise, permutations, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.distributions import student_isf
-
-__all__ = [
-    "ARRANGEMENTS",
-    "CORRELATED",
-    "EXPLAINED",
-    "BlockMeans",
-    "Carried",
-    "Clocks",
-    "Turning",
-    "angle_of",
-    "carried",
-    "clocks",
-    "gravity_turning",
-    "rotation_of",
-    "signed_permutation",
-    "turning",
-    "turning_best",
-    "turns_backwards",
-]
 
 _BLOCK = 0.2
 """Seconds over which the specific force is averaged."""
@@ -76,11 +60,11 @@ class Turning(NamedTuple):
 
 def signed_permutation(matrix: FloatArray) -> FloatArray:
     """Return the signed permutation (3, 3) that is nearest to a matrix whose columns may have any length."""
-    columns = matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+    columns = _directions(matrix.T).T
     best, nearest = -np.inf, np.eye(3)
     for order in permutations(range(3)):
         entries = columns[order, range(3)]
-        total = float(np.sum(np.abs(entries)))
+        total = np.sum(np.abs(entries))
         if total > best + 1e-12:
             best, nearest = total, np.zeros((3, 3))
             nearest[order, range(3)] = np.where(entries < 0, -1.0, 1.0)
@@ -98,13 +82,18 @@ def turning_best(products: FloatArray) -> FloatArray:
 
 def rotation_of(matrix: FloatArray) -> FloatArray:
     """Return the orthogonal matrix (3, 3) nearest to one whose columns may have any length."""
-    u, _, v = np.linalg.svd(matrix / np.maximum(np.linalg.norm(matrix, axis=0), 1e-300))
+    u, _, v = np.linalg.svd(_directions(matrix.T).T)
     return u @ v
 
 
 def angle_of(rotation: FloatArray) -> float:
     """Return the angle (rad) of a rotation (3, 3)."""
     return float(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1.0, 1.0)))
+
+
+def turned_between(time: FloatArray, rate: FloatArray) -> FloatArray:
+    """Return the angle (m - 1, 3) by which rates (m, 3) turn from each stamp to the next, by the trapezoid."""
+    return midpoints(rate) * np.diff(time)[:, None]
 
 
 class BlockMeans(NamedTuple):
@@ -124,7 +113,7 @@ class BlockMeans(NamedTuple):
     def turned(self, delay: FloatArray | float = 0.0) -> FloatArray:
         """Return the gyroscope's angle (n, 3) from each block to the next, its stamps (n + 1,) `delay` s late."""
         stamps = self.centre + delay
-        return np.diff(np.stack([np.interp(stamps, self.time, axis) for axis in self.angle.T], axis=1), axis=0)
+        return np.diff(interpolated(self.time, self.angle, stamps), axis=0)
 
 
 def gravity_turning(
@@ -140,8 +129,7 @@ def gravity_turning(
     mean = force[: count * span].reshape(count, span, 3).mean(axis=1)
     centre = force_time[: count * span].reshape(count, span).mean(axis=1)
     rate = rate - np.median(rate, axis=0)
-    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(rate_time)[:, None]
-    angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    angle = np.cumulative_sum(turned_between(rate_time, rate), axis=0, include_initial=True)
     length = np.linalg.norm(mean, axis=1)
     usual = np.median(length)
     off = np.abs(length - usual) / max(usual, 1e-300)
@@ -156,7 +144,7 @@ def gravity_turning(
     for gap in np.flatnonzero(step > max(_BLOCK, 2.5 * np.median(step))):
         first, last = np.searchsorted(centre, rate_time[gap : gap + 2])
         weight[max(first - 1, 0) : last] = 0.0
-    return BlockMeans(centre, (mean[1:] + mean[:-1]) / 2, change, weight, rate_time, angle)
+    return BlockMeans(centre, midpoints(mean), change, weight, rate_time, angle)
 
 
 _TURNED = 0.1
@@ -184,14 +172,14 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     kept = values > 1e-6 * values[-1]
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     matrix = inverse @ (columns.T @ changes)
-    left = float(np.sum((changes - columns @ matrix) ** 2))
+    left = np.sum((changes - columns @ matrix) ** 2)
     variance = np.where(kept.all(), np.diag(inverse), np.inf) * left / max(len(changes) - 9, 1)
     return Turning(
         matrix.reshape(3, 3),
         np.sqrt(variance).reshape(3, 3),
         1 - left / total,
         product / power,
-        product / float(np.sqrt(power * total)),
+        product / np.sqrt(power * total),
     )
 
 
@@ -217,7 +205,7 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
     if len(starts) < _CLEAR:
         return False
     rows = starts[:, None] + np.arange(span)
-    turn = np.stack([np.interp(force_time[rows], rate_time, axis) for axis in (rate - np.median(rate, axis=0)).T], 2)
+    turn = interpolated(rate_time, rate - np.median(rate, axis=0), force_time[rows])
     steps = turn * np.gradient(force_time)[rows][:, :, None]
     turning = np.linalg.norm(steps, axis=2).sum(axis=1) > 0.5
     if turning.sum() < _CLEAR:
@@ -236,7 +224,7 @@ def turns_backwards(force_time: FloatArray, force: FloatArray, rate_time: FloatA
 
 _TURN_SECONDS, _TURN_STEPS, _MOST = 10.0, 128, 24
 """Longest turn from rest to rest, s, the steps in which its rotation is put together, and turns that are enough."""
-_TURN_ANGLE = np.radians(20)
+TURN_ANGLE = np.radians(20)
 """Angle by which gravity must turn from rest to rest to show anything."""
 _JUMP = 0.15
 """Share of the way from one rest's gravity to the next's that may lie before and behind a jump."""
@@ -278,8 +266,7 @@ def carried(
     from scipy.spatial.transform import Rotation
 
     edges = np.searchsorted(force_time, rests)
-    up = np.stack([force[a : max(b, a + 1)].mean(axis=0) for a, b in edges])
-    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-300)
+    up = _directions(of_each(np.mean, force, edges))
     interval = np.diff(rate_time)
     gap = 2.5 * np.median(interval)
     middle = rests.mean(axis=1)
@@ -290,7 +277,7 @@ def carried(
         and interval[slice(*np.searchsorted(rate_time, (start, stop)))].max(initial=0.0) < gap
         for (_, start), (stop, _), a, b in zip(rests, rests[1:], middle, middle[1:], strict=False)
     ]
-    turned = np.sum(up[1:] * up[:-1], axis=1) < np.cos(_TURN_ANGLE)
+    turned = np.sum(up[1:] * up[:-1], axis=1) < np.cos(TURN_ANGLE)
     kept = [
         not _jumps(force[stop:start], *up[[at, at + 1]]) for at, ((_, stop), (start, _)) in enumerate(pairwise(edges))
     ]
@@ -300,9 +287,9 @@ def carried(
         return Carried(1.0, np.pi, 0)
     at_rest = np.concatenate([rate[a:b] for a, b in np.searchsorted(rate_time, rests)])
     rate = rate - np.median(at_rest, axis=0) if len(at_rest) else rate
-    angle = np.concatenate([np.zeros((1, 3)), np.cumsum((rate[1:] + rate[:-1]) / 2 * interval[:, None], axis=0)])
+    angle = np.cumulative_sum(turned_between(rate_time, rate), axis=0, include_initial=True)
     stamps = np.linspace(middle[used], middle[used + 1], _TURN_STEPS + 1)
-    passed = np.stack([np.interp(stamps, rate_time, axis) for axis in angle.T], axis=2)
+    passed = interpolated(rate_time, angle, stamps)
     steps = passed[1:] - passed[:-1]
     factors = np.concatenate([_FACTORS, -_FACTORS])
     turns = Rotation.from_rotvec((factors[:, None, None, None] * steps).reshape(-1, 3)).as_matrix()
@@ -321,9 +308,22 @@ def carried(
     return Carried(float(factor), float(best.min()), len(used))
 
 
+def of_each(statistic: Callable[..., Any], values: FloatArray, edges: IntArray) -> FloatArray:
+    """Return a statistic, of NumPy's signature, of the rows of values (n, m) in each of k stretches: (k, m).
+
+    edges: (k, 2) the first row of each stretch and the one after its last; an empty one has one row.
+    """
+    return np.stack([statistic(values[first : max(last, first + 1)], axis=0) for first, last in edges])
+
+
+def _directions(vectors: FloatArray) -> FloatArray:
+    """Vectors (n, 3) scaled to length one; one of no length stays."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
+
+
 def _jumps(force: FloatArray, before: FloatArray, after: FloatArray) -> bool:
     """Whether gravity jumps from one direction (3,) to another within a step of the force (n, 3): rows were cut out."""
-    up = force / np.maximum(np.linalg.norm(force, axis=1, keepdims=True), 1e-300)
+    up = _directions(force)
     near = _JUMP * np.linalg.norm(after - before)
     left, reached = (np.linalg.norm(up - direction, axis=1) < near for direction in (before, after))
     return bool(np.any(left[:-1] & reached[1:]))
@@ -383,7 +383,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     off = np.linalg.norm(blocks.force - np.median(blocks.force, axis=0), axis=1)
     if np.quantile(off, 0.99) < _TURNED * np.median(np.linalg.norm(blocks.force, axis=1)):
         return None
-    middle = float(blocks.centre.mean())
+    middle = blocks.centre.mean()
     edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)
     places = np.array([blocks.centre[a:b].mean() for a, b in pairwise(edges)]) - middle
     changes, levers = blocks.weight[:, None] * blocks.change, _levers(blocks)
@@ -402,7 +402,7 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
 
     line = np.zeros(2)  # of the lag: at the middle, and by time
     power = np.add.reduceat(np.sum(changes**2, axis=1), edges[:-1])
-    whole = float(power.sum())
+    whole = power.sum()
     enough = (1 - _WELL) * whole
     normal, product = sums(0.0)
     if left(normal.sum(axis=0), product.sum(axis=0), whole) > enough:
@@ -414,7 +414,8 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
             best = np.argmin(residuals, axis=0)
             trusted = residuals.min(axis=0) < (1 - _WELL) * power
             if trusted.sum() >= 3:
-                line = _robust_line(places[trusted], _LAGS[best[trusted]])
+                robust = scipy.stats.theilslopes(_LAGS[best[trusted]], places[trusted], method="joint")
+                line = np.array([robust.intercept, robust.slope])
     for step in _STEPS:
         lag = line[0] + line[1] * (blocks.centre - middle)
         turned = blocks.turned(lag)
@@ -437,17 +438,10 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
         missed = shifts[good] - design @ change
         line = line + change
     freedom = int(good.sum()) - 2
-    spread = float(np.sum(weight * missed**2)) / freedom
+    spread = np.sum(weight * missed**2) / freedom
     # parts that agree by chance are no surer than the noise of their samples lets them be
-    spread = max(spread * float(student_isf(0.025, freedom) / 1.96) ** 2, float(np.mean(rest**2)))
+    spread = max(spread * float(student_isf(0.025, freedom) / 1.96) ** 2, np.mean(rest**2))
     sigma, drift_sigma = np.sqrt(spread * np.diag(inverse))
     columns = _columns(levers, blocks.turned(line[0] + line[1] * (blocks.centre - middle)))
     explained = 1 - float(left(columns.T @ columns, columns.T @ changes.ravel(), whole)) / max(whole, 1e-300)
     return Clocks(float(line[0]), max(float(sigma), 1e-4), float(line[1]), float(drift_sigma), middle, explained)
-
-
-def _robust_line(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return offset and slope (2,) by the median of all pairs' slopes (Theil and Sen)."""
-    first, second = np.triu_indices(len(x), 1)
-    slope = np.median((y[second] - y[first]) / (x[second] - x[first]))
-    return np.array([np.median(y - slope * x), slope])

@@ -10,8 +10,6 @@ import scipy
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 
-__all__ = ["UNIT_LENGTH", "Attitude"]
-
 UNIT_LENGTH = 0.01  # off one, of a quaternion that is one
 _JUMP = 2.0  # rad; between neighbouring stamps nothing turns so far
 
@@ -35,8 +33,7 @@ class Attitude:
 
     def __post_init__(self) -> None:
         length = np.linalg.norm(self.quaternion, axis=1)
-        bad = ~np.isfinite(length) | (np.abs(length - 1) > UNIT_LENGTH)
-        if bad.mean() > 0.5:
+        if np.mean(np.abs(length - 1) <= UNIT_LENGTH) < 0.5:
             raise InputError(
                 f"{self.name}: its quaternions have the length {np.median(length):.4g} and not 1: the columns are "
                 "not a quaternion, or not in this order."
@@ -47,12 +44,12 @@ class Attitude:
     def usable(self) -> Attitude:
         """Return the rows whose quaternion is one, of length one and without jumps of sign."""
         length = np.linalg.norm(self.quaternion, axis=1)
-        kept = np.isfinite(length) & (np.abs(length - 1) < UNIT_LENGTH)
+        kept = np.abs(length - 1) < UNIT_LENGTH
         vectors = {"velocity": self.velocity, "position": self.position}
         vectors = {name: values[kept] for name, values in vectors.items() if values is not None}
         notes = self.notes
         if not kept.all():
-            notes += (f"{self.name}: {int(np.sum(~kept))} of {len(kept)} rows hold no attitude and are left out.",)
+            notes += (f"{self.name}: {np.sum(~kept)} of {len(kept)} rows hold no attitude and are left out.",)
         unit = self.quaternion[kept] / length[kept, None]
         flips = np.concatenate([[1.0], np.cumprod(np.sign(np.sum(unit[1:] * unit[:-1], axis=1) + 1e-12))])
         return replace(self, time=self.time[kept], quaternion=unit * flips[:, None], notes=notes, **vectors)

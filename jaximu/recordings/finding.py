@@ -2,16 +2,15 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu.ground.array_types import IntArray
+from jaximu.ground.document import Json
 from jaximu.recordings.recording import Recording
 
-__all__ = ["Finding", "Rows"]
-
-Rows = NDArray[np.int64]
+Rows = IntArray
+NO_ROWS: Rows = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -40,9 +39,9 @@ class Finding:
     without: Mapping[str, Rows] = field(default_factory=dict, compare=False, repr=False)
     numbers: Mapping[str, float] = field(default_factory=dict)
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the finding as `diagnosis.json` has it."""
-        document: dict[str, Any] = {"name": self.name, "rows": list(self.rows), "text": self.text}
+        document: Json = {"name": self.name, "rows": list(self.rows), "text": self.text}
         if self.repair:
             document["repair"] = self.repair
         if self.rivals:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import replace
 
 import numpy as np
 
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import FilePath, InputError
 from jaximu.recordings.readers.reader import read_table
 from jaximu.recordings.recording import Recording
-
-__all__ = ["without_flagged"]
 
 _STATUS = re.compile(r"(?:^|[^a-z])(?:status|flags?|errors?|faults?)(?:$|[^a-z])", re.IGNORECASE)
 
 
-def without_flagged(recording: Recording, path: str | os.PathLike[str]) -> Recording:
+def without_flagged(recording: Recording, path: FilePath) -> Recording:
     """Return a recording without the rows of its file in which a status column is not as usual, and say so.
 
     A column whose name holds status, flag, error or fault counts. Only rows of sensors that share the file's stamps are
@@ -28,7 +25,7 @@ def without_flagged(recording: Recording, path: str | os.PathLike[str]) -> Recor
     except InputError:  # a format that is no table of columns
         return recording
     notes, bad = [], np.zeros(table.source.rows, bool)
-    for at, name in enumerate(table.names or ()):
+    for at, name in enumerate(table.header):
         if not _STATUS.search(name) or table.columns[at].dtype == object:
             continue
         values, counts = np.unique(table.columns[at], return_counts=True)

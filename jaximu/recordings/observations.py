@@ -11,8 +11,6 @@ from jaxtyping import Bool, Float, Int
 from jaximu.ground.array_types import Array
 from jaximu.model.stimulus import Stimulus
 
-__all__ = ["POWER_ON", "Observations", "Poses", "SlowNoise", "Stations", "Turns"]
-
 POWER_ON = {"gyroscope": 0.05, "accelerometer": 0.05}
 """What a bias may differ by from one power-on to the next (one sigma), rad/s and m/s²: as good as free."""
 

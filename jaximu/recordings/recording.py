@@ -4,6 +4,7 @@ Frames: body axes are right-handed and belong to the sensor's case; specific for
 rest; angular rate follows the right-hand rule.
 """
 
+import math
 import re
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -12,9 +13,9 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
@@ -35,7 +36,7 @@ def _unset() -> FloatArray:
     return np.empty(0)
 
 
-_GAP = 1.6
+GAP = 1.6
 """Times the usual interval from which on a longer one is a gap."""
 
 
@@ -95,32 +96,32 @@ class Signal(Comparable):
         """
         interval = np.diff(self.time)
         usual = np.median(interval)
-        longest = _GAP * max(usual, np.mean(np.minimum(interval, 3 * usual)))
+        longest = GAP * max(usual, np.mean(np.minimum(interval, 3 * usual)))
         return float(1.0 / np.mean(interval[interval <= longest]))
 
     @property
     def edges(self) -> FloatArray:
         """(n + 1,) where samples begin and end: half way between neighbours, half a period beyond the outer two."""
-        middle, half = (self.time[1:] + self.time[:-1]) / 2, 0.5 / self.rate
-        return np.concatenate([[self.time[0] - half], middle, [self.time[-1] + half]])
+        half = 0.5 / self.rate
+        return np.concatenate([[self.time[0] - half], midpoints(self.time), [self.time[-1] + half]])
 
     def at(self, times: FloatArray) -> FloatArray:
         """(..., m) the output at times (...), along straight lines; the first and last value beyond the ends."""
-        return np.stack([np.interp(times, self.time, axis) for axis in self.values.T], axis=-1)
+        return interpolated(self.time, self.values, times)
 
     def samples(self, seconds: float) -> int:
         """Return how many samples so many seconds are; of a half, rounding of the rate does not decide."""
         return int(seconds * self.rate + 0.5 + 1e-9)
 
     @cached_property
+    def step(self) -> FloatArray:
+        """(m,) the step that the output of each axis comes in, in SI: the least difference of two of its values."""
+        return np.array([np.min(steps) if len(steps) else 0.0 for steps in map(steps_of, self.si()[:20000].T)])
+
+    @property
     def rounding_variance(self) -> float:
         """Variance, summed over the axes (SI units squared), of rounding to the steps that the output comes in."""
-        steps = []
-        for axis in self.si()[:20000].T:
-            difference = np.asarray(np.diff(np.unique(axis)), np.float64)
-            difference = difference[difference > 1e-10 * np.ptp(axis)]  # rounding of the computer's
-            steps.append(difference.min() ** 2 / 12 if len(difference) else 0.0)
-        return max(float(np.sum(steps)), 1e-24)
+        return max(np.sum(self.step**2) / 12, 1e-24)
 
 
 class Defect(str):
@@ -243,7 +244,10 @@ class ReadOptions:
     check: refuse what is not plausible, see `jaximu.recordings.recording.plausibility`.
     alone: take a file of a gyroscope alone; its accelerometer then has no samples.
     device: whose rows to take of a table in which several units write in turn.
-    topic, instance, stamp: what to take from bags and flight logs, see `jaximu.recordings.columns.table.Selection`.
+    topic: of a file that holds more than one sensor of a kind, name of the message or topic; two of them,
+        "accelerometer,gyroscope", where they are apart.
+    instance: which of several sensors, from 0.
+    stamp: "header" (the sensor's own, default) or "receive" (the logger's).
     like: how the log of a calibration was read, which is used where options and file leave something open: columns
         where the header is the same, axes where the file's writer has not applied them, rate and scales where needed.
         Axes and scales that contradict it are refused.
@@ -265,6 +269,11 @@ class ReadOptions:
     instance: int | None = None
     stamp: str = "header"
     like: Reading | None = None
+
+    @property
+    def known(self) -> Reading:
+        """How the calibrated log was read; without one a reading that says nothing."""
+        return self.like or Reading()
 
 
 _SAME_RANGE = 0.05
@@ -358,11 +367,14 @@ class Recording(Result, Comparable, page="recording"):
         return later("report.figures", "signals_figure")(self)
 
 
-def recordings_of(recordings: "Recording | Sequence[Any]") -> list[Recording]:
-    """Return one recording or several as a list. Raises InputError for anything else, saying how to read a file."""
-    several: list[Any] = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
+def recordings_of(recordings: Any, *others: type) -> list[Any]:
+    """Return one recording or several as a list. Raises InputError for anything else, saying how to read a file.
+
+    **Arguments:** `others`: what may stand among them.
+    """
+    several = list(recordings) if isinstance(recordings, (list, tuple)) else [recordings]
     for value in several:
-        if isinstance(value, Recording):
+        if isinstance(value, (Recording, *others)):
             continue
         is_path = isinstance(value, (str, PathLike))
         what = f"the path {str(value)!r}" if is_path else f"a value of type {type(value).__name__}"
@@ -551,12 +563,12 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
 
 
 _ACCEL_SLIPS = {
-    STANDARD_GRAVITY: "g",
-    STANDARD_GRAVITY * 1e-3: "mg",
-    1 / STANDARD_GRAVITY: "m/s², stated as g",
-    1e-3: "mg, stated as g",
+    "g": STANDARD_GRAVITY,
+    "mg": STANDARD_GRAVITY * 1e-3,
+    "m/s², stated as g": 1 / STANDARD_GRAVITY,
+    "mg, stated as g": 1e-3,
 }
-_GYRO_SLIPS = {1 / 57.29578: "deg/s", 57.29578: "rad/s, stated as deg/s", 1 / 57295.78: "mdeg/s", 1e-3: "mdeg/s"}
+_GYRO_SLIPS = {"deg/s": 1 / 57.29578, "rad/s, stated as deg/s": 57.29578, "mdeg/s": 1 / 57295.78, "mrad/s": 1e-3}
 
 
 def _require_own_columns(recording: Recording, gravity: LocalGravity) -> None:
@@ -658,15 +670,33 @@ def _gyro_advice(gyroscope: Signal, ratio: float) -> str:
     return "check --gyro-scale" if gyroscope.unit == "count" else _unit_advice(ratio, _GYRO_SLIPS)
 
 
-def _unit_advice(ratio: float, slips: dict[float, str]) -> str:
+def _unit_advice(ratio: float, slips: Mapping[str, float]) -> str:
     """What the column is likely to be in, when true = ratio · stated."""
-    nearest = min(slips, key=lambda slip: abs(np.log(ratio / slip)))
-    if abs(np.log(ratio / nearest)) > np.log(1.6):
+    nearest, off = likeliest(ratio, slips)
+    if off > np.log(1.6):
         return "check the unit in the column name or in --columns"
-    return f"these columns look like {slips[nearest]}: change the unit in the header or with --columns"
+    return f"these columns look like {nearest}: change the unit in the header or with --columns"
 
 
-def runs_of(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
+def likeliest(size: float, known: Mapping[str, float]) -> tuple[str, float]:
+    """Return the name of the known size that is nearest to a size by their ratio, and the logarithm it is off by."""
+    off = {name: abs(math.log(size / value)) for name, value in known.items()}
+    nearest = min(off, key=off.__getitem__)
+    return nearest, off[nearest]
+
+
+def steps_of(values: FloatArray) -> FloatArray:
+    """Return the differences (k,) of neighbouring levels of an axis (n,), rounding apart."""
+    steps = np.diff(np.unique(values))
+    return steps[steps > 1e-9 * np.ptp(values)]
+
+
+def floor_of(values: FloatArray) -> float:
+    """Return what values (n,) are where they are lowest: the median of those up to thrice the lowest twentieth's."""
+    return float(np.median(values[values <= 3 * np.percentile(values, 5)]))
+
+
+def runs_of(flags: BoolArray) -> IntArray:
     """(k, 2) first and last + 1 of every run of True."""
     return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
 
@@ -683,7 +713,7 @@ def smoothed_slope(time: FloatArray, values: FloatArray, window: float) -> Float
     last = np.maximum(np.searchsorted(time, time + window / 2, "right"), np.minimum(here + 2, len(time)))
 
     def total(terms: FloatArray) -> FloatArray:
-        running = np.concatenate([[0.0], np.cumsum(terms)])
+        running = np.cumulative_sum(terms, include_initial=True)
         return running[last] - running[first]
 
     count, sum_time = last - first, total(time)

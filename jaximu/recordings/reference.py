@@ -9,19 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol as Interface
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
+from jaximu.ground.differences import interpolated
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.rotation import unit_vectors
 from jaximu.recordings.attitude import UNIT_LENGTH
-from jaximu.recordings.readers.schedule import ScheduleEntry
-from jaximu.recordings.recording import Recording, Signal, runs_of
-
-__all__ = ["Entry", "Integral", "entries_of_columns", "match_reference", "means_over", "rest_rate"]
+from jaximu.recordings.entry import ScheduleEntry, times_of
+from jaximu.recordings.recording import Recording, Signal, floor_of, runs_of
 
 _MOVING = np.radians(2.0)  # rad/s, mean rate over a second that no pose has
 _OFF = 20.0  # degrees between a pose's "up" and what the accelerometer reads as its data sheet has it
@@ -33,39 +31,23 @@ _SHORTEST, _LONGEST_TURN = 1.0, 120.0  # s
 _SMALLEST_TURN = np.radians(5)
 
 
-class Entry(Interface):
-    """A pose or a turn on the recording's clock, as a schedule or a protocol has it.
+class Integral:
+    """The running integral of a signal, each sample holding from half way to the one before to half way to the next.
 
-    kind: "pose" or "turn". vector (3,): unit, body frame, "up" or the axis. angle: rad. heading: rad or None.
+    values: (n, m) of its samples; its output in SI by default.
     """
 
-    @property
-    def start(self) -> float: ...
-    @property
-    def stop(self) -> float: ...
-    @property
-    def kind(self) -> str: ...
-    @property
-    def vector(self) -> FloatArray: ...
-    @property
-    def angle(self) -> float: ...
-    @property
-    def heading(self) -> float | None: ...
-
-
-class Integral:
-    """The running integral of a signal, each sample holding from half way to the one before to half way to the next."""
-
-    def __init__(self, signal: Signal, values: FloatArray):
+    def __init__(self, signal: Signal, values: FloatArray | None = None):
+        values = signal.si() if values is None else values
         self.edges = signal.edges
         self.origin = values.mean(axis=0)  # the sums of what is left lose fewer digits
         steps = (values - self.origin) * np.diff(self.edges)[:, None]
-        self.sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+        self.sums = np.cumulative_sum(steps, axis=0, include_initial=True)
 
     def over(self, start, stop) -> FloatArray:
         """Return the integral (..., 3) from `start` to `stop` (...)."""
         start, stop = np.asarray(start), np.asarray(stop)
-        ends = [np.stack([np.interp(t, self.edges, axis) for axis in self.sums.T], axis=-1) for t in (start, stop)]
+        ends = [interpolated(self.edges, self.sums, t) for t in (start, stop)]
         return ends[1] - ends[0] + self.origin * (stop - start)[..., None]
 
 
@@ -74,15 +56,17 @@ def means_over(signal: Signal, span: FloatArray) -> FloatArray:
     return Integral(signal, signal.values).over(*span.T) / np.diff(span)
 
 
-def rest_rate(integral: Integral, entries: Sequence[Entry]) -> FloatArray:
+def rest_rate(integral: Integral, entries: Sequence[ScheduleEntry]) -> FloatArray:
     """The median of the mean outputs in poses: the gyroscope's bias, for purposes that do not ask for more."""
-    rests = np.array([(entry.start, entry.stop) for entry in entries if entry.kind == "pose"])
+    rests = times_of([entry for entry in entries if entry.kind == "pose"])
     if not len(rests):
         return np.zeros(3)
     return np.median(integral.over(*rests.T) / np.diff(rests), axis=0)
 
 
-def match_reference(recording: Recording, entries: Sequence[Entry]) -> tuple[list[Entry], tuple[str, ...]]:
+def match_reference(
+    recording: Recording, entries: Sequence[ScheduleEntry]
+) -> tuple[list[ScheduleEntry], tuple[str, ...]]:
     """Return the entries that can be used, turns without a stated sense given the gyroscope's, and notes.
 
     Raises `InputError` where the reference does not fit the recording, `NotPossibleError` where nothing is left.
@@ -93,7 +77,7 @@ def match_reference(recording: Recording, entries: Sequence[Entry]) -> tuple[lis
     if not usable:
         raise NotPossibleError(f"{where}: the reference names no pose or turn that can be used.")
     if gyroscope is not None:
-        rate = Integral(gyroscope, gyroscope.si())
+        rate = Integral(gyroscope)
         bias = rest_rate(rate, usable)
         usable = [_with_sense(entry, rate, bias, notes) for entry in usable]
         turns = [(entry, _turned(entry, rate, bias)) for entry in usable if entry.kind == "turn"]
@@ -105,11 +89,11 @@ def match_reference(recording: Recording, entries: Sequence[Entry]) -> tuple[lis
     return usable, tuple(notes)
 
 
-def _label(entry: Entry) -> str:
-    return f"{getattr(entry, 'label', 'the ' + entry.kind)} ({entry.start:.6g} to {entry.stop:.6g} s)"
+def _label(entry: ScheduleEntry) -> str:
+    return f"{entry.label or f'the {entry.kind}'} ({entry.start:.6g} to {entry.stop:.6g} s)"
 
 
-def _inside(recording: Recording, entry: Entry, notes: list[str]) -> bool:
+def _inside(recording: Recording, entry: ScheduleEntry, notes: list[str]) -> bool:
     """Whether the log holds an entry without a gap."""
     there = [signal for signal in recording.signals.values() if len(signal) > 1]
     first, last = min(signal.time[0] for signal in there), max(signal.time[-1] for signal in there)
@@ -130,21 +114,20 @@ def _inside(recording: Recording, entry: Entry, notes: list[str]) -> bool:
     return True
 
 
-def _turned(entry: Entry, rate: Integral, bias: FloatArray) -> FloatArray:
+def _turned(entry: ScheduleEntry, rate: Integral, bias: FloatArray) -> FloatArray:
     """The angle (3,), rad, that the gyroscope shows."""
     return rate.over(entry.start, entry.stop) - bias * (entry.stop - entry.start)
 
 
-def _with_sense(entry: Entry, rate: Integral, bias: FloatArray, notes: list[str]) -> Entry:
+def _with_sense(entry: ScheduleEntry, rate: Integral, bias: FloatArray, notes: list[str]) -> ScheduleEntry:
     if entry.kind == "pose" or not math.isnan(entry.angle):
         return entry
     sense = math.copysign(2 * math.pi, _turned(entry, rate, bias) @ entry.vector)
     notes.append("turns whose angle is not stated are taken as 360° in the sense that the gyroscope shows.")
-    assert isinstance(entry, ScheduleEntry)
     return replace(entry, angle=sense)
 
 
-def _require_units(turns: Sequence[tuple[Entry, FloatArray]], where: str) -> None:
+def _require_units(turns: Sequence[tuple[ScheduleEntry, FloatArray]], where: str) -> None:
     """Refuse angles in another unit than the gyroscope's; `turns`: with the angle (3,) that the gyroscope shows."""
     ratio = np.median([abs(turned @ entry.vector / entry.angle) for entry, turned in turns] or [1.0])
     for slip, unit, other in ((57.29578, "rad", "deg"), (1 / 57.29578, "deg", "rad")):
@@ -156,7 +139,7 @@ def _require_units(turns: Sequence[tuple[Entry, FloatArray]], where: str) -> Non
             )
 
 
-def _require_clock(entries: Sequence[Entry], rate: Integral, bias: FloatArray, where: str) -> None:
+def _require_clock(entries: Sequence[ScheduleEntry], rate: Integral, bias: FloatArray, where: str) -> None:
     """Refuse a reference whose poses hold motion, and say which shift would suit better."""
     moving = []
     for entry in entries:
@@ -167,7 +150,7 @@ def _require_clock(entries: Sequence[Entry], rate: Integral, bias: FloatArray, w
                 moving.append(entry)
     if not moving:
         return
-    span = np.array([(entry.start, entry.stop) for entry in entries])
+    span = times_of(entries)
     stated = np.array([entry.angle * entry.vector if entry.kind == "turn" else np.zeros(3) for entry in entries])
     rest = ~stated.any(axis=1)
     weight = np.where(rest, 100.0, 1.0)  # turns are off by the scale's error, rests by next to nothing
@@ -189,7 +172,7 @@ def _require_clock(entries: Sequence[Entry], rate: Integral, bias: FloatArray, w
     raise InputError(f"{text}: the reference does not match the log in time, or belongs to another log.")
 
 
-def _require_turn(entry: Entry, turned: FloatArray, where: str) -> None:
+def _require_turn(entry: ScheduleEntry, turned: FloatArray, where: str) -> None:
     along = turned @ entry.vector
     across = np.linalg.norm(turned - along * entry.vector)
     if 0.7 < along / entry.angle < 1.4 and across < 0.3 * abs(entry.angle):
@@ -204,12 +187,11 @@ def _require_turn(entry: Entry, turned: FloatArray, where: str) -> None:
     raise InputError(f"{text}{shown} about x, y, z: the reference does not describe this turn, or not at this time.")
 
 
-def _require_poses(recording: Recording, poses: Sequence[Entry], where: str) -> None:
+def _require_poses(recording: Recording, poses: Sequence[ScheduleEntry], where: str) -> None:
     if not poses or not len(recording.accelerometer):
         return
-    force = Integral(recording.accelerometer, recording.accelerometer.si())
-    read = force.over(*np.array([(pose.start, pose.stop) for pose in poses]).T)
-    read = read / np.linalg.norm(read, axis=1, keepdims=True)
+    force = Integral(recording.accelerometer)
+    read = unit_vectors(force.over(*times_of(poses).T))
     stated = np.stack([pose.vector for pose in poses])
     off = np.degrees(np.arccos(np.clip(np.sum(read * stated, axis=1), -1, 1)))
     if not (off > _OFF).any():
@@ -238,7 +220,7 @@ def _require_poses(recording: Recording, poses: Sequence[Entry], where: str) -> 
 # --- reference columns ----------------------------------------------------------------------------------------------
 
 
-def entries_of_columns(recording: Recording) -> list[Entry]:
+def entries_of_columns(recording: Recording) -> list[ScheduleEntry]:
     """Return poses (the reference at rest for a second or more) and the turns between them from reference columns.
 
     An attitude tells all. A table's angle or rate tells turns about the table's axis, which then must be vertical and
@@ -256,15 +238,14 @@ def entries_of_columns(recording: Recording) -> list[Entry]:
     if recording.table_angle is not None:
         angle = np.unwrap(signal.values[:, 0])
     else:
-        integral = Integral(signal, signal.values)
+        integral = Integral(signal)
         angle = integral.over(np.full(len(signal), integral.edges[0]), signal.time)[:, 0]
     return _entries_of_table(recording, signal.time, angle)
 
 
 def _rests(time: FloatArray, moved: FloatArray, where: str) -> FloatArray:
     """Intervals (n, 2) over which the reference rests; `moved` (n,) is its rate at each stamp, its noise included."""
-    lowest = np.percentile(moved, 5)
-    limit = np.clip(_NOISY * np.median(moved[moved <= 3 * lowest]), _STILL, _MOVING)
+    limit = np.clip(_NOISY * floor_of(moved), _STILL, _MOVING)
     runs = runs_of(moved < limit)
     spans = np.stack([time[runs[:, 0]] + _WINDOW, time[runs[:, 1] - 1] - _WINDOW], axis=1)
     spans = spans[spans[:, 1] - spans[:, 0] >= _SHORTEST]
@@ -273,13 +254,13 @@ def _rests(time: FloatArray, moved: FloatArray, where: str) -> FloatArray:
     return spans
 
 
-def _neighbours(count: int, samples: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _neighbours(count: int, samples: float) -> tuple[IntArray, IntArray]:
     """The samples so many before and after each of `count`, as far as there are any."""
     step, index = max(1, round(samples)), np.arange(count)
     return np.maximum(index - step, 0), np.minimum(index + step, count - 1)
 
 
-def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[Entry]:
+def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[ScheduleEntry]:
     length = np.linalg.norm(attitude.values, axis=1)
     if (np.abs(length - 1) > UNIT_LENGTH).any():
         worst = np.argmax(np.abs(length - 1))
@@ -292,25 +273,25 @@ def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[Entry]:
     before, after = _neighbours(len(attitude), _WINDOW * attitude.rate / 2)
     angle = (rotation[before].inv() * rotation[after]).magnitude()
     spans = _rests(attitude.time, angle / (attitude.time[after] - attitude.time[before]), recording.name)
-    entries: list[Entry] = []
+    entries: list[ScheduleEntry] = []
     for index, (start, stop) in enumerate(spans):
         inside = (attitude.time >= start) & (attitude.time <= stop)
         up = rotation[inside].inv().apply([0.0, 0.0, 1.0]).mean(axis=0)
-        entries.append(ScheduleEntry(start, stop, "pose", up / np.linalg.norm(up), label="the pose"))
+        entries.append(ScheduleEntry(start, stop, "pose", up / np.linalg.norm(up)))
         if index + 1 < len(spans) and (following := spans[index + 1, 0]) - stop < _LONGEST_TURN:
             during = rotation[(attitude.time >= stop) & (attitude.time <= following)]
             total = (during[:-1].inv() * during[1:]).as_rotvec().sum(axis=0)
             turned = float(np.linalg.norm(total))
             if turned > _SMALLEST_TURN:
-                entries.append(ScheduleEntry(stop, following, "turn", total / turned, turned, label="the turn"))
+                entries.append(ScheduleEntry(stop, following, "turn", total / turned, turned))
     return entries
 
 
-def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray) -> list[Entry]:
+def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray) -> list[ScheduleEntry]:
     before, after = _neighbours(len(time), _WINDOW / np.median(np.diff(time)) / 2)
     moved = np.abs(angle[after] - angle[before]) / (time[after] - time[before])
     if recording.gyroscope is not None:  # a unit is mounted again while the table stands
-        rate = Integral(recording.gyroscope, recording.gyroscope.si())
+        rate = Integral(recording.gyroscope)
         mean = rate.over(time[before], time[after]) / (time[after] - time[before])[:, None]
         off = np.linalg.norm(mean - np.median(mean[moved < _STILL], axis=0), axis=1)
         moved = np.where(off > _MOVING, np.inf, moved)
@@ -320,7 +301,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
             f"{recording.name}: holds a gyroscope alone, and table columns do not say about which of its axes the "
             "table turns; write a schedule."
         )
-    force = Integral(recording.accelerometer, recording.accelerometer.si())
+    force = Integral(recording.accelerometer)
     read = force.over(*spans.T)
     size = np.abs(read)
     axis = np.argmax(size, axis=1)
@@ -333,13 +314,13 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
             f"{recording.name}: from {start:.6g} to {stop:.6g} s no axis of the body is vertical ({off[first]:.0f}° "
             "off): table columns describe only turns about a vertical body axis; write a schedule for other poses."
         )
-    entries: list[Entry] = []
+    entries: list[ScheduleEntry] = []
     for index, ((start, stop), up) in enumerate(zip(spans, ups, strict=True)):
-        heading = float(np.interp((start + stop) / 2, time, angle)) if recording.table_angle is not None else None
-        entries.append(ScheduleEntry(start, stop, "pose", up, heading=heading, label="the pose"))
+        heading = np.interp((start + stop) / 2, time, angle) if recording.table_angle is not None else None
+        entries.append(ScheduleEntry(start, stop, "pose", up, heading=heading))
         if index + 1 < len(spans) and up @ ups[index + 1] > 0.5:
             following = spans[index + 1, 0]
             turned = float(np.interp(following, time, angle) - np.interp(stop, time, angle))
             if abs(turned) > _SMALLEST_TURN and following - stop < _LONGEST_TURN:
-                entries.append(ScheduleEntry(stop, following, "turn", up, turned, label="the turn"))
+                entries.append(ScheduleEntry(stop, following, "turn", up, turned))
     return entries

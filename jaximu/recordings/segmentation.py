@@ -9,30 +9,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
+from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE
 from jaximu.recordings.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
-from jaximu.recordings.recording import PoseMeans, Recording, Signal, runs_of
-
-__all__ = [
-    "Segmentation",
-    "SegmentationOptions",
-    "find_stops",
-    "noise_by_model",
-    "observe_means",
-    "observed_poses",
-    "require_model",
-    "rest_statistics",
-    "segment",
-]
-
+from jaximu.recordings.recording import PoseMeans, Recording, Signal, floor_of, runs_of
 
 THRESHOLDS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 200, 400)
 _DISTINCT = np.radians(5.0)  # neighbouring poses closer than this count as one that broke in two
@@ -96,7 +83,7 @@ class _Moments:
         np.cumsum(values, axis=1, out=self._sums[:, 1:])
         np.cumsum(np.square(values, out=values), axis=1, out=self._squares[:, 1:])
 
-    def between(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+    def between(self, start: FloatArray, stop: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
         """Mean (W, 3) and unbiased variance (W, 3) of the samples from `start` to before `stop`, and their number."""
         first, last = np.searchsorted(self.signal.time, start), np.searchsorted(self.signal.time, stop)
         count = last - first
@@ -115,20 +102,17 @@ def _windows(moments: _Moments, centres: FloatArray, width: float) -> tuple[Floa
 
 def _floor(variance: FloatArray, moments: _Moments) -> float:
     """The variance of windows at rest: the median of those near the lowest."""
-    finite = variance[np.isfinite(variance)]
-    lowest = np.percentile(finite, 5)
-    floor = np.median(finite[finite <= 3 * lowest])
+    floor = floor_of(variance[np.isfinite(variance)])
     # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
     # simulated output without noise is constant but for the rounding of the running sums.
-    total = float(moments.between(np.array([-np.inf]), np.array([np.inf]))[1].sum())
+    total = moments.between(np.array([-np.inf]), np.array([np.inf]))[1].sum()
     rounding = np.finfo(np.float64).eps * len(moments.signal) * total
     return max(floor, moments.signal.rounding_variance, rounding)
 
 
 def _angles(vectors: FloatArray, others: FloatArray) -> FloatArray:
     """Angle (rad) between each vector and the other of its row."""
-    units, other_units = (rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (vectors, others))
-    return 2 * np.arcsin(np.clip(np.linalg.norm(other_units - units, axis=1) / 2, 0, 1))
+    return 2 * np.arcsin(np.clip(np.linalg.norm(unit_vectors(others) - unit_vectors(vectors), axis=1) / 2, 0, 1))
 
 
 def _samples(signal: Signal, start: float, stop: float) -> slice:
@@ -188,7 +172,7 @@ def segment(recording: Recording, options: SegmentationOptions | None = None) ->
     gyroscope, scan = recording.gyroscope, _Scan.of(recording, options.window)
     width, centres, moments, means, ratio = scan.width, scan.centres, scan.moments, scan.means, scan.ratio
     turning = np.zeros(len(centres)) if gyroscope is None else _turning(means[1], ratio, options.rate_limit)
-    sums = np.vstack([np.zeros(3), np.cumsum(means[0], axis=0)])
+    sums = np.cumulative_sum(means[0], axis=0, include_initial=True)
 
     def runs(factor: float) -> tuple[FloatArray, int]:
         # A unit held by hand trembles: where much variance must pass as still, so must the mean rate it brings along.
@@ -417,7 +401,7 @@ def require_model(signal: Signal, noise: AxisNoise | None, name: str) -> AxisNoi
 
 
 def noise_by_model(
-    signal: Signal, noise: AxisNoise, start: FloatArray, stop: FloatArray, same: NDArray[np.bool_]
+    signal: Signal, noise: AxisNoise, start: FloatArray, stop: FloatArray, same: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """White density (3, 3) and covariance (3, n, n) of slow bias over intervals, in output units; `same` (n, n) tells
     which intervals belong to one recording: between power-ons nothing is carried over.
@@ -571,7 +555,7 @@ def _with_noise(
     power_on = np.repeat(np.arange(len(parts)), [len(part.intervals) for part in parts])
     together = power_on[:, None] == power_on
 
-    def among(rows: NDArray[np.int64], covariance: FloatArray, size: int) -> FloatArray:
+    def among(rows: IntArray, covariance: FloatArray, size: int) -> FloatArray:
         """The covariance of these rows among so many, each of which has a variance of one else."""
         whole = np.tile(np.eye(size), (3, 1, 1))
         whole[:, rows[:, None], rows] = covariance
@@ -580,10 +564,16 @@ def _with_noise(
     def of_poses(covariance: FloatArray) -> FloatArray:
         return np.diagonal(covariance, axis1=1, axis2=2)[:, :padded].T[:, :, None] * np.eye(3)
 
+    def by_model(
+        name: str, signal: Signal, start: FloatArray, stop: FloatArray, same: BoolArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """White density and covariance over intervals of which the first are the poses, white noise in theirs."""
+        white, slow = noise_by_model(signal, require_model(signal, getattr(noise, name), name), start, stop, same)
+        slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)[:count]
+        return white, slow
+
     accelerometer, gyroscope = parts[0].recording.accelerometer, parts[0].recording.gyroscope
-    model = require_model(accelerometer, noise.accelerometer, "accelerometer")
-    white, slow = noise_by_model(accelerometer, model, start, stop, together)
-    slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
+    _, slow = by_model("accelerometer", accelerometer, start, stop, together)
     slow[:, at_rest, at_rest] += np.concatenate([_rounding(part.recording.accelerometer, part) for part in parts], 1)
     forces = among(at_rest, slow, padded)
     poses = replace(poses, accelerometer_covariance=of_poses(forces))
@@ -591,7 +581,6 @@ def _with_noise(
     rates = np.tile(np.eye(intervals), (3, 1, 1))
     part_of_turn = np.zeros(turns.interval.shape, np.int64)
     if gyroscope is not None:
-        model = require_model(gyroscope, noise.gyroscope, "gyroscope")
         used = np.flatnonzero(turns.mask[: count - 1])
         elapsed = np.cumsum(turns.interval, axis=1) - turns.interval / 2
         total = np.maximum(np.sum(turns.interval, axis=1, keepdims=True), 1e-9)
@@ -601,10 +590,9 @@ def _with_noise(
         last = np.concatenate([stop, edges[:, 1:].ravel()])
         owner = np.concatenate([power_on, np.repeat(power_on[used], _PARTS)])
         alike = owner[:, None] == owner
-        white, slow = noise_by_model(gyroscope, model, first, last, alike)
+        white, slow = by_model("gyroscope", gyroscope, first, last, alike)
         # a later power-on has another bias: what its means at rest have in common tells nothing of the first one's
         slow += (alike & (owner > 0)) * np.square(POWER_ON["gyroscope"] * gyroscope.nominal_scale)[:, None, None]
-        slow[:, at_rest, at_rest] += np.diag(white)[:, None] / (stop - start)
         shift = np.sqrt(np.concatenate([_rounding(part.recording.gyroscope or gyroscope, part) for part in parts], 1))
         # every pose of a recording reads the same rate, and rounds it the same way
         slow[:, :count, :count] += shift[:, :, None] * shift[:, None, :] * together

@@ -31,18 +31,14 @@ Beside LOG, such a file called LOG.trace.toml is read without being named.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import date
 from pathlib import Path
 from typing import Any
 
-from jaximu.ground.document import file_digest, read_toml
-from jaximu.ground.errors import InputError, only
+from jaximu.ground.document import Json, file_digest, read_toml
+from jaximu.ground.errors import FilePath, InputError, only
 
-__all__ = ["NEEDED", "missing", "read_trace", "sidecar"]
-
-_TEXT = ("serial", "model", "lot", "operator", "station", "fixture")
-_DATES = ("date", "received")
 _REFERENCE = ("name", "certificate", "expires", "file", "value", "uncertainty")
 _CERTIFICATE = ("number", "laboratory", "address", "customer", "authorised_by")
 NEEDED = (
@@ -52,36 +48,32 @@ NEEDED = (
 """What ISO/IEC 17025, 7.8.2 and 7.8.4, asks of a certificate and the recording does not say."""
 
 
-def sidecar(log: str | os.PathLike[str]) -> Path | None:
+def sidecar(log: FilePath) -> Path | None:
     """Return the file beside a log that says what it is traced by; None where there is none."""
     path = Path(f"{os.fspath(log)}.trace.toml")
     return path if path.is_file() else None
 
 
-def read_trace(path: str | os.PathLike[str] | None, stated: Mapping[str, str | None] | None = None) -> dict[str, Any]:
+def read_trace(path: FilePath | None, stated: Mapping[str, str | None] | None = None) -> Json:
     """Return what a file, if any, and options say; options go first.
 
     Raises `InputError` naming file and key: what is not known, has no text, or a reference whose certificate had
     expired on the day of the calibration.
     """
     name, document = ("the options", {}) if path is None else (os.fspath(path), read_toml(path))
-    trace: dict[str, Any] = {}
+    trace: Json = {}
     for key, value in document.items():
         where = f"{name}, {key}"
-        if key in _TEXT:
-            trace[key] = _text(value, where)
-        elif key in _DATES:
-            trace[key] = _date(value, where).isoformat()
+        if key in _SAID:
+            trace[key] = _SAID[key](value, where)
         elif key in ("environment", "certificate") and isinstance(value, dict):
             only(value, _CERTIFICATE if key == "certificate" else value, where)
             trace[key] = {name: _text(text, f"{where}.{name}") for name, text in value.items()}
         elif key == "reference" and isinstance(value, list):
             trace[key] = [_reference(reference, f"{where} {number}", name) for number, reference in enumerate(value, 1)]
         else:
-            only({key: value}, (*_TEXT, *_DATES, "[environment]", "[[reference]]", "[certificate]"), name)
-    for key, value in (stated or {}).items():
-        if value is not None:
-            trace[key] = _date(value, f"--{key}").isoformat() if key in _DATES else _text(value, f"--{key}")
+            only({key: value}, (*_SAID, "[environment]", "[[reference]]", "[certificate]"), name)
+    trace |= {key: _SAID[key](value, f"--{key}") for key, value in (stated or {}).items() if value is not None}
     _refuse_expired(trace, name)
     return trace
 
@@ -99,11 +91,18 @@ def _text(value: Any, where: str) -> str:
     return str(value).strip()
 
 
-def _date(value: Any, where: str) -> date:
+def _date(value: Any, where: str) -> str:
     try:
-        return date.fromisoformat(str(value)[:10])
+        return date.fromisoformat(str(value)[:10]).isoformat()
     except ValueError:
         raise InputError(f'{where}: a date such as "2026-03-04" is needed, found {value!r}.') from None
+
+
+_SAID: dict[str, Callable[[Any, str], str]] = {
+    **{key: _text for key in ("serial", "model", "lot", "operator", "station", "fixture")},
+    **{"date": _date, "received": _date},
+}
+"""What a file's first part and options say, and what makes it out."""
 
 
 def _reference(entry: Any, where: str, name: str) -> dict[str, str]:
@@ -113,9 +112,8 @@ def _reference(entry: Any, where: str, name: str) -> dict[str, str]:
     for key in ("name", "certificate"):
         if key not in entry:
             raise InputError(f"{where}: the {key} is missing.")
-    reference = {key: _text(value, f"{where}.{key}") for key, value in entry.items() if key != "expires"}
-    if "expires" in entry:
-        reference["expires"] = _date(entry["expires"], f"{where}.expires").isoformat()
+    made_out = {"expires": _date}
+    reference = {key: made_out.get(key, _text)(value, f"{where}.{key}") for key, value in entry.items()}
     if "file" in entry:
         path = Path(name).parent / reference["file"]
         reference |= {"file": str(path), "sha256": file_digest(path)}

@@ -10,7 +10,8 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.atomic import atomic_write
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import FilePath, InputError
+from jaximu.ground.units import column_title
 from jaximu.recordings.columns.names import GROUPS
 from jaximu.recordings.recording import Recording
 
@@ -24,7 +25,7 @@ Blocks = dict[str, tuple[str, np.ndarray]]
 """By group ("time", "accel", …): the unit and the (rows, m) values, NaN where the sensor has no sample."""
 
 
-def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
+def write_recording(recording: Recording, path: FilePath) -> None:
     """Writes the recording by the suffix of `path` (.csv, .tsv, .txt, .parquet, .npz, .mat), whole or not at all.
 
     Sensors with stamps of their own are written at the union of the stamps, with empty cells in between. Raw counts
@@ -48,7 +49,7 @@ def arrow_table(recording: Recording) -> "pa.Table":
     return table if axes is None else table.replace_schema_metadata({AXES: axes})
 
 
-def check_suffix(path: str | os.PathLike[str]) -> "Callable[[Recording, Path], None]":
+def check_suffix(path: FilePath) -> "Callable[[Recording, Path], None]":
     """The writer of this suffix. Raises InputError if there is none."""
     writer = _WRITERS.get(Path(path).suffix.lower())
     if writer is None:
@@ -56,7 +57,7 @@ def check_suffix(path: str | os.PathLike[str]) -> "Callable[[Recording, Path], N
     return writer
 
 
-def write_parts(parts: Iterable[Recording], path: str | os.PathLike[str]) -> None:
+def write_parts(parts: Iterable[Recording], path: FilePath) -> None:
     """Writes the parts of one recording to Parquet one after the other, in bounded memory, whole or not at all.
 
     The parts must have the same signals and `start`. Raises InputError for a path that cannot be written.
@@ -102,7 +103,8 @@ def _columns(recording: Recording) -> dict[str, np.ndarray]:
     named: dict[str, np.ndarray] = {}
     for key, (unit, values) in _blocks(recording).items():
         names = GROUPS[key].columns if key in GROUPS else (key,)
-        named |= {name if unit == "1" else f"{name} [{unit}]": values[:, at] for at, name in enumerate(names)}
+        stated = None if unit == "1" else unit
+        named |= {column_title(name, stated): values[:, at] for at, name in enumerate(names)}
     return named
 
 

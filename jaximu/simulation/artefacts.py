@@ -11,13 +11,11 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES
 from jaximu.recordings.recording import axis_matrix
-
-__all__ = ["ARTEFACTS", "Artefact", "LoggedRows"]
 
 _SENSORS = tuple(INERTIAL_QUANTITIES)
 _COLUMNS = {f"{PREFIXES[sensor]}_{axis}": (sensor, index) for sensor in _SENSORS for index, axis in enumerate("xyz")}
@@ -27,11 +25,11 @@ _COLUMNS = {f"{PREFIXES[sensor]}_{axis}": (sensor, index) for sensor in _SENSORS
 class LoggedRows:
     """A block of rows: number (n,) of each row in the whole recording, time (n,) s, values by signal (n, m)."""
 
-    row: NDArray[np.int64]
-    time: NDArray[np.float64]
-    values: dict[str, NDArray[np.float64]]
+    row: IntArray
+    time: FloatArray
+    values: dict[str, FloatArray]
 
-    def keep(self, mask: NDArray[np.bool_]) -> None:
+    def keep(self, mask: BoolArray) -> None:
         """Drop the rows where the mask is false."""
         self.row, self.time = self.row[mask], self.time[mask]
         self.values = {name: value[mask] for name, value in self.values.items()}
@@ -68,10 +66,19 @@ class _OfAnAxis(Artefact):
         if self.axis not in _COLUMNS:
             raise InputError(f"artefact {self.name}: axis must be one of {', '.join(_COLUMNS)}, found {self.axis!r}.")
 
-    def values(self, samples: LoggedRows) -> NDArray[np.float64]:
+    def values(self, samples: LoggedRows) -> FloatArray:
         """The axis's values (n,), a view."""
         sensor, index = _COLUMNS[self.axis]
         return samples.values[sensor][:, index]
+
+
+@dataclass(frozen=True)
+class _OfAShare(Artefact):
+    share: float
+
+    def __post_init__(self):
+        if not 0 <= self.share < 1:
+            raise InputError(f"artefact {self.name}: share must be at least 0 and below 1, found {self.share}.")
 
 
 @dataclass(frozen=True)
@@ -199,16 +206,11 @@ class StuckAxis(_OfAnAxis):
 
 
 @dataclass(frozen=True)
-class Repeated(Artefact):
+class Repeated(_OfAShare):
     """A `share` of the samples repeat all values of the sample before (the logger was quicker than the sensor)."""
-
-    share: float
 
     name = "repeated"
     catalogue = "data.stuck_axis"
-
-    def __post_init__(self):
-        _share(self)
 
     def apply(self, samples, rng, kept):
         repeat = rng.random(len(samples.time)) < self.share
@@ -222,16 +224,11 @@ class Repeated(Artefact):
 
 
 @dataclass(frozen=True)
-class Dropped(Artefact):
+class Dropped(_OfAShare):
     """A `share` of the samples are lost."""
-
-    share: float
 
     name = "dropped"
     catalogue = "data.gap"
-
-    def __post_init__(self):
-        _share(self)
 
     def apply(self, samples, rng, kept):
         samples.keep(rng.random(len(samples.time)) >= self.share)
@@ -282,11 +279,6 @@ def _in_order(artefact: StuckAxis | Gap) -> None:
         raise InputError(
             f"artefact {artefact.name}: start must be before stop, found {artefact.start} and {artefact.stop}."
         )
-
-
-def _share(artefact: Repeated | Dropped) -> None:
-    if not 0 <= artefact.share < 1:
-        raise InputError(f"artefact {artefact.name}: share must be at least 0 and below 1, found {artefact.share}.")
 
 
 ARTEFACTS: dict[str, type[Artefact]] = {

@@ -8,8 +8,6 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.model import Noise, White
 from jaximu.model.sensor import Imu, Triad
 
-__all__ = ["ACCELEROMETER_DENSITY", "GYROSCOPE_DENSITY", "consumer_noise", "draw_imu"]
-
 ACCELEROMETER_DENSITY = 100e-6 * STANDARD_GRAVITY
 """White noise of a consumer accelerometer, 100 µg/√Hz, in m/s² per √Hz, two-sided."""
 GYROSCOPE_DENSITY = float(np.radians(0.005))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -12,13 +11,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from numpy.typing import NDArray
 
 from jaximu.ground import stored
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
-from jaximu.ground.document import SOFTWARE, Document
-from jaximu.ground.errors import InputError
+from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
 from jaximu.ground.tracing import is_traced
@@ -29,12 +27,11 @@ from jaximu.model.sensor import Imu, Triad
 from jaximu.model.state_space import BLOCK
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings import write_recording
+from jaximu.recordings.entry import ScheduleEntry, times_of
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.write import write_parts
 from jaximu.simulation.artefacts import ARTEFACTS, Artefact, LoggedRows
-from jaximu.simulation.protocols import Environment, Interval, Motion, Plan, Protocol, block_length
-
-__all__ = ["Case", "Stream", "Truth", "simulate", "simulate_cases", "write_case"]
+from jaximu.simulation.protocols import Environment, Motion, Plan, Protocol, block_length
 
 TRUTH_SCHEMA = "jaximu.truth/1"
 
@@ -75,8 +72,6 @@ class Case:
                 "a unit that is traced cannot be simulated, which draws noise and cuts logs on the host: what it puts "
                 "out along a path is jaximu.Imu.respond."
             )
-        if not (np.isfinite(rate) and rate > 0):
-            raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
         seeds = tuple(seed) if isinstance(seed, Sequence) else (seed,)
         plan = protocol.plan(_generator(seeds, "motion", power_on), environment)
         noise = dict(noise or {})
@@ -114,7 +109,7 @@ class Truth(Document):
         return self.case.imu
 
     @property
-    def schedule(self) -> list[Interval]:
+    def schedule(self) -> list[ScheduleEntry]:
         """Rests and turns, on the recording's clock."""
         half = 0.5 / self.case.rate
         return [
@@ -125,14 +120,13 @@ class Truth(Document):
     @property
     def intervals(self) -> FloatArray:
         """(P, 2) start and stop of each rest (s, on the recording's clock), at the edges of samples."""
-        poses = [interval for interval in self.schedule if interval.kind == "pose"]
-        return np.array([(pose.start, pose.stop) for pose in poses]).reshape(-1, 2)
+        return times_of([interval for interval in self.schedule if interval.kind == "pose"])
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Json:
         """Return the truth as the JSON document of schema `jaximu.truth/1`."""
         case, motion = self.case, self.case.plan.motion
 
-        def documents(effects: Iterable[Effect], output_unit: str = "") -> dict[str, Any]:
+        def documents(effects: Iterable[Effect], output_unit: str = "") -> Json:
             return {effect.name: effect.document(output_unit) for effect in effects}
 
         triads = {
@@ -159,7 +153,17 @@ class Truth(Document):
             "gravity": float(motion.gravity),
             "earth_rotation": np.asarray(motion.earth).tolist(),
             "magnetic_field": np.asarray(motion.field).tolist(),
-            "schedule": [asdict(interval) | {"vector": interval.vector.tolist()} for interval in self.schedule],
+            "schedule": [
+                {
+                    "start": entry.start,
+                    "stop": entry.stop,
+                    "kind": entry.kind,
+                    "vector": entry.vector.tolist(),
+                    "angle": entry.angle,
+                    "heading": entry.heading or 0.0,
+                }
+                for entry in self.schedule
+            ],
             "artefacts": [
                 {"name": artefact.name} | {k: None if v == np.inf else v for k, v in asdict(artefact).items()}
                 for artefact in case.artefacts
@@ -172,12 +176,12 @@ class Truth(Document):
             "software": SOFTWARE,
         }
 
-    def save_schedule(self, path: str | os.PathLike[str]) -> None:
+    def save_schedule(self, path: FilePath) -> None:
         """Write rests and turns as a turntable schedule (CSV, angles in degrees), as `--reference` reads it."""
         lines = ["start [s],stop [s],kind,x,y,z,angle [deg],heading [deg]"]
         for interval in self.schedule:
             x, y, z = interval.vector
-            angle, heading = np.degrees(interval.angle), np.degrees(interval.heading)
+            angle, heading = np.degrees(interval.angle), np.degrees(interval.heading or 0.0)
             extra = f"{angle:.12g}," if interval.kind == "turn" else f",{heading:.12g}"
             times = f"{interval.start:.9g},{interval.stop:.9g}"
             lines.append(f"{times},{interval.kind},{x:.12g},{y:.12g},{z:.12g},{extra}")
@@ -285,7 +289,7 @@ class _Logger:
         ]
         self.kept: list[Any] = [None] * len(case.artefacts)
 
-    def logged(self, rows: NDArray[np.int64], columns: Mapping[str, FloatArray]) -> LoggedRows:
+    def logged(self, rows: IntArray, columns: Mapping[str, FloatArray]) -> LoggedRows:
         """Return what is logged in the rows of a block where these are the outputs."""
         values = {name: np.array(column)[: len(rows)] for name, column in columns.items()}
         for name, (scale, stream) in self.noise.items():
@@ -364,7 +368,7 @@ def simulate_cases(cases: Sequence[Case]) -> list[tuple[Recording, Truth]]:
     return [(_recording(case, parts), Truth(case, notes)) for case, parts, notes in units]
 
 
-def write_case(case: Case, path: str | os.PathLike[str]) -> Truth:
+def write_case(case: Case, path: FilePath) -> Truth:
     """Simulate a case into a file, by its suffix; Parquet in bounded memory, whole or not at all. Return the truth."""
     if Path(path).suffix.lower() == ".parquet":
         source = Stream([case])

@@ -48,8 +48,8 @@ from typing import Any
 
 import numpy as np
 
-from jaximu.ground.document import read_toml
-from jaximu.ground.errors import InputError, nearest, only
+from jaximu.ground.document import Json, read_toml
+from jaximu.ground.errors import FilePath, InputError, nearest, only
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS
 from jaximu.model import Noise, parse_quantity
 from jaximu.model.data_sheet import SI_UNITS
@@ -61,14 +61,12 @@ from jaximu.simulation.artefacts import ARTEFACTS, Artefact
 from jaximu.simulation.engine import Case
 from jaximu.simulation.protocols import PROTOCOLS, Environment, Protocol, Tone
 
-__all__ = ["Draw", "Specification", "read_specification"]
-
 _TRIAD_KEYS = ("output_unit", "counts", "gain", "scale", "misalignment", "bias", "temperature_reference", "noise")
 _NOISE_KEYS = inspect.getfullargspec(Noise.from_datasheet).kwonlyargs
 _TOP_KEYS = ("seed", "units", "recordings", "rate", "protocol", "environment", *SENSOR_UNITS, "effects", "artefacts")
 
 
-def read_specification(path: str | os.PathLike[str]) -> Specification:
+def read_specification(path: FilePath) -> Specification:
     """Read and check a specification. Raises `InputError`, naming file and key, for anything that is not understood."""
     return Specification(read_toml(path), os.fspath(path))
 
@@ -76,7 +74,7 @@ def read_specification(path: str | os.PathLike[str]) -> Specification:
 class Specification:
     """A checked specification: `case(unit, recording)` draws one recording of it."""
 
-    def __init__(self, document: dict[str, Any], name: str = "specification"):
+    def __init__(self, document: Json, name: str = "specification"):
         self.document, self.name = document, name
         self._known(document, _TOP_KEYS, "")
         self.seed = self._count("seed", 0, least=0)
@@ -111,10 +109,10 @@ class Specification:
 
     # --- parts: `case` puts the name of the specification before what they say is wrong --------------------------
 
-    def _known(self, table: Any, known: Iterable[str], where: str) -> dict[str, Any]:
+    def _known(self, table: Any, known: Iterable[str], where: str) -> Json:
         return only(table, known, self.name, where and f"[{where}]")
 
-    def _table(self, key: str, known: Iterable[str]) -> dict[str, Any]:
+    def _table(self, key: str, known: Iterable[str]) -> Json:
         return self._known(self.document.get(key, {}), known, key)
 
     def _count(self, key: str, default: int, least: int = 1) -> int:

@@ -8,20 +8,20 @@ from jaximu.recordings.columns.guess import advise
 from jaximu.recordings.columns.names import GROUPS, QUANTITIES, TIME, Column, header_columns, parse_columns
 from jaximu.recordings.columns.table import LogTable
 
-__all__ = ["choose_columns", "choose_pair", "column_units"]
-
 _LISTED = 30
+Used = dict[str, tuple[int, Unit]]
+"""By canonical name, the columns that are used: their index and unit."""
 
 
 def column_units(
     table: LogTable, columns: Sequence[Column], option: str = "--columns", sensor: str | None = None
-) -> dict[str, tuple[int, Unit]]:
+) -> Used:
     """The used columns of a table by canonical name: their index and unit.
 
     Raises InputError for a doubled name, a triad without one of its axes, a unit that is missing (with a line to
     copy), unknown, or one of another quantity. `sensor`: the one that the file must hold, where it is for one alone.
     """
-    used: dict[str, tuple[int, Unit]] = {}
+    used: Used = {}
     for index, column in enumerate(columns):
         if column.name is None:
             continue

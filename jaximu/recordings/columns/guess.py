@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import listed, unit_text
-from jaximu.ground.units import STANDARD_GRAVITY, Unit, find_unit, parse_column
+from jaximu.ground.units import SENSORS, STANDARD_GRAVITY, Unit, column_title, find_unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.alignment import CORRELATED, Turning, turning
 from jaximu.recordings.columns.habits import Field, fields_of, last_of, measures, sensor_of, words_of
@@ -27,9 +27,7 @@ from jaximu.recordings.columns.known import EPOCH
 from jaximu.recordings.columns.names import COUNTS_ADVICE, GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.nominal import fit_sphere, quiet_means
 from jaximu.recordings.columns.table import LogTable
-from jaximu.recordings.recording import FASTEST, SLOWEST, Signal
-
-__all__ = ["ASSUMED_RATE", "Advice", "OpenPoint", "advise", "left_open", "without_gravity"]
+from jaximu.recordings.recording import FASTEST, SLOWEST, Signal, likeliest
 
 ASSUMED_RATE = 100.0  # Hz, of a log that does not say it
 
@@ -177,9 +175,8 @@ class _Triad:
         """The unit in which it holds 1 g at rest, "?" where several fit; "count": something else in whole numbers."""
         if not self.steady:
             return None
-        near = {unit: abs(math.log(self.level / one)) for unit, one in _GRAVITY_IN.items()}
-        best = min(near, key=lambda unit: near[unit])
-        if near[best] > math.log(1.15):
+        best, off = likeliest(self.level, _GRAVITY_IN)
+        if off > math.log(1.15):
             return "count" if self.whole and self.level > 50 else None
         if best in ("mg", "cm/s^2"):  # 1000 mg, 981 cm/s² and 1024 counts are close together
             if not self.still:
@@ -222,7 +219,7 @@ class _Guess:
     def __init__(self, table: LogTable, sensor: str | None):
         self.table, self.role = table, sensor
         self.width = len(table.columns)
-        self.fields = fields_of(table.names) if table.names else [Field((), None, None, None)] * self.width
+        self.fields = fields_of(table.header)
         self.numbers = [self._numbers(at) for at in range(self.width)]
         self.reasons: list[str] = []
         self.questions: list[OpenPoint] = []
@@ -264,6 +261,10 @@ class _Guess:
     def _has(self, name: str) -> bool:
         return any(column.name == name for column in self.chosen.values())
 
+    def _looked_at(self) -> Iterable[tuple[int, Field, FloatArray | None]]:
+        """The number of each column, what its name says, and its numbers."""
+        return zip(range(self.width), self.fields, self.numbers, strict=True)
+
     @property
     def columns(self) -> list[Column]:
         return [self.chosen.get(at, Column(None)) for at in range(self.width)]
@@ -295,12 +296,12 @@ class _Guess:
     def _time_column(self) -> int | None:
         named = [
             at
-            for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True))
+            for at, field, values in self._looked_at()
             if field.sensor == TIME and values is not None and rises(self.table.columns[at])
         ]
         if named:
             return min(named, key=lambda at: find_unit(self.fields[at].unit or "", "time") is None)
-        for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
+        for at, field, values in self._looked_at():
             if values is None or field.sensor or not rises(values):
                 continue
             named = find_unit(field.unit or "", "time") or {"time", "date"} & set(field.stem) or _ends_in_time(field)
@@ -322,7 +323,7 @@ class _Guess:
         steps = np.diff(values)
         if (steps < 0).any():
             steps = np.where(steps < 0, np.median(steps[steps > 0]), steps)
-            self.numbers[self.time] = values[0] + np.concatenate([[0.0], np.cumsum(steps)])
+            self.numbers[self.time] = values[0] + np.cumulative_sum(steps, include_initial=True)
 
     def _named_triads(self) -> list[_Triad]:
         """The triads that names show, of whatever sensor."""
@@ -343,7 +344,7 @@ class _Guess:
             if len(axes) != 3 or (*stem, "w") in quaternions:
                 continue
             named = sensor is not None and bool(stem)
-            if sensor is None and not stem and self.file in ("accel", "gyro", "mag"):
+            if sensor is None and not stem and self.file in SENSORS:
                 sensor = self.file
             if sensor is None and not measures(unit) and not stem and self.file_not:
                 self._ask(f"Does this file hold an accelerometer? By its name it is {self.file_not}.")
@@ -402,7 +403,7 @@ class _Guess:
         unknown = self.unknown = [triad for triad in triads if triad.sensor is None]
         taken = {at for triad in triads for at in triad.places} | {self.time}
         free: list[int] = []
-        for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
+        for at, field, values in self._looked_at():
             if at in taken or values is None or field.sensor or field.why_not or set(field.stem) & _COUNTERS:
                 continue
             finite = values[np.isfinite(values)]
@@ -554,7 +555,7 @@ class _Guess:
         """How far the time column rises a row."""
         values = np.asarray(self.numbers[self.time or 0])
         steps = np.diff(values[np.isfinite(values)])
-        return float(np.sum(steps)) / max(int(np.sum(steps > 0)), 1)
+        return np.sum(steps) / max(int(np.sum(steps > 0)), 1)
 
     def _time_units(self) -> list[tuple[str, float]]:
         """The units in which the stamps mean a plausible rate, or the stated one; by name and factor."""
@@ -704,14 +705,13 @@ class _Guess:
         resting = accel is not None and accel.still and not accel.posed and not gyro.turns
         accel_unit = next((column.unit for column in self.chosen.values() if column.name == "accel_x"), None)
         if unit is None and slope is not None:
-            near = {name: abs(math.log(slope / factor)) for name, factor in _ANGLES.items()}
-            best = min(near, key=lambda name: near[name])
+            best, off = likeliest(slope, _ANGLES)
             close = 0.25
             if gyro.whole:  # counts may be anything: 16.4 to 1 deg/s are 1.06 mrad/s
                 close = 0.1 if best in ("rad/s", "deg/s") else 0.025
             if accel_unit == "m/s":
                 unit = self._angle_increment(slope)
-            elif near[best] < close:
+            elif off < close:
                 unit = best
                 self.reasons.append(f"in {unit} the integrated rates {_TURN} (factor {slope / _ANGLES[best]:.3f})")
         if unit is None and per_sample is not None and not gyro.whole:
@@ -790,7 +790,7 @@ class _Guess:
                 if unit:
                     self._take(triad, "mag", unit)
         self._quaternion()
-        for at, (field, values) in enumerate(zip(self.fields, self.numbers, strict=True)):
+        for at, field, values in self._looked_at():
             name = field.sensor or ""
             if name.startswith("attitude_"):
                 self.chosen[at] = Column(name, field.unit)
@@ -820,7 +820,7 @@ class _Guess:
     def _quaternion(self) -> None:
         """An attitude by name, whose four numbers have norm 1."""
         named: dict[str, dict[str, int]] = {}
-        for at, name in enumerate(self.table.names or ()):
+        for at, name in enumerate(self.table.header):
             if match := re.fullmatch(r"(.*?)[\W_]*([wxyz])", parse_column(name)[0].strip().lower()):
                 named.setdefault(match[1], {})[match[2]] = at
         for head, places in named.items():
@@ -905,13 +905,12 @@ def column_text(columns: Sequence[Column]) -> str:
     names, at = [column.name for column in columns], 0
     triads: dict[tuple, str] = {group.columns: key for key, group in GROUPS.items() if len(group.columns) == 3}
     while at < len(columns):
-        unit = f" [{columns[at].unit}]" if columns[at].unit else ""
         triad = triads.get(tuple(names[at : at + 3]))
         skipped = len(list(takewhile(lambda name: name is None, names[at:])))
         if skipped:
             entries += [f"_*{skipped}"] if skipped > 3 else ["_"] * skipped
         else:
-            entries.append(f"{triad or names[at]}{unit}")
+            entries.append(column_title(triad or names[at] or "", columns[at].unit))
         at += skipped or (3 if triad else 1)
     return ",".join(entries)
 

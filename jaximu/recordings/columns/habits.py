@@ -11,9 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from unicodedata import combining, normalize
 
-from jaximu.ground.units import STANDARD_GRAVITY, find_unit, parse_column
-
-__all__ = ["QUANTITIES", "Field", "fields_of", "last_of", "measures", "sensor_of", "stated_rate", "words_of"]
+from jaximu.ground.units import SENSORS, STANDARD_GRAVITY, find_unit, parse_column
 
 _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
@@ -155,7 +153,7 @@ class Field:
     @property
     def canonical(self) -> str | None:
         """The column in our words, None where the name does not say it all."""
-        if self.sensor in ("accel", "gyro", "mag"):
+        if self.sensor in SENSORS:
             return f"{self.sensor}_{self.axis}" if self.axis and self.axis in "xyz" else None
         return self.sensor
 
@@ -267,6 +265,11 @@ def _time(words: list[str], unit: str | None = None) -> bool:
     )
 
 
+def _in_place(words: Sequence[str], at: int, *others: str) -> tuple[str, ...]:
+    """The words with others, or none, in place of one."""
+    return (*words[:at], *others, *words[at + 1 :])
+
+
 def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
     """The words without the axis among them, and the axis."""
     letters = [at for at, word in enumerate(words) if word in ("x", "y", "z")]
@@ -276,15 +279,15 @@ def _axis(words: list[str]) -> tuple[tuple[str, ...], str | None]:
     of_sensor = len(words) > 1 and any(word in _WORDS or word in _HELPERS for word in words)
     for places in (letters, turns if of_sensor else []):
         if len(places) == 1:
-            at = places[0]
-            return (*words[:at], *words[at + 1 :]), _TURNS.get(words[at], words[at])
+            word = words[places[0]]
+            return _in_place(words, places[0]), _TURNS.get(word, word)
     for at, word in enumerate(words):
         if match := _GLUED.fullmatch(word):
-            return (*words[:at], match[1], *words[at + 1 :]), match[2]
+            return _in_place(words, at, match[1]), match[2]
         if match := _LEADING.fullmatch(word):
-            return (*words[:at], match[2], *words[at + 1 :]), match[1]
+            return _in_place(words, at, match[2]), match[1]
         if match := _TURN_RATE.fullmatch(word):
-            return (*words[:at], "rate", *words[at + 1 :]), _TURNS[match[1]]
+            return _in_place(words, at, "rate"), _TURNS[match[1]]
     if words and words[-1] in ("0", "1", "2", "3"):
         return tuple(words[:-1]), words[-1]
     return tuple(words), None

@@ -13,8 +13,6 @@ from jaximu.ground.units import find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, last_of
 from jaximu.recordings.columns.table import LogTable
 
-__all__ = ["EPOCH", "JOINED", "known_names", "sentence_names", "whole_stamps"]
-
 
 @dataclass(frozen=True)
 class _KnownLayout:
@@ -83,6 +81,8 @@ _LAYOUTS = [
         ),
     )
 ]
+_Named = tuple[tuple[str, ...], str]
+"""Names in our words, and a note of whose they are."""
 JOINED = "whole time [ns]"
 """Name of a column of stamps that was joined from two."""
 _LATEST = 2**33  # s
@@ -91,7 +91,7 @@ _GAPS = 0.1  # of the seconds may begin with a row whose rest does not fall, as 
 _SENSOR_LOGGER = {"time": "time [ns]", "seconds_elapsed": "", "x": "", "y": "", "z": ""}
 
 
-def known_names(table: LogTable) -> tuple[tuple[str, ...], str] | None:
+def known_names(table: LogTable) -> _Named | None:
     """The names in our words, with units, for a table whose names show what wrote it, and a note; None for any other.
 
     What is not used keeps its name.
@@ -139,7 +139,7 @@ _MESSAGE = re.compile(r"(?:.*[./_])?(angular_velocity|linear_acceleration)[./_](
 EPOCH = 1e9, 2.2e9  # s since 1970 that a log's stamps lie between
 
 
-def _of_message(table: LogTable, names: tuple[str, ...]) -> tuple[tuple[str, ...], str] | None:
+def _of_message(table: LogTable, names: tuple[str, ...]) -> _Named | None:
     """The names of a table of sensor_msgs/Imu, whatever stands before them: a topic, a message's name."""
     titles = {"angular_velocity": "gyro_{} [rad/s]", "linear_acceleration": "accel_{} [m/s^2]"}
     matches = [_MESSAGE.fullmatch(name.strip().lower()) for name in names]
@@ -167,7 +167,7 @@ def sentence_names(name: str, count: int) -> list[str] | None:
     return list(names[1:]) if names is not None and len(names) == count + 1 else None
 
 
-def _without_header(table: LogTable) -> tuple[tuple[str, ...], str] | None:
+def _without_header(table: LogTable) -> _Named | None:
     """The names of rows without a header that show what wrote them: VectorNav's sentences, ROS's own CSV."""
     first = table.columns[0]
     if len(table.columns) == len(_ECHOED) and [column.dtype.kind for column in table.columns[:3]] == ["i", "i", "O"]:
@@ -198,25 +198,25 @@ def whole_stamps(table: LogTable) -> LogTable:
     They belong together by their names (sec and nanosec), or because the one falls just where the other rises. The
     column of the seconds holds both then, in nanoseconds and called `JOINED`; the other stays.
     """
-    fields = fields_of(table.names or ())
-    for rest, title in enumerate(table.names or ()):
+    fields = fields_of(table.header)
+    for rest, title in enumerate(table.header):
         prefix, unit = last_of(title)
         parts = _PARTS.get(fields[rest].unit or unit or "")
         if parts is None or not _between(table.columns[rest], parts):
             continue
         for at, field in enumerate(fields):
-            head, seconds = last_of(table.names[at]) if table.names else ("", None)
+            head, seconds = last_of(table.header[at])
             written = _seconds(table.columns[at]) if at != rest else None
             alike = seconds == "s" and head == prefix
             if written is None or not (
                 alike or ((field.sensor == "time" or seconds == "s") and _in_step(written, table.columns[rest]))
             ):
                 continue
-            names = [*(table.names or ())]
+            names = [*table.header]
             names[at] = JOINED
             joined = table.with_column(at, written * 10**9 + table.columns[rest] * (10**9 // parts))
             note = f"time is {table.label(at)} and {table.label(rest)}."
-            return replace(joined, names=tuple(names), notes=(*table.notes, note))
+            return replace(joined, names=tuple(names)).noted(note)
     return table
 
 

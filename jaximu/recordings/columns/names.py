@@ -93,9 +93,7 @@ def header_columns(table: LogTable) -> tuple[Column, ...] | None:
 
     Of several columns of time the first that states its unit and rises counts.
     """
-    if table.names is None:
-        return None
-    fields = fields_of(table.names)
+    fields = fields_of(table.header)
     columns = [Column(field.canonical, field.unit) for field in fields]
     times = [at for at, column in enumerate(columns) if column.name == TIME]
     bare = [at for at in times if fields[at].bare_time]

@@ -154,7 +154,7 @@ def fit_sphere(points: FloatArray) -> tuple[FloatArray, float] | None:
     for _ in range(5):
         fitted = miss <= max(4.0 * np.median(miss), 1e-6 * radius)
         solution = np.linalg.lstsq(design[fitted], target[fitted], rcond=None)[0]
-        radius = float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-12)))
+        radius = np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-12))
         miss = np.abs(np.linalg.norm(scaled - solution[:3], axis=1) - radius)
     weight = root[fitted] ** 2
     around = scaled[fitted] - np.sum(weight * scaled[fitted], 0) / weight.sum()

@@ -25,25 +25,6 @@ _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
 
 
 @dataclass(frozen=True)
-class MessageSelection:
-    """What to take from a file that holds more than one sensor of a kind, or more than one stamp of a sample.
-
-    topic: name of the message or topic; two of them, "accelerometer,gyroscope", where they are apart. instance: which
-    of several sensors, from 0. stamp: "header" (the sensor's own, default) or "receive" (the logger's).
-    """
-
-    topic: str | None = None
-    instance: int | None = None
-    stamp: str = "header"
-
-    def __post_init__(self) -> None:
-        if self.stamp not in ("header", "receive"):
-            raise InputError(f"--stamp: {self.stamp!r} is neither header nor receive.")
-        if self.instance is not None and self.instance < 0:
-            raise InputError(f"--instance: sensors count from 0, found {self.instance}.")
-
-
-@dataclass(frozen=True)
 class LogTable:
     """A file's columns.
 
@@ -99,9 +80,13 @@ class LogTable:
         """The table with other values in one column."""
         return replace(self, columns=(*self.columns[:index], values, *self.columns[index + 1 :]))
 
+    def noted(self, *notes: str) -> "LogTable":
+        """The table with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
+
     def label(self, index: int) -> str:
         """The column's name in the file, or its 1-based number."""
-        name = parse_name(self.names[index]) if self.names else ""
+        name = parse_name(self.header[index])
         return repr(name) if name else f"number {index + 1}"
 
     def numbers(self, index: int) -> np.ndarray:
@@ -179,8 +164,10 @@ def from_arrow(column: pa.ChunkedArray) -> np.ndarray:
     else:
         return np.array(column.to_pylist(), dtype=object)
     column = column if kind == wanted else column.cast(wanted)
-    parts = [_chunk(chunk) for chunk in column.chunks if len(chunk)]
-    return np.concatenate(parts) if parts else np.empty(0, np.int64 if wanted == pa.int64() else np.float64)
+    if column.null_count:
+        column = column.cast(pa.float64(), safe=False).fill_null(np.nan)
+    parts = [np.from_dlpack(chunk) for chunk in column.chunks if len(chunk)]
+    return np.concatenate(parts) if parts else np.empty(0, wanted.to_pandas_dtype())
 
 
 def to_arrow(values: np.ndarray, nulls: bool = True) -> pa.Array:
@@ -196,15 +183,6 @@ def _looked_up(chunk: Any) -> np.ndarray:
     words = np.array([*chunk.dictionary.to_pylist(), None], dtype=object)
     places = from_arrow(pa.chunked_array([chunk.indices]))
     return words[np.where(np.isnan(places), len(words) - 1, places).astype(np.int64)]
-
-
-def _chunk(chunk: Any) -> np.ndarray:
-    validity, data = chunk.buffers()
-    values = np.from_dlpack(pa.Array.from_buffers(chunk.type, len(chunk), [None, data], offset=chunk.offset))
-    if chunk.null_count == 0:
-        return values
-    valid = np.unpackbits(np.frombuffer(validity, np.uint8), bitorder="little")[chunk.offset :][: len(chunk)]
-    return np.where(valid, values, np.nan)
 
 
 def named_with_units(fields: Sequence[Any]) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
+    from jaximu.recordings.entry import ScheduleEntry
     from jaximu.recordings.readers.attitude import holds_attitude, read_attitude
     from jaximu.recordings.readers.reader import (
         advise_reading,
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
         read_means,
         read_recording,
     )
-    from jaximu.recordings.readers.schedule import ScheduleEntry, read_reference, read_schedule
+    from jaximu.recordings.readers.schedule import read_reference, read_schedule
     from jaximu.recordings.recording import ReadOptions
 
 __all__ = [
@@ -33,9 +34,10 @@ __all__ = [
 __getattr__ = lazily(
     __name__,
     {
+        "jaximu.recordings.entry": "ScheduleEntry",
         "jaximu.recordings.readers.attitude": "holds_attitude, read_attitude",
         "jaximu.recordings.readers.reader": "advise_reading, read_frame, read_magnetometer, read_means, read_recording",
-        "jaximu.recordings.readers.schedule": "ScheduleEntry, read_reference, read_schedule",
+        "jaximu.recordings.readers.schedule": "read_reference, read_schedule",
         "jaximu.recordings.recording": "ReadOptions",
     },
 )

@@ -11,15 +11,13 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from jaximu.ground.errors import InputError, readable
+from jaximu.ground.units import SENSORS
 from jaximu.recordings.columns.habits import sensor_of, words_of
 from jaximu.recordings.columns.table import Unpacking
 from jaximu.recordings.recording import Source
 
-__all__ = ["SUFFIXES", "by_sensor", "is_archive", "is_log", "logs_below", "opened"]
-
 _MOST = 1000  # files of a recording
 _LETTERS = 3  # of a word that names a file's sensor
-_SENSORS = "accel", "gyro", "mag"
 _PART = "part of a measurement"
 """In place of a sensor: gravity alone, or what is left without it."""
 _WITH_GRAVITY = ("total", "acceleration")
@@ -149,7 +147,7 @@ def _chosen(files: Collection[str], path: Path, name: str) -> dict[str, str]:
 def by_sensor(files: Iterable[str]) -> dict[str, str]:
     """Return by sensor the files of one folder that are called after an accelerometer and others; else nothing."""
     paths = [PurePosixPath(file) for file in files]
-    best = {sensor: _best([file for file in paths if _rank(file)[0] == sensor]) for sensor in _SENSORS}
+    best = {sensor: _best([file for file in paths if _rank(file)[0] == sensor]) for sensor in SENSORS}
     sensors = {sensor: file for sensor, file in best.items() if file is not None}
     if "accel" not in sensors or len(sensors) < 2 or len({file.parent for file in sensors.values()}) > 1:
         return {}

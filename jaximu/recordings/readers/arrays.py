@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.ground.units import parse_column
+from jaximu.ground.units import column_title, parse_column
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.recording import Source
 
@@ -56,7 +56,7 @@ def table_of(variables: Mapping[str, Any], source: Source) -> LogTable:
         axes = _AXES.get(count, tuple(map(str, range(count))))
         for axis, column in zip(axes, array.T, strict=True):
             title = base if count == 1 else f"{base}_{axis}"
-            names.append(f"{title} [{unit}]" if unit else title)
+            names.append(column_title(title, unit))
             columns.append(np.ascontiguousarray(column, np.float64 if column.dtype.kind == "f" else np.int64))
     return LogTable(source, tuple(names), tuple(columns), rate=rate)
 

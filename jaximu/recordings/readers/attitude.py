@@ -5,18 +5,17 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import scipy
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError
+from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.units import parse_column, unit
 from jaximu.recordings.attitude import Attitude
 from jaximu.recordings.columns.table import LogTable
 from jaximu.recordings.readers.reader import read_tables
-
-__all__ = ["holds_attitude", "read_attitude"]
 
 _HABITS = {
     "time": (r".*(?:time|stamp).*|t|sec(?:onds)?",),
@@ -38,11 +37,13 @@ _FACTORS = {
     **{"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048},
 }
 """Units of velocity and position in SI."""
+_Places = dict[str, dict[str, int]]
+"""By kind the column of each axis."""
 _EPOCHS = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "µs"), (1e11, 1e-3, "ms"))
 """Stamps above these count since 1970 in the unit named."""
 
 
-def read_attitude(path: str | os.PathLike[str]) -> Attitude:
+def read_attitude(path: FilePath) -> Attitude:
     """Read what a reference says of a body's attitude, from the body to a frame whose z points up.
 
     A table (CSV, Parquet, MAT, …) with a column for each of: time; a quaternion (qw … qz, attitude_w …, or q0 … q3 with
@@ -59,26 +60,30 @@ def read_attitude(path: str | os.PathLike[str]) -> Attitude:
     )
 
 
-def holds_attitude(path: str | os.PathLike[str]) -> bool:
+def holds_attitude(path: FilePath) -> bool:
     """Return whether a file has columns of an attitude. Raises `InputError` where it cannot be read."""
     return bool(_tables(path))
 
 
-def _tables(path: str | os.PathLike[str]) -> list[tuple[LogTable, dict[str, dict[str, int]]]]:
+def _tables(path: FilePath) -> list[tuple[LogTable, _Places]]:
     """Return the tables of a file that hold an attitude, and where their columns are."""
-    tables = [(table, _places(table)) for table in read_tables(path)]
+    tables = [(table, _places(table)) for table in map(_named, read_tables(path))]
     kinds = {"quaternion", "numbered", "euler", "rotation vector", "table angles"}
     return [(table, places) for table, places in tables if kinds & set(places)]
 
 
-def _places(table: LogTable) -> dict[str, dict[str, int]]:
+def _named(table: LogTable) -> LogTable:
+    """Return the table, with TUM's names where it has none and as many columns."""
+    if table.names is not None or len(table.columns) != len(_TUM):
+        return table
+    note = f"{table.path}: eight columns without names are taken as time, position and quaternion with w last."
+    return replace(table, names=_TUM).noted(note)
+
+
+def _places(table: LogTable) -> _Places:
     """Return by kind the columns of each axis, complete kinds alone."""
-    if table.names is None:
-        if len(table.columns) != len(_TUM):
-            return {}
-        return {"time": {"": 0}, "position": {"x": 1, "y": 2, "z": 3}, "quaternion": {"x": 4, "y": 5, "z": 6, "w": 7}}
-    kinds: dict[str, dict[str, int]] = {}
-    for at, name in enumerate(table.names):
+    kinds: _Places = {}
+    for at, name in enumerate(table.header):
         plain = re.sub(r"[^a-z0-9]+", "_", re.sub(r"[\[(].*", "", name.lower())).strip("_")
         for kind, patterns in _HABITS.items():
             match = next(filter(None, (re.fullmatch(pattern, plain) for pattern in patterns)), None)
@@ -100,7 +105,7 @@ def _columns(table: LogTable, places: dict[str, int], axes: Sequence[str], quant
     columns = []
     for axis in axes:
         at = places[axis]
-        title = table.names[at] if table.names else ""
+        title = table.header[at]
         stated, factor = parse_column(title)[1], 1.0
         if stated and quantity == "angle":
             factor = unit(stated, (quantity,), file=table.path, column=title).factor
@@ -112,7 +117,7 @@ def _columns(table: LogTable, places: dict[str, int], axes: Sequence[str], quant
     return np.stack(columns, axis=1)
 
 
-def _attitude(table: LogTable, places: dict[str, dict[str, int]], name: str) -> Attitude:
+def _attitude(table: LogTable, places: _Places, name: str) -> Attitude:
     notes = list(table.notes)
     time, start = _time(table, places, name, notes)
     if "quaternion" in places:
@@ -130,30 +135,25 @@ def _attitude(table: LogTable, places: dict[str, dict[str, int]], name: str) -> 
         vector = _columns(table, places["rotation vector"], "xyz", "angle")
         quaternion = _quaternion(scipy.spatial.transform.Rotation.from_rotvec(vector))
     vectors = {kind: _columns(table, places[kind], "xyz", kind) for kind in ("velocity", "position") if kind in places}
-    if table.names is None:
-        notes.append(f"{name}: eight columns without names are taken as time, position and quaternion with w last.")
-    kept = np.isfinite(time) & np.isfinite(quaternion).all(axis=1)
-    for values in vectors.values():
-        kept &= np.isfinite(values).all(axis=1)
+    kept = np.isfinite(np.column_stack([time, quaternion, *vectors.values()])).all(axis=1)
     if kept.sum() < 16:
         raise InputError(f"{name}: {int(kept.sum())} rows hold an attitude, too few to compare with.")
     if not kept.all():
-        notes.append(f"{name}: {int(np.sum(~kept))} of {len(kept)} rows hold no attitude and are left out.")
+        notes.append(f"{name}: {np.sum(~kept)} of {kept.size} rows hold no attitude and are left out.")
     vectors = {kind: values[kept] for kind, values in vectors.items()}
     return Attitude(time[kept], quaternion[kept], **vectors, start=start, name=name, notes=tuple(notes))
 
 
 def _from_angles(table: LogTable, places: dict[str, int], axes: dict[str, str], name: str) -> FloatArray:
     """Return the quaternions (n, 4) of turns by the columns named, each about its axis as the ones before left it."""
-    titles = [table.names[places[column]] for column in axes] if table.names else []
-    for title in titles:
+    for title in (table.header[places[column]] for column in axes):
         if parse_column(title)[1] is None:
             raise InputError(f"{name}: {title} states no unit: name it {title} [deg] or {title} [rad].")
     angles = _columns(table, places, tuple(axes), "angle")
     return _quaternion(scipy.spatial.transform.Rotation.from_euler("".join(axes.values()).upper(), angles))
 
 
-def _time(table: LogTable, places: dict[str, dict[str, int]], name: str, notes: list[str]) -> tuple[FloatArray, float]:
+def _time(table: LogTable, places: _Places, name: str, notes: list[str]) -> tuple[FloatArray, float]:
     """Return stamps (n,) in s since the first, and the first one's absolute stamp, s; zero where there is none."""
     if "time" not in places:
         if table.rate is None:
@@ -161,7 +161,7 @@ def _time(table: LogTable, places: dict[str, dict[str, int]], name: str, notes: 
         return np.arange(len(table.columns[0])) / table.rate, 0.0
     at = places["time"][""]
     stamps = table.numbers(at)
-    stated = parse_column(table.names[at])[1] if table.names else "s"
+    stated = parse_column(table.header[at])[1]
     if stated is None:
         factor, unit_name = next(
             ((factor, unit_name) for least, factor, unit_name in _EPOCHS if stamps[0] > least), (1.0, "s")

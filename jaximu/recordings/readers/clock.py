@@ -7,8 +7,6 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import find_unit
 
-__all__ = ["DAY", "measured", "seconds_of"]
-
 _CLOCK = re.compile(r"(?:^|[\sT])(\d{1,2}):(\d{2}):(\d{2})(?:[.,:](\d{1,9}))?\s*([AaPp][Mm])?")
 _MEASURED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)\s*([^\d\s.].*?)\s*")
 DAY = 86400 * 10**9

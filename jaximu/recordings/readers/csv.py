@@ -5,7 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate, pairwise
 from os import SEEK_END
@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from jaximu.ground.errors import InputError
-from jaximu.ground.units import find_unit, parse_column
+from jaximu.ground.units import column_title, find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, sensor_of, stated_rate, words_of
 from jaximu.recordings.columns.table import HEAD, LogTable, from_arrow, parse_name
 from jaximu.recordings.readers.clock import DAY, measured, seconds_of
@@ -65,39 +65,38 @@ def read(path: Path, source: Source) -> LogTable:
         data = _lines(path.read_bytes() if whole is None else whole)
         table, rows, remarks = _read_cleaned(data, layout, source.path)
         parsed = [from_arrow(column) for column in table.columns], table.schema
-    (columns, schema), names = parsed, layout.names or None
-    midnight = 0
-    if names:  # a column of dates states its own unit
-        names = tuple(
-            f"{name} [{kind.type.unit}]" if pa.types.is_timestamp(kind.type) and "[" not in name else name
-            for name, kind in zip(names, schema, strict=True)
-        )
-    if names and any(column.dtype == object for column in columns):
+    columns, schema = parsed
+    names = [  # a column of dates states its own unit
+        f"{name} [{kind.type.unit}]" if pa.types.is_timestamp(kind.type) and "[" not in name else name
+        for name, kind in zip(layout.names or [""] * len(columns), schema, strict=True)
+    ]
+    if layout.names:
         names, columns = _vectors_apart(names, columns)
+    midnight = 0
     for at, column in enumerate(columns):
         if column.dtype != object:
             continue
+        unit = ""
         if at == len(columns) - 1 and str(columns[0][0]).startswith("$"):
             columns[at] = np.array([str(cell).partition("*")[0] for cell in column], object)  # NMEA's checksum
         elif all(str(cell).endswith(";") for cell in column):
             columns[at] = np.array([cell[:-1] for cell in column], object)
         elif (stamps := seconds_of(column)) is not None:
-            columns[at] = stamps
+            columns[at], unit = stamps, "ns"
             midnight = int(np.argmax(np.diff(stamps // DAY, prepend=stamps[:1] // DAY) > 0))
-            if names:
-                names = (*names[:at], f"{parse_column(names[at])[0]} [ns]", *names[at + 1 :])
         elif with_unit := measured(column, layout.decimal):
-            columns[at] = with_unit[0]
-            if names:
-                names = (*names[:at], f"{parse_column(names[at])[0]} [{with_unit[1]}]", *names[at + 1 :])
-    table = LogTable(source, names, tuple(columns), rows, layout.rate)
-    notes = remarks if wide or whole is None else (*remarks, _CUT_OFF)
+            columns[at], unit = with_unit
+        if unit:
+            names[at] = f"{parse_column(names[at])[0]} [{unit}]"
+    table = LogTable(source, tuple(names) if layout.names else None, tuple(columns), rows, layout.rate, remarks)
+    if not (wide or whole is None):
+        table = table.noted(_CUT_OFF)
     if midnight:
-        notes = (*notes, f"the time of day passes midnight (row {table.row(midnight)}): it goes on from there.")
-    return replace(table, notes=notes)
+        table = table.noted(f"the time of day passes midnight (row {table.row(midnight)}): it goes on from there.")
+    return table
 
 
-def _vectors_apart(names: tuple[str, ...], columns: Sequence[np.ndarray]) -> tuple[tuple[str, ...], list[np.ndarray]]:
+def _vectors_apart(names: Sequence[str], columns: Sequence[np.ndarray]) -> tuple[list[str], list[np.ndarray]]:
     """The columns, with x, y and z of their own where each cell holds three numbers, in brackets or with bars."""
     titles: list[str] = []
     parts: list[np.ndarray] = []
@@ -108,11 +107,11 @@ def _vectors_apart(names: tuple[str, ...], columns: Sequence[np.ndarray]) -> tup
             titles, parts = [*titles, name], [*parts, column]
             continue
         title, unit = parse_column(name)
-        titles += [f"{title}.{axis}" + (f" [{unit}]" if unit else "") for axis in "xyz"]
+        titles += [column_title(f"{title}.{axis}", unit) for axis in "xyz"]
         parts += [
             *np.array([[number for number in match.groups() if number] for match in matches if match], np.float64).T
         ]
-    return tuple(titles), parts
+    return titles, parts
 
 
 def _without_zeros(path: Path) -> bytes | None:
@@ -142,7 +141,7 @@ def _read_straight(path: Path, layout: _Layout) -> tuple[list[np.ndarray], pa.Sc
         for _ in range(layout.first):
             file.readline()
         while piece := file.read(_PIECE):
-            table = _parse(pa.BufferReader(piece + file.readline()), layout, 1 << 20)
+            table = _parse(piece + file.readline(), layout, 1 << 20)
             schemas.append(table.schema)
             parts.append([from_arrow(column) for column in table.columns])
         fields = [_common(kinds) for kinds in zip(*schemas, strict=True)]
@@ -172,16 +171,13 @@ def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np
     A column may be of any types.
     """
     body, rows = _body(data, layout)
-    notes: tuple[str, ...] = ()
-    for attempt in (1, 2):
-        try:
-            return _parse(pa.BufferReader(body), layout, block=min(len(body) + 1, _SINGLE_BLOCK)), rows, notes
-        except pa.ArrowInvalid as error:
-            if attempt == 1:
-                body, rows, notes = _without_remarks(body, layout, rows, path)
-                continue
-            raise InputError(f"{path}: cannot be read as a table: {str(error).splitlines()[0][:200]}") from None
-    raise AssertionError("the second attempt returns or raises")
+    with suppress(pa.ArrowInvalid):
+        return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, ()
+    body, rows, notes = _without_remarks(body, layout, rows, path)
+    try:
+        return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, notes
+    except pa.ArrowInvalid as error:
+        raise InputError(f"{path}: cannot be read as a table: {str(error).splitlines()[0][:200]}") from None
 
 
 def _text(line: bytes) -> str:
@@ -311,9 +307,9 @@ def _body(data: bytes, layout: _Layout) -> tuple[bytes, np.ndarray]:
     return data, np.array(kept) + 1
 
 
-def _parse(file: pa.NativeFile, layout: _Layout, block: int) -> pa.Table:
+def _parse(data: bytes, layout: _Layout, block: int) -> pa.Table:
     return pc.read_csv(
-        file,
+        pa.BufferReader(data),
         read_options=pc.ReadOptions(
             column_names=[f"c{at}" for at in range(layout.width)],
             block_size=block,

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import LogTable, MessageSelection
-from jaximu.recordings.recording import Source
+from jaximu.recordings.columns.table import LogTable
+from jaximu.recordings.recording import ReadOptions, Source
 
 _ACCEL = {f"Acc{axis.upper()}": f"accel_{axis} [m/s^2]" for axis in "xyz"}
 _GYRO = {f"Gyr{axis.upper()}": f"gyro_{axis} [rad/s]" for axis in "xyz"}
@@ -28,12 +28,12 @@ _LATEST = 2.0**53  # us: beyond it a double is no exact stamp
 _KINDS = {"IMU": _ACCEL | _GYRO | {"T": "temperature [degC]"}, "ACC": _ACCEL, "GYR": _GYRO}
 
 
-def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
+def read(path: Path, source: Source, options: ReadOptions) -> tuple[LogTable, ...]:
     """The tables in a DataFlash log. Raises InputError for a message or an instance that it does not have."""
     with _opened(path) as (log, silent):
         rows = _rows(log)
     instances = sorted({instance for _, instance in rows})
-    instance = selection.instance if selection.instance is not None else (instances or [0])[0]
+    instance = options.instance if options.instance is not None else (instances or [0])[0]
     counts = {kind: len(rows[kind, instance]) for kind in _KINDS if (kind, instance) in rows}
     raw = min(counts.get("ACC", 0), counts.get("GYR", 0))
     if not counts or (raw == 0 and "IMU" not in counts):
@@ -41,9 +41,9 @@ def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTa
         if instances:
             remedy = f"there are instances {', '.join(map(str, instances))} (--instance)"
         raise InputError(f"{source.path}: has no IMU messages, and no ACC with GYR, of instance {instance}; {remedy}.")
-    topic = (selection.topic or ("ACC" if raw > counts.get("IMU", 0) else "IMU")).upper()
+    topic = (options.topic or ("ACC" if raw > counts.get("IMU", 0) else "IMU")).upper()
     if topic not in counts:
-        raise InputError(f"{source.path}: --topic {selection.topic}: there are {', '.join(counts)} here.")
+        raise InputError(f"{source.path}: --topic {options.topic}: there are {', '.join(counts)} here.")
     notes = [
         "ArduPilot axes are forward, right, down (gravity reads about -9.8 on z at rest): --axes FRD turns them.",
         f"read: {'ACC and GYR' if topic != 'IMU' else 'IMU'}, instance {instance}"
@@ -57,10 +57,8 @@ def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTa
     tables = []
     for kind in ("IMU",) if topic == "IMU" else ("ACC", "GYR"):
         if (kind, instance) in rows:
-            time, values = (
-                rows[kind, instance][:, 0 if selection.stamp == "receive" else 1],
-                rows[kind, instance][:, 2:].T,
-            )
+            received, sampled, *values = rows[kind, instance].T
+            time = received if options.stamp == "receive" else sampled
             tables.append(_table(source, time, dict(zip(_KINDS[kind].values(), values, strict=True))))
     if topic != "IMU" and ("IMU", instance) in rows:  # the temperature is there alone
         heat = rows["IMU", instance]

@@ -13,9 +13,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from jaximu.ground.errors import InputError, readable
-
-__all__ = ["KALIBR_UNITS", "kalibr_yaml", "read_noise"]
+from jaximu.ground.errors import FilePath, InputError, readable
 
 KALIBR_UNITS = {
     "accelerometer_noise_density": "m/s^2/sqrt(Hz)",
@@ -67,7 +65,7 @@ def _line(text: str) -> str:
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
-def read_noise(path: str | os.PathLike[str]) -> dict[str, float]:
+def read_noise(path: FilePath) -> dict[str, float]:
     """The noise densities in an `imu.yaml` such as `jaximu allan -o DIR` writes. Raises `InputError` without any."""
     with readable(path):
         text = Path(path).read_text(encoding="utf-8", errors="replace")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from jaximu.ground.units import column_title
 from jaximu.recordings.columns.table import LogTable, Unpacking
 from jaximu.recordings.readers.arrays import table_of
 from jaximu.recordings.readers.mat5 import checked
@@ -47,7 +48,7 @@ def read_hdf5(data: bytes, source: Source) -> LogTable:
         opened = variables
         for group in groups:
             opened = opened.setdefault(group, {})
-        opened[f"{name} [{unit}]" if unit else name] = value.decode() if isinstance(value, bytes) else value
+        opened[column_title(name, unit)] = value.decode() if isinstance(value, bytes) else value
 
     rates: dict[str, Any] = {}
 

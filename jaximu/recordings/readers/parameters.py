@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,10 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError, name_of, readable
+from jaximu.ground.errors import FilePath, InputError, name_of, readable
 from jaximu.recordings.readers import dataflash, ulog
-
-__all__ = ["ParameterFile", "read_parameters"]
 
 _ROW = re.compile(r"^(?:\d+\s+\d+\s+)?([A-Z]\w*)[\s,=]+(\S+?)(?:[\s,@#].*)?$")
 
@@ -55,7 +52,7 @@ class ParameterFile:
         return np.array([self.value(name) for name in names])
 
 
-def read_parameters(path: str | os.PathLike[str]) -> ParameterFile:
+def read_parameters(path: FilePath) -> ParameterFile:
     """Return the parameters in a log or a list. Raises `InputError` for a file that holds none, naming the row."""
     name, file = name_of(path), Path(path)
     with readable(name):

@@ -13,12 +13,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.ground.units import find_unit
+from jaximu.ground.units import column_title, find_unit
 from jaximu.recordings.columns.table import HEAD, LogTable
 from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
-
-__all__ = ["explained", "prints", "read"]
 
 _LOOKED_AT = 400  # lines in which a shape is looked for
 _LONGEST = 40  # lines of a sample
@@ -158,7 +156,7 @@ def _with_units(names: list[str], parts: list[str]) -> list[str]:
     if stated and stated[-1] and not any(stated[:-1]):
         several, head = len(names[-1].split()) > 1, names[-1].rpartition(" ")[0]
         stated = [stated[-1] if several or name.rpartition(" ")[0] == head else "" for name in names]
-    return [f"{name} [{unit}]" if unit and name else name for name, unit in zip(names, stated, strict=True)]
+    return [column_title(name, name and unit) for name, unit in zip(names, stated, strict=True)]
 
 
 def _names(sample: tuple[str, ...]) -> list[str]:

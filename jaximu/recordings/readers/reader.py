@@ -17,12 +17,12 @@ import numpy as np
 import pyarrow as pa
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError, name_of, readable
+from jaximu.ground.errors import FilePath, InputError, name_of, readable
 from jaximu.ground.quantities import counted
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, Unit, parse_column
 from jaximu.ground.units import unit as unit_named
 from jaximu.recordings.columns import nominal
-from jaximu.recordings.columns.choose import choose_columns, choose_pair, column_units
+from jaximu.recordings.columns.choose import Used, choose_columns, choose_pair, column_units
 from jaximu.recordings.columns.guess import Advice, advise, without_gravity
 from jaximu.recordings.columns.known import JOINED, known_names, whole_stamps
 from jaximu.recordings.columns.names import (
@@ -37,7 +37,6 @@ from jaximu.recordings.columns.table import (
     FEW,
     HEAD,
     LogTable,
-    MessageSelection,
     from_arrow,
     mapped_axes,
     named_with_units,
@@ -86,8 +85,8 @@ def _noted(notes: Sequence[str]) -> Iterator[None]:
 
 
 def read_recording(
-    path: str | os.PathLike[str],
-    gyro_log: str | os.PathLike[str] | None = None,
+    path: FilePath,
+    gyro_log: FilePath | None = None,
     options: ReadOptions | None = None,
     require_gyroscope: bool = False,
 ) -> Recording:
@@ -128,10 +127,10 @@ def read_recording(
     return recording
 
 
-def _read(path: str | os.PathLike[str], options: ReadOptions) -> list[LogTable]:
+def _read(path: FilePath, options: ReadOptions) -> list[LogTable]:
     """The tables of a file, with the rows of one unit where several write into it in turn."""
-    tables = read_tables(path, MessageSelection(options.topic, options.instance, options.stamp))
-    usual = (options.like or Reading()).device
+    tables = read_tables(path, options)
+    usual = options.known.device
     return [table if table.messages else of_device(table, options.device, usual) for table in tables]
 
 
@@ -165,18 +164,23 @@ def _sound(options: ReadOptions | None) -> ReadOptions:
         parse_axes(options.axes)
     if options.rate is not None and not 0.0 < options.rate < 1e6:
         raise InputError(f"--rate: {options.rate:g} is no sample rate in Hz.")
-    like = options.like or Reading()
-    return replace(
+    like = options.known
+    options = replace(
         options,
         topic=options.topic or like.topic,
         instance=like.instance if options.instance is None else options.instance,
         stamp=like.stamp if options.stamp == "header" else options.stamp,
     )
+    if options.stamp not in ("header", "receive"):
+        raise InputError(f"--stamp: {options.stamp!r} is neither header nor receive.")
+    if options.instance is not None and options.instance < 0:
+        raise InputError(f"--instance: sensors count from 0, found {options.instance}.")
+    return options
 
 
 def _alike(options: ReadOptions, table: LogTable) -> ReadOptions:
     """Return the options, with what `like` knows of a file of this header and options leave open."""
-    like = options.like or Reading()
+    like = options.known
     if options.columns is None and options.gyro_columns is None and table.header == tuple(like.header):
         options = replace(options, columns=like.columns, gyro_columns=like.gyro_columns)
     options = replace(options, axes=like.axes if options.axes is None and table.axes is None else options.axes)
@@ -193,7 +197,7 @@ def _of_two_files(options: ReadOptions, table: LogTable) -> bool:
 
 def _counts(options: ReadOptions, name: str) -> tuple[Stated | None, Stated | None]:
     """Return scale and offset of a triad in counts, as options or else the calibrated log state them."""
-    like = options.like or Reading()
+    like = options.known
     scale, offset = (getattr(options, f"{PREFIXES[name]}_{part}") for part in ("scale", "offset"))
     return like.scales.get(name) if scale is None else scale, like.offsets.get(name) if offset is None else offset
 
@@ -213,7 +217,7 @@ def _read_as(
         columns=columns,
         gyro_columns=of_gyroscope,
         header=table.header if columns or of_gyroscope else (),
-        rate=options.rate or (options.like or Reading()).rate,
+        rate=options.rate or options.known.rate,
         axes=table.axes,
         frame=table.frame,
         units={name: unit for part in parts for name, unit in part.units.items()},
@@ -244,8 +248,7 @@ def _finished(parts: "Sequence[_FilePart]", table: LogTable, options: ReadOption
     recording = _assemble(parts, table, options)
     if options.axes:
         recording = apply_axes(recording, options.axes)
-    if options.like is not None:
-        options.like.require_alike(recording.reading, recording.name, options.like.units)
+    options.known.require_alike(recording.reading, recording.name, options.known.units)
     try:
         notes = plausibility(recording, options.gravity) if options.check else ()
     except InputError as error:
@@ -256,7 +259,7 @@ def _finished(parts: "Sequence[_FilePart]", table: LogTable, options: ReadOption
     return replace(recording, notes=(*recording.notes, *notes))
 
 
-def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None = None) -> tuple[Signal, float, Source]:
+def read_magnetometer(path: FilePath, options: ReadOptions | None = None) -> tuple[Signal, float, Source]:
     """Return the magnetometer of a file that may hold nothing else, the absolute stamp of its t = 0, and its source.
 
     A field needs no clock: where neither stamps nor a rate are known, a row counts as a second. Raises InputError
@@ -281,7 +284,7 @@ def read_magnetometer(path: str | os.PathLike[str], options: ReadOptions | None 
     return signal, float(part.origin), part.source
 
 
-def read_means(path: str | os.PathLike[str], options: ReadOptions | None = None) -> PoseMeans:
+def read_means(path: FilePath, options: ReadOptions | None = None) -> PoseMeans:
     """Return the poses of a table with a row of mean outputs a pose, as papers print them.
 
     Columns `accel_x [m/s^2]`, … and perhaps `gyro_x [deg/s]`, … hold the means; `accel_sigma_x [m/s^2]`, … the samples'
@@ -310,7 +313,7 @@ def read_means(path: str | os.PathLike[str], options: ReadOptions | None = None)
 
 def _sigma_of_means(table: LogTable, sensor: str, base: str) -> FloatArray | None:
     """The standard deviations (P, 3) of a triad's means, from those of its samples and their number."""
-    named = {name: (at, stated) for at, (name, stated) in enumerate(map(parse_column, table.names or ()))}
+    named = {name: (at, stated) for at, (name, stated) in enumerate(map(parse_column, table.header))}
     names = [f"{sensor}_sigma_{axis}" for axis in "xyz"]
     there = [name for name in names if name in named]
     if not there:
@@ -407,7 +410,7 @@ def _of_text(head: bytes, name: str) -> _Format:
     return _PRINTED if prints(head) else _TEXT
 
 
-def read_table(path: str | os.PathLike[str]) -> LogTable:
+def read_table(path: FilePath) -> LogTable:
     """The columns of a file that is one table. Raises InputError naming the file."""
     first, *others = read_tables(path)
     if others:
@@ -415,6 +418,7 @@ def read_table(path: str | os.PathLike[str]) -> LogTable:
     return first
 
 
+_ANY = ReadOptions()
 _KEPT: ContextVar[dict[Any, tuple[LogTable, ...]] | None] = ContextVar("tables that are kept", default=None)
 
 
@@ -428,28 +432,29 @@ def tables_kept() -> Iterator[None]:
         _KEPT.reset(token)
 
 
-def read_tables(path: str | os.PathLike[str], selection: MessageSelection | None = None) -> tuple[LogTable, ...]:
+def read_tables(path: FilePath, options: ReadOptions = _ANY) -> tuple[LogTable, ...]:
     """The tables of a file, the accelerometer's first; the format is found from the content.
 
-    Raises InputError naming the file, and the package to install where one is missing.
+    Of `options` topic, instance and stamp count. Raises InputError naming the file, and the package to install where
+    one is missing.
     """
-    kept, key = _KEPT.get(), (name_of(path), selection or MessageSelection())
+    kept, key = _KEPT.get(), (name_of(path), options.topic, options.instance, options.stamp)
     if kept is None:
-        return _tables_of(path, selection)
+        return _tables_of(path, options)
     if key not in kept:
-        kept[key] = _tables_of(path, selection)
+        kept[key] = _tables_of(path, options)
     return kept[key]
 
 
-def _tables_of(path: str | os.PathLike[str], selection: MessageSelection | None) -> tuple[LogTable, ...]:
+def _tables_of(path: FilePath, options: ReadOptions) -> tuple[LogTable, ...]:
     name, file = name_of(path), Path(path)
     with readable(file):
         archive = is_archive(file)
     if not archive:
-        return _tables_of_file(file, name, selection)
+        return _tables_of_file(file, name, options)
     try:
         with opened(file, name) as files:
-            parts = {sensor: _tables_of_file(inner, inside, selection) for sensor, (inside, inner) in files.items()}
+            parts = {sensor: _tables_of_file(inner, inside, options) for sensor, (inside, inner) in files.items()}
         source = Source(name, _hash(file), 0)
     except InputError:
         raise
@@ -457,20 +462,21 @@ def _tables_of(path: str | os.PathLike[str], selection: MessageSelection | None)
         raise _damaged(name, "a ZIP archive", error) from error
     tables = parts.get("") or _of_sensors({sensor: first for sensor, (first, *_) in parts.items()})
     if "" in parts and file.is_dir():  # of a folder with one log in it
-        tables = [replace(table, notes=(*table.notes, f"read from {files[''][0]}.")) for table in tables]
+        tables = [table.noted(f"read from {files[''][0]}.") for table in tables]
     return tuple(replace(table, source=replace(source, rows=table.source.rows)) for table in tables)
 
 
 def _of_sensors(tables: Mapping[str, LogTable]) -> list[LogTable]:
     """The sensors of a recording of several files; what cannot be used beside the accelerometer is left out."""
-    first, *others = tables.items()
-    whole, notes = [of_sensor(table, sensor) for sensor, table in [first]], []
-    for sensor, table in others:
+    whole, notes = [], []
+    for sensor, table in tables.items():
         try:
             whole.append(of_sensor(table, sensor))
         except InputError as error:
+            if not whole:
+                raise
             notes.append(f"not used: {error.args[0]}")
-    return [replace(whole[0], notes=(*whole[0].notes, *notes)), *whole[1:]]
+    return [whole[0].noted(*notes), *whole[1:]]
 
 
 def _damaged(name: str, kind: str, error: Exception) -> InputError:
@@ -478,12 +484,12 @@ def _damaged(name: str, kind: str, error: Exception) -> InputError:
     return InputError(f"{name}: begins like {kind} but cannot be read; it is cut off or damaged ({reason}).")
 
 
-def _tables_of_file(file: Path, name: str, selection: MessageSelection | None) -> tuple[LogTable, ...]:
+def _tables_of_file(file: Path, name: str, options: ReadOptions) -> tuple[LogTable, ...]:
     """The tables of one file, which messages call `name`."""
     with readable(name):
         kind = _recognise(file, name)
         data = file if kind.by_path else file.read_bytes()
-    more = (selection or MessageSelection(),) if kind.needs or kind is _TAGGED else ()
+    more = (options,) if kind.needs or kind is _TAGGED else ()
     try:
         with ThreadPoolExecutor(1) as beside:
             # a thread costs a small file more than it saves
@@ -508,7 +514,7 @@ def _tables_of_file(file: Path, name: str, selection: MessageSelection | None) -
     return tuple(_checked(table, source) for table in (tables if isinstance(tables, tuple) else (tables,)))
 
 
-def advise_reading(path: str | os.PathLike[str], rate: float | None = None) -> Advice | None:
+def advise_reading(path: FilePath, rate: float | None = None) -> Advice | None:
     """How to read a table whose header does not say it all; None for a log that names its columns itself.
 
     `rate`: Hz, where it is known. Raises InputError as `read_tables` does.
@@ -525,7 +531,7 @@ def _checked(table: LogTable, source: Source) -> LogTable:
         raise InputError(f"{table.path}: holds {counted(rows, 'row')} of data; a recording needs more.")
     table = apart(replace(table, source=replace(source, rows=rows)))
     known = known_names(table)
-    return table if known is None else replace(table, names=known[0], notes=(*table.notes, known[1]))
+    return table if known is None else replace(table, names=known[0]).noted(known[1])
 
 
 def _hash(path: Path) -> str:
@@ -567,15 +573,10 @@ def extract(
     ]
     sensor = "gyro" if option == "--gyro-columns" else None
     used = column_units(table, wanted, option, sensor)
-    put_right = _ordered if table.messages else _rising
-    disorder: list[str] = []
-    if TIME in used:
-        table, unstamped = _stamped(table, used)
-        table, wraps = _carried_on(table, used)
-        table, disorder = put_right(table, used)
-        disorder = [*unstamped, *wraps, *disorder]
+    for put_right in (_stamped, _carried_on, _ordered if table.messages else _rising) if TIME in used else ():
+        table = put_right(table, *used[TIME])
     stamps, origin, notes = _stamps(table, used, options)
-    notes = [*table.notes, *disorder, *notes]
+    notes = [*table.notes, *notes]
     signals: dict[str, Signal] = {}
     for key in sorted(groups & {group_of[name] for name in used if name != TIME}, key=list(GROUPS).index):
         places = [used[name] for name in GROUPS[key].columns]
@@ -611,24 +612,21 @@ def _per_second(unit: Unit, sensor: str, stamps: FloatArray) -> Unit:
     return Unit(unit.name, quantity, unit.factor / np.median(np.diff(stamps))) if quantity else unit
 
 
-def _stamped(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTable, list[str]]:
-    """The rows without a few that have no time, and a note."""
-    missing = np.isnan(table.numbers(used[TIME][0]))
+def _stamped(table: LogTable, clock: int, unit: Unit) -> LogTable:
+    """The rows without a few that have no time in the column `clock`, with a note."""
+    missing = np.isnan(table.numbers(clock))
     if not 0 < missing.mean() <= FEW:
-        return table, []
-    first = table.row(np.argmax(missing))
-    return table.take(np.flatnonzero(~missing)), [
-        f"{counted(int(missing.sum()), 'row')} without a time left out (row {first})."
-    ]
+        return table
+    note = f"{counted(int(missing.sum()), 'row')} without a time left out (row {table.row(np.argmax(missing))})."
+    return table.take(np.flatnonzero(~missing)).noted(note)
 
 
-def _carried_on(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTable, list[str]]:
+def _carried_on(table: LogTable, clock: int, unit: Unit) -> LogTable:
     """The rows with a time that goes on where a counter passed its end, or a day or a week of GPS began, and a note."""
-    index, unit = used[TIME]
-    stamps = table.numbers(index)
+    stamps = table.numbers(clock)
     steps = np.diff(stamps)
     if not (steps < 0).any() or not (steps > 0).any():  # NaN is neither
-        return table, []
+        return table
     usual = np.median(steps[steps > 0])
     for seconds in _ENDS:
         span = seconds / unit.factor
@@ -644,22 +642,20 @@ def _carried_on(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[Log
         turns = np.zeros(len(stamps), stamps.dtype)
         turns[back + 1] = full
         places = f"{counted(len(back), 'place')} (row {table.row(back[0] + 1)})"
-        return table.with_column(index, stamps + np.cumsum(turns)), [
-            f"the clock starts again after {seconds:.10g} s in {places}: its time goes on from there."
-        ]
-    return table, []
+        note = f"the clock starts again after {seconds:.10g} s in {places}: its time goes on from there."
+        return table.with_column(clock, stamps + np.cumsum(turns)).noted(note)
+    return table
 
 
-def _ordered(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTable, list[str]]:
-    """The messages in the order of their stamps, each stamp once, and what was put right.
+def _ordered(table: LogTable, clock: int, unit: Unit) -> LogTable:
+    """The messages in the order of their stamps, each stamp once, with notes of what was put right.
 
     Raises InputError where the clock was set back, or many messages share stamps.
     """
-    index, unit = used[TIME]
-    stamps = table.numbers(index)
+    stamps = table.numbers(clock)
     steps = np.diff(stamps)
     if not (steps <= 0).any():
-        return table, []
+        return table
     back = (np.maximum.accumulate(stamps) - stamps).max() * unit.factor
     if back > _SET_BACK:
         first = np.argmax(steps < 0) + 1
@@ -675,28 +671,28 @@ def _ordered(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTab
             f"{table.path}: {shared} of {len(order)} messages share the stamp of another; use the other stamps "
             "(--stamp receive, or --stamp header)."
         )
-    notes: list[str] = []
+    table = table.take(kept)
     if out_of_order := int((steps < 0).sum()):
         text = (
             f"{out_of_order} messages came out of order, by up to {1e3 * back:.3g} ms, and were sorted by their stamps."
         )
-        notes.append(Defect("data.order", text))
+        table = table.noted(Defect("data.order", text))
     if shared:
-        notes.append(Defect("data.duplicate", f"{shared} messages repeat the stamp of another and were left out."))
-    return table.take(kept), notes
+        text = f"{shared} messages repeat the stamp of another and were left out."
+        table = table.noted(Defect("data.duplicate", text))
+    return table
 
 
-def _rising(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTable, list[str]]:
-    """The rows of a table in the order of their stamps, each row once, and what was put right.
+def _rising(table: LogTable, clock: int, unit: Unit) -> LogTable:
+    """The rows of a table in the order of their stamps, each row once, with notes of what was put right.
 
     Rows that share a stamp but differ keep it, unless so many do that the stamps are times of arrival in bursts: then
     they follow each other by nothing. Raises InputError where the clock starts again within the file.
     """
-    index, unit = used[TIME]
-    stamps = table.numbers(index)
+    stamps = table.numbers(clock)
     steps = np.diff(stamps)
     if not (steps <= 0).any() or np.isnan(stamps).any():
-        return table, []
+        return table
 
     def listed(rows: np.ndarray) -> str:
         return ", ".join(str(table.row(row)) for row in rows[:5])
@@ -713,7 +709,7 @@ def _rising(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTabl
             f"The stamps jitter by {1e3 * spread:.2g} ms and go back in {counted(len(back), 'place')}, and "
             "the rows are in order: a steady clock fitted to the stamps replaces them."
         )
-        return table.with_column(index, even), [Defect("data.jitter", text)]
+        return table.with_column(clock, even).noted(Defect("data.jitter", text))
     if len(back):
         order = np.argsort(stamps, kind="stable")
         if backwards:
@@ -754,8 +750,8 @@ def _rising(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTabl
         )
     shared = kept_steps == 0
     if len(back) and (shared.any() or close > before):
-        return table, []  # sorting does not help: stamps are wrong, and which, the refusal says
-    table, stamps = table.take(kept), stamps[kept]
+        return table  # sorting does not help: stamps are wrong, and which, the refusal says
+    table, stamps = table.take(kept).noted(*notes), stamps[kept]
     if not len(back) and shared.sum() >= _FEW_SHARED and _FEW_SHARES < shared.mean() <= 0.25:
         even = _even_clock(stamps)
         if even is not None:
@@ -764,12 +760,12 @@ def _rising(table: LogTable, used: dict[str, tuple[int, Unit]]) -> tuple[LogTabl
                 f"{shared.sum()} stamps repeat the one before, and the rows are in order: a steady clock of "
                 f"{rate:.5g} Hz fitted to the stamps replaces them."
             )
-            return table.with_column(index, even), [*notes, Defect("data.jitter", text)]
+            return table.with_column(clock, even).noted(Defect("data.jitter", text))
     if shared.mean() > 0.25:  # bursts with one time of arrival for all their rows
         number = np.arange(len(kept))
         position = number - np.maximum.accumulate(np.where(np.concatenate([[True], ~shared]), number, 0))
-        table = table.with_column(index, stamps.astype(np.float64) + 1e-4 * usual * position)
-    return table, notes
+        table = table.with_column(clock, stamps.astype(np.float64) + 1e-4 * usual * position)
+    return table
 
 
 def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
@@ -789,15 +785,13 @@ def _even_clock(stamps: np.ndarray) -> np.ndarray | None:
     return stamps[0] + (np.round(even).astype(stamps.dtype) if whole else even)
 
 
-def _stamps(
-    table: LogTable, used: dict[str, tuple[int, Unit]], options: ReadOptions
-) -> tuple[FloatArray, Fraction | float, list[str]]:
+def _stamps(table: LogTable, used: Used, options: ReadOptions) -> tuple[FloatArray, Fraction | float, list[str]]:
     """(rows,) seconds since the first stamp (NaN where it is missing), that stamp in seconds, notes.
 
     Integer stamps (nanoseconds since 1970 do not fit a float64) are subtracted before they become floats.
     """
     if TIME not in used:
-        alike = (options.like or Reading()).rate
+        alike = options.known.rate
         rates = ((options.rate, "--rate"), (table.rate, "the file's sampling rate"), (alike, "the calibrated log"))
         rate, origin = next((pair for pair in rates if pair[0]), (None, ""))
         if not rate:

@@ -6,7 +6,6 @@ Records that name their sensor (`"sensor": "Accelerometer"`) become tables of th
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -14,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from jaximu.ground.distributions import robust_sigma
+from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
-from jaximu.ground.units import parse_column
+from jaximu.ground.units import SENSORS, column_title, parse_column
 from jaximu.recordings.columns.habits import fields_of, sensor_of, words_of
 from jaximu.recordings.columns.names import GROUPS, TIME, Column, header_columns, rises
 from jaximu.recordings.columns.table import LogTable
@@ -24,7 +25,6 @@ from jaximu.recordings.readers.clock import seconds_of
 from jaximu.recordings.recording import Source
 
 _TAGS = ("sensor", "sensorname", "sensor_name", "type", "name", "topic")
-_TRIADS = {"accel", "gyro", "mag"}
 _ANDROID = {"accel": "m/s^2", "gyro": "rad/s", "mag": "uT"}
 
 
@@ -51,7 +51,7 @@ def read(data: bytes, source: Source) -> LogTable | tuple[LogTable, ...]:
     raise InputError(f"{source.path}: holds no columns of numbers.")
 
 
-def _records(document: Any) -> list[dict[str, Any]] | None:
+def _records(document: Any) -> list[Json] | None:
     """The longest list of records, or of rows under a list of names, in a document."""
     if isinstance(document, list):
         return [record for record in document if isinstance(record, dict)] if any(map(_is_record, document)) else None
@@ -60,10 +60,7 @@ def _records(document: Any) -> list[dict[str, Any]] | None:
     rows, sensors = document.get("values"), document.get("sensors")
     if isinstance(rows, list) and isinstance(sensors, list) and rows and isinstance(rows[0], list):
         columns = [sensor for sensor in sensors if isinstance(sensor, Mapping) and "name" in sensor]
-        names = [
-            f"{column['name']} [{column['units']}]" if column.get("units") else str(column["name"])
-            for column in columns
-        ]
+        names = [column_title(column["name"], column.get("units")) for column in columns]
         return [dict(zip(names, row, strict=False)) for row in rows]
     lists = [records for value in document.values() if (records := _records(value))]
     return max(lists, key=len) if lists else None
@@ -84,7 +81,7 @@ def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield prefix + name, item
 
 
-def _columns(records: list[dict[str, Any]]) -> dict[str, list[Any]]:
+def _columns(records: list[Json]) -> dict[str, list[Any]]:
     flat = [dict(_leaves(record)) for record in records]
     names = dict.fromkeys(name for record in flat for name in record)
     return {name: [record.get(name) for record in flat] for name in names}
@@ -111,12 +108,12 @@ def _table(columns: Mapping[str, Any], source: Source) -> LogTable:
     return table_of(arrays, source)
 
 
-def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[str, LogTable]]:
+def _by_sensor(records: list[Json], source: Source) -> Iterator[LogTable]:
     """A table for each sensor that the records name."""
     tag = next((key for key in records[0] if key.lower() in _TAGS and isinstance(records[0][key], str)), None)
     if tag is None:
         return
-    parts: dict[str, list[dict[str, Any]]] = {}
+    parts: dict[str, list[Json]] = {}
     for record in records:
         if (sensor := _sensor(record.get(tag, ""))) and len(record) > 3:
             parts.setdefault(sensor, []).append(record)
@@ -129,11 +126,10 @@ def _by_sensor(records: list[dict[str, Any]], source: Source) -> Iterator[tuple[
             title = f"{sensor}_{last}" if last in ("x", "y", "z") else name
             if android:
                 unit = "ns" if name == "timestamp" else _ANDROID[sensor] if last in ("x", "y", "z") else ""
-                title = f"{title} [{unit}]" if unit else title
+                title = column_title(title, unit)
             named[title] = values
         table = _table(named, source)
-        notes = ('units are those of Android\'s sensors, by "type" in each line.',) if android else ()
-        yield sensor, replace(table, notes=(*table.notes, *notes))
+        yield table.noted('units are those of Android\'s sensors, by "type" in each line.') if android else table
 
 
 def of_sensor(table: LogTable, sensor: str) -> LogTable:
@@ -149,35 +145,28 @@ def of_sensor(table: LogTable, sensor: str) -> LogTable:
         raise InputError(f"{table.path}: columns {', '.join(sorted(missing))} are missing; it has {table.header}.")
     places = {column.name: at for at, column in enumerate(columns)}
     kept = {name: columns[places[name]].unit for name in wanted if name in places}
-    names = tuple(f"{name} [{unit}]" if unit else name for name, unit in kept.items())
+    names = tuple(column_title(name, unit) for name, unit in kept.items())
     return replace(table, names=names, columns=tuple(table.columns[places[name]] for name in kept))
 
 
 def apart(table: LogTable) -> LogTable:
     """A table whose rows name their sensor, as columns x, y, z, with columns for each sensor; any other as it is."""
-    for at, column in enumerate(table.columns if table.names else ()):
+    for at, column in enumerate(table.columns):
         if column.dtype != object or len(tags := dict.fromkeys(column[:10000].tolist())) > 40:
             continue
         sensors = {tag: sensor for tag in tags if (sensor := _sensor(tag))}
-        axes = {field.axis: index for index, field in enumerate(fields_of(table.names or ())) if not field.stem}
+        axes = {field.axis: index for index, field in enumerate(fields_of(table.header)) if not field.stem}
         if "accel" not in sensors.values() or not {"x", "y", "z"} <= set(axes):
             continue
         parts = []
         for tag, sensor in sensors.items():
-            part, names = table.take(np.flatnonzero(column == tag)), list(table.names or ())
+            part, names = table.take(np.flatnonzero(column == tag)), [*table.header]
             for axis in "xyz":
-                unit = parse_column(names[axes[axis]])[1]
-                names[axes[axis]] = f"{sensor}_{axis} [{unit}]" if unit else f"{sensor}_{axis}"
+                names[axes[axis]] = column_title(f"{sensor}_{axis}", parse_column(names[axes[axis]])[1])
             kept = [index for index in range(len(names)) if index != at and part.columns[index].dtype != object]
-            part = replace(
-                part,
-                names=tuple(names[index] for index in kept),
-                rows=1,
-                columns=tuple(part.columns[index] for index in kept),
-            )
-            parts.append((sensor, part))
-        joined = _joined(parts)
-        return replace(joined, notes=(*joined.notes, f"each row is one sensor's, by {table.label(at)}."))
+            columns = tuple(part.columns[index] for index in kept)
+            parts.append(replace(part, names=tuple(names[index] for index in kept), rows=1, columns=columns))
+        return _joined(parts).noted(f"each row is one sensor's, by {table.label(at)}.")
     return table
 
 
@@ -193,10 +182,10 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
     usual: the unit to take where none is chosen and it is there. Raises `InputError` where none of them, or one that is
     not there, was chosen.
     """
-    fields = fields_of(table.names or ())
-    triads = {field.sensor for field in fields if field.axis} & _TRIADS
+    fields = fields_of(table.header)
+    triads = {field.sensor for field in fields if field.axis} & SENSORS.keys()
     for at, field in enumerate(fields if triads else ()):
-        words = set(words_of(table.names[at])) if table.names else set()
+        words = set(words_of(table.header[at]))
         if field.canonical or not words or not words <= _DEVICE or (field.axis and field.sensor):
             continue
         names = np.array(list(map(str, table.columns[at].tolist())))
@@ -214,9 +203,8 @@ def of_device(table: LogTable, device: str | None, usual: str | None = None) -> 
             )
         if device not in units:
             raise InputError(f"{table.path}: --device {device}: column {table.label(at)} holds {', '.join(units[:8])}.")
-        taken = table.take(np.flatnonzero(names == device))
         note = f"the rows are those of {device}, by column {table.label(at)}."
-        return replace(taken, device=device, notes=(*taken.notes, note))
+        return replace(table.take(np.flatnonzero(names == device)), device=device).noted(note)
     return _unnamed_device(table, device or usual)
 
 
@@ -248,8 +236,7 @@ def _unnamed_device(table: LogTable, device: str | None) -> LogTable:
             f"1 … --device {count} (as the first rows come). {_all_of(table, units)}"
         )
     taken = table.take(np.arange(int(device) - 1, len(table.columns[0]), count))
-    note = f"the rows are those of unit {device} of {count} that write in turn."
-    return replace(taken, device=device, notes=(*taken.notes, note))
+    return replace(taken, device=device).noted(f"the rows are those of unit {device} of {count} that write in turn.")
 
 
 _ORDINALS = ("", "", "second", "third", "fourth", "fifth", "sixth")
@@ -261,8 +248,8 @@ def _units_in_turn(table: LogTable) -> int:
     Biases of two units differ all along; whatever else swings as quickly drifts against the rows.
     """
     columns = []
-    for at, field in enumerate(fields_of(table.names) if table.names else [None] * len(table.columns)):
-        if field is not None and field.sensor not in _TRIADS:
+    for at, field in enumerate(fields_of(table.header)):
+        if table.names and field.sensor not in SENSORS:
             continue
         try:
             values = np.asarray(table.numbers(at)[:_ROWS], np.float64)
@@ -286,8 +273,7 @@ def _differ_in_turn(values: np.ndarray, count: int) -> bool:
     fourth = parts.shape[1] // 4
     pattern = np.sort(parts, axis=1)[:, fourth : parts.shape[1] - fourth].mean(axis=1)
     middle = np.median(pattern, axis=0)
-    scatter = 1.4826 * np.median(np.abs(pattern - middle), axis=0).max()
-    usual = 1.4826 * np.median(np.abs(parts - pattern[:, None]))
+    scatter, usual = robust_sigma(pattern - middle, axis=0).max(), robust_sigma(parts - pattern[:, None])
     apart = np.ptp(middle)  # rows that repeat themselves to the last digit were made
     return bool(apart > max(_DISTINCT * scatter, _PLAIN * usual) and scatter > 1e-9 * apart)
 
@@ -304,19 +290,19 @@ def _alike(table: LogTable, groups: Sequence[np.ndarray]) -> bool:
 
 def _sensor(tag: Any) -> str | None:
     """The sensor of three axes that a row's tag names."""
-    words = re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", str(tag)).lower())
-    return sensor if (sensor := sensor_of(tuple(words))[0]) in _TRIADS else None
+    return sensor if (sensor := sensor_of(tuple(words_of(str(tag))))[0]) in SENSORS else None
 
 
-def _joined(tables: list[tuple[str, LogTable]]) -> LogTable:
+def _joined(tables: list[LogTable]) -> LogTable:
     """The sensors' tables as one, in the order of their stamps."""
+    first = tables[0]
     if len(tables) == 1:
-        return tables[0][1]
-    names = list(dict.fromkeys(name for _, table in tables for name in table.names or ()))
-    held = [dict(zip(table.names or (), table.columns, strict=True)) for _, table in tables]
+        return first
+    held = [dict(zip(table.header, table.columns, strict=True)) for table in tables]
+    names = list(dict.fromkeys(name for part in held for name in part))
     clock = next((name for name in names if all(name in part and rises(part[name]) for part in held)), None)
     if clock is None:
-        raise InputError(f"{tables[0][1].path}: the rows of its sensors share no column of time.")
+        raise InputError(f"{first.path}: the rows of its sensors share no column of time.")
     stamps = np.unique(np.concatenate([part[clock] for part in held]))
     columns = {name: np.full(len(stamps), np.nan) for name in names}
     for part in held:
@@ -324,5 +310,4 @@ def _joined(tables: list[tuple[str, LogTable]]) -> LogTable:
         for name, values in part.items():
             columns[name][places] = values
     columns[clock] = stamps
-    first = tables[0][1]
     return LogTable(replace(first.source, rows=len(stamps)), tuple(names), tuple(columns.values()), notes=first.notes)

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import LogTable, MessageSelection, Unpacking
-from jaximu.recordings.recording import Source
+from jaximu.recordings.columns.table import LogTable, Unpacking
+from jaximu.recordings.recording import ReadOptions, Source
 
 _BLOCK = 1 << 12  # messages held undecoded
 _LONGEST = 1 << 12  # bytes of a message of these kinds, its frame's name included
@@ -74,7 +74,7 @@ class _File(io.BufferedReader):
         return super().read(size if size is None else min(size, self.size))
 
 
-def read_ros1(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
+def read_ros1(path: Path, source: Source, options: ReadOptions) -> tuple[LogTable, ...]:
     """The tables in a ROS 1 bag. Raises InputError where topics are missing or to be chosen."""
     from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag1 import Reader
@@ -100,10 +100,10 @@ def read_ros1(path: Path, source: Source, selection: MessageSelection) -> tuple[
         _bounded(decompressors, {"bz2": BZ2Decompressor, "lz4": LZ4FrameDecompressor}, unpacking),
         Bounded(_Path(path)) as bag,
     ):
-        return _read(bag, bag.messages, source, selection, cdr=False)
+        return _read(bag, bag.messages, source, options, cdr=False)
 
 
-def read_ros2(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
+def read_ros2(path: Path, source: Source, options: ReadOptions) -> tuple[LogTable, ...]:
     """The tables in a ROS 2 bag: its folder, or one .db3 or .mcap file."""
     import apsw
     from lz4.frame import LZ4FrameDecompressor
@@ -127,7 +127,7 @@ def read_ros2(path: Path, source: Source, selection: MessageSelection) -> tuple[
             for connection, stamp, data in bag.messages(chosen):
                 yield connection, stamp, unpacking.unpack(zstd.ZstdDecompressor(), data)
 
-        return _read(bag, messages if packed else bag.messages, source, selection, cdr=True)
+        return _read(bag, messages if packed else bag.messages, source, options, cdr=True)
 
 
 @contextmanager
@@ -155,9 +155,9 @@ def _check_packed(path: Path, zstd: Any, unpacking: Unpacking) -> None:
 
 
 def _read(
-    bag: Any, iterate: Callable[[Sequence[Any]], Iterator[Any]], source: Source, selection: MessageSelection, cdr: bool
+    bag: Any, iterate: Callable[[Sequence[Any]], Iterator[Any]], source: Source, options: ReadOptions, cdr: bool
 ) -> tuple[LogTable, ...]:
-    wanted = _wanted(bag.connections, source, selection)
+    wanted = _wanted(bag.connections, source, options)
     kinds = {topic: kind for topic, kind, _ in wanted}
     chosen = [connection for connection in bag.connections if kinds.get(connection.topic) == connection.msgtype]
     for connection in chosen:
@@ -170,7 +170,7 @@ def _read(
         if len(data) > _LONGEST:
             raise ValueError("a message is not as its definition says")
         decoded[connection.topic].add(received, data)
-    tables = (decoded[topic].table(source, topic, columns, selection.stamp) for topic, _, columns in wanted)
+    tables = (decoded[topic].table(source, topic, columns, options.stamp) for topic, _, columns in wanted)
     return tuple(table for table in tables if table)
 
 
@@ -190,16 +190,14 @@ def _named(path: Path) -> Iterator[Path]:
         yield link
 
 
-def _wanted(
-    connections: Sequence[Any], source: Source, selection: MessageSelection
-) -> list[tuple[str, str, dict[str, int]]]:
+def _wanted(connections: Sequence[Any], source: Source, options: ReadOptions) -> list[tuple[str, str, dict[str, int]]]:
     """Topic, type and columns of each table: of the one topic of `sensor_msgs/Imu`, or of those asked for, of which
     the first has the accelerometer and the second the gyroscope; and of what goes with them.
     """
     imu = {connection.topic: connection for connection in connections if connection.msgtype == _IMU}
     listed = ", ".join(f"{topic} ({connection.msgcount} messages)" for topic, connection in imu.items()) or "none"
-    if selection.topic is not None:
-        topics = [topic.strip() for topic in selection.topic.split(",")]
+    if options.topic is not None:
+        topics = [topic.strip() for topic in options.topic.split(",")]
         if unknown := [topic for topic in topics if topic not in imu]:
             raise InputError(f"{source.path}: has no IMU topic {unknown[0]}; --topic can be {listed}.")
         if len(topics) > 2:

@@ -12,45 +12,29 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaximu.ground.array_types import FloatArray
-from jaximu.ground.errors import InputError, readable
+from jaximu.ground.errors import FilePath, InputError, readable
 from jaximu.ground.units import parse_column, unit
+from jaximu.recordings.attitude import UNIT_LENGTH
 from jaximu.recordings.columns.names import GROUPS, header_columns
+from jaximu.recordings.entry import ScheduleEntry
 from jaximu.recordings.readers.reader import extract, read_table
 from jaximu.recordings.recording import ReadOptions, Recording
 
-__all__ = ["ScheduleEntry", "read_reference", "read_schedule"]
-
 _FIELDS = ("start", "stop", "kind", "x", "y", "z", "angle", "heading")
 _QUANTITIES = {"start": "time", "stop": "time", "angle": "angle", "heading": "angle"}
+_Columns = dict[str, tuple[int, float]]
+"""The place of each column, and the factor that takes it to SI."""
 _REFERENCES = ("table_angle", "table_rate", "attitude")
 
 
-@dataclass(frozen=True)
-class ScheduleEntry:
-    """A pose or a turn from `start` to `stop` (s, on the log's clock).
-
-    kind: "pose" or "turn". vector (3,): unit, body frame, "up" or the axis. angle: rad, of a turn; NaN for a full turn
-    whose sense nobody wrote down. heading: rad, of a pose, or None. label: where it stands, for messages.
-    """
-
-    start: float
-    stop: float
-    kind: str
-    vector: FloatArray
-    angle: float = 0.0
-    heading: float | None = None
-    label: str = "entry"
-
-
-def read_reference(path: str | os.PathLike[str], recording: Recording) -> tuple[ScheduleEntry, ...] | Recording:
+def read_reference(path: FilePath, recording: Recording) -> tuple[ScheduleEntry, ...] | Recording:
     """Return the entries of a schedule or of named sections; or the recording with the reference columns of the file.
 
     Entries are on the recording's own clock, seconds since `recording.start`. Raises InputError naming file and row.
@@ -86,7 +70,7 @@ def _text(name: str) -> str:
         return Path(name).read_bytes().decode("utf-8-sig", errors="replace")
 
 
-def read_schedule(path: str | os.PathLike[str]) -> tuple[ScheduleEntry, ...]:
+def read_schedule(path: FilePath) -> tuple[ScheduleEntry, ...]:
     """Return the entries of a turntable schedule, on the log's clock, in order of time.
 
     Raises InputError naming the row for a cell that is missing or not understood, entries that overlap, and a header
@@ -103,9 +87,9 @@ def read_schedule(path: str | os.PathLike[str]) -> tuple[ScheduleEntry, ...]:
     return tuple(entries)
 
 
-def _columns(header: Sequence[str], name: str) -> dict[str, tuple[int, float]]:
+def _columns(header: Sequence[str], name: str) -> _Columns:
     """The place of each column and the factor that takes it to SI."""
-    columns: dict[str, tuple[int, float]] = {}
+    columns: _Columns = {}
     for at, cell in enumerate(header):
         title, stated = parse_column(cell)
         title = title.strip().lower()
@@ -125,7 +109,7 @@ def _columns(header: Sequence[str], name: str) -> dict[str, tuple[int, float]]:
     return columns
 
 
-def _entry(cells: Sequence[str], columns: dict[str, tuple[int, float]], where: str) -> ScheduleEntry:
+def _entry(cells: Sequence[str], columns: _Columns, where: str) -> ScheduleEntry:
     def number(title: str, optional: bool = False) -> float:
         """NaN for an optional cell that is empty."""
         at, factor = columns.get(title, (len(cells), 1.0))
@@ -149,8 +133,8 @@ def _entry(cells: Sequence[str], columns: dict[str, tuple[int, float]], where: s
     if stop <= start:
         raise InputError(f"{where}: stop ({stop:g} s) is not after start ({start:g} s).")
     vector = np.array([number(axis) for axis in "xyz"])
-    length = float(np.linalg.norm(vector))
-    if abs(length - 1) > 0.01:
+    length = np.linalg.norm(vector)
+    if abs(length - 1) > UNIT_LENGTH:
         raise InputError(f"{where}: x, y, z has the length {length:.4g}; a direction has the length 1.")
     angle, heading = (number(title, optional=True) for title in ("angle", "heading"))
     angle = 0.0 if math.isnan(angle) else angle

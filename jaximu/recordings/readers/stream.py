@@ -17,8 +17,6 @@ from typing import IO, Any
 
 from jaximu.ground.errors import InputError
 
-__all__ = ["Lines"]
-
 _PATIENCE = 10.0  # s without a line after which a source is taken for dead
 _LONGEST = 1 << 12  # bytes of a line
 

@@ -13,8 +13,8 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from jaximu.ground.errors import InputError
-from jaximu.recordings.columns.table import HEAD, LogTable, MessageSelection, from_arrow
-from jaximu.recordings.recording import Source
+from jaximu.recordings.columns.table import HEAD, LogTable, from_arrow
+from jaximu.recordings.recording import ReadOptions, Source
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ def dialect(data: bytes) -> _Dialect | None:
     return next((dialect_of for dialect_of in _DIALECTS if dialect_of.sign.search(data[:HEAD])), None)
 
 
-def read(data: bytes, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
+def read(data: bytes, source: Source, options: ReadOptions) -> tuple[LogTable, ...]:
     """The tables in a tagged text, one a sensor. Raises InputError where no row of a sensor is there."""
     log = dialect(data)
     assert log is not None
     tables: list[LogTable] = []
     shift = 0 if b"Stream Type,F#" not in data[:HEAD] else -1  # older versions write no index
-    stamp = selection.stamp if selection.stamp in log.notes else "header"
+    stamp = options.stamp if options.stamp in log.notes else "header"
     for tag, (name, first) in log.tags.items():
         rows = re.findall(rb"^" + tag.encode() + rb",.*$", data, re.MULTILINE)
         rows = [row for row in rows if row.partition(b",")[2][:1].isdigit()]  # not the header itself

@@ -19,8 +19,8 @@ import numpy as np
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import counted
 from jaximu.ground.units import SENSORS
-from jaximu.recordings.columns.table import LogTable, MessageSelection
-from jaximu.recordings.recording import Source
+from jaximu.recordings.columns.table import LogTable
+from jaximu.recordings.recording import ReadOptions, Source
 
 _Fields = Mapping[str, np.ndarray]
 _DEEPEST_FIFO = 32  # samples of a message
@@ -84,7 +84,7 @@ _SOURCES = {
 """By `--topic`: the messages of accelerometer and gyroscope, the raw ones first."""
 
 
-def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTable, ...]:
+def read(path: Path, source: Source, options: ReadOptions) -> tuple[LogTable, ...]:
     """The tables in a ULog. Raises InputError for a topic or an instance that it does not have."""
     log = _opened(path, {name for messages in _SOURCES.values() for name, _ in messages})
     logged = {
@@ -94,7 +94,7 @@ def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTa
     }
     first_names = {accel for (accel, _), _ in _SOURCES.values()}
     instances = sorted({instance for name, instance in logged if name in first_names})
-    instance = selection.instance if selection.instance is not None else (instances or [0])[0]
+    instance = options.instance if options.instance is not None else (instances or [0])[0]
     usable = {
         topic: min(_samples(logged[name, instance]) for name, _ in messages)
         for topic, messages in _SOURCES.items()
@@ -108,9 +108,9 @@ def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTa
             f"vehicle_imu of instance {instance} ({held}); choose with --instance, or log them (SDLOG_PROFILE, high "
             "rate sensors)."
         )
-    if selection.topic is not None and selection.topic not in usable:
-        raise InputError(f"{source.path}: --topic {selection.topic}: there are {', '.join(usable)} here.")
-    topic = selection.topic or max(usable, key=lambda name: usable[name])
+    if options.topic is not None and options.topic not in usable:
+        raise InputError(f"{source.path}: --topic {options.topic}: there are {', '.join(usable)} here.")
+    topic = options.topic or max(usable, key=lambda name: usable[name])
     notes = ["PX4 axes are forward, right, down (gravity reads about -9.8 on z at rest): --axes FRD turns them."]
     others = [f"{name} ({count} samples)" for name, count in usable.items() if name != topic]
     more = f"; there are also {', '.join(others)} (--topic)" if others else ""
@@ -127,7 +127,7 @@ def read(path: Path, source: Source, selection: MessageSelection) -> tuple[LogTa
         notes.append("parts of the file are damaged and were left out.")
     tables = []
     for title, (name, samples) in zip(("accel_{} [m/s^2]", "gyro_{} [rad/s]"), _SOURCES[topic], strict=True):
-        time, values = samples(logged[name, instance], selection.stamp)
+        time, values = samples(logged[name, instance], options.stamp)
         unit = "ns" if name.endswith("_fifo") else "us"
         tables.append(_table(source, time, dict(zip(map(title.format, "xyz"), values, strict=True)), unit))
     heat = logged.get(("sensor_accel", instance), {})

@@ -7,7 +7,7 @@ from jaximu.ground.reexport import lazily
 if TYPE_CHECKING:
     from jaximu.simulation.protocols.base import Plan, Protocol
     from jaximu.simulation.protocols.catalogue import PROTOCOLS
-    from jaximu.simulation.protocols.course import Course, Environment, Interval, Tone, attitude_of
+    from jaximu.simulation.protocols.course import Course, Environment, Tone, attitude_of
     from jaximu.simulation.protocols.dividing_head import DividingHead
     from jaximu.simulation.protocols.ferraris import Ferraris
     from jaximu.simulation.protocols.hand_held import HandHeld
@@ -27,7 +27,6 @@ __all__ = [
     "Environment",
     "Ferraris",
     "HandHeld",
-    "Interval",
     "Motion",
     "Plan",
     "Positions",
@@ -49,7 +48,7 @@ __getattr__ = lazily(
     {
         "jaximu.simulation.protocols.base": "Plan, Protocol",
         "jaximu.simulation.protocols.catalogue": "PROTOCOLS",
-        "jaximu.simulation.protocols.course": "Course, Environment, Interval, Tone, attitude_of",
+        "jaximu.simulation.protocols.course": "Course, Environment, Tone, attitude_of",
         "jaximu.simulation.protocols.dividing_head": "DividingHead",
         "jaximu.simulation.protocols.ferraris": "Ferraris",
         "jaximu.simulation.protocols.hand_held": "HandHeld",

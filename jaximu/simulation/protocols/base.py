@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import ClassVar
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.model.stimulus import Stimulus
-from jaximu.simulation.protocols.course import Course, Environment, Interval
+from jaximu.recordings.entry import ScheduleEntry
+from jaximu.simulation.protocols.course import Course, Environment
 from jaximu.simulation.protocols.motion import Motion
-
-__all__ = ["Plan", "Protocol"]
 
 
 @dataclass(frozen=True)
@@ -22,8 +21,18 @@ class Plan:
     """A protocol made out: its motion, its rests and turns, and what a log of it holds beside the sensors."""
 
     motion: Motion
-    intervals: tuple[Interval, ...]
+    intervals: tuple[ScheduleEntry, ...]
     columns: tuple[str, ...] = ()  # of `Recording`: temperature, ambient_temperature, current, attitude, table_rate
+
+
+def may_be_zero(default: float = 0.0) -> Any:
+    """Return a field of a protocol that may be zero, as others may not."""
+    return field(default=default, metadata={"zero": True})
+
+
+def signed(default: float | tuple[float, float, float]) -> Any:
+    """Return a field of a protocol that may have any sign."""
+    return field(default=default, metadata={"signed": True})
 
 
 @dataclass(frozen=True)
@@ -70,8 +79,6 @@ class Protocol:
     def stimulus(self, rate: float = 100.0, seed: int = 0, environment: Environment | None = None) -> Stimulus:
         """Return what the sensors go through, at `rate` (Hz); see `Stimulus` for its fields."""
         require_float64()
-        if not (np.isfinite(rate) and rate > 0):
-            raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
         return self.plan(np.random.default_rng(seed), environment).motion.stimulus(rate)
 
     def _own(self, environment: Environment, **values) -> Environment:

@@ -12,8 +12,6 @@ from jaximu.simulation.protocols.soak_and_ramp import SoakAndRamp
 from jaximu.simulation.protocols.static import Static
 from jaximu.simulation.protocols.vibration import Vibration
 
-__all__ = ["PROTOCOLS"]
-
 _KINDS = (
     Static,
     Positions,

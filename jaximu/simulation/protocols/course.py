@@ -12,29 +12,13 @@ from numpy.typing import ArrayLike
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
+from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.recordings.entry import ScheduleEntry
 from jaximu.simulation.protocols.motion import Motion, earth_rate, field_of
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
-
-__all__ = ["Course", "Environment", "Interval", "Tone", "attitude_of"]
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A rest or a turn of a protocol, from `start` to `stop` (s).
-
-    kind: "pose" or "turn". vector (3,): in the body frame, "up" of a pose or the axis of a turn (right-hand rule).
-    angle: rad turned. heading: rad, of a pose, about "up" from an arbitrary zero.
-    """
-
-    start: float
-    stop: float
-    kind: str
-    vector: FloatArray
-    angle: float = 0.0
-    heading: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -105,7 +89,7 @@ def attitude_of(up: ArrayLike, heading: ArrayLike = 0.0) -> Rotation:
     (rad) about it.
     """
     up = np.asarray(up, float)
-    x, y, z = np.moveaxis(up / np.linalg.norm(up, axis=-1, keepdims=True), -1, 0)
+    x, y, z = np.moveaxis(unit_vectors(up), -1, 0)
     azimuth = np.where(np.hypot(x, y) < 1e-9, 0.0, np.arctan2(y, x))  # where z is up or down, rounding has none
     angles = [np.broadcast_to(heading, z.shape), -np.arccos(np.clip(z, -1, 1)), -azimuth]
     # Rz(heading) Ry(−polar angle) Rz(−azimuth)
@@ -117,7 +101,7 @@ class Course:
     """A motion in the making: rests and turns one after the other, each exactly as long as said."""
 
     attitude: Rotation = field(default_factory=lambda: scipy.spatial.transform.Rotation.identity())
-    intervals: list[Interval] = field(default_factory=list)
+    intervals: list[ScheduleEntry] = field(default_factory=list)
     time: float = 0.0
     _segments: list[tuple] = field(default_factory=list)
 
@@ -129,7 +113,7 @@ class Course:
         if mark:
             up = self.attitude.inv().apply([0.0, 0.0, 1.0])
             heading = (self.attitude * attitude_of(up).inv()).as_rotvec()[2]
-            self.intervals.append(Interval(start, self.time, "pose", up, 0.0, float(heading)))
+            self.intervals.append(ScheduleEntry(start, self.time, "pose", up, 0.0, float(heading)))
 
     def turn(
         self,
@@ -148,7 +132,7 @@ class Course:
         start = self._add(duration, rotation, ramp, displacement, bend)
         self.attitude = self.attitude * scipy.spatial.transform.Rotation.from_rotvec(rotation)
         if mark and angle > 0:
-            self.intervals.append(Interval(start, self.time, "turn", rotation / angle, angle))
+            self.intervals.append(ScheduleEntry(start, self.time, "turn", rotation / angle, angle))
 
     def spin(self, axis: FloatArray, angle: float, rate: float, ramp_duration: float) -> None:
         """Turn by `angle` (rad) about `axis` at the constant `rate` (rad/s), reached in `ramp_duration` (s).

@@ -7,8 +7,6 @@ import numpy as np
 from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course, attitude_of
 
-__all__ = ["DividingHead"]
-
 _POSITIONS = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
 
 

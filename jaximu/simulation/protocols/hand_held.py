@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
-from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.base import Protocol, may_be_zero
 from jaximu.simulation.protocols.course import Course, attitude_of
 from jaximu.simulation.protocols.positions import spiral
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
-
-__all__ = ["HandHeld"]
 
 
 @dataclass(frozen=True)
@@ -30,9 +28,9 @@ class HandHeld(Protocol):
     poses: int = 40
     pose_duration: float = 4.0
     turn_duration: float = 1.5
-    initial_rest: float = field(default=0.0, metadata={"zero": True})
-    displacement: float = field(default=0.0, metadata={"zero": True})
-    bend: float = field(default=0.0, metadata={"zero": True})
+    initial_rest: float = may_be_zero()
+    displacement: float = may_be_zero()
+    bend: float = may_be_zero()
 
     kind = "hand-held"
 

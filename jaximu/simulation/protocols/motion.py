@@ -17,11 +17,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array, FloatArray
+from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.stimulus import Stimulus
-
-__all__ = ["BLOCKS", "Motion", "block_length", "earth_rate", "field_of", "smooth_course"]
 
 BLOCKS = (4096, 16384, 65536)
 
@@ -77,7 +76,9 @@ class Motion(eqx.Module):
         return float(np.sum(self.duration))
 
     def samples(self, rate: float) -> int:
-        """Return the number of samples at `rate` (Hz)."""
+        """Return the number of samples at `rate` (Hz). Raises `InputError` for what is no rate."""
+        if not (np.isfinite(rate) and rate > 0):
+            raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
         return round(self.length * rate)
 
     def block(self, first, rate, length: int) -> Stimulus:

@@ -9,8 +9,6 @@ from jaximu.ground.errors import InputError
 from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course, attitude_of
 
-__all__ = ["Positions", "directions", "spiral"]
-
 _FACES = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
 _CORNERS = [np.array(signs) / np.sqrt(3) for signs in itertools.product((1.0, -1.0), repeat=3)]
 _EDGES = [

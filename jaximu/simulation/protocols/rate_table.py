@@ -8,8 +8,6 @@ import numpy as np
 from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course, attitude_of
 
-__all__ = ["RateTable"]
-
 
 @dataclass(frozen=True)
 class RateTable(Protocol):

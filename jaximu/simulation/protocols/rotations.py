@@ -10,8 +10,6 @@ from jaximu.ground.errors import InputError
 from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course, attitude_of
 
-__all__ = ["NINETEEN", "Rotations", "rotation_vector"]
-
 NINETEEN = "y90 y90 y90 y-90 y-90 y-90 z90 x90 x90 x90 x-90 x-90 x-90 z90 z90 z-90 z-90 z-90"
 """The rotations between nineteen positions from which a filter determines a unit."""
 

@@ -7,8 +7,6 @@ import numpy as np
 from jaximu.simulation.protocols.base import Protocol
 from jaximu.simulation.protocols.course import Course, attitude_of
 
-__all__ = ["SingleAxisTable"]
-
 
 @dataclass(frozen=True)
 class SingleAxisTable(Protocol):

@@ -1,16 +1,14 @@
 """A temperature chamber: soaks and ramps of several rates, up and down (S15)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.base import Protocol, may_be_zero, signed
 from jaximu.simulation.protocols.course import Course, attitude_of
 from jaximu.simulation.protocols.positions import directions
-
-__all__ = ["SoakAndRamp"]
 
 
 @dataclass(frozen=True)
@@ -22,12 +20,12 @@ class SoakAndRamp(Protocol):
     positions, moved within `turn_duration`, during every soak; with 1 it rests with z up.
     """
 
-    low: float = field(default=-20.0, metadata={"signed": True})
-    high: float = field(default=60.0, metadata={"signed": True})
+    low: float = signed(-20.0)
+    high: float = signed(60.0)
     rates: Sequence[float] = (1.0, 2.0, 4.0)
     soak_duration: float = 900.0
-    device_lag: float = field(default=0.0, metadata={"zero": True})
-    self_heating: float = field(default=0.0, metadata={"zero": True})
+    device_lag: float = may_be_zero()
+    self_heating: float = may_be_zero()
     positions: int = 1
     turn_duration: float = 2.0
 

@@ -1,12 +1,10 @@
 """At rest in one pose."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from jaximu.ground.errors import InputError
-from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.base import Protocol, signed
 from jaximu.simulation.protocols.course import Course, attitude_of
-
-__all__ = ["Static"]
 
 
 @dataclass(frozen=True)
@@ -14,7 +12,7 @@ class Static(Protocol):
     """At rest for `duration`, with the body vector `up` pointing up: what an Allan deviation is computed from."""
 
     duration: float = 3600.0
-    up: tuple[float, float, float] = field(default=(0.0, 0.0, 1.0), metadata={"signed": True})
+    up: tuple[float, float, float] = signed((0.0, 0.0, 1.0))
 
     kind = "static"
 

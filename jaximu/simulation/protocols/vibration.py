@@ -1,15 +1,13 @@
 """On a shaker: vibration of several strengths at rest (S22)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from jaximu.ground.errors import InputError
-from jaximu.simulation.protocols.base import Protocol
+from jaximu.simulation.protocols.base import Protocol, may_be_zero, signed
 from jaximu.simulation.protocols.course import Course, Tone, attitude_of
-
-__all__ = ["Vibration"]
 
 
 @dataclass(frozen=True)
@@ -23,9 +21,9 @@ class Vibration(Protocol):
     levels: Sequence[float] = (2.0, 5.0, 10.0)
     frequencies: Sequence[float] = (80.0, 230.0)
     duration: float = 60.0
-    direction: tuple[float, float, float] = field(default=(0.0, 0.0, 1.0), metadata={"signed": True})
-    rocking: float = field(default=0.0, metadata={"zero": True})
-    up: tuple[float, float, float] = field(default=(0.0, 0.0, 1.0), metadata={"signed": True})
+    direction: tuple[float, float, float] = signed((0.0, 0.0, 1.0))
+    rocking: float = may_be_zero()
+    up: tuple[float, float, float] = signed((0.0, 0.0, 1.0))
 
     kind = "vibration"
 
