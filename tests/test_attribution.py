@@ -1,6 +1,7 @@
 """What belongs to a unit, a session or the board: simulated boards, drawn estimates, and patterns that do not fit."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,8 +9,9 @@ from simulated_board import PATTERN, board
 
 from jaximu.cli.app import main
 from jaximu.diagnosis import COMMON_DRIFT, attribute, places_of
-from jaximu.diagnosis.attribution import split
+from jaximu.diagnosis.attribution import attributed, split
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.model.effects import CATALOGUE
 from jaximu.report.html import write_report
 
 UNITS, SESSIONS = 4, 3
@@ -47,6 +49,16 @@ def test_a_common_course_is_taken_off_before_the_units_are_judged(attribution):
     assert [part.diagnosis["effects"][0]["name"] for part in attribution.recordings if part.unit == "1"] == [
         "gyro.g_sensitivity"
     ] * 2
+
+
+def test_a_curve_of_one_recording_belongs_to_nothing(attribution):
+    parts = list(attribution.recordings)
+    (sensitivity,) = parts[0].named
+    curve = CATALOGUE["gyro.learned_time"].make(1e-3, low=0.0, high=60.0)
+    parts[0] = replace(parts[0], named=(sensitivity, replace(sensitivity, effect=curve)))
+    findings, single, _ = attributed(parts, [], 0.05)
+    assert [finding.name for finding in findings] == ["gyro.g_sensitivity"]
+    assert single == {"gyro.learned_time": ["unit 1 in session 1"]}
 
 
 def test_document_and_page(attribution, tmp_path):
@@ -130,7 +142,7 @@ def test_what_the_others_tell_is_as_well_known_as_it_says():
         values = common + apart + 0.2 * random.standard_normal((UNITS, SESSIONS, 3))
         divided = split(drawn(random, values), *LABELS, 0.05)
         for index in (0, SESSIONS + 1):
-            mean, covariance = divided.told(index)
+            mean, covariance = divided.predicted(index)
             off = values.reshape(-1, 3)[index] - mean
             squares.append(off @ np.linalg.solve(covariance, off))
     assert 0.8 < np.mean(squares) / 3 < 1.3  # 360 squares of normal numbers: 1 ± 0.07, the variances estimated

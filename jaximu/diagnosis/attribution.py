@@ -82,7 +82,7 @@ class BoardRecording:
 
     diagnosis: the document. named: the effects that it names. chi2_heldout: per condition, on parts left out, with the
     effects in the model. alone: the verdict with what the session has in common. without_drift: that was taken off.
-    lines: at rest, that move. told: effects that were taken off, as the other recordings tell them.
+    lines: at rest, that move. taken_off: effects, as the other recordings have them.
     """
 
     file: str
@@ -96,7 +96,7 @@ class BoardRecording:
     alone: str
     without_drift: bool = False
     lines: tuple[MovingLine, ...] = ()
-    told: tuple[str, ...] = ()
+    taken_off: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, file: str, unit: str, session: str, diagnosis: Diagnosis) -> BoardRecording:
@@ -129,15 +129,15 @@ class BoardRecording:
             lines=diagnosis.lines,
         )
 
-    def explained(self, repeated: BoardRecording, told: tuple[str, ...], without_drift: bool) -> BoardRecording:
+    def repeated(self, other: BoardRecording, known: Sequence[KnownEffect], without_drift: bool) -> BoardRecording:
         """Return the recording as diagnosed once more, effects taken off; estimates still come from before that."""
         return replace(
-            repeated,
+            other,
             evidence=self.evidence,
             rests=self.rests,
             alone=self.alone,
             without_drift=without_drift,
-            told=told,
+            taken_off=tuple(one.effect.name for one in known),
         )
 
     @property
@@ -154,7 +154,7 @@ class BoardRecording:
             "verdict": self.diagnosis["verdict"],
             "verdict_alone": self.alone,
             "without_common_drift": self.without_drift,
-            "told_by_others": list(self.told),
+            "taken_off": list(self.taken_off),
             "effects": self.diagnosis["effects"],
             "chi2_heldout": self.chi2_heldout,
         }
@@ -202,10 +202,10 @@ class BoardRecording:
         """Yield an effect whose coefficients have this mean and covariance, in units of their sizes, if it can be."""
         block = self.block(name, inner)
         if block is not None:
-            asked = self.evidence.blocks[block]
+            question = self.evidence.blocks[block]
             values, vectors = np.linalg.eigh(covariance)
-            root = asked.sizes[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-            yield KnownEffect(CATALOGUE[name].make(mean * asked.sizes, **asked.inner), root)
+            root = question.sizes[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+            yield KnownEffect(CATALOGUE[name].make(mean * question.sizes, **question.inner), root)
 
 
 def _inner(effect: Named) -> dict[str, float]:
@@ -242,14 +242,14 @@ class Split:
     owner: IntArray
     shared: FloatArray
 
-    def told(self, index: int) -> tuple[FloatArray, FloatArray]:
-        """Return what the other recordings tell of a recording's coefficients: mean (q,) and covariance (q, q)."""
+    def predicted(self, index: int) -> tuple[FloatArray, FloatArray]:
+        """Return what the other recordings say of a recording's coefficients: mean (q,) and covariance (q, q)."""
         others = self.owner != index
         common = np.tensordot(self.rows[others], self.shared, (1, 0))
         spread = np.tensordot(common, self.rows[others], ((1, 2), (2, 1))) + np.eye(int(others.sum()))
         pulled = np.linalg.solve(spread, np.column_stack([self.measured[others], common[..., index]]))
-        own = self.shared[index, index] * np.eye(self.rows.shape[2])
-        return common[..., index].T @ pulled[:, 0], own - common[..., index].T @ pulled[:, 1:]
+        before = self.shared[index, index] * np.eye(self.rows.shape[2])
+        return common[..., index].T @ pulled[:, 0], before - common[..., index].T @ pulled[:, 1:]
 
 
 def split(
@@ -649,7 +649,8 @@ def attribute(
     """Diagnose recordings of several units in several sessions, and split what is named by what it belongs to.
 
     A time course that all units of a session have in common is taken off its recordings, as the other units show it,
-    and they are diagnosed again; each keeps the diagnosis that explains it with fewer effects.
+    and they are diagnosed once more. What stays unexplained is diagnosed with what the other recordings say of its
+    unit's own effects taken off. Each recording keeps the diagnosis that explains it with fewer effects.
 
     **Arguments:** `pattern`: of their files, see `places_of`; `level`: of all attributions together where nothing
     belongs to anything; `report`: is given each step in words; `options`: as for [`jaximu.diagnose`][].
@@ -659,12 +660,9 @@ def attribute(
     """
     recordings, gravity = recordings_of(list(recordings)), as_gravity(gravity)
     files = [recording.sources[0].path if recording.sources else recording.name for recording in recordings]
-    places = places_of(files, pattern)
-    skipped: dict[str, str] = {}
+    places, skipped = places_of(files, pattern), {}
 
-    def diagnosed(
-        index: int, recording: Recording, what: str, known: Sequence[KnownEffect] = ()
-    ) -> BoardRecording | None:
+    def ask(index: int, recording: Recording, what: str, known: Sequence[KnownEffect] = ()) -> BoardRecording | None:
         unit, session = places[index]
         report(f"unit {unit} in session {session}{what}, {index + 1} of {len(recordings)}")
         try:
@@ -674,32 +672,39 @@ def attribute(
             return None
         return BoardRecording.of(files[index], unit, session, diagnosis)
 
-    first = {index: diagnosed(index, recording, "") for index, recording in enumerate(recordings)}
+    first = {index: ask(index, recording, "") for index, recording in enumerate(recordings)}
     parts = {index: part for index, part in first.items() if part is not None}
     require_several([(part.unit, part.session) for part in parts.values()], next(iter(skipped.values()), ""))
     members = [[p for p in parts.values() if p.session == s] for s in _in_order(p.session for p in parts.values())]
-    together = {of[0].session: of for of in members if len(of) > 1}
-    drifts = [CommonDrift.of(of) for of in together.values()]
+    drifts = [CommonDrift.of(of) for of in members if len(of) > 1]
     common = [drift for drift in drifts if drift.p_value * len(drifts) < level]
-    warm = {drift.session for drift in common}
-    steady: dict[int, Recording] = {}
+    steady = _without_common_drift(parts, recordings, common)
     for index, part in parts.items():
-        if part.session in warm:
-            others = [other for other in together[part.session] if other is not part]
-            steady[index] = CommonDrift.of(others, 0).taken_off(recordings[index], part)
-            repeated = diagnosed(index, steady[index], ", its common drift taken off")
-            if repeated is not None:
-                parts[index] = min(replace(repeated, alone=part.alone, without_drift=True), part, key=_rank)
-    for (index, part), known in zip(parts.items(), attributed(list(parts.values()), common, level)[2], strict=True):
+        second = ask(index, steady[index], ", its common drift taken off") if index in steady else None
+        if second is not None:
+            parts[index] = min(replace(second, alone=part.alone, without_drift=True), part, key=_rank)
+    predictions = attributed(list(parts.values()), common, level)[2]
+    for (index, part), known in zip(parts.items(), predictions, strict=True):
         if known and part.diagnosis["verdict"] == "unexplained":
-            repeated = diagnosed(index, steady.get(index, recordings[index]), ", with what the others tell", known)
-            if repeated is not None:
-                told = tuple(one.effect.name for one in known)
-                parts[index] = min(part.explained(repeated, told, index in steady), part, key=_rank)
+            second = ask(index, steady.get(index, recordings[index]), ", as the others show its unit", known)
+            if second is not None:
+                parts[index] = min(part.repeated(second, known, index in steady), part, key=_rank)
     split_up, single, _ = attributed(list(parts.values()), common, level)
     lines, apart = attributed_lines(list(parts.values()), level)
     findings, single = (*map(_of_drift, common), *split_up, *lines), single | apart
     return Attribution(tuple(parts.values()), findings, tuple(drifts), single, skipped, gravity.latitude)
+
+
+def _without_common_drift(
+    parts: Mapping[int, BoardRecording], recordings: Sequence[Recording], common: Sequence[CommonDrift]
+) -> dict[int, Recording]:
+    """Return the recordings of sessions with a common time course without it, as the other units show it."""
+    sessions, steady = {drift.session for drift in common}, {}
+    for index, part in parts.items():
+        if part.session in sessions:
+            others = [other for other in parts.values() if other.session == part.session and other is not part]
+            steady[index] = CommonDrift.of(others, 0).taken_off(recordings[index], part)
+    return steady
 
 
 def _rank(part: BoardRecording) -> tuple[bool, int, float]:
@@ -723,9 +728,13 @@ def attributed(
     named = sorted((effect for part in parts for effect in part.named), key=lambda effect: effect.p_value)
     strongest = {effect.name: effect for effect in reversed(named)}
     shared = {drift.session: np.stack([drift.times, drift.curve], axis=1) for drift in common}
-    findings, single, beside = [], {}, {}
-    told: list[list[KnownEffect]] = [[] for _ in parts]
+    questions = {block.name for part in parts for block in part.evidence.blocks}
+    findings, beside = [], {}
+    single = {name: _places(parts, name) for name in strongest if name not in questions}  # a curve is of one recording
+    predictions: list[list[KnownEffect]] = [[] for _ in parts]
     for name, strong in sorted(strongest.items(), key=lambda entry: entry[1].p_value):
+        if name in single:
+            continue
         inner, kind = _inner(strong), CATALOGUE[name]
         sizes = np.asarray(kind(np.zeros(kind.size), **inner).typical_sizes(1.0).coefficients)
         estimates = [part.estimate(name, inner, beside, shared.get(part.session)) for part in parts]
@@ -752,11 +761,16 @@ def attributed(
         if divided.parts:
             beside[name] = inner
         else:
-            single[name] = [part.place for part in parts if name in [effect.name for effect in part.named]]
+            single[name] = _places(parts, name)
         if divided.parts and kind.scope == "device":
             for index, part in enumerate(parts):
-                told[index] += part.known(name, inner, *divided.told(index))
-    return findings, single, told
+                predictions[index] += part.known(name, inner, *divided.predicted(index))
+    return findings, single, predictions
+
+
+def _places(parts: Sequence[BoardRecording], name: str) -> list[str]:
+    """Return where an effect is named, in words."""
+    return [part.place for part in parts if name in [effect.name for effect in part.named]]
 
 
 def attributed_lines(parts: Sequence[BoardRecording], level: float) -> tuple[list[Attributed], dict[str, list[str]]]:

@@ -785,8 +785,8 @@ class _Course:
         """Take a curve over the time of the recording for what it is, drift of a bias, beside what stands."""
         before, after = (float(np.sum(one.evidence.residual**2)) for one in (self.extension.base, curve.state))
         size = curve.effect.size
-        found = Found(curve.effect.name, (), float(chi2_sf(before - after, size)), before - after, size)
-        self._settle(found=[*self.extension.found, found], state=curve.state, complete=True)
+        drift = Found(curve.effect.name, (), float(chi2_sf(before - after, size)), before - after, size)
+        self._settle(found=[*self.extension.found, drift], state=curve.state, complete=True)
         self.gain = curve.gain
 
     def _names(self) -> str:

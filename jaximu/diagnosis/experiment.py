@@ -198,9 +198,9 @@ class Experiment(Data):
         if self.drift is not None:
             noise += np.diag(self.drift.by_hand)
         for effect, root in self.known:
-            of_name = {place for place, other in whole.all_effects().items() if other.name == effect.name}
-            (place,) = of_name - set(unit)
-            numbers = [(name.owner, name.effect) == place and name.part == "coefficients" for name in names]
+            of_name = {key for key, other in whole.all_effects().items() if other.name == effect.name}
+            (key,) = of_name - set(unit)
+            numbers = [(name.owner, name.effect) == key and name.part == "coefficients" for name in names]
             unknown = np.concatenate([unknown, about.columns[0][:, numbers] @ root], axis=1)
         return about, noise, unknown, mine
 

@@ -125,7 +125,7 @@ def learn(
         gain = on_held_out(held, state, fitted)
         if gain.log_likelihood <= 0:
             return None
-    before, after = (select(each.evidence, level).explained for each in (state, fitted))
+    before, after = (select(fit.evidence, level).explained for fit in (state, fitted))
     drift = effect.scope == "session" and gain.smaller([effect]) and after and not before
     if gained < _PAYS and not drift:
         return None

@@ -141,10 +141,10 @@ def _verdicts_table(attribution: Attribution) -> Table:
     cells = {
         (part.unit, part.session): f"{_short(part.diagnosis)}\nχ² {number(part.chi2_heldout, 3)}"
         + " *" * part.without_drift
-        + " †" * bool(part.told)
+        + " †" * bool(part.taken_off)
         for part in attribution.recordings
     }
-    told = listed(list(dict.fromkeys(effect_title(name) for part in attribution.recordings for name in part.told)))
+    names = dict.fromkeys(effect_title(name) for part in attribution.recordings for name in part.taken_off)
     return Table(
         ("", *(f"session {session}" for session in attribution.sessions)),
         [
@@ -153,7 +153,7 @@ def _verdicts_table(attribution: Attribution) -> Table:
         ],
         "χ² per condition on parts left out: 1 is noise and drift alone."
         + (" *: the common drift was taken off, as the other units show it." if attribution.common else "")
-        + (f" †: {told} was taken off, as the other recordings tell it." if told else ""),
+        + (f" †: {listed(list(names))} was taken off, as the other recordings show it." if names else ""),
     )
 
 
