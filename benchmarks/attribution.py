@@ -4,6 +4,7 @@ Eight units in three sessions. Three units have a g-sensitivity of their own, on
 share, and the Earth turns below all of them, whose vertical part looks like a g-sensitivity that all have in common.
 Most boards are drawn as estimates: recordings are simulated and diagnosed once, and the noise, drift and faults of each
 board are drawn in their whitened conditions. `--whole` boards of fewer units go through all of it, from samples on.
+`--measured`: eight units in four sessions that were measured (needs JAXIMU_DATA), in one run.
 """
 
 import argparse
@@ -20,8 +21,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import jax
 import numpy as np
 from common import Table, finish, share
+from real_diagnosis import MIMU4444
 from simulated_board import PATTERN, board
 
+from jaximu import read_recording, wgs84_gravity
 from jaximu.diagnosis import COMMON_DRIFT, CommonDrift, attribute, diagnose
 from jaximu.diagnosis.attribution import BoardRecording, split
 from jaximu.model.effects import CATALOGUE
@@ -97,13 +100,57 @@ def whole_board(seed):
     return true, reported
 
 
+def measured():
+    """Diagnose the measured board, and keep each recording's verdict and what belongs to what."""
+    folder = Path(os.environ["JAXIMU_DATA"]) / "mimu4444"
+    recordings = [read_recording(path, options=MIMU4444) for path in sorted(folder.glob("*.parquet"))]
+    began = time.monotonic()
+    attribution = attribute(recordings, PATTERN, wgs84_gravity(59.35))
+    parts = attribution.recordings
+    explained = sum(part.diagnosis["verdict"] != "unexplained" and part.chi2_heldout < 1.3 for part in parts)
+    marks = "; *: the session's common drift taken off; †: what the other recordings say of the unit taken off"
+    table = Table(
+        "MIMU4444: what explains each recording, and χ² per condition on parts left out",
+        ["unit", *(f"session {session}" for session in attribution.sessions)],
+        f"{explained} of {len(parts)} explained with χ² below 1.3 (goal 28){marks}. One run, with the latitude, in "
+        f"{time.monotonic() - began:.0f} s.",
+    )
+    for unit in attribution.units:
+        table.add(
+            unit,
+            *(
+                f"{', '.join(e['name'] for e in part.diagnosis['effects']) or part.diagnosis['verdict']} "
+                f"({part.chi2_heldout:.2f}{' *' * part.without_drift}{' †' * bool(part.taken_off)})"
+                + " and more, unexplained"
+                * (part.diagnosis["verdict"] == "unexplained" and bool(part.named))
+                for part in parts
+                if part.unit == unit
+            ),
+        )
+    owners = Table("MIMU4444: what belongs to what", ["finding", "belongs to", "units", "sessions", "share", "p-value"])
+    for finding in attribution.findings:
+        owners.add(
+            finding.name,
+            finding.belongs_to,
+            ", ".join(finding.units),
+            ", ".join(finding.sessions),
+            f"{100 * finding.share:.0f} %",
+            f"{finding.p_value:.1g}",
+        )
+    figures = {"explained": explained, "recordings": [part.document() for part in parts]}
+    finish("attribution_measured", [table, owners], figures, script="attribution")
+
+
 def main():
     """Draw boards with faults and without, and a few whole ones, and keep the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--small", action="store_true", help="ten boards; results are not kept")
     parser.add_argument("--boards", type=int, default=100)
     parser.add_argument("--whole", type=int, default=0, help="small boards that are simulated and diagnosed as a whole")
+    parser.add_argument("--measured", action="store_true", help="the measured board, and nothing else")
     options = parser.parse_args()
+    if options.measured:
+        return measured()
     count, began = 10 if options.small else options.boards, time.monotonic()
     plain = templates()
     studies = {

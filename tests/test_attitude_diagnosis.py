@@ -16,7 +16,7 @@ from jaximu.calibration import calibrate_against_attitude, load_calibration
 from jaximu.cli.app import main
 from jaximu.data.attitude import EXCESS_NAMES
 from jaximu.diagnosis import diagnose_against_attitude
-from jaximu.diagnosis.experiment import Experiment
+from jaximu.diagnosis.experiment import Experiment, KnownEffect
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.lever_arm import AccelLeverArm
@@ -52,10 +52,11 @@ def later(made, values, delay):
 def calibrated():
     made = moved()
     calibration, measurement = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
-    setup = tuple(each for each in calibration.imu.all_effects().values() if each.scope == "fixture")
+    setup = (each for each in calibration.imu.all_effects().values() if each.scope == "fixture")
+    known = tuple(map(KnownEffect.of_setup, setup))
     excess = np.array([calibration.excess[name] for name in EXCESS_NAMES])
     start = jax.tree.map(np.asarray, calibration.imu.with_effects())
-    return calibration, Experiment(measurement, start, setup=setup, excess=excess)
+    return calibration, Experiment(measurement, start, known=known, excess=excess)
 
 
 def test_what_is_not_known_of_the_reference_is_part_of_the_noise(calibrated):
@@ -82,10 +83,11 @@ def test_near_the_level_the_twin_is_as_wrong_as_the_recording():
     """A reference's tilt and the accelerometer's bias look alike there: what a fit leaves to the tilt is no error."""
     made = moved(2, swing=0.1)
     calibration, measurement = calibrate_against_attitude(unit_of(made), reference_of(made), GRAVITY)
-    setup = tuple(each for each in calibration.imu.all_effects().values() if each.scope == "fixture")
+    setup = (each for each in calibration.imu.all_effects().values() if each.scope == "fixture")
+    known = tuple(map(KnownEffect.of_setup, setup))
     excess = np.array([calibration.excess[name] for name in EXCESS_NAMES])
     start = jax.tree.map(np.asarray, calibration.imu.with_effects())
-    experiment = Experiment(measurement, start, setup=setup, excess=excess)
+    experiment = Experiment(measurement, start, known=known, excess=excess)
     state = experiment.fit(asking=())
     for seed in (1, 2, 3):
         copied = experiment.twin(state, None, seed)
