@@ -122,6 +122,7 @@ def test_the_earths_rotation_is_no_finding_where_the_latitude_is_known(on_earth)
     known, unknown = (diagnose(recording, gravity)
                       for gravity in (wgs84_gravity(48.0), replace(wgs84_gravity(48.0), latitude=None)))  # fmt: skip
     assert known.verdict == "adequate"
+    assert known.document()["not_observable"]["gyro.earth_rotation"] == "it is known, and taken off"
     assert [each.name for each in unknown.effects] == ["gyro.earth_rotation"]
 
 

@@ -1,6 +1,7 @@
 """Smooth terms of a covariate: splines as they should be, found where nothing explains a misfit, and used like any."""
 
 import json
+from dataclasses import replace
 
 import hidden_effects as hidden
 import jax
@@ -171,6 +172,26 @@ def test_a_curve_is_undone_by_recover():
     output = triad.respond(Stimulus(angular_rate=rate))
     assert np.abs(output - rate).max() > 1e-3
     np.testing.assert_allclose(triad.recover(output), rate, atol=1e-12)
+
+
+def test_a_bias_that_drifts_along_a_hump_is_named(tmp_path):
+    """Neither ramp, warm-up nor step: a curve over time beside which nothing stands out is drift, and a cause."""
+    case = hidden.draw_case(12, (), temperature=False, static_minutes=30)
+    files = case.write(tmp_path, ("fit", "static"))
+    recording = read_recording(files["fit"])
+    gyroscope = recording.gyroscope
+    share = np.linspace(0.0, 1.0, len(gyroscope))
+    hump = np.exp(-(((share - 0.55) / 0.15) ** 2))
+    amount = np.array([0.0, 2e-3, -1e-3]) * gyroscope.nominal_scale
+    drifting = replace(recording, gyroscope=replace(gyroscope, values=gyroscope.values + hump[:, None] * amount))
+    found = diagnose(drifting, GRAVITY, static=read_recording(files["static"]))
+    assert (found.verdict, [cause.name for cause in found.named]) == ("effects", ["gyro.learned_time"])
+    assert found.gain.log_likelihood > 10 and found.learned.drift
+    assert "bias drift along a curve" in found.summary().verdict[0]
+    truth = np.interp(found.learned.x, gyroscope.time - gyroscope.time[0], hump) * 2e-3
+    curve = found.learned.y[:, 1]
+    assert np.corrcoef(curve, truth)[0, 1] > 0.95
+    assert np.mean(np.abs(curve - truth - np.mean(curve - truth)) < found.learned.half_width[:, 1]) > 0.9
 
 
 @pytest.fixture(scope="module")
