@@ -686,7 +686,7 @@ def attribute(
     predictions = attributed(list(parts.values()), common, level)[2]
     for (index, part), known in zip(parts.items(), predictions, strict=True):
         if known and part.diagnosis["verdict"] == "unexplained":
-            second = ask(index, steady.get(index, recordings[index]), ", as the others show its unit", known)
+            second = ask(index, (dict(enumerate(recordings)) | steady)[index], ", as the others show its unit", known)
             if second is not None:
                 parts[index] = min(part.repeated(second, known, index in steady), part, key=_rank)
     split_up, single, _ = attributed(list(parts.values()), common, level)
