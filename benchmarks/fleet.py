@@ -49,7 +49,7 @@ def units(count: int) -> list[FleetUnit]:
             values = recording.accelerometer.values.copy()
             values[len(values) // 2 : len(values) // 2 + 150] += 0.05
             recording = replace(recording, accelerometer=replace(recording.accelerometer, values=values))
-        found.append(FleetUnit(observed_poses(segment(recording), 9.80665), nominal_imu(recording)[0], True))
+        found.append(FleetUnit(observed_poses(segment(recording), 9.80665), nominal_imu(recording), True))
     return found
 
 

@@ -299,7 +299,7 @@ def fleet(small: bool) -> None:
         alone = replace(found, recording=replace(recording, gyroscope=None, magnetometer=None))
         ways = {
             "accelerometers": lambda part=alone: FleetUnit(
-                observed_poses(part, 9.80665), nominal_imu(part.recording)[0], False
+                observed_poses(part, 9.80665), nominal_imu(part.recording), False
             ),
             "magnetometers": lambda one=recording.magnetometer, part=found: field_unit(one, part, None, "").unit,
         }

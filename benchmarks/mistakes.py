@@ -95,7 +95,7 @@ def plain_fit(recording: Recording) -> tuple[np.ndarray, np.ndarray, float] | No
     """Return gains and biases, their standard deviations, and the turns' rms, °, of poses and turns as they are."""
     try:
         observations = observed_poses(segment(recording), GRAVITY.value)
-        found = fit_hand_held(nominal_imu(recording)[0], observations)
+        found = fit_hand_held(nominal_imu(recording), observations)
         turns = residual_rms(found.imu, observations)["gravity_direction"][0]
     except (JaximuError, KeyError, ValueError, ArithmeticError):
         return None

@@ -70,7 +70,7 @@ def held_out_angles(nominal, observations, method: str) -> float:
 def xsens(folder):
     recording = read_recording(folder / "imu_tk_xsens/xsens_acc.mat", folder / "imu_tk_xsens/xsens_gyro.mat", XSENS)
     observations = observed_poses(segment(recording), XSENS_GRAVITY.value)
-    nominal, _ = nominal_imu(recording)
+    nominal = nominal_imu(recording)
     figures, rows, models = {}, [], {}
     for method in ("two-step", "two-step-rk4", "joint"):
         fit = fit_hand_held(nominal, observations, method)

@@ -136,7 +136,7 @@ def test_agrees_with_the_calibration_of_one_recording(folder, table):
 def test_the_answer_is_where_a_step_from_it_ends(folder):
     """A step of the data evaluated anew at the answer: a thousandth of a standard deviation at most."""
     recording = read_recording(folder / "unit005.parquet")
-    unit = FleetUnit(observed_poses(segment(recording), 9.80665), nominal_imu(recording)[0], True)
+    unit = FleetUnit(observed_poses(segment(recording), 9.80665), nominal_imu(recording), True)
     ((fitted, _),) = fit_units([unit])
     observations = PosesAndTurns.of(jax.tree.map(lambda leaf: np.asarray(leaf)[None], unit.observations))
     exact = fit(fitted.imu, observations, without_equipment, excess=fitted.excess, estimate_excess=False, max_passes=1)
@@ -158,7 +158,7 @@ def test_units_of_other_scales_and_shapes_are_fitted_as_if_alone():
         other = Signal(force.time, force.values / 9.80665 * scale, "mg") if scale > 1 else force
         recording = replace(recording, accelerometer=other)
         observations = observed_poses(segment(recording), 9.80665)
-        units.append(FleetUnit(observations, nominal_imu(recording)[0], gyroscope))
+        units.append(FleetUnit(observations, nominal_imu(recording), gyroscope))
     for unit, (fitted, rms) in zip(units, fit_units(units), strict=True):
         single = fit_hand_held(unit.nominal, unit.observations, "joint" if unit.gyroscope else "accelerometer")
         assert fitted.names == single.names and fitted.converged == single.converged

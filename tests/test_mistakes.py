@@ -100,7 +100,7 @@ def test_rows_that_are_left_out_are_no_motion_to_start_from(triad):
     values, start, stop = getattr(log, triad).copy(), log.count // 2, log.count // 2 + round(8.0 / log.period)
     values[start:stop, 2] = values[start - 1, 2]
     ready = prepare(replace(log, **{triad: values}).to_recording())
-    gyroscope = nominal_imu(ready.recording)[0].gyroscope
+    gyroscope = nominal_imu(ready.recording).gyroscope
     assert gyroscope is not None
     np.testing.assert_allclose(gyroscope.gain, np.eye(3), atol=0.1)
 

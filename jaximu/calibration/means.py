@@ -49,7 +49,7 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     """
     gravity, recording = as_gravity(gravity), means.recording
     poses, observations = len(recording.accelerometer), observe_means(means, gravity.value)
-    nominal, notes = nominal_imu(recording)
+    nominal, notes = nominal_imu(recording), ()
     method = "accelerometer" if recording.gyroscope is None else "joint"
     free = [name for name in names_of(nominal) if name.owner == "accelerometer" and without_equipment_or_effects(name)]
     few = means.accelerometer_sigma is None and poses < len(free) + _SPARE

@@ -33,8 +33,8 @@ def as_stated(recording: Recording, factors: FloatArray | float = 1.0) -> Imu:
     return Imu.nominal(*known)
 
 
-def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
-    """Return the unit as the recording's nominal scales and offsets describe it, and notes for the user.
+def nominal_imu(recording: Recording) -> Imu:
+    """Return the unit as the recording's nominal scales and offsets describe it, where a fit starts.
 
     Axes or signs that are not what they should be, a stated gyroscope scale that is off by tens of percent (another
     range was set, or the factory corrected it) or a gyroscope mounted at an angle lead a fit over large turns into a
@@ -44,17 +44,17 @@ def nominal_imu(recording: Recording) -> tuple[Imu, tuple[str, ...]]:
     factors = _forces(recording)
     imu = as_stated(recording, factors)
     if gyroscope is None:
-        return imu, ()
+        return imu
     motion = recording.turning
     if (factors != 1).any():
         motion = turning(accelerometer.time, accelerometer.si() / factors, gyroscope.time, gyroscope.si())
     if motion is None or motion.explained < EXPLAINED or not float(np.max(motion.sigma)) < _KNOWN:
-        return imu, ()
-    matrix, notes = _start(motion)
+        return imu
+    matrix = _start(motion)
     if np.array_equal(matrix, np.eye(3)):
-        return imu, ()
+        return imu
     gain = np.diag(gyroscope.nominal_scale) @ np.linalg.inv(matrix)
-    return eqx.tree_at(lambda unit: unit.gyroscope.gain, imu, gain), notes
+    return eqx.tree_at(lambda unit: unit.gyroscope.gain, imu, gain)
 
 
 def _forces(recording: Recording) -> FloatArray:
@@ -80,18 +80,11 @@ def _forces(recording: Recording) -> FloatArray:
     return np.asarray(np.where(np.abs(np.log(factors)) > _ODD, factors, 1.0), np.float64)
 
 
-def _start(motion: Turning) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return the matrix from rates as read to true ones that a fit starts from, and what is to be said of it."""
+def _start(motion: Turning) -> FloatArray:
+    """Return the matrix (3, 3) from rates as read to true ones that a fit starts from."""
     arranged = signed_permutation(motion.matrix)
     rest = arranged.T @ motion.matrix
     if angle_of(rotation_of(rest)) > _MOUNTED:
-        return motion.matrix, ()
+        return motion.matrix
     scales = np.maximum(np.diag(rest), 1e-6)
-    off = np.abs(np.log(scales)) > _SAME
-    if not off.any():
-        return arranged, ()
-    usual = float(np.exp(np.mean(np.log(scales))))
-    return np.asarray(arranged * np.where(off, scales, 1.0), np.float64), (
-        f"the gyroscope reads {100 / usual:.0f} % of the rate at which gravity turns in the accelerometer: the fit "
-        "started from the latter.",
-    )
+    return np.asarray(arranged * np.where(np.abs(np.log(scales)) > _SAME, scales, 1.0), np.float64)

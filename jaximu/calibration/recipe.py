@@ -140,10 +140,9 @@ def _calibrated_jointly(
     notes = [*notes_of(*ready), *mixed, *notes_of(*recorded, *parts, noise)]
     if noise is None and recorded:
         notes.append(f"{_NO_DRIFT}, unless data were observed with a noise model.")
-    remarks: tuple[str, ...] = ()
     unit = Imu.nominal() if start is None else start
     if start is None and recorded:
-        unit, remarks = nominal_imu(recorded[0])
+        unit = nominal_imu(recorded[0])
     if "magnetometer" in unit.triads():
         raise InputError("the start has a magnetometer, which these data do not determine: start without it.")
     if unit.setup and sum(not one.no_fixture for one in data) > 1:
@@ -161,7 +160,7 @@ def _calibrated_jointly(
         loss=choices.loss,
         excess_names=_distinct([name for kind in kinds for name in kind.excess_names]),
         rms=[errors_of(kinds, imu) for imu in (unit, fitted.imu)],
-        notes=[*notes, *remarks],
+        notes=notes,
         advice=kinds[0].advice,
         known=() if prior is None else prior.names,
         data=provenance(recorded) if recorded else {},
@@ -287,7 +286,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         )
     noise = noise_of(static)
     observations = observed_poses(segmentations, gravity.value, noise=noise)
-    nominal, notes = nominal_imu(recordings[0])
+    nominal = nominal_imu(recordings[0])
     fitted = fit_hand_held(nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
     poses, turns = (int(np.sum(mask)) for mask in (observations.poses.mask, observations.turns.mask))
@@ -310,7 +309,6 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         observations = measurement.along(fitted.imu, tuple(fitted.imu.all_effects().values())).observations
     notes = (
         *notes_of(*recordings),
-        *notes,
         *mixed,
         *notes_of(noise, *segmentations),
     )

@@ -317,7 +317,7 @@ def _calibration(
 ) -> tuple[Calibration, list[str]]:
     """Put the fitted terms into a unit: the base calibration's, or the data sheet's."""
     recording, notes = blocks.recordings[0], []
-    unit = nominal_imu(recording)[0] if base is None else base.imu
+    unit = nominal_imu(recording) if base is None else base.imu
     names, covariance = ([], np.zeros((0, 0))) if base is None else _kept_numbers(base, fits)
     covariances = [covariance]
     triads: dict[str, Any] = {}

@@ -783,7 +783,8 @@ class _Course:
 
     def _drifts(self, curve: LearnedTerm) -> None:
         """Take a curve over the time of the recording for what it is, drift of a bias, beside what stands."""
-        before, after = (float(np.sum(one.evidence.residual**2)) for one in (self.extension.base, curve.state))
+        without = self.extension.state if self.extension.found else self.extension.base
+        before, after = (float(np.sum(one.evidence.residual**2)) for one in (without, curve.state))
         size = curve.effect.size
         drift = Found(curve.effect.name, (), float(chi2_sf(before - after, size)), before - after, size)
         self._settle(found=[*self.extension.found, drift], state=curve.state, complete=True)

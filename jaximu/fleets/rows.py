@@ -173,9 +173,8 @@ def _unit(
     recording: Recording, segmentation: Segmentation, settings: Settings, noise: NoiseModel | None
 ) -> tuple[FleetUnit, tuple[str, ...]]:
     observations = observed_poses(segmentation, settings.gravity.value, noise=noise)
-    nominal, notes = nominal_imu(recording)
-    notes += () if noise is None else noise.notes
-    return FleetUnit(observations, nominal, recording.gyroscope is not None), notes
+    notes = () if noise is None else noise.notes
+    return FleetUnit(observations, nominal_imu(recording), recording.gyroscope is not None), notes
 
 
 def _facts(recording: Recording, unit: FleetUnit, notes: Sequence[str]) -> Json:

@@ -53,12 +53,11 @@ def _stuck_axis(sensor: Sensor, change: BoolArray, axis: int) -> Finding | None:
     if not len(candidates):
         return None
     limits = np.concatenate([stops(values, extreme) for extreme in (values.max(), values.min())])
-    long = candidates[
-        [
-            np.mean(others[start:stop]) > 0.5 and not any(a <= start and stop < b for a, b in limits)
-            for start, stop in candidates
-        ]
+    inside = [
+        bool(np.mean(others[start:stop]) > 0.5) and not any(a <= start and stop < b for a, b in limits)
+        for start, stop in candidates
     ]
+    long = candidates[np.array(inside)]
     if not len(long):
         return None
     first, rows = long[:, 0], _repeating(long)
