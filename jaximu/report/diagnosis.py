@@ -320,8 +320,8 @@ def _learned_part(diagnosis: Diagnosis) -> Iterator[Section]:
     yield Section(
         "How the bias drifts" if learned.drift else "What the misfit depends on",
         [
-            f"The {learned.triad}'s bias drifts by more than its noise: the extended calibration takes this curve "
-            f"({name}) off. It belongs to this recording."
+            f"The {learned.triad}'s bias drifts by more than its noise. The extended model has the drift as a curve "
+            f"({name}). It belongs to this recording, and `jaximu compensate` leaves it alone."
             if learned.drift
             else f"No known effect explains it, but the {learned.triad}'s misfit depends on {learned.covariate}: a "
             f"smooth curve ({name}) follows it, and the extended calibration contains the curve.",
