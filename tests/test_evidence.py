@@ -8,7 +8,7 @@ import scipy.linalg
 import scipy.stats
 
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, EffectBlock, Evidence, detection_limit, limit_noncentrality
-from jaximu.diagnosis.improvement import _beside_open, _likelihood, cross_validated
+from jaximu.diagnosis.improvement import _beside_open, _by_parts, _likelihood
 from jaximu.diagnosis.selection import select, strength_needed
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
 
@@ -444,24 +444,29 @@ def test_conditions_left_out_by_a_parameter_each_are_not_there():
     assert found.freedom.tolist() == expected.freedom.tolist()
 
 
-def left_out(seed, times):
-    """The gain by cross-validation where the second block is there, `times` its limit: poses are every third row."""
+def left_out(seed, times, interleaved=False):
+    """The gain by cross-validation where the second block is there, `times` its limit.
+
+    Two rows are of a pose, and the third of the turn to the next.
+    """
     random, jacobian, blocks = problem(seed, rows=90)
     _, weights = correlated(random, 90)
     blocks = [EffectBlock(each.name, weights @ each.columns, each.sizes) for each in blocks]
     noise = random.standard_normal(90)
     residual = noise + planted(Evidence(noise, weights @ jacobian, blocks), 1, times, random)
-    pose, ones = np.arange(90) // 3, np.ones(90)
-    kinds = (ResidualKind("of a pose", "of a pose", "m/s^2", 3),)
-    rows = Rows(kinds, np.zeros(90, int), pose, pose, ones, ones > 0, {TIME: pose.astype(float)}, np.zeros((30, 2)))
-    experiment = SimpleNamespace(real=rows)
+    pose, turn, ones = np.arange(90) // 3, np.arange(90) % 3 == 2, np.ones(90)
+    kinds = tuple(ResidualKind(words, words, "m/s^2", 1) for words in ("of a pose", "of a turn"))
+    last = np.minimum(pose + turn, 29)
+    rows = Rows(kinds, turn.astype(int), pose, last, ones, ones > 0, {TIME: pose.astype(float)}, np.zeros((30, 2)))
+    experiment = SimpleNamespace(real=rows, folds=lambda *parts: rows.folds(rows.parts(*parts)))
     base = SimpleNamespace(weights=weights, evidence=Evidence(residual, weights @ jacobian, blocks))
-    return cross_validated(experiment, base)  # pyright: ignore[reportArgumentType]
+    return _by_parts(experiment, base, interleaved)  # pyright: ignore[reportArgumentType]
 
 
-def test_predictions_of_what_was_left_out_keep_their_covariance():
-    """χ² of all folds together, whose errors are alike in part: its mean is that of the dimensions."""
-    gains = [left_out([23, seed], 3.0) for seed in range(40)]
+@pytest.mark.parametrize("interleaved", [False, True])
+def test_predictions_of_what_was_left_out_keep_their_covariance(interleaved):
+    """χ² of all folds together, whose errors are alike in part: its mean is the number of conditions."""
+    gains = [left_out([23, seed], 3.0, interleaved) for seed in range(40)]
     after = np.array([gain.after.chi_squared for gain in gains])
     count = gains[0].after.count
     assert count == 90
@@ -469,7 +474,7 @@ def test_predictions_of_what_was_left_out_keep_their_covariance():
     assert np.mean([gain.before.chi_squared for gain in gains]) > 1.5 * count
     assert all(gain.log_likelihood > 10 for gain in gains)
     # what is not there gains nothing but by a false alarm in a fold
-    idle = [left_out([24, seed], 0.0).log_likelihood for seed in range(20)]
+    idle = [left_out([24, seed], 0.0, interleaved).log_likelihood for seed in range(20)]
     assert np.max(idle) < 5
 
 

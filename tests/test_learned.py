@@ -187,6 +187,9 @@ def test_a_bias_that_drifts_along_a_hump_is_named(tmp_path):
     found = diagnose(drifting, GRAVITY, static=read_recording(files["static"]))
     assert (found.verdict, [cause.name for cause in found.named]) == ("effects", ["gyro.learned_time"])
     assert found.gain.log_likelihood > 10 and found.learned.drift
+    # it is never used beyond the recording, and was predicted between poses; stretches stand beside that
+    assert found.gain.data == "every 8th pose left out in turn"
+    assert found.gain.smaller([found.learned.effect]) and found.gain.otherwise.data == "8 parts left out in turn"
     assert "bias drift along a curve" in found.summary().verdict[0]
     truth = np.interp(found.learned.x, gyroscope.time - gyroscope.time[0], hump) * 2e-3
     curve = found.learned.y[:, 1]

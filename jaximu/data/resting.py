@@ -148,10 +148,11 @@ class Resting(OfOneUnit):
             return {}
         return dict.fromkeys(_IN_POSES, "in one pose it is a bias over temperature: poses tell them apart")
 
-    def parts(self, real: Rows, count: int) -> list[IntArray]:
-        """Return whole ways of the temperature, where there are enough."""
+    def parts(self, real: Rows, count: int, interleaved: bool = False) -> list[IntArray]:
+        """Return whole ways of the temperature, where there are enough, unless parts are to be interleaved."""
         legs = self.blocks.legs()
-        return folds_of(legs) if len(legs) >= WAYS else super().parts(real, count)
+        whole = len(legs) >= WAYS and not interleaved
+        return folds_of(legs) if whole else super().parts(real, count, interleaved)
 
     def observed(self, imu: Imu, details: _AtRests) -> Observed:
         """Return the blocks; a smooth function of temperature is a shape where it is not allowed beforehand."""

@@ -169,10 +169,7 @@ class Named:
             "heldout_rms_after": after,
             "unit": unit,
             "residual": kind,
-            "heldout_loglik": gain.log_likelihood,
-            "heldout_chi_squared_before": gain.before.chi_squared / gain.before.count,
-            "heldout_chi_squared_after": gain.after.chi_squared / gain.after.count,
-            "data": gain.data,
+            **gain.document(),
         }
 
 
@@ -724,7 +721,7 @@ class _Course:
         if self.other is not None and any(effect.scope == "device" for effect in state.effects):
             gain = on_held_out(self.other, base, state)
         else:
-            gain = measured(experiment, base, state) if measured is not None else cross_validated(experiment, base)
+            gain = (measured or cross_validated)(experiment, base, state)
             if self.other is not None:
                 self.notes.append(
                     "the effects found belong to this recording and not to the unit, so the held-out one cannot "

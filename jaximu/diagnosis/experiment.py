@@ -19,9 +19,9 @@ from jaximu.diagnosis.shapes import imitated_shapes, shapes_without_cause
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import Linear, Prior, effect_numbers, fit, linearise
 from jaximu.estimation.problem import Name
-from jaximu.estimation.rows import Rows
+from jaximu.estimation.rows import Fold, Rows
 from jaximu.estimation.track import added
-from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
+from jaximu.ground.array_types import Array, BoolArray, FloatArray
 from jaximu.ground.document import Json
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE, Effect
@@ -38,7 +38,6 @@ _PLAUSIBLE = 20.0
 _SURE = 5.0
 """Standard deviations that samples of instants must change the conditions by to be told from means."""
 _SEED = 20260101
-_PARTS = 8  # left out in turn
 _LACKING = {
     "vibration_power": "the recording has no vibration that stands out",
     "magnetic_field": "no magnetometer was recorded with it",
@@ -239,9 +238,9 @@ class Experiment(Data):
         parts, rate = self.still_parts("accelerometer")
         return float(np.median([len(part) for part in parts])) / rate
 
-    def parts(self, real: Rows | None = None, count: int = _PARTS) -> list[IntArray]:
-        """Return the observations that are left out in turn, in the order of time."""
-        return self.data.parts(self.real if real is None else real, count)
+    def folds(self, count: int, interleaved: bool = False) -> list[Fold]:
+        """Return what is left out in turn: stretches of the recording or, `interleaved`, every so many observations."""
+        return self.real.folds(self.data.parts(self.real, count, interleaved))
 
     def without(self, observation: int) -> Experiment:
         """Return the experiment with an observation, and what touches it, left out."""

@@ -14,8 +14,10 @@ from jaximu.diagnosis.experiment import Experiment, State
 from jaximu.diagnosis.selection import select
 from jaximu.estimation.leave_out import LeftOut, leave_out, off
 from jaximu.estimation.problem import Name
+from jaximu.estimation.rows import Rows
 from jaximu.estimation.uncertainty import describe
-from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.document import Json
 from jaximu.ground.quantities import change
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu
@@ -42,16 +44,30 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Gain:
-    """The base model's and the extended model's predictions, and what they were made of."""
+    """The base model's and the extended model's predictions, and what they were made of.
+
+    otherwise: the same with parts of the recording left out in another way.
+    """
 
     before: Prediction
     after: Prediction
     data: str
+    otherwise: Gain | None = None
 
     @property
     def log_likelihood(self) -> float:
         """What the extension gains, nats."""
         return self.after.log_likelihood - self.before.log_likelihood
+
+    def document(self) -> Json:
+        """Return the likelihoods as `diagnosis.json` has them."""
+        return {
+            "heldout_loglik": self.log_likelihood,
+            "heldout_chi_squared_before": self.before.chi_squared / self.before.count,
+            "heldout_chi_squared_after": self.after.chi_squared / self.after.count,
+            "data": self.data,
+            "otherwise": None if self.otherwise is None else self.otherwise.document(),
+        }
 
     def smaller(self, effects: Sequence[Effect]) -> bool:
         """Return whether some error of what was left out is smaller with the extension."""
@@ -138,8 +154,26 @@ def _likelihood(conditions: FloatArray, covariance: FloatArray) -> tuple[float, 
     return chi_squared, likelihood
 
 
-def cross_validated(experiment: Experiment, base: State) -> Gain:
-    """Leave out every fifth of the recording in turn, select and fit on the rest, and predict what was left out.
+def cross_validated(experiment: Experiment, base: State, extended: State | None = None) -> Gain:
+    """Leave out a fifth of the recording at a time, select and fit on the rest, and predict what was left out.
+
+    A fifth is one stretch of it: what belongs to a unit holds beyond what it was fitted to. Effects of the `extended`
+    fit that belong to the recording are only ever used within it: of these it is every fifth pose. The other way stands
+    beside it.
+    """
+    if extended is None:
+        return _by_parts(experiment, base, interleaved=False)
+    gain, otherwise = (_by_parts(experiment, base, way) for way in (within(extended), not within(extended)))
+    return replace(gain, otherwise=otherwise)
+
+
+def within(state: State) -> bool:
+    """Return whether all effects of a fit belong to its recording, and are never used beyond it."""
+    return all(effect.scope == "session" for effect in state.effects)
+
+
+def _by_parts(experiment: Experiment, base: State, interleaved: bool) -> Gain:
+    """Return the gain on parts left out in turn, one stretch each or `interleaved`.
 
     The whole selection is repeated inside every fold, so a term that was chosen for its luck has none here. All is
     linear about the base fit. Conditions that touch a pose left out are left out with it, and predicted from all
@@ -153,14 +187,15 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
     count_out = 0
     errors = {key: np.zeros(len(real)) for key in ("before", "after")}
     squared, likelihood = {"before": 0.0, "after": 0.0}, {"before": 0.0, "after": 0.0}
-    for fold in real.parts(_FOLDS):
-        rows = real.touching(fold)
-        if not rows.any() or np.sum(~rows) <= evidence.jacobian.shape[1]:
+    for rows, scored in experiment.folds(_FOLDS, interleaved):
+        if len(real) - len(rows) <= evidence.jacobian.shape[1]:
             continue
         models = {"before": [(1.0, ())], "after": _models(evidence.without(base.weights[:, rows]))}
-        parts = {key: [_left_out(base, blocks, rows) for _, blocks in options] for key, options in models.items()}
+        parts = {
+            key: [_left_out(base, blocks, rows, scored) for _, blocks in options] for key, options in models.items()
+        }
         blind = [null_space(part.directions.T) for options in parts.values() for part, _ in options if part.blind]
-        determined = null_space(np.concatenate(blind, axis=1).T, rcond=1e-6) if blind else np.eye(rows.sum())
+        determined = null_space(np.concatenate(blind, axis=1).T, rcond=1e-6) if blind else np.eye(int(scored.sum()))
         count_out += determined.shape[1]
         for key, options in parts.items():
             weight = np.array([share for share, _ in models[key]])
@@ -172,13 +207,17 @@ def cross_validated(experiment: Experiment, base: State) -> Gain:
             part_squared, part_likelihood = _likelihood(
                 determined.T @ estimate, determined.T @ np.asarray(spread) @ determined
             )
-            # a turn between two folds is left out twice; its later error is kept
-            rest = (root @ np.tensordot(weight, [residual for _, residual in options], 1))[rows]
-            errors[key][rows] = rest - off(determined, estimate)
+            rest = (root @ np.tensordot(weight, [residual for _, residual in options], 1))[rows[scored]]
+            errors[key][rows[scored]] = rest - off(determined, estimate)
             squared[key] += part_squared
             likelihood[key] += part_likelihood
     predictions = {key: Prediction(real.rms(errors[key]), squared[key], count_out, likelihood[key]) for key in errors}
-    return Gain(predictions["before"], predictions["after"], f"{_FOLDS} parts left out in turn")
+    return Gain(predictions["before"], predictions["after"], parts_left_out(_FOLDS, real, interleaved))
+
+
+def parts_left_out(count: int, real: Rows, interleaved: bool) -> str:
+    """Say what a gain was measured on."""
+    return f"every {count}th {real.observation} left out in turn" if interleaved else f"{count} parts left out in turn"
 
 
 def _models(evidence: Evidence) -> list[tuple[float, tuple[int, ...]]]:
@@ -206,9 +245,12 @@ def _models(evidence: Evidence) -> list[tuple[float, tuple[int, ...]]]:
     return [(weight / total, blocks) for weight, blocks in models]
 
 
-def _left_out(base: State, blocks: Sequence[int], rows: BoolArray) -> tuple[LeftOut, FloatArray]:
-    """Predict conditions, a mask, with blocks in the model; return what the others' numbers leave of all (n,), too."""
+def _left_out(base: State, blocks: Sequence[int], rows: IntArray, scored: BoolArray) -> tuple[LeftOut, FloatArray]:
+    """Predict those `scored` (m,) of conditions left out, by place (m,), with blocks in the model.
+
+    What the others' numbers leave of all conditions (n,) is returned too.
+    """
     evidence = base.evidence
     columns = np.concatenate([evidence.jacobian, *(evidence.blocks[k].columns for k in blocks)], axis=1)
     (part,) = leave_out(base.weights, columns, evidence.residual, [rows])
-    return part, evidence.residual - columns @ part.numbers
+    return part.only(scored), evidence.residual - columns @ part.numbers

@@ -8,25 +8,26 @@ score.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import numpy as np
 
 from jaximu.diagnosis.experiment import LEAST_WARMING, Experiment, State
-from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out
+from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out, parts_left_out
 from jaximu.diagnosis.selection import LEVEL, select
 from jaximu.estimation.fitting import Prior
 from jaximu.estimation.leave_out import leave_out
 from jaximu.estimation.problem import Name
-from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.estimation.rows import Fold
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Json
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.learned import Learned as Curve
 
+_PARTS = 8  # left out in turn
 _STRENGTHS = 10.0 ** np.arange(7)
 """Prior variances tried, of what the data tells best, in variances that the data tells it with."""
 _PAYS = 10.0
@@ -74,12 +75,11 @@ class LearnedTerm:
             "triad": self.triad,
             **self.effect.document(output),
             "improvement": {
-                "heldout_loglik": self.gain.log_likelihood,
+                **self.gain.document(),
                 "heldout_rms": [
                     {"residual": kind, "before": before, "after": after, "unit": unit}
                     for kind, ((before, unit), (after, _)) in kinds.items()
                 ],
-                "data": self.gain.data,
             },
             "curve": {
                 "x": self.x.tolist(),
@@ -99,28 +99,20 @@ def learn(
     **Arguments:** `state`: a fit that leaves something unexplained; `held`: another recording of the unit, on which
     the gain is measured (and must be one) where the curve belongs to the unit; `level`: of what a curve leaves.
     """
-    folds = _predicted_folds(experiment, state)
-    if not folds:
+    for interleaved in (False, True):
+        best = _best(experiment, state, interleaved)
+        of_recording = best is not None and best[0].scope == "session"
+        if best is not None and of_recording == interleaved and best[2].log_likelihood > (0 if interleaved else _PAYS):
+            break
+    else:
         return None
-    base = _left_out(state, np.zeros((len(state.conditions), 0)), 1.0, folds)
-    best: tuple[float, Curve, float, Any] | None = None
-    for effect, columns, root in curves(experiment, state):
-        for strength in _STRENGTHS / max(np.linalg.eigvalsh(columns.T @ columns)[-1], 1e-300):
-            left = _left_out(state, columns, strength, folds)
-            gained = left[0] - base[0]
-            if best is None or gained > best[0]:
-                best = gained, effect, strength, (left, root)
-    if best is None:
-        return None
-    gained, effect, strength, (left, root) = best
-    if gained < (0.0 if effect.scope == "session" else _PAYS):
-        return None
+    effect, spread, gain = best
     try:
-        fitted = _fitted(experiment, state, effect, root * np.sqrt(strength))
+        fitted = _fitted(experiment, state, effect, spread)
     except NotPossibleError:  # a curve that leads a fit to nothing explains nothing
         return None
-    predictions = [_prediction(experiment, parts) for parts in (base, left)]
-    gain = Gain(predictions[0], predictions[1], f"{len(folds)} parts left out in turn")
+    blocks = gain if gain.otherwise is None else gain.otherwise
+    gained, alone = gain.log_likelihood, blocks.after.log_likelihood
     if held is not None and effect.scope == "device":
         gain = on_held_out(held, state, fitted)
         if gain.log_likelihood <= 0:
@@ -129,12 +121,40 @@ def learn(
     drift = effect.scope == "session" and gain.smaller([effect]) and after and not before
     if gained < _PAYS and not drift:
         return None
-    return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, left[0], drift)
+    return LearnedTerm(curve_of(fitted), gain, *_curve(fitted), fitted, alone, drift)
+
+
+def _best(experiment: Experiment, state: State, interleaved: bool) -> tuple[Curve, FloatArray, Gain] | None:
+    """Return the curve that predicts best what is left out, what its coefficients are a priori (q,), and its gain.
+
+    Where that is `interleaved`, only curves that belong to the recording are asked: all others are used beyond it.
+    """
+    folds = {way: _predicted_folds(experiment, way, state) for way in (False, True)}
+    if not folds[interleaved]:
+        return None
+    plain = {way: _left_out(experiment, state, folds[way]) for way in folds}
+
+    def gain(columns: FloatArray, way: bool) -> Gain:
+        count, after = len(folds[way]), _left_out(experiment, state, folds[way], columns)
+        return Gain(plain[way], after, parts_left_out(count, experiment.real, way))
+
+    best: tuple[Curve, FloatArray, FloatArray, Gain] | None = None
+    for effect, columns, root in curves(experiment, state):
+        if interleaved and effect.scope != "session":
+            continue
+        for size in np.sqrt(_STRENGTHS / max(np.linalg.eigvalsh(columns.T @ columns)[-1], 1e-300)):
+            gained = gain(size * columns, interleaved)
+            if best is None or gained.log_likelihood > best[3].log_likelihood:
+                best = effect, size * root, size * columns, gained
+    if best is None:
+        return None
+    effect, spread, columns, gained = best
+    return effect, spread, replace(gained, otherwise=gain(columns, not interleaved)) if interleaved else gained
 
 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:
     """Return the log-likelihood (nats) of parts left out in turn, as a fit predicts them without a smooth term."""
-    return _left_out(state, np.zeros((len(state.conditions), 0)), 1.0, _folds(experiment))[0]
+    return _left_out(experiment, state, experiment.folds(_PARTS)).log_likelihood
 
 
 def left_out(experiment: Experiment, before: State, after: State) -> Gain:
@@ -142,10 +162,9 @@ def left_out(experiment: Experiment, before: State, after: State) -> Gain:
 
     Only the numbers are fitted without a part; the effects, and their inner parameters, were chosen with all of it.
     """
-    nothing = np.zeros((len(after.conditions), 0))
-    folds = _predicted_folds(experiment, before, after)
-    predictions = [_prediction(experiment, _left_out(state, nothing, 1.0, folds)) for state in (before, after)]
-    return Gain(predictions[0], predictions[1], f"{len(folds)} parts left out in turn")
+    folds = _predicted_folds(experiment, False, before, after)
+    predictions = [_left_out(experiment, state, folds) for state in (before, after)]
+    return Gain(predictions[0], predictions[1], parts_left_out(len(folds), experiment.real, False))
 
 
 def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatArray, FloatArray]]:
@@ -191,37 +210,30 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
     return effect
 
 
-def _folds(experiment: Experiment) -> list[BoolArray]:
-    """Conditions (n,) that touch each of the parts, in the order of time, which are left out in turn."""
-    parts = [experiment.real.touching(part) for part in experiment.parts()]
-    return [rows for rows in parts if rows.any()]
+def _predicted_folds(experiment: Experiment, interleaved: bool, *states: State) -> list[Fold]:
+    """Return the parts that all fits predict from the others: the rest are no comparison."""
+    folds = experiment.folds(_PARTS, interleaved)
+    return [fold for fold in folds if all(_left_out(experiment, state, [fold]).count for state in states)]
 
 
-def _predicted_folds(experiment: Experiment, *states: State) -> list[BoolArray]:
-    """Conditions (n,) of the parts that all fits predict from the others: the rest are no comparison."""
-    nothing = np.zeros((len(states[0].conditions), 0))
-    return [fold for fold in _folds(experiment) if all(_left_out(state, nothing, 1.0, [fold])[2] for state in states)]
-
-
-def _left_out(state: State, columns: FloatArray, strength: float, folds) -> tuple[float, float, int, FloatArray]:
-    """Return the log-likelihood of all parts left out, χ², how many conditions they are, and their errors (n,)."""
+def _left_out(
+    experiment: Experiment, state: State, folds: Sequence[Fold], columns: FloatArray | None = None
+) -> Prediction:
+    """Predict parts left out in turn, beside columns (n, q) of numbers that are a priori of variance one."""
     jacobian, residual = state.evidence.jacobian, state.evidence.residual
-    known = np.eye(columns.shape[1]) / np.sqrt(strength)
-    known = np.concatenate([np.zeros((len(known), jacobian.shape[1])), known], axis=1)
+    columns = np.zeros((len(residual), 0)) if columns is None else columns
+    known = np.eye(columns.shape[1], jacobian.shape[1] + columns.shape[1], jacobian.shape[1])
     design = np.concatenate([np.concatenate([jacobian, columns], axis=1), known])
-    parts = leave_out(state.weights, design, np.pad(residual, (0, len(known))), folds)
-    predicted = [part for part in parts if not part.blind]  # else the rest does not determine the parameters
+    parts = leave_out(state.weights, design, np.pad(residual, (0, len(known))), [rows for rows, _ in folds])
+    # where a part is blind the rest does not determine the parameters
+    predicted = [part.only(scored) for part, (_, scored) in zip(parts, folds, strict=True) if not part.blind]
     squared, count = sum(part.chi_squared for part in predicted), sum(len(part.errors) for part in predicted)
     # noise that looks too small is widened, or any term that makes predictions uncertain would pay
     unit, errors = max(1.0, squared / max(count, 1)), np.zeros(len(residual))
     for part in predicted:
         errors[part.rows] = part.errors
-    return sum(part.log_likelihood(unit) for part in predicted), squared / unit, count, errors
-
-
-def _prediction(experiment: Experiment, left: tuple[float, float, int, FloatArray]) -> Prediction:
-    likelihood, squared, count, errors = left
-    return Prediction(experiment.real.rms(errors), squared, count, likelihood)
+    likelihood = sum(part.log_likelihood(unit) for part in predicted)
+    return Prediction(experiment.real.rms(errors), squared / unit, count, likelihood)
 
 
 def _fitted(experiment: Experiment, state: State, effect: Curve, spread: FloatArray) -> State:

@@ -300,9 +300,12 @@ class Data(ABC):
         """Return effects, by name, that this recording cannot show, and why."""
         return {}
 
-    def parts(self, real: Rows, count: int) -> list[IntArray]:
-        """Return the observations that are left out in turn; `real`: the rows that are no padding."""
-        return real.parts(count)
+    def parts(self, real: Rows, count: int, interleaved: bool = False) -> list[IntArray]:
+        """Return the observations that are left out in turn, as [`jaximu.estimation.rows.Rows.parts`][] has them.
+
+        `real`: the rows that are no padding.
+        """
+        return real.parts(count, interleaved)
 
     def observed(self, imu: Imu, details: Any) -> Observed:
         """Return the observations along which shapes without a cause are looked for."""

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 
 from jaximu.ground.array_types import BoolArray, FloatArray
 
@@ -53,6 +54,13 @@ class LeftOut(NamedTuple):
     def blind(self) -> bool:
         """Whether there is a direction in which the others predict nothing."""
         return self.directions.shape[1] < len(self.errors)
+
+    def only(self, some: BoolArray) -> LeftOut:
+        """Return the same of some (m,) of the rows; the others were left out as well."""
+        unknown = null_space(self.directions.T)[some]
+        known = null_space(unknown.T, rcond=_BLIND) if unknown.size else np.eye(int(some.sum()))
+        values, vectors = np.linalg.eigh(known.T @ self.covariance[np.ix_(some, some)] @ known)
+        return LeftOut(self.rows[some], self.errors[some], 1 / values, known @ vectors, self.numbers)
 
 
 def leave_out(

@@ -13,6 +13,9 @@ from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 TIME, TEMPERATURE = "time [s]", "temperature [°C]"
 """The covariate that all conditions have, and the one that those with a thermometer have."""
 
+Fold = tuple[IntArray, BoolArray]
+"""The conditions (m,), by place, that are left out together, and which of them (m,) are predicted."""
+
 
 class ResidualKind(NamedTuple):
     """A kind of condition: its name, in words, the unit its rms is told in, how many components make one vector.
@@ -69,9 +72,15 @@ class Rows:
         """Return which rows (n,) touch one of the observations."""
         return np.isin(self.first, observations) | np.isin(self.last, observations)
 
-    def parts(self, count: int) -> list[IntArray]:
-        """Return the observations in so many parts, in the order of time, to be left out in turn."""
-        return np.array_split(np.arange(int(self.last.max()) + 1), count)
+    def parts(self, count: int, interleaved: bool = False) -> list[IntArray]:
+        """Return the observations in so many parts to be left out in turn: in the order of time, or dealt out."""
+        observations = np.arange(int(self.last.max()) + 1)
+        return [observations[k::count] for k in range(count)] if interleaved else np.array_split(observations, count)
+
+    def folds(self, parts: Sequence[IntArray]) -> list[Fold]:
+        """Return what is left out with each part, and predicted with it: what touches it, and what begins in it."""
+        rows = [np.flatnonzero(self.touching(part)) for part in parts]
+        return [(out, np.isin(self.first[out], part)) for out, part in zip(rows, parts, strict=True) if len(out)]
 
     def dependences(self, index: int) -> dict[str, FloatArray]:
         """Return the covariates (v,) of the vectors of a kind: its time, and those that are known and change."""

@@ -347,13 +347,16 @@ def _gains(diagnosis: Diagnosis) -> Iterator[Table]:
 
 def _gain_table(diagnosis: Diagnosis, what: str, gain: Gain) -> Table:
     """Return the errors of a model without and with an extension."""
-    words = _kind_words(diagnosis)
-    before, after = (part.chi_squared / part.count for part in (gain.before, gain.after))
+    words, caption = _kind_words(diagnosis), ""
+    for way in (gain, gain.otherwise):
+        if way is not None:
+            before, after = (part.chi_squared / part.count for part in (way.before, way.after))
+            caption += f"{'Otherwise measured' if caption else 'Measured'} on {way.data}: "
+            caption += f"χ² per condition {before:.2f} → {after:.2f}, log-likelihood {way.log_likelihood:+.1f}. "
     return Table(
         ("error, rms", f"base model → {what}"),
         [(words[kind], gain.errors(kind)) for kind in gain.before.rms],
-        f"Measured on {gain.data}. χ² per condition {before:.2f} → {after:.2f} (1 is noise alone), log-likelihood "
-        f"{gain.log_likelihood:+.1f}.",
+        f"{caption}A χ² of 1 is noise alone.",
     )
 
 
