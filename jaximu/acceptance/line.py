@@ -35,10 +35,11 @@ from jaximu.fleets.population import LEVEL, days_of, read_fleet
 from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, covariances, free_places, require_table
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
-from jaximu.ground.distributions import student_cdf
+from jaximu.ground.distributions import student_two_sided
 from jaximu.ground.document import Document, Json, file_digest
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
+from jaximu.ground.quantities import Z95
 from jaximu.ground.units import SENSORS
 from jaximu.model.sensor import Imu
 
@@ -457,7 +458,7 @@ def _alarms(
             alarms.append(Alarm(kind, name, station, texts, ((float(away[most]), 3),)))
     if course is not None and course.p_value * questions < LEVEL:
         texts = (f"{spoken(name)} of the golden unit {golden} drifts by ", " in 30 days (± ", ", 95 %)")
-        amounts = ((30 * course.slope, 3), (30 * 1.96 * course.sigma, 2))
+        amounts = ((30 * course.slope, 3), (30 * Z95 * course.sigma, 2))
         alarms.append(Alarm("golden", name, "", texts, amounts))
     return alarms
 
@@ -503,7 +504,7 @@ def _shift(values: FloatArray, inside: BoolArray, all_of: BoolArray) -> tuple[fl
     parts = np.array([np.var(side, ddof=1) / len(side) for side in sides])
     shift, variance = float(sides[0].mean() - sides[1].mean()), float(parts.sum())
     freedom = variance**2 / float(np.sum(parts**2 / np.array([len(side) - 1 for side in sides])))
-    return shift, 2 * float(student_cdf(-abs(shift) / np.sqrt(variance), freedom))
+    return shift, float(student_two_sided(shift / np.sqrt(variance), freedom))
 
 
 def write_verdicts(line: Line, path: FilePath) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.ground.array_types import FloatArray, IntArray
-from jaximu.ground.distributions import chi2_isf
+from jaximu.ground.distributions import deviation_interval
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
 
@@ -174,9 +174,8 @@ def deviation(
         m, lag, a = (int(number) for number in (grid.factor[column], grid.lag[column], alpha[row, column]))
         freedom[row, column] = degrees_of_freedom(kind, samples + 1, m, a, lag)
     freedom *= np.minimum(1.0, count / np.maximum(1, grid.count))
-    tail = (1 - confidence) / 2
     distinct, index = np.unique(freedom, return_inverse=True)
-    low, high = (np.sqrt(distinct / chi2_isf(p, distinct))[index].reshape(value.shape) for p in (tail, 1 - tail))
+    low, high = deviation_interval(distinct, confidence)[:, index.ravel()].reshape(2, *value.shape)
     shape = (*data.shape[:-1], len(tau))
     value, low, high, count, alpha, freedom = (
         array.reshape(shape) for array in (value, value * low, value * high, count, alpha, freedom)
