@@ -32,7 +32,9 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.stored import compiled
 from jaximu.ground.units import INERTIAL_QUANTITIES
-from jaximu.model import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
+from jaximu.model import BiasRepeatability, Noise, Process
+from jaximu.model.data_sheet import TERM_NAMES
+from jaximu.model.processes import TERM_PROCESSES
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
 from jaximu.navigation import Navigation, deviation, linearised, mechanise, noise_covariance
@@ -42,18 +44,9 @@ from jaximu.planning.goals import group_of
 from jaximu.planning.information import root_of
 
 SCHEMA = "jaximu.consequences/1"
-_PROCESSES: dict[str, Callable[[FloatArray], Process]] = {
-    "N": White,
-    "B": BiasInstability,
-    "K": RandomWalk,
-    "repeatability": BiasRepeatability,
-}
-NOISE_WORDS = {
-    "N": "white noise N",
-    "B": "bias instability B",
-    "K": "rate random walk K",
-    "repeatability": "bias repeatability",
-}
+_PROCESSES: dict[str, Callable[[FloatArray], Process]] = TERM_PROCESSES | {"repeatability": BiasRepeatability}
+NOISE_WORDS = {term: f"{TERM_NAMES[term]} {term}" for term in "NBK"} | {"repeatability": "bias repeatability"}
+"""The terms of a noise file that navigation feels, in English."""
 _TOGETHER = 25
 """Draws that are mechanised side by side; more do not fit into the caches."""
 
@@ -393,7 +386,7 @@ def _draw(run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise,
     root = root_of(run.covariance)
     streams = [
         Noise(
-            tuple(_PROCESSES[term](figure) for term, figure in noise.get(triad, {}).items() if term in _PROCESSES),
+            tuple(_PROCESSES[term](figure) for term, figure in noise.get(triad, {}).items() if term in NOISE_WORDS),
             INERTIAL_QUANTITIES[triad],
         )
         for triad in ("gyroscope", "accelerometer")

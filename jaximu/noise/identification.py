@@ -26,7 +26,7 @@ from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_isf
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov
+from jaximu.model.processes import MEMBER_VARIANCE, TERM_PROCESSES, BiasInstability, FirstOrderGaussMarkov
 from jaximu.noise.cleaning import BRIDGED, PeriodicLine, filled, lowest, periodic_lines, without_line, without_outliers
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation
 
@@ -234,14 +234,9 @@ def _deviation(values: FloatArray, rate: float, confidence: float) -> Deviation:
 def _basis(factors: FloatArray, rate: float, terms: Sequence[str]) -> FloatArray:
     """Allan variance (T, terms) of each term of size one, exact for samples: see `jaximu.model.processes`."""
     tau = factors / rate
-    columns = {
-        "Q": 3 / tau**2,
-        "N": 1 / tau,
-        "B": np.full_like(tau, 2 * np.log(2) / np.pi),
-        "K": tau / 3 + 1 / (6 * tau * rate**2),
-        "R": tau**2 / 2,
-    }
-    return np.stack([columns[term] for term in terms], axis=-1)
+    sampled = {"K": 1 / (6 * tau * rate**2)}  # of a walk, which its samples follow by steps
+    columns = [TERM_PROCESSES[term](1.0).allan_variance(tau) + sampled.get(term, 0.0) for term in terms]
+    return np.stack(columns, axis=-1)
 
 
 def _held_back(tau: FloatArray, rate: float, theta: dict[str, float], time_constant: float) -> FloatArray:
@@ -379,7 +374,7 @@ def _column(spectrum: _Spectrum, term: str) -> FloatArray:
         density = 1 / (4 * np.sin(half) ** 2 * rate**2)
     else:  # the flicker noise of `jaximu.model.processes`: a bank of Gauss–Markov processes
         bank = BiasInstability(1.0, longest=max(1e5, 100 * spectrum.samples / rate)).bank(1 / rate)
-        density = sum((_markov(spectrum, time) for time in bank), start=np.zeros_like(half)) * np.log(4) / np.pi
+        density = sum((_markov(spectrum, time) for time in bank), start=np.zeros_like(half)) * MEMBER_VARIANCE
     return (density * _passed(spectrum.angle * rate, spectrum.high_pass)) @ _WEIGHT
 
 

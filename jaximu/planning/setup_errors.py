@@ -351,7 +351,7 @@ def _mean_covariances(noise: tuple[processes.Process, ...], density: FloatArray,
             fast = fast + AxisNoise(none, sized(process.Q) ** 2, np.zeros((3, 0)), np.zeros(0)).covariance(start, stop)
         elif isinstance(process, processes.BiasInstability):
             times = process.bank(_FLICKER_INTERVAL)
-            variance = np.outer(sized(process.B) ** 2 * np.log(times[1] / times[0]) / np.pi, np.ones(len(times)))
+            variance = np.outer(sized(process.B) ** 2 * processes.MEMBER_VARIANCE, np.ones(len(times)))
             slow = slow + AxisNoise(none, none, variance, times).covariance(start, stop)
         elif isinstance(process, processes.RandomWalk):
             # the means of min(s, t) = (s + t)/2 − |s − t|/2; the latter's second integral is −|h|³/12
