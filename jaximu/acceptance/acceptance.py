@@ -80,6 +80,12 @@ class Judged:
     probability: FloatArray
     verdict: NDArray[np.str_]
 
+    def result(self, row: int, index: int) -> Json:
+        """Return what an item of a unit says of its value."""
+        arrays = {key: getattr(self.measured, key) for key in ("value", "sigma", "freedom")}
+        numbers = {key: float(array[row, self.places[index]]) for key, array in arrays.items()}
+        return numbers | {"probability": float(self.probability[row, index]), "verdict": str(self.verdict[row, index])}
+
 
 def judge(units: Units, limits: Limits) -> Judged:
     """Hold units of one structure to limits of parameters and outputs; other limits are left alone."""
@@ -210,26 +216,12 @@ def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged
     if warm and calibrated and not calibrated[0] <= warm[0] <= warm[1] <= calibrated[1]:
         beyond = f"{calibrated[0]:.1f} to {calibrated[1]:.1f} °C that were calibrated"
         return Item.of(limit, name, reason=f"the limit's temperatures go beyond the {beyond}")
-    value, sigma, gravity, freedom = (
-        float(array[0, at]) for array in (measured.value, measured.sigma, measured.gravity, measured.freedom)
-    )
-    verdict, recording = str(judged.verdict[0, index]), float(np.sqrt(max(sigma**2 - gravity**2, 0.0)))
-    advice = ""
-    if verdict == UNDECIDED:
-        needed = limit.nearest(value) / float(limits.rule.multiple(freedom))
+    result, gravity, advice = judged.result(0, index), float(measured.gravity[0, at]), ""
+    recording = float(np.sqrt(max(result["sigma"] ** 2 - gravity**2, 0.0)))
+    if result["verdict"] == UNDECIDED:
+        needed = limit.nearest(result["value"]) / float(limits.rule.multiple(result["freedom"]))
         advice = deciding(needed, recording, gravity, calibration.gravity.sigma, record)
-    return Item.of(
-        limit,
-        name,
-        value=value,
-        sigma=sigma,
-        freedom=freedom,
-        verdict=verdict,
-        gravity=gravity,
-        probability=float(judged.probability[0, index]),
-        recording=recording,
-        advice=advice,
-    )
+    return Item.of(limit, name, **result, gravity=gravity, recording=recording, advice=advice)
 
 
 def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:

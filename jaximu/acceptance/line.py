@@ -180,13 +180,10 @@ class Line(Result, Document, page="line"):
         return [] if judged is None else [self._item(judged, row, index) for index in range(len(judged.names))]
 
     def _item(self, judged: Judged, row: int, index: int) -> Item:
-        at, measured = judged.places[index], judged.measured
-        numbers: Json = {"reason": "not determined"}
-        if at >= 0 and measured.determined[row, at]:
-            numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
-            numbers["probability"] = float(judged.probability[row, index])
-        verdict = str(judged.verdict[row, index])
-        return Item.of(judged.limits[index], judged.names[index], verdict=verdict, **numbers)
+        at = judged.places[index]
+        known = at >= 0 and judged.measured.determined[row, at]
+        result = judged.result(row, index) if known else {"reason": "not determined"}
+        return Item.of(judged.limits[index], judged.names[index], **result)
 
     def document(self) -> Json:
         """Return verdicts and statistics as JSON has them; single units' verdicts stand in the table."""

@@ -35,6 +35,7 @@ from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.data.preintegration import preintegrate_samples
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import interpolated
+from jaximu.ground.distributions import rms
 from jaximu.ground.document import SOFTWARE, Document, Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import Gravity
@@ -113,6 +114,12 @@ class ModelledErrors:
     def words(self) -> str:
         """What it is."""
         return f"expected from the calibration's covariance along {self.trajectory.words}"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What its errors lack."""
+        unrecorded = "vibration, sampling and time stamps are not in the multipliers: they need a recorded motion."
+        return () if self.trajectory.recorded else (unrecorded,)
 
     def over(self, length: float) -> Stretches:
         """Return stretches of one length (s), one after the other."""
@@ -272,11 +279,8 @@ class MeasuredErrors:
             errors.append(np.asarray(integrated[2]) - at_start.inv().apply(away + up * time[:, None] ** 2 / 2))
         edges = self.stamp[first][:, None] + np.cumulative_sum(held, axis=1, include_initial=True)
         edges = np.clip(edges, self.stamp[0], self.stamp[-1])
-        path = scipy.spatial.transform.Slerp(self.stamp, known)(edges.ravel()).as_quat()
-        before, after = (
-            rotations.from_quat(path.reshape(*edges.shape, 4)[:, part].reshape(-1, 4))
-            for part in (slice(None, -1), slice(1, None))
-        )
+        path = scipy.spatial.transform.Slerp(self.stamp, known)
+        before, after = path(edges[:, :-1].ravel()), path(edges[:, 1:].ravel())
         turning = (before.inv() * after).as_rotvec().reshape(rates.shape) / np.where(held > 0, held, 1.0)[..., None]
         velocity_errors = np.asarray(_integrated(turning, forces, held)[1]) - gained
         return np.concatenate(errors, axis=1), velocity_errors
@@ -455,10 +459,7 @@ def estimator_noise(
     notes += [f"{interval * source.rate:.2g} samples lie between two states."] if interval * source.rate < 2 else []
     parts = {length: _part(source, noise, length) for length in kept}
     walks = {length: {triad: _walk(part, triad) for triad in INERTIAL_QUANTITIES} for length, part in parts.items()}
-    if isinstance(source, MeasuredErrors):
-        notes += source.notes
-    elif not source.trajectory.recorded:
-        notes.append("vibration, sampling and time stamps are not in the multipliers: they need a recorded motion.")
+    notes += source.notes
     rng = np.random.default_rng(seed)
     triads: dict[str, TriadNoise] = {}
     turned = np.ones(len(kept))
@@ -473,7 +474,7 @@ def estimator_noise(
         table = np.array(rows, float)
         terms = [_terms(parts[length], triad) for length in kept]
         triads[triad] = TriadNoise(
-            _rms(noise[triad]["N"]),
+            rms(noise[triad]["N"]),
             np.array([walks[length][triad] for length in kept]),
             table[:, 0],
             table[:, 1],
@@ -544,10 +545,6 @@ def _squared(root: FloatArray) -> FloatArray:
     return root @ np.swapaxes(root, 1, 2)
 
 
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: float) -> _Length:
     stretches = source.over(length)
     if len(stretches.start) < _FEWEST:
@@ -572,7 +569,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
     for triad, columns in _COLUMNS.items():
         sizes = noise[triad]
         spread[triad, "N"] = np.einsum("njik,j->nik", white[:, columns], np.square(sizes["N"]))
-        spread[triad, "white"] = np.sum(white[:, columns], axis=1) * _rms(sizes["N"]) ** 2
+        spread[triad, "white"] = np.sum(white[:, columns], axis=1) * rms(sizes["N"]) ** 2
         spread[triad, "1"] = np.sum(walk[:, columns], axis=1)
         if np.any(sizes.get("K", 0.0)):
             spread[triad, "K"] = np.einsum("njik,j->nik", walk[:, columns], np.square(sizes["K"]))

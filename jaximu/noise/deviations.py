@@ -183,16 +183,21 @@ def deviation(
     return Deviation(kind, tau, grid.factor, value, low, high, count, alpha, freedom, confidence)
 
 
-def _require_sense(data: FloatArray, rate: float, difference: _DeviationKind, phase: bool, confidence: float) -> None:
-    """Raise `InputError` or `NotPossibleError` for a signal or numbers of which no deviation can be taken."""
-    if data.ndim < 1 or data.shape[-1] < 3:
-        raise NotPossibleError(f"a deviation needs at least three samples, found shape {data.shape}.")
+def require_samples(data: FloatArray, rate: float, confidence: float) -> None:
+    """Raise `InputError` for samples, a rate (Hz) or a confidence of which no analysis makes sense."""
     if not (np.isfinite(rate) and rate > 0):
         raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
     if not 0 < confidence < 1:
         raise InputError(f"the confidence must lie between 0 and 1, found {confidence}.")
     if np.isinf(data).any():
         raise InputError("the signal holds infinite values.")
+
+
+def _require_sense(data: FloatArray, rate: float, difference: _DeviationKind, phase: bool, confidence: float) -> None:
+    """Raise `InputError` or `NotPossibleError` for a signal or numbers of which no deviation can be taken."""
+    if data.ndim < 1 or data.shape[-1] < 3:
+        raise NotPossibleError(f"a deviation needs at least three samples, found shape {data.shape}.")
+    require_samples(data, rate, confidence)
     if (difference.total or phase) and np.isnan(data).any():
         what = "the total deviation mirrors the recording at its ends" if difference.total else "a phase is one curve"
         raise InputError(f"{what} and cannot be taken over gaps (NaN).")

@@ -28,7 +28,7 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.processes import MEMBER_VARIANCE, TERM_PROCESSES, BiasInstability, FirstOrderGaussMarkov
 from jaximu.noise.cleaning import BRIDGED, PeriodicLine, filled, lowest, periodic_lines, without_line, without_outliers
-from jaximu.noise.deviations import Deviation, averaging_factors, deviation
+from jaximu.noise.deviations import Deviation, averaging_factors, deviation, require_samples
 
 TERMS = "QNBKR"
 _SHORTEST = 256
@@ -145,13 +145,8 @@ def identify(
         raise InputError(f"terms must be some of {', '.join(TERMS)}, found {terms!r}.")
     if not 0 <= gauss_markov <= 3:
         raise InputError(f"gauss_markov must be 0 to 3 processes, found {gauss_markov}.")
-    if not (np.isfinite(rate) and rate > 0):
-        raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
-    if not 0 < confidence < 1:
-        raise InputError(f"the confidence must lie between 0 and 1, found {confidence}.")
     data = np.asarray(values, float)
-    if np.isinf(data).any():
-        raise InputError("the signal holds infinite values.")
+    require_samples(data, rate, confidence)
     if data.ndim not in (1, 2):
         raise InputError(f"values must be (n,) or (axes, n), found shape {data.shape}.")
     axes = [_identify(axis, rate, terms, confidence, gauss_markov, highest) for axis in np.atleast_2d(data)]

@@ -92,16 +92,20 @@ class Equipment:
         return "by hand" if self.by_hand else f"on the {self.name.replace('-', ' ')}"
 
     @property
+    def robot(self) -> bool:
+        """Whether it reports the attitude."""
+        return self.accuracy is not None
+
+    @property
     def chained(self) -> bool:
         """Whether each turn leads from one pose to the next."""
-        return self.by_hand or self.in_sequence or self.accuracy is not None
+        return self.by_hand or self.in_sequence or self.robot
 
     @property
     def largest_turn(self) -> float:
         """Radians of a turn from one pose to the next at the most: a robot's rate is limited, too."""
-        if self.accuracy is None:
-            return float(np.radians(self.turn_limit))
-        return float(np.radians(min(self.turn_limit, (1 - RAMP) * self.fastest * self.turn)))
+        fastest = (1 - RAMP) * self.fastest * self.turn if self.robot else self.turn_limit
+        return float(np.radians(min(self.turn_limit, fastest)))
 
 
 EQUIPMENT = {
@@ -398,9 +402,8 @@ def _searched(
 ) -> tuple[Design, Design, DesignCovariance, bool]:
     """The best design; it rounded, or a classical one that does as well; what this leaves; whether it is classical."""
     fastest = np.radians(equipment.fastest)
-    robot = equipment.accuracy is not None
-    starts = _starts(poses, turns, equipment, seed)[: _FEW_STARTS if robot else None]
-    sought = optimise(_coarsened(question), starts, fastest, report, FEW_STEPS if robot else STEPS)
+    starts = _starts(poses, turns, equipment, seed)[: _FEW_STARTS if equipment.robot else None]
+    sought = optimise(_coarsened(question), starts, fastest, report, FEW_STEPS if equipment.robot else STEPS)
     exact = _ordered(sought, equipment)
     design = _rounded(exact, equipment)
     best = covariance(question, design)
@@ -419,14 +422,11 @@ def question_of(
     known: Known, equipment: Equipment, criterion: str, parameter: str | None, poses: int = 12
 ) -> tuple[DesignQuestion, tuple[str, ...]]:
     """Return what a design is asked for, and notes on what had to be assumed; arguments as in [`propose`]."""
-    robot = equipment.accuracy is not None
-    for name in ("rest", "turn", "step"):
+    for name, unit in {"rest": "", "turn": "", "step": "", "accuracy": " degrees"}.items():
         value = getattr(equipment, name)
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"the {name} must be greater than zero, found {value:g}.")
-    if equipment.accuracy is not None and not (np.isfinite(equipment.accuracy) and equipment.accuracy > 0):
-        raise InputError(f"the accuracy must be greater than zero degrees, found {equipment.accuracy:g}.")
-    if robot and known.imu.gyroscope is None:
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InputError(f"the {name} must be greater than zero{unit}, found {value:g}.")
+    if equipment.robot and known.imu.gyroscope is None:
         raise InputError(
             "a robot's attitude calibrates a gyroscope, and this unit has none: plan for a table, --equipment table."
         )
@@ -446,7 +446,7 @@ def question_of(
             "a calibration by hand has the accelerometer's axes for its frame; how they lie to the table's is "
             "taken as open.",
         )
-    if robot:
+    if equipment.robot:
         notes += (
             f"the attitude's error is taken as {equipment.accuracy:g}° (1 σ, each axis), independent from stamp to "
             "stamp, and the gyroscope's bias as constant; what is off alike in all poses, such as a bent arm, is not "
@@ -465,7 +465,7 @@ def question_of(
         equipment.by_hand,
         equipment.z_up,
         criterion,
-        poses * equipment.rest + (poses - 1) * equipment.turn if robot else None,
+        poses * equipment.rest + (poses - 1) * equipment.turn if equipment.robot else None,
     )
     return question, (*notes, *more)
 
@@ -640,7 +640,7 @@ def _neighbourly(attitudes: FloatArray) -> FloatArray:
 
 def _rounded(design: Design, equipment: Equipment) -> Design:
     step, attitude = np.radians(equipment.step), np.asarray(design.attitude)
-    if equipment.accuracy is not None:
+    if equipment.robot:
         round_ = np.array([round_attitude(quaternion, step) for quaternion in attitude])
         signs = np.where(np.sum(round_ * attitude, axis=1) >= 0, 1.0, -1.0)
         return replace(design, attitude=round_ * signs[:, None])  # each turn goes the way that was sought
@@ -667,9 +667,7 @@ def _words(attitude: FloatArray, equipment: Equipment) -> str:
     if equipment.by_hand:
         return attitude_words(attitude)
     tilt = pose_words(up_of(attitude))
-    if equipment.accuracy is None:
-        return tilt
-    return f"{tilt}; heading {heading_of(attitude):.4g}°".replace(" -", " −")
+    return f"{tilt}; heading {heading_of(attitude):.4g}°".replace(" -", " −") if equipment.robot else tilt
 
 
 def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
@@ -691,7 +689,7 @@ def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
         angle = float(np.linalg.norm(vector))
         axis = vector / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
         words = f"the direct way, {np.degrees(angle):.0f}°"
-        if equipment.accuracy is not None:
+        if equipment.robot:
             about = ", ".join(f"{component + 0.0:.3f}" for component in np.round(axis, 3))
             words = f"{np.degrees(angle):.1f}° about ({about}) of the unit's axes"
         turns.append(Turn(axis, angle, angle / equipment.turn, words))
