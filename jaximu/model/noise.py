@@ -118,6 +118,13 @@ class Noise:
         """Return the Allan deviation in theory at averaging times (n,), s: variances of the processes added up."""
         return np.sqrt(sum((process.allan_variance(tau) for process in self.processes), start=np.zeros(np.shape(tau))))
 
+    def squares(self) -> dict[str, FloatArray]:
+        """Return the squares (3,) of the sizes of the terms there are, by letter, SI."""
+        squares: dict[str, FloatArray] = {}
+        for process in self.processes:
+            squares[process.letter] = squares.get(process.letter, np.zeros(3)) + process.size[..., 0] ** 2
+        return squares
+
     def figures(self, rate: float | None = None) -> list[dict[str, object]]:
         """Return each term as a data sheet would: continuous in SI and in the customary unit; discrete where it is one.
 

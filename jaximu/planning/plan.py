@@ -51,7 +51,7 @@ from jaximu.planning.poses import (
     short_order,
     up_of,
 )
-from jaximu.planning.setup_errors import white_density
+from jaximu.planning.setup_errors import noise_squares
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.positions import directions, spiral
@@ -168,9 +168,9 @@ class Known:
         """Return the first unit of a specification as its data sheet, with its white noise; nothing calibrated yet."""
         case = specification.case(0)
         noise = {
-            name: _in_output(triad, np.diag(white))
+            name: _in_output(triad, np.diag(noise_squares(case, name)["N"]))
             for name, triad in case.imu.triads().items()
-            if (white := white_density(case, name)) is not None
+            if "N" in noise_squares(case, name)
         }
         gravity = LocalGravity(float(case.plan.motion.gravity), 0.0)
         return cls(
