@@ -19,7 +19,7 @@ from jaximu.calibration import Calibration
 from jaximu.estimation.problem import flatten, names_of, typical_sizes
 from jaximu.estimation.uncertainty import pose_advice, station_advice
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import FilePath
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import Z95
@@ -54,14 +54,12 @@ class Acceptance(Result, Document, page="certificate"):
         """Return the verdict as the JSON document of schema `jaximu.acceptance/1`."""
         return {
             "schema": SCHEMA,
-            "verdict": self.verdict,
+            **entries(self, "verdict", "trace", "notes"),
             "serial": self.serial or None,
             "calibration": {"file": self.file, "digest": self.digest},
             "limits": dict(self.limits),
             "decision": self.rule.document(),
             "items": [item.document() for item in self.items],
-            "trace": self.trace,
-            "notes": list(self.notes),
             "software": SOFTWARE,
         }
 

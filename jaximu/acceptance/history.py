@@ -31,7 +31,7 @@ from jaximu.estimation.projection import output_error
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import holm
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
@@ -77,18 +77,9 @@ class Movement:
 
     def document(self, per: str) -> Json:
         """Return it as JSON has it; `per`: unit of time."""
-        return {
-            "name": self.name,
-            "unit": self.unit,
-            "values": list(self.values),
-            "sigmas": list(self.sigmas),
-            "difference": self.difference,
-            "sigma": self.sigma,
-            "z": self.z,
-            "p_value": self.p_value,
+        names = ("name", "unit", "values", "sigmas", "difference", "sigma", "z", "p_value", "moved", "tested")
+        return entries(self, *names) | {
             "p_value_all_allowed_for": self.adjusted if self.tested else None,
-            "moved": self.moved,
-            "tested": self.tested,
             "drift": self.line.document() | {"unit": f"{self.unit} per {per}"},
         }
 
@@ -173,25 +164,18 @@ class UnitHistory(Result, Document, page="history"):
         def reached(limit: LimitReached) -> Json:
             low, high = (end if np.isfinite(end) else None for end in (limit.limit.low, limit.limit.high))
             due = None if limit.after is None else self.due(limit.after)
-            return {
-                "name": limit.name,
-                "low": low,
-                "high": high,
-                "unit": limit.limit.unit,
-                "after": limit.after,
-                "date": due and due.isoformat(),
-            }
+            about = {"low": low, "high": high, "unit": limit.limit.unit, "date": due and due.isoformat()}
+            return entries(limit, "name", "after") | about
 
         columns = zip(self.files, self.times.tolist(), self.dates, self.temperatures, strict=True)
         return {
             "schema": SCHEMA,
-            "verdict": self.verdict,
+            **entries(self, "verdict", "level", "notes"),
             "calibrations": [
                 {"file": file, "time": time, "date": day and day.isoformat(), "temperature": temperature}
                 for file, time, day, temperature in columns
             ],
             "time_unit": self.per,
-            "level": self.level,
             "together": {name: test.document() for name, test in self.together.items()},
             "moved": [movement.name for movement in self.moved],
             "parameters": [movement.document(self.per) for movement in self.movements],
@@ -202,7 +186,6 @@ class UnitHistory(Result, Document, page="history"):
                 "items": [reached(limit) for limit in self.limits],
             },
             "not_compared": list(self.left_out),
-            "notes": list(self.notes),
             "software": SOFTWARE,
         }
 

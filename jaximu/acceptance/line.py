@@ -36,7 +36,7 @@ from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, covariances, free_plac
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.distributions import student_two_sided
-from jaximu.ground.document import Document, Json, file_digest
+from jaximu.ground.document import Document, Json, entries, file_digest
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import Z95
@@ -113,7 +113,7 @@ class Alarm:
 
     def document(self) -> dict[str, str]:
         """Return the alarm as JSON has it."""
-        return {"kind": self.kind, "name": self.name, "where": self.where, "text": self.text}
+        return entries(self, "kind", "name", "where", "text")
 
 
 @dataclass(frozen=True)
@@ -194,8 +194,8 @@ class Line(Result, Document, page="line"):
             "verdict": self.verdict if limits else None,
             "table": self.table.file,
             "counts": dict(self.counts) if limits else None,
-            "limits": None if limits is None else {"file": limits.file, "sha256": limits.sha256},
-            "decision": None if limits is None else limits.rule.document(),
+            "limits": limits and entries(limits, "file", "sha256"),
+            "decision": limits and limits.rule.document(),
             "items": items,
             "line": [_entry(quantity) for quantity in self.followed],
             "alarms": [alarm.document() for alarm in self.alarms],
@@ -208,29 +208,22 @@ def _entry(quantity: FollowedQuantity) -> Json:
     able = quantity.capability
     return {
         "name": quantity.name,
-        "capability": None
-        if able is None
-        else {
+        "capability": able
+        and entries(able, "mean", "deviation")
+        | {
             "units": able.count,
-            "mean": able.mean,
-            "deviation": able.deviation,
             "cp": None if np.isnan(able.cp[0]) else with_ends(able.cp),
             "cpk": with_ends(able.cpk),
         },
         "cpk_by_lot": {lot: with_ends(able.cpk) for lot, able in quantity.lots.items()},
         "charts": {
-            where: {
-                "centre": chart.centre,
-                "deviation": chart.deviation,
-                "reach": chart.bound,
-                "beyond": len(chart.beyond),
-                "jumps": len(chart.jumps),
-                "drifting": len(chart.drifting),
-            }
+            where: entries(chart, "centre", "deviation")
+            | {"reach": chart.bound}
+            | {name: len(getattr(chart, name)) for name in ("beyond", "jumps", "drifting")}
             for where, (chart, _) in quantity.charts.items()
         },
-        "gauge": None if quantity.gauge is None else quantity.gauge.document(),
-        "drift": None if quantity.drift is None else vars(quantity.drift),
+        "gauge": quantity.gauge and quantity.gauge.document(),
+        "drift": quantity.drift and vars(quantity.drift),
     }
 
 

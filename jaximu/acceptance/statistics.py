@@ -10,7 +10,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, deviation_interval, f_tails, normal_isf, student_two_sided
-from jaximu.ground.document import Json
+from jaximu.ground.document import Json, entries
 
 _WEIGHT = 0.2  # of the newest value in the moving average
 _MEAN_RANGE = 2 / np.sqrt(np.pi)  # mean range of two normal numbers, d2 = 1.128
@@ -130,17 +130,13 @@ class Gauge:
 
     def document(self) -> Json:
         """Return it as JSON has it."""
-        return {
+        return entries(self, "reproducibility", "parts", "crossed", "p_value") | {
             "repeatability": with_ends(self.repeatability),
-            "reproducibility": self.reproducibility,
             "gauge": self.total,
-            "parts": self.parts,
             "ndc": self.categories,
             "units": self.count,
             "recordings": self.repetitions,
-            "crossed": self.crossed,
             "observed_over_stated": self.explained,
-            "p_value": self.p_value,
         }
 
 

@@ -25,7 +25,7 @@ from jaximu.calibration import Calibration
 from jaximu.data.preintegration import increments
 from jaximu.estimation.problem import Name, names_of
 from jaximu.ground.array_types import BoolArray, FloatArray
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
@@ -149,7 +149,7 @@ class Consequences(Result, Document, page="consequences"):
         known = self.known | {"the whole calibration": np.zeros_like(self.noise)}
         return {
             "schema": SCHEMA,
-            "times": self.times.tolist(),
+            **entries(self, "times", "calibration_file", "notes"),
             **tracks(np.sqrt(self.total)),
             "budget": listed({name: position(variances) for name, variances in self.terms.items()}),
             "calibration": {"position": position(self.calibration).tolist()},
@@ -164,9 +164,7 @@ class Consequences(Result, Document, page="consequences"):
                 "position_sigma": track(np.sqrt(against.total), 0),
                 "position_apart": track(self.apart, 0),
             },
-            "calibration_file": self.calibration_file,
             "path": self.trajectory.words,
-            "notes": list(self.notes),
             "software": SOFTWARE,
         }
 

@@ -36,7 +36,7 @@ from jaximu.data.preintegration import preintegrate_samples
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import interpolated
 from jaximu.ground.distributions import rms
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import Gravity
 from jaximu.ground.page import Result
@@ -395,16 +395,14 @@ class EstimatorNoise(Result, Document, page="estimator_noise"):
         """Return it as the JSON document of schema `jaximu.estimator-noise/1`; densities are SI and continuous."""
         return {
             "schema": SCHEMA,
-            "lengths": self.lengths.tolist(),
+            **entries(self, "lengths", "notes"),
             "interval": float(self.lengths[self.chosen]),
             "stretches": list(self.count),
             **{
-                name: {
+                name: entries(triad, "multiplier", "low", "high")
+                | {
                     "noise_density": triad.white,
                     "random_walk": triad.walk.tolist(),
-                    "multiplier": triad.multiplier.tolist(),
-                    "low": triad.low.tolist(),
-                    "high": triad.high.tolist(),
                     "terms": [
                         {"term": term, "multiple": multiples.tolist()} for term, multiples in triad.terms.items()
                     ],
@@ -417,7 +415,6 @@ class EstimatorNoise(Result, Document, page="estimator_noise"):
             },
             "densities": self.densities(),
             "errors": self.words,
-            "notes": list(self.notes),
             "software": SOFTWARE,
         }
 

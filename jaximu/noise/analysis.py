@@ -9,7 +9,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import deviation_interval
-from jaximu.ground.document import SOFTWARE, Json, read_document
+from jaximu.ground.document import SOFTWARE, Json, entries, read_document
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
@@ -80,8 +80,7 @@ class NoiseAnalysis(Result, Comparable, page="allan"):
                 for name, table in self.repeatability.items()
             }
             or None,
-            "files": list(self.files),
-            "notes": list(self.notes),
+            **entries(self, "files", "notes"),
             "software": SOFTWARE,
         }
 

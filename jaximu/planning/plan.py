@@ -14,7 +14,7 @@ from jaximu.data.attitude import INTERVALS
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
 from jaximu.estimation.uncertainty import WeakDirection, weak_directions
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.page import Result
@@ -300,40 +300,26 @@ class Proposal(Result, Document, page="plan"):
         sigmas = zip(self.names, self.before.tolist(), self.after.tolist(), strict=True)
         return {
             "schema": SCHEMA,
-            "source": self.source,
+            **entries(self, "source", "rank", "notes"),
             "equipment": self.equipment.name,
-            "rest": self.equipment.rest,
-            "turn": self.equipment.turn,
+            **entries(self.equipment, "rest", "turn"),
             "accuracy": None if self.equipment.accuracy is None else {"value": self.equipment.accuracy, "unit": "deg"},
-            "poses": [
-                {"up": pose.up.tolist(), "attitude": pose.attitude.tolist(), "words": pose.words} for pose in self.poses
-            ],
+            "poses": [entries(pose, "up", "attitude", "words") for pose in self.poses],
             "turns": [
-                {
-                    "axis": turn.axis.tolist(),
-                    "angle": float(np.degrees(turn.angle)),
-                    "angle_unit": "deg",
-                    "rate": float(np.degrees(turn.rate)),
-                    "rate_unit": "deg/s",
-                    "words": turn.words,
-                }
+                entries(turn, "axis", "words")
+                | {"angle": float(np.degrees(turn.angle)), "angle_unit": "deg"}
+                | {"rate": float(np.degrees(turn.rate)), "rate_unit": "deg/s"}
                 for turn in self.turns
             ],
             "criterion": {
                 "name": self.criterion,
                 "before": self.criterion_before,
                 "after": self.criterion_after,
-                "gain": self.gain,
-                "rounding_loss": self.rounding_loss,
+                **entries(self, "gain", "rounding_loss"),
             },
             "sigma": {name: {"before": before, "after": after} for name, before, after in sigmas},
-            "rank": self.rank,
             "parameters": len(self.names),
-            "open": [
-                {"text": direction.text, "sigma": direction.sigma, "determined": direction.determined}
-                for direction in self.open
-            ],
-            "notes": list(self.notes),
+            "open": [entries(direction, "text", "sigma", "determined") for direction in self.open],
             "software": SOFTWARE,
         }
 
