@@ -25,6 +25,7 @@ from jaximu.ground.page import Result
 from jaximu.ground.quantities import Z95
 
 SCHEMA = "jaximu.acceptance/1"
+_TERM = ("value", "low", "high")
 _BY_HAND = ("joint", "two-step", "two-step-rk4", "accelerometer")
 
 
@@ -241,11 +242,11 @@ def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
 def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> list[Item]:
     items = []
     for axis in limit.axes or range(3):
-        name, term = f"{limit.owner}.{limit.part}[{axis}]", _noise_term(limit, axis, noise)
-        if isinstance(term[0], str):
-            items.append(Item.of(limit, name, reason=term[0], advice=term[1]))
+        name, (reason, advice, term) = f"{limit.owner}.{limit.part}[{axis}]", _noise_term(limit, axis, noise)
+        if reason:
+            items.append(Item.of(limit, name, reason=reason, advice=advice))
             continue
-        value, low, high = term
+        value, low, high = (float(term[key]) for key in _TERM)
         sigma, advice = (high - low) / (2 * Z95), ""
         judged = limit.judged(rule, value, sigma)
         if judged["verdict"] == UNDECIDED:
@@ -255,22 +256,22 @@ def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> l
     return items
 
 
-def _noise_term(limit: Limit, axis: int, noise: Mapping[str, Any] | None) -> tuple:
-    """Return value, low, high (95 %) of a term of an axis; or why there is none, and what to record."""
+def _noise_term(limit: Limit, axis: int, noise: Mapping[str, Any] | None) -> tuple[str, str, Mapping[str, Any]]:
+    """Return why an axis has no such term, and what to record, both "" where there is one; and the term (95 %)."""
     several = limit.part == "repeatability"
     if noise is None:
         what = "several recordings at rest, one a power-on" if several else "a recording at rest"
         logs = "LOG LOG …" if several else "LOG"
-        return f"it takes {what}", f"Run jaximu allan {logs} -o noise, and add --noise noise/allan.json."
+        return f"it takes {what}", f"Run jaximu allan {logs} -o noise, and add --noise noise/allan.json.", {}
     if several:
         known = (noise.get("repeatability") or {}).get(limit.owner)
         if known is None:
-            return "allan.json is of one recording", "Give jaximu allan one recording at rest a power-on."
-        return tuple(float(known[key][axis]) for key in ("value", "low", "high"))
+            return "allan.json is of one recording", "Give jaximu allan one recording at rest a power-on.", {}
+        return "", "", {key: known[key][axis] for key in _TERM}
     axes = noise.get(limit.owner)
     if axes is None:
-        return f"allan.json holds no {limit.owner}", ""
+        return f"allan.json holds no {limit.owner}", "", {}
     term = axes[axis]["terms"].get(limit.part)
     if term is None:
-        return "the recording at rest does not show this term", "Record longer at rest."
-    return tuple(float(term[key]) for key in ("value", "low", "high"))
+        return "the recording at rest does not show this term", "Record longer at rest.", {}
+    return "", "", term

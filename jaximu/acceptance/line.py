@@ -31,7 +31,7 @@ from jaximu.acceptance.statistics import (
     with_ends,
 )
 from jaximu.acceptance.words import amount, si_unit, spoken
-from jaximu.fleets.population import LEVEL, days_of, read_fleet
+from jaximu.fleets.population import FEWEST, LEVEL, days_of, read_fleet
 from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, covariances, free_places, require_table
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
@@ -43,8 +43,6 @@ from jaximu.ground.quantities import Z95
 from jaximu.ground.units import SENSORS
 from jaximu.model.sensor import Imu
 
-_FEWEST = 8  # units of a chart
-_GOLDEN = 4  # recordings of a unit from which its drift is asked about
 _SHOWN_ITEMS = 1000  # of a table, that its document holds
 _ROW = (
     "device",
@@ -391,20 +389,20 @@ def follow(table: Batch, limits: Limits | None = None, golden: str = "") -> Line
         charts = {}
         for station in stations:
             some = first[np.array(table.stations)[first] == station]
-            if len(some) >= _FEWEST:
+            if len(some) >= FEWEST:
                 charts[station] = control_chart(values[some], LEVEL / len(shown) / len(stations)), some
         limit = by_name.get(name)
         able = capability(values[first], limit.low, limit.high) if limit is not None and len(first) > 1 else None
-        lots = () if limit is None else _groups(table.lots, first).items()
+        lots = _groups(table.lots, first).items()
         by_lot = {lot: capability(values[some], limit.low, limit.high) for lot, some in lots if limit}
         study = gauge(values, recording, table.devices, table.stations)
-        course = drift(table.days[watched], values[watched]) if np.sum(watched) >= _GOLDEN else None
+        course = drift(table.days[watched], values[watched])
         followed.append(FollowedQuantity(name, limit, able, by_lot, charts, study, course))
         alarms += _alarms(table, name, charts, course, golden, len(shown))
         for kind, labels in (("station", table.stations), ("lot", table.lots)):
             alarms += _compared(kind, _groups(labels, first), name, values[first], first, len(shown))
     if not any(quantity.charts for quantity in followed):
-        notes.append(f"fewer than {_FEWEST} units: no control chart.")
+        notes.append(f"fewer than {FEWEST} units: no control chart.")
     elif np.isnan(table.days[first]).all():
         notes.append("no dates are known: the charts follow the order of the table.")
     return Line(table, limits, judged, measured, verdicts, tuple(followed), tuple(alarms), golden, tuple(notes))
@@ -458,7 +456,7 @@ def _groups(labels: Sequence[str], first: IntArray) -> dict[str, IntArray]:
     of_first = np.array(labels)[first]
     names = [label for label in sorted(set(of_first.tolist())) if label]
     return {
-        label: first[of_first == label] for label in names if len(names) > 1 and np.sum(of_first == label) >= _FEWEST
+        label: first[of_first == label] for label in names if len(names) > 1 and np.sum(of_first == label) >= FEWEST
     }
 
 

@@ -24,7 +24,6 @@ from jaximu.navigation.trajectory import Place, level_driving
 from jaximu.noise.stated import sensor_noise
 
 _LATITUDE = 45.0  # deg, of the path
-_UP = 8  # of the nine errors: the rotation about the vertical
 
 
 def navigation_items(
@@ -46,8 +45,8 @@ def navigation_items(
             items += [Item.of(limit, limit.key, reason=str(error).rstrip(".")) for limit in here]
             continue
         exact = consequences(gravity_known, level_driving(site, after), draws=0, files=(file, ""))
-        errors = [
-            (np.sqrt(variances[-1, :3]), np.degrees(np.sqrt(variances[-1, _UP:])))
+        errors = [  # of position, and of the rotation about the vertical
+            (np.sqrt(variances[-1, :3]), np.degrees(np.sqrt(variances[-1, -1:])))
             for variances in (outcome.calibration, exact.calibration, outcome.noise)
         ]
         for limit in here:

@@ -13,7 +13,6 @@ from jaximu.ground.distributions import chi2_isf, chi2_sf, deviation_interval, f
 from jaximu.ground.document import Json, entries
 
 _WEIGHT = 0.2  # of the newest value in the moving average
-_MEAN_RANGE = 2 / np.sqrt(np.pi)  # mean range of two normal numbers, d2 = 1.128
 _CATEGORIES = 1.41  # AIAG's √2: a category is a 97 % interval of the gauge wide
 _POOLED = 0.25  # p-value from which AIAG takes an interaction for repeatability
 
@@ -78,7 +77,8 @@ def control_chart(values: FloatArray, level: float) -> Chart:
     """
     count = len(values)
     ranges = np.abs(np.diff(values))
-    centre, deviation = float(np.mean(values)), float(np.mean(ranges) / _MEAN_RANGE)
+    # two normal numbers have a mean range of 2/√π = 1.128 of their deviation
+    centre, deviation = float(np.mean(values)), float(np.mean(ranges) * np.sqrt(np.pi) / 2)
     bound = float(normal_isf(level / 2 / count))
     average = np.empty(count)
     running = centre
@@ -210,10 +210,10 @@ class Drift:
 
 def drift(days: FloatArray, values: FloatArray) -> Drift | None:
     """Return the drift of values (n,) over days (n,), by least squares; None for fewer than four or a single day."""
+    if len(values) < 4 or not np.ptp(days) > 0:
+        return None
     away = days - days.mean()
     square = float(away @ away)
-    if len(values) < 4 or not square > 0:
-        return None
     slope = float(away @ values) / square
     rest = values - values.mean() - slope * away
     sigma = float(np.sqrt(rest @ rest / (len(values) - 2) / square))

@@ -315,7 +315,7 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
     return Run(
         imu,
         trajectory.start,
-        replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None),
+        stimulus.beside_motion(),
         trajectory.intervals,
         compiled(Imu.respond)(imu, stimulus),
         covariance,

@@ -189,9 +189,7 @@ class MeasuredErrors:
         data, known = measurement.intervals, measurement.attitude
         mounting = Mounting.of(fitted.imu)
         middle = (np.asarray(data.since) + np.asarray(data.until)) / 2
-        beside = replace(
-            measurement.around(fitted.imu), specific_force=None, angular_rate=None, angular_acceleration=None
-        )
+        beside = measurement.around(fitted.imu).beside_motion()
         force, rate = compiled(Imu.recover)(replace(fitted.imu, setup=()), data.force, data.rate, beside)
         tilt = scipy.spatial.transform.Rotation.from_rotvec(np.append(mounting.tilt, 0.0))
         whole = replace(known, quaternion=np.asarray(mounting.unit_attitude(known.quaternion))).rotation()

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSOR_QUANTITIES
@@ -280,7 +281,7 @@ def random_walk_only(analysis: NoiseAnalysis, name: str) -> Walk:
 
 def _root_mean_square(axes: Sequence[tuple[float, str]]) -> Walk:
     values, origin = zip(*axes, strict=True)
-    return Walk(float(np.sqrt(np.mean(np.square(values)))), origin)
+    return Walk(rms(values), origin)
 
 
 def white_noise_only(analysis: NoiseAnalysis, name: str) -> Walk:
