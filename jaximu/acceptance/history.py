@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from jaximu.acceptance.decision import Rule
 from jaximu.acceptance.epochs import Epoch, Scales, epochs_of, over_temperature, owner_of, require_apart
 from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits
 from jaximu.acceptance.quantities import output_stimulus
@@ -30,7 +31,7 @@ from jaximu.estimation.problem import flatten, names_of
 from jaximu.estimation.projection import output_error
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import holm
+from jaximu.ground.distributions import holm, rms
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.page import Result
@@ -223,7 +224,8 @@ def compare(
     require_apart(calibrations, files)
     order, days, times, per, notes = _in_order(calibrations, files, dates)
     ordered, files = [calibrations[index] for index in order], tuple(files[index] for index in order)
-    epochs = epochs_of(ordered, files, {} if limits is None else limits.nominal)
+    limits = limits or Limits((), Rule(), {}, "", "")
+    epochs = epochs_of(ordered, files, limits.nominal)
     names, left_out = _comparable(epochs)
     covariance = _covariance(epochs, names)
     movements = _courses(epochs, names, covariance, times, level)
@@ -241,9 +243,9 @@ def compare(
         together,
         output,
         reached,
-        "" if limits is None else limits.file,
+        limits.file,
         (*left_out, *silent, *unknown),
-        (*notes, *_notes(epochs, {} if limits is None else limits.nominal)),
+        (*notes, *_notes(epochs, limits.nominal)),
         level,
     )
 
@@ -493,7 +495,7 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
     return OutputChange(
         float(length[worst]),
         float(np.sqrt(along @ spread[worst] @ along)),
-        float(np.sqrt(np.mean(length**2))),
+        rms(length),
         float(np.sqrt(np.mean(np.trace(spread, axis1=1, axis2=2)))),
         over,
         SENSOR_UNITS[owner],
@@ -514,11 +516,9 @@ def _error(first: Imu, last: Imu, stimulus: Stimulus, owner: str) -> Any:
 
 
 def _limits_reached(
-    movements: Sequence[Movement], limits: Limits | None, first: Calibration
+    movements: Sequence[Movement], limits: Limits, first: Calibration
 ) -> tuple[tuple[LimitReached, ...], list[str]]:
     """Return when each limit's guard band is reached, and which limits cannot be followed, in sentences."""
-    if limits is None:
-        return (), []
     reached, unknown = [], []
     for limit in limits.limits:
         triad = first.triads().get(limit.owner)

@@ -262,18 +262,18 @@ def read_table(path: FilePath) -> Batch:
         outputs[f"{owner}_unit"] = output_units[0]
     like = Imu.nominal(**outputs)
     like = like if gyroscope else Imu(like.accelerometer, None)
-    parts = [numbers(column) for column in list(COLUMN_PLACES)[: 2 * len(triads)]]
+    values = np.concatenate([numbers(column) for column in list(COLUMN_PLACES)[: 2 * len(triads)]], axis=1)
     free = free_places(gyroscope)
     covariance = covariances(numbers("covariance"))[np.ix_(range(len(rows)), free, free)]
     # gravity's part is in the sigmas and not in the covariance; it acts on the accelerometer's gain as a whole
     scales = [0, 4, 8]
     variances = np.diagonal(covariance, axis1=1, axis2=2)[:, [free.index(index) for index in scales]]
     added = numbers("accel_gain_sigma")[:, scales] ** 2 - variances
-    gravity = np.sqrt(np.maximum(np.mean(added / parts[0][:, scales] ** 2, axis=1), 0.0))
-    by_gravity = np.where(np.array(free) < 9, np.concatenate(parts, axis=1)[:, free], 0.0) * gravity[:, None]
+    gravity = np.sqrt(np.maximum(np.mean(added / values[:, scales] ** 2, axis=1), 0.0))
+    by_gravity = np.where(np.array(free) < 9, values[:, free], 0.0) * gravity[:, None]
     units = Units(
         like,
-        np.concatenate(parts, axis=1),
+        values,
         tuple(PARAMETERS[index] for index in free),
         covariance + by_gravity[:, :, None] * by_gravity[:, None, :],
         gravity,

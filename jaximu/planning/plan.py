@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import jax
 import numpy as np
@@ -283,10 +284,8 @@ class Proposal(Result, Document, page="plan"):
             for pose in self.poses
         ]
         turns = [("turn", turn.axis, np.degrees(turn.angle), self.equipment.turn, 0.0) for turn in self.turns]
-        if robot:
-            entries = [
-                entry for pair in zip(entries, [*turns, None], strict=True) for entry in pair if entry is not None
-            ]
+        if robot:  # each turn follows its pose
+            entries = [entry for pair in zip_longest(entries, turns) for entry in pair if entry]
         else:
             entries += turns
         for kind, vector, angle, duration, heading in entries:
