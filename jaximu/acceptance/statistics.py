@@ -41,12 +41,11 @@ def capability(values: FloatArray, low: float, high: float) -> Capability:
     """
     count, mean, deviation = len(values), float(np.mean(values)), float(np.std(values, ddof=1))
     with np.errstate(divide="ignore", invalid="ignore"):
-        cp = np.float64(high - low) / (6 * deviation) if np.isfinite(high - low) else np.nan
-        cpk = np.float64(min(high - mean, mean - low)) / (3 * deviation)
-    low_end, high_end = deviation_interval(count - 1)
-    half = normal_isf(0.025) * np.sqrt(1 / (9 * count) + cpk**2 / (2 * (count - 1)))
-    cps, cpks = (cp, cp / high_end, cp / low_end), (cpk, cpk - half, cpk + half)
-    return Capability(count, mean, deviation, *(tuple(map(float, numbers)) for numbers in (cps, cpks)))
+        cp = float(np.float64(high - low) / (6 * deviation)) if np.isfinite(high - low) else np.nan
+        cpk = float(np.float64(min(high - mean, mean - low)) / (3 * deviation))
+    low_end, high_end = deviation_interval(count - 1).tolist()
+    half = float(normal_isf(0.025) * np.sqrt(1 / (9 * count) + cpk**2 / (2 * (count - 1))))
+    return Capability(count, mean, deviation, (cp, cp / high_end, cp / low_end), (cpk, cpk - half, cpk + half))
 
 
 @dataclass(frozen=True)

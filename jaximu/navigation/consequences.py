@@ -44,7 +44,7 @@ from jaximu.planning.goals import group_of
 from jaximu.planning.information import root_of
 
 SCHEMA = "jaximu.consequences/1"
-_PROCESSES: dict[str, Callable[[FloatArray], Process]] = TERM_PROCESSES | {"repeatability": BiasRepeatability}
+_PROCESSES: Mapping[str, Callable[[FloatArray], Process]] = TERM_PROCESSES | {"repeatability": BiasRepeatability}
 NOISE_WORDS = {term: f"{TERM_NAMES[term]} {term}" for term in "NBK"} | {"repeatability": "bias repeatability"}
 """The terms of a noise file that navigation feels, in English."""
 _TOGETHER = 25

@@ -660,7 +660,7 @@ def _bounds(fit: _Fit, index: int, threshold: float) -> tuple[float, float]:
 
 def _ramp_bounds(fit: _Fit, threshold: float) -> tuple[float, float]:
     """Return where the profile of −log L has risen by `threshold`, for the slope of the ramp, per second."""
-    spread = 1 / np.sqrt(fit.by_variance @ fit.model.gram[:, 0, 0])
+    spread = 1 / float(np.sqrt(fit.by_variance @ fit.model.gram[:, 0, 0]))
     low, high = _ends(
         lambda at: fit.model.solve(fit.theta, ramp=at).loss - fit.loss - threshold, fit.sizes[0], spread, threshold
     )
