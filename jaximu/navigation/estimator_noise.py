@@ -455,7 +455,7 @@ def estimator_noise(
     parts = {length: _part(source, noise, length) for length in kept}
     walks = {length: {triad: _walk(part, triad) for triad in INERTIAL_QUANTITIES} for length, part in parts.items()}
     notes += source.notes
-    rng = np.random.default_rng(seed)
+    rng, chosen = np.random.default_rng(seed), kept.index(interval)
     triads: dict[str, TriadNoise] = {}
     turned = np.ones(len(kept))
     for triad in _OWN:  # the gyroscope first
@@ -463,21 +463,20 @@ def estimator_noise(
             _multiplier(parts[length], triad, walks[length], one, draws, rng)
             for length, one in zip(kept, turned, strict=True)
         ]
-        if rows[kept.index(interval)] is None:
+        if rows[chosen] is None:
             notes.append(f"the reference has neither velocity nor position: the {triad}'s noise is left as it is.")
             rows = [(1.0, 1.0, 1.0)] * len(kept)
-        table = np.array(rows, float)
+        multiplier, low, high = np.array(rows, float).T
         terms = [_terms(parts[length], triad) for length in kept]
         triads[triad] = TriadNoise(
             rms(noise[triad]["N"]),
             np.array([walks[length][triad] for length in kept]),
-            table[:, 0],
-            table[:, 1],
-            table[:, 2],
+            multiplier,
+            low,
+            high,
             {name: np.array([term_values[name] for term_values in terms]) for name in terms[0]},
         )
         turned = triads[triad].applied
-    chosen = kept.index(interval)
     final = {triad: float(triad_noise.applied[chosen]) for triad, triad_noise in triads.items()}
     stated = dict.fromkeys(final, 1.0)
     rows = [[_nees(parts[length], multipliers, walks[interval]) for multipliers in (stated, final)] for length in kept]

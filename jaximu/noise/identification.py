@@ -209,8 +209,7 @@ def _identify(
         for i in range(markov)
     )
     limits = {term: _limit(best, term, threshold) for term in offered if result[term] is None}
-    misfit, freedom = replace(best, model=replace(best.model, excess=0.0)).misfit()
-    quality = misfit, freedom
+    quality = replace(best, model=replace(best.model, excess=0.0)).misfit()
     return Identified(result, measured, quality, limits, excess, lines, warm_up, outliers, high_pass, processes)
 
 
