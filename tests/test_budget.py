@@ -17,7 +17,7 @@ from jaximu.estimation.problem import Parameters
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.rotation import integrate_rates
 from jaximu.ground.units import STANDARD_GRAVITY
-from jaximu.model import BiasInstability, RandomWalk
+from jaximu.model import BiasInstability, Noise, RandomWalk, White
 from jaximu.planning import budget as planning
 from jaximu.planning.budget import budget
 from jaximu.planning.goals import parse_goal, per_si
@@ -164,10 +164,10 @@ def test_one_mounting_of_a_head_turns_both_gains_and_nothing_else(head):
 def test_means_of_slow_noise():
     """A Wiener process from zero: the mean over [a, b] has K² (a + (b − a)/3), later means covary by K² (a + b)/2."""
     start, stop = np.array([2.0, 10.0]), np.array([8.0, 15.0])
-    _, walk, _ = _mean_covariances((RandomWalk(0.3),), np.zeros(3), start, stop)
+    _, walk = _mean_covariances(Noise((White(0.0), RandomWalk(0.3))).squares(), start, stop)
     np.testing.assert_allclose(walk[1], 0.09 * np.array([[4.0, 5.0], [5.0, 10 + 5 / 3]]), rtol=1e-12)
     start, stop = np.array([0.0, 20.0]), np.array([20.0, 40.0])
-    _, flicker, _ = _mean_covariances((BiasInstability(0.2),), np.zeros(3), start, stop)
+    _, flicker = _mean_covariances(Noise((White(0.0), BiasInstability(0.2))).squares(), start, stop)
     allan = 0.5 * (flicker[0, 0, 0] + flicker[0, 1, 1] - 2 * flicker[0, 0, 1])
     assert allan == pytest.approx(2 * np.log(2) / np.pi * 0.04, rel=0.01)
 

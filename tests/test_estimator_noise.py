@@ -39,7 +39,7 @@ def turning(seconds=80.0):
     rate[:, 2] = np.where(np.arange(count) < count // 2, TURN, -TURN)
     force = np.tile([0.0, 0.0, G], (count, 1))
     stimulus = Stimulus(force, rate, time=np.arange(count) / RATE)
-    return Trajectory.of(level_driving(PLACE, 20.0).start, stimulus, np.full(count, 1 / RATE), "turns")
+    return Trajectory(level_driving(PLACE, 20.0).start, stimulus, np.full(count, 1 / RATE), "turns").cut()
 
 
 def scale_unknown(sigma):
@@ -118,7 +118,7 @@ def test_late_stamps_cost_what_changes_meanwhile():
     rate[:, 2] = growth * (np.arange(count) / RATE - 20)
     stimulus = Stimulus(np.tile([0.0, 0.0, G], (count, 1)), rate, time=np.arange(count) / RATE)
     start = level_driving(PLACE, 20.0).start
-    path = Trajectory.of(start, stimulus, np.full(count, 1 / RATE), "a ramp", (), True, jitter)
+    path = Trajectory(start, stimulus, np.full(count, 1 / RATE), "a ramp", (), True, jitter).cut()
     found = estimator_noise(ModelledErrors(scale_unknown(1e-12), path), WHITE)
     expected = growth * jitter / np.sqrt(RATE) / 2e-4 / np.sqrt(3)
     share = np.sqrt(1 - 1 / (found.lengths * RATE))  # the first sample of a stretch has none before it

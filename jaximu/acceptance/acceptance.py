@@ -19,12 +19,13 @@ from jaximu.calibration import Calibration
 from jaximu.estimation.problem import flatten, names_of, typical_sizes
 from jaximu.estimation.uncertainty import pose_advice, station_advice
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import FilePath
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import Z95
 
 SCHEMA = "jaximu.acceptance/1"
+_TERM = ("value", "low", "high")
 _BY_HAND = ("joint", "two-step", "two-step-rk4", "accelerometer")
 
 
@@ -54,14 +55,12 @@ class Acceptance(Result, Document, page="certificate"):
         """Return the verdict as the JSON document of schema `jaximu.acceptance/1`."""
         return {
             "schema": SCHEMA,
-            "verdict": self.verdict,
+            **entries(self, "verdict", "trace", "notes"),
             "serial": self.serial or None,
             "calibration": {"file": self.file, "digest": self.digest},
             "limits": dict(self.limits),
             "decision": self.rule.document(),
             "items": [item.document() for item in self.items],
-            "trace": self.trace,
-            "notes": list(self.notes),
             "software": SOFTWARE,
         }
 
@@ -79,6 +78,12 @@ class Judged:
     places: tuple[int, ...]
     probability: FloatArray
     verdict: NDArray[np.str_]
+
+    def result(self, row: int, index: int) -> Json:
+        """Return what an item of a unit says of its value."""
+        arrays = {key: getattr(self.measured, key) for key in ("value", "sigma", "freedom")}
+        numbers = {key: float(array[row, self.places[index]]) for key, array in arrays.items()}
+        return numbers | {"probability": float(self.probability[row, index]), "verdict": str(self.verdict[row, index])}
 
 
 def judge(units: Units, limits: Limits) -> Judged:
@@ -210,26 +215,12 @@ def _item(calibration: Calibration, units: Units, limits: Limits, judged: Judged
     if warm and calibrated and not calibrated[0] <= warm[0] <= warm[1] <= calibrated[1]:
         beyond = f"{calibrated[0]:.1f} to {calibrated[1]:.1f} °C that were calibrated"
         return Item.of(limit, name, reason=f"the limit's temperatures go beyond the {beyond}")
-    value, sigma, gravity, freedom = (
-        float(array[0, at]) for array in (measured.value, measured.sigma, measured.gravity, measured.freedom)
-    )
-    verdict, recording = str(judged.verdict[0, index]), float(np.sqrt(max(sigma**2 - gravity**2, 0.0)))
-    advice = ""
-    if verdict == UNDECIDED:
-        needed = limit.nearest(value) / float(limits.rule.multiple(freedom))
+    result, gravity, advice = judged.result(0, index), float(measured.gravity[0, at]), ""
+    recording = float(np.sqrt(max(result["sigma"] ** 2 - gravity**2, 0.0)))
+    if result["verdict"] == UNDECIDED:
+        needed = limit.nearest(result["value"]) / float(limits.rule.multiple(result["freedom"]))
         advice = deciding(needed, recording, gravity, calibration.gravity.sigma, record)
-    return Item.of(
-        limit,
-        name,
-        value=value,
-        sigma=sigma,
-        freedom=freedom,
-        verdict=verdict,
-        gravity=gravity,
-        probability=float(judged.probability[0, index]),
-        recording=recording,
-        advice=advice,
-    )
+    return Item.of(limit, name, **result, gravity=gravity, recording=recording, advice=advice)
 
 
 def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
@@ -251,11 +242,11 @@ def _record(calibration: Calibration, units: Units, slope: FloatArray) -> str:
 def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> list[Item]:
     items = []
     for axis in limit.axes or range(3):
-        name, term = f"{limit.owner}.{limit.part}[{axis}]", _noise_term(limit, axis, noise)
-        if isinstance(term[0], str):
-            items.append(Item.of(limit, name, reason=term[0], advice=term[1]))
+        name, (reason, advice, term) = f"{limit.owner}.{limit.part}[{axis}]", _noise_term(limit, axis, noise)
+        if reason:
+            items.append(Item.of(limit, name, reason=reason, advice=advice))
             continue
-        value, low, high = term
+        value, low, high = (float(term[key]) for key in _TERM)
         sigma, advice = (high - low) / (2 * Z95), ""
         judged = limit.judged(rule, value, sigma)
         if judged["verdict"] == UNDECIDED:
@@ -265,22 +256,22 @@ def _noise_items(limit: Limit, rule: Rule, noise: Mapping[str, Any] | None) -> l
     return items
 
 
-def _noise_term(limit: Limit, axis: int, noise: Mapping[str, Any] | None) -> tuple:
-    """Return value, low, high (95 %) of a term of an axis; or why there is none, and what to record."""
+def _noise_term(limit: Limit, axis: int, noise: Mapping[str, Any] | None) -> tuple[str, str, Mapping[str, Any]]:
+    """Return why an axis has no such term, and what to record, both "" where there is one; and the term (95 %)."""
     several = limit.part == "repeatability"
     if noise is None:
         what = "several recordings at rest, one a power-on" if several else "a recording at rest"
         logs = "LOG LOG …" if several else "LOG"
-        return f"it takes {what}", f"Run jaximu allan {logs} -o noise, and add --noise noise/allan.json."
+        return f"it takes {what}", f"Run jaximu allan {logs} -o noise, and add --noise noise/allan.json.", {}
     if several:
         known = (noise.get("repeatability") or {}).get(limit.owner)
         if known is None:
-            return "allan.json is of one recording", "Give jaximu allan one recording at rest a power-on."
-        return tuple(float(known[key][axis]) for key in ("value", "low", "high"))
+            return "allan.json is of one recording", "Give jaximu allan one recording at rest a power-on.", {}
+        return "", "", {key: known[key][axis] for key in _TERM}
     axes = noise.get(limit.owner)
     if axes is None:
-        return f"allan.json holds no {limit.owner}", ""
+        return f"allan.json holds no {limit.owner}", "", {}
     term = axes[axis]["terms"].get(limit.part)
     if term is None:
-        return "the recording at rest does not show this term", "Record longer at rest."
-    return tuple(float(term[key]) for key in ("value", "low", "high"))
+        return "the recording at rest does not show this term", "Record longer at rest.", {}
+    return "", "", term

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from jaximu.acceptance.decision import Rule
 from jaximu.acceptance.epochs import Epoch, Scales, epochs_of, over_temperature, owner_of, require_apart
 from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits
 from jaximu.acceptance.quantities import output_stimulus
@@ -30,8 +31,8 @@ from jaximu.estimation.problem import flatten, names_of
 from jaximu.estimation.projection import output_error
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import holm
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.distributions import holm, rms
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
@@ -77,18 +78,9 @@ class Movement:
 
     def document(self, per: str) -> Json:
         """Return it as JSON has it; `per`: unit of time."""
-        return {
-            "name": self.name,
-            "unit": self.unit,
-            "values": list(self.values),
-            "sigmas": list(self.sigmas),
-            "difference": self.difference,
-            "sigma": self.sigma,
-            "z": self.z,
-            "p_value": self.p_value,
+        names = ("name", "unit", "values", "sigmas", "difference", "sigma", "z", "p_value", "moved", "tested")
+        return entries(self, *names) | {
             "p_value_all_allowed_for": self.adjusted if self.tested else None,
-            "moved": self.moved,
-            "tested": self.tested,
             "drift": self.line.document() | {"unit": f"{self.unit} per {per}"},
         }
 
@@ -173,25 +165,18 @@ class UnitHistory(Result, Document, page="history"):
         def reached(limit: LimitReached) -> Json:
             low, high = (end if np.isfinite(end) else None for end in (limit.limit.low, limit.limit.high))
             due = None if limit.after is None else self.due(limit.after)
-            return {
-                "name": limit.name,
-                "low": low,
-                "high": high,
-                "unit": limit.limit.unit,
-                "after": limit.after,
-                "date": due and due.isoformat(),
-            }
+            about = {"low": low, "high": high, "unit": limit.limit.unit, "date": due and due.isoformat()}
+            return entries(limit, "name", "after") | about
 
         columns = zip(self.files, self.times.tolist(), self.dates, self.temperatures, strict=True)
         return {
             "schema": SCHEMA,
-            "verdict": self.verdict,
+            **entries(self, "verdict", "level", "notes"),
             "calibrations": [
                 {"file": file, "time": time, "date": day and day.isoformat(), "temperature": temperature}
                 for file, time, day, temperature in columns
             ],
             "time_unit": self.per,
-            "level": self.level,
             "together": {name: test.document() for name, test in self.together.items()},
             "moved": [movement.name for movement in self.moved],
             "parameters": [movement.document(self.per) for movement in self.movements],
@@ -202,7 +187,6 @@ class UnitHistory(Result, Document, page="history"):
                 "items": [reached(limit) for limit in self.limits],
             },
             "not_compared": list(self.left_out),
-            "notes": list(self.notes),
             "software": SOFTWARE,
         }
 
@@ -240,7 +224,8 @@ def compare(
     require_apart(calibrations, files)
     order, days, times, per, notes = _in_order(calibrations, files, dates)
     ordered, files = [calibrations[index] for index in order], tuple(files[index] for index in order)
-    epochs = epochs_of(ordered, files, {} if limits is None else limits.nominal)
+    limits = limits or Limits((), Rule(), {}, "", "")
+    epochs = epochs_of(ordered, files, limits.nominal)
     names, left_out = _comparable(epochs)
     covariance = _covariance(epochs, names)
     movements = _courses(epochs, names, covariance, times, level)
@@ -258,9 +243,9 @@ def compare(
         together,
         output,
         reached,
-        "" if limits is None else limits.file,
+        limits.file,
         (*left_out, *silent, *unknown),
-        (*notes, *_notes(epochs, {} if limits is None else limits.nominal)),
+        (*notes, *_notes(epochs, limits.nominal)),
         level,
     )
 
@@ -510,7 +495,7 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
     return OutputChange(
         float(length[worst]),
         float(np.sqrt(along @ spread[worst] @ along)),
-        float(np.sqrt(np.mean(length**2))),
+        rms(length),
         float(np.sqrt(np.mean(np.trace(spread, axis1=1, axis2=2)))),
         over,
         SENSOR_UNITS[owner],
@@ -531,11 +516,9 @@ def _error(first: Imu, last: Imu, stimulus: Stimulus, owner: str) -> Any:
 
 
 def _limits_reached(
-    movements: Sequence[Movement], limits: Limits | None, first: Calibration
+    movements: Sequence[Movement], limits: Limits, first: Calibration
 ) -> tuple[tuple[LimitReached, ...], list[str]]:
     """Return when each limit's guard band is reached, and which limits cannot be followed, in sentences."""
-    if limits is None:
-        return (), []
     reached, unknown = [], []
     for limit in limits.limits:
         triad = first.triads().get(limit.owner)

@@ -64,16 +64,15 @@ def write_measurements(verdicts: Sequence[Acceptance] | Line, path: FilePath) ->
         temporary.write_bytes(writer(rows))
 
 
+def _row(item: Item, device: str, file: str, date: str) -> Json:
+    return item.document() | {"device": device, "file": file, "date": date, "item": item}
+
+
 def _of_units(verdicts: Sequence[Acceptance]) -> Iterator[Json]:
     for acceptance in verdicts:
         day = str((acceptance.trace or {}).get("date", ""))
         for item in acceptance.items:
-            yield item.document() | {
-                "device": acceptance.serial or acceptance.file,
-                "file": acceptance.file,
-                "date": day,
-                "item": item,
-            }
+            yield _row(item, acceptance.serial or acceptance.file, acceptance.file, day)
 
 
 def _of_line(line: Line) -> Iterator[Json]:
@@ -81,14 +80,9 @@ def _of_line(line: Line) -> Iterator[Json]:
     for row, (device, file, day) in enumerate(zip(table.devices, table.files, table.days.tolist(), strict=True)):
         date = "" if np.isnan(day) else str(np.datetime64(int(day), "D"))
         for item in line.judgement(row):
-            yield item.document() | {"device": device, "file": file, "date": date, "item": item}
+            yield _row(item, device, file, date)
     for missing in sorted(set(range(table.total)) - set(table.rows.tolist())):
-        yield _NOT_CALIBRATED.document() | {
-            "device": f"row {missing + 1} of {table.file}",
-            "file": table.file,
-            "date": "",
-            "item": _NOT_CALIBRATED,
-        }
+        yield _row(_NOT_CALIBRATED, f"row {missing + 1} of {table.file}", table.file, "")
 
 
 def _by_unit(rows: list[Json]) -> Iterator[tuple[str, list[Json]]]:
@@ -141,15 +135,8 @@ def _openhtf(rows: list[Json]) -> bytes:
         day = some[0]["date"]
         stamp = round(1000 * datetime.fromisoformat(day).replace(tzinfo=UTC).timestamp()) if day else None
         outcome, marginal = "PASS" if verdict == PASS else "FAIL", verdict == UNDECIDED
-        details = (
-            []
-            if verdict == PASS
-            else [
-                {"code": verdict, "description": f"{row['name']}: {_said(row)}"}
-                for row in some
-                if row["verdict"] != PASS
-            ]
-        )
+        missed = [row for row in some if row["verdict"] != PASS]
+        details = [{"code": verdict, "description": f"{row['name']}: {_said(row)}"} for row in missed]
         times = {"start_time_millis": stamp, "end_time_millis": stamp}
         phase = {
             "name": "calibration",

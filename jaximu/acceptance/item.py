@@ -9,7 +9,7 @@ import numpy as np
 
 from jaximu.acceptance.decision import UNDECIDED
 from jaximu.acceptance.limits import Limit
-from jaximu.ground.document import Json
+from jaximu.ground.document import Json, entries
 
 _MOST = 100.0
 """Times the poses from which no recording is advised any more."""
@@ -50,20 +50,13 @@ class Item:
 
     def document(self) -> Json:
         """Return the item as JSON has it; uncertainty is expanded, k = 2."""
-        return {
-            "name": self.name,
-            "value": self.value,
+        names = ("name", "value", "unit", "verdict", "probability", "source", "reason", "advice")
+        return entries(self, *names) | {
             "uncertainty": None if self.sigma is None else 2 * self.sigma,
             "low": _finite(self.low),
             "high": _finite(self.high),
-            "unit": self.unit,
-            "verdict": self.verdict,
-            "probability": self.probability,
             "degrees_of_freedom": _finite(self.freedom),
-            "source": self.source,
-            "reason": self.reason,
-            "advice": self.advice,
-            "budget": {"recording": self.recording, "gravity": self.gravity},
+            "budget": entries(self, "recording", "gravity"),
         }
 
 

@@ -42,7 +42,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import Json, file_digest, read_toml
 from jaximu.ground.errors import FilePath, InputError, only
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS, unit
-from jaximu.model.data_sheet import SI_UNITS, parse_quantity
+from jaximu.model.data_sheet import NUMBER_WITH_UNIT, SI_UNITS, parse_quantity
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.columns.nominal import parse_offset, parse_scale
 
@@ -58,7 +58,6 @@ OUTPUTS = ("output", "raw_output")
 _PARTS = ("bias", "scale", "misalignment", *OUTPUTS, "repeatability")
 _LONGEST = 3600.0  # s, of navigation
 _KEY = re.compile(r"([a-z_.A-Z]+?)(?:\[(\d)(?:,\s*(\d))?\])?")
-_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
 _KEYS = ("within", "low", "high", "typical", "source", "over", "temperature", "after")
 _TOP = ("rule", "risk", "source", "limits", "nominal")
 
@@ -239,7 +238,7 @@ def _value(stated: Any, base: str, where: str) -> float:
 
 def _split(stated: Any, where: str, hint: str) -> tuple[float, str]:
     """Return a number and the text of its unit."""
-    match = _NUMBER.fullmatch(stated) if isinstance(stated, str) else None
+    match = NUMBER_WITH_UNIT.fullmatch(stated) if isinstance(stated, str) else None
     if match is None or not match[2]:
         raise InputError(f"{where}: {stated!r} needs a number with its unit{hint}.")
     return float(match[1]), match[2]

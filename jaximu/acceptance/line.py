@@ -31,19 +31,18 @@ from jaximu.acceptance.statistics import (
     with_ends,
 )
 from jaximu.acceptance.words import amount, si_unit, spoken
-from jaximu.fleets.population import LEVEL, days_of, read_fleet
+from jaximu.fleets.population import FEWEST, LEVEL, days_of, read_fleet
 from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, covariances, free_places, require_table
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
-from jaximu.ground.distributions import student_cdf
-from jaximu.ground.document import Document, Json, file_digest
+from jaximu.ground.distributions import student_two_sided
+from jaximu.ground.document import Document, Json, entries, file_digest
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
+from jaximu.ground.quantities import Z95
 from jaximu.ground.units import SENSORS
 from jaximu.model.sensor import Imu
 
-_FEWEST = 8  # units of a chart
-_GOLDEN = 4  # recordings of a unit from which its drift is asked about
 _SHOWN_ITEMS = 1000  # of a table, that its document holds
 _ROW = (
     "device",
@@ -112,7 +111,7 @@ class Alarm:
 
     def document(self) -> dict[str, str]:
         """Return the alarm as JSON has it."""
-        return {"kind": self.kind, "name": self.name, "where": self.where, "text": self.text}
+        return entries(self, "kind", "name", "where", "text")
 
 
 @dataclass(frozen=True)
@@ -179,13 +178,10 @@ class Line(Result, Document, page="line"):
         return [] if judged is None else [self._item(judged, row, index) for index in range(len(judged.names))]
 
     def _item(self, judged: Judged, row: int, index: int) -> Item:
-        at, measured = judged.places[index], judged.measured
-        numbers: Json = {"reason": "not determined"}
-        if at >= 0 and measured.determined[row, at]:
-            numbers = {key: float(getattr(measured, key)[row, at]) for key in ("value", "sigma", "freedom")}
-            numbers["probability"] = float(judged.probability[row, index])
-        verdict = str(judged.verdict[row, index])
-        return Item.of(judged.limits[index], judged.names[index], verdict=verdict, **numbers)
+        at = judged.places[index]
+        known = at >= 0 and judged.measured.determined[row, at]
+        result = judged.result(row, index) if known else {"reason": "not determined"}
+        return Item.of(judged.limits[index], judged.names[index], **result)
 
     def document(self) -> Json:
         """Return verdicts and statistics as JSON has them; single units' verdicts stand in the table."""
@@ -196,8 +192,8 @@ class Line(Result, Document, page="line"):
             "verdict": self.verdict if limits else None,
             "table": self.table.file,
             "counts": dict(self.counts) if limits else None,
-            "limits": None if limits is None else {"file": limits.file, "sha256": limits.sha256},
-            "decision": None if limits is None else limits.rule.document(),
+            "limits": limits and entries(limits, "file", "sha256"),
+            "decision": limits and limits.rule.document(),
             "items": items,
             "line": [_entry(quantity) for quantity in self.followed],
             "alarms": [alarm.document() for alarm in self.alarms],
@@ -210,29 +206,22 @@ def _entry(quantity: FollowedQuantity) -> Json:
     able = quantity.capability
     return {
         "name": quantity.name,
-        "capability": None
-        if able is None
-        else {
+        "capability": able
+        and entries(able, "mean", "deviation")
+        | {
             "units": able.count,
-            "mean": able.mean,
-            "deviation": able.deviation,
             "cp": None if np.isnan(able.cp[0]) else with_ends(able.cp),
             "cpk": with_ends(able.cpk),
         },
         "cpk_by_lot": {lot: with_ends(able.cpk) for lot, able in quantity.lots.items()},
         "charts": {
-            where: {
-                "centre": chart.centre,
-                "deviation": chart.deviation,
-                "reach": chart.bound,
-                "beyond": len(chart.beyond),
-                "jumps": len(chart.jumps),
-                "drifting": len(chart.drifting),
-            }
+            where: entries(chart, "centre", "deviation")
+            | {"reach": chart.bound}
+            | {name: len(getattr(chart, name)) for name in ("beyond", "jumps", "drifting")}
             for where, (chart, _) in quantity.charts.items()
         },
-        "gauge": None if quantity.gauge is None else quantity.gauge.document(),
-        "drift": None if quantity.drift is None else vars(quantity.drift),
+        "gauge": quantity.gauge and quantity.gauge.document(),
+        "drift": quantity.drift and vars(quantity.drift),
     }
 
 
@@ -273,18 +262,18 @@ def read_table(path: FilePath) -> Batch:
         outputs[f"{owner}_unit"] = output_units[0]
     like = Imu.nominal(**outputs)
     like = like if gyroscope else Imu(like.accelerometer, None)
-    parts = [numbers(column) for column in list(COLUMN_PLACES)[: 2 * len(triads)]]
+    values = np.concatenate([numbers(column) for column in list(COLUMN_PLACES)[: 2 * len(triads)]], axis=1)
     free = free_places(gyroscope)
     covariance = covariances(numbers("covariance"))[np.ix_(range(len(rows)), free, free)]
     # gravity's part is in the sigmas and not in the covariance; it acts on the accelerometer's gain as a whole
     scales = [0, 4, 8]
     variances = np.diagonal(covariance, axis1=1, axis2=2)[:, [free.index(index) for index in scales]]
     added = numbers("accel_gain_sigma")[:, scales] ** 2 - variances
-    gravity = np.sqrt(np.maximum(np.mean(added / parts[0][:, scales] ** 2, axis=1), 0.0))
-    by_gravity = np.where(np.array(free) < 9, np.concatenate(parts, axis=1)[:, free], 0.0) * gravity[:, None]
+    gravity = np.sqrt(np.maximum(np.mean(added / values[:, scales] ** 2, axis=1), 0.0))
+    by_gravity = np.where(np.array(free) < 9, values[:, free], 0.0) * gravity[:, None]
     units = Units(
         like,
-        np.concatenate(parts, axis=1),
+        values,
         tuple(PARAMETERS[index] for index in free),
         covariance + by_gravity[:, :, None] * by_gravity[:, None, :],
         gravity,
@@ -400,20 +389,20 @@ def follow(table: Batch, limits: Limits | None = None, golden: str = "") -> Line
         charts = {}
         for station in stations:
             some = first[np.array(table.stations)[first] == station]
-            if len(some) >= _FEWEST:
+            if len(some) >= FEWEST:
                 charts[station] = control_chart(values[some], LEVEL / len(shown) / len(stations)), some
         limit = by_name.get(name)
         able = capability(values[first], limit.low, limit.high) if limit is not None and len(first) > 1 else None
-        lots = () if limit is None else _groups(table.lots, first).items()
+        lots = _groups(table.lots, first).items()
         by_lot = {lot: capability(values[some], limit.low, limit.high) for lot, some in lots if limit}
         study = gauge(values, recording, table.devices, table.stations)
-        course = drift(table.days[watched], values[watched]) if np.sum(watched) >= _GOLDEN else None
+        course = drift(table.days[watched], values[watched])
         followed.append(FollowedQuantity(name, limit, able, by_lot, charts, study, course))
         alarms += _alarms(table, name, charts, course, golden, len(shown))
         for kind, labels in (("station", table.stations), ("lot", table.lots)):
             alarms += _compared(kind, _groups(labels, first), name, values[first], first, len(shown))
     if not any(quantity.charts for quantity in followed):
-        notes.append(f"fewer than {_FEWEST} units: no control chart.")
+        notes.append(f"fewer than {FEWEST} units: no control chart.")
     elif np.isnan(table.days[first]).all():
         notes.append("no dates are known: the charts follow the order of the table.")
     return Line(table, limits, judged, measured, verdicts, tuple(followed), tuple(alarms), golden, tuple(notes))
@@ -457,7 +446,7 @@ def _alarms(
             alarms.append(Alarm(kind, name, station, texts, ((float(away[most]), 3),)))
     if course is not None and course.p_value * questions < LEVEL:
         texts = (f"{spoken(name)} of the golden unit {golden} drifts by ", " in 30 days (± ", ", 95 %)")
-        amounts = ((30 * course.slope, 3), (30 * 1.96 * course.sigma, 2))
+        amounts = ((30 * course.slope, 3), (30 * Z95 * course.sigma, 2))
         alarms.append(Alarm("golden", name, "", texts, amounts))
     return alarms
 
@@ -467,7 +456,7 @@ def _groups(labels: Sequence[str], first: IntArray) -> dict[str, IntArray]:
     of_first = np.array(labels)[first]
     names = [label for label in sorted(set(of_first.tolist())) if label]
     return {
-        label: first[of_first == label] for label in names if len(names) > 1 and np.sum(of_first == label) >= _FEWEST
+        label: first[of_first == label] for label in names if len(names) > 1 and np.sum(of_first == label) >= FEWEST
     }
 
 
@@ -503,7 +492,7 @@ def _shift(values: FloatArray, inside: BoolArray, all_of: BoolArray) -> tuple[fl
     parts = np.array([np.var(side, ddof=1) / len(side) for side in sides])
     shift, variance = float(sides[0].mean() - sides[1].mean()), float(parts.sum())
     freedom = variance**2 / float(np.sum(parts**2 / np.array([len(side) - 1 for side in sides])))
-    return shift, 2 * float(student_cdf(-abs(shift) / np.sqrt(variance), freedom))
+    return shift, float(student_two_sided(shift / np.sqrt(variance), freedom))
 
 
 def write_verdicts(line: Line, path: FilePath) -> None:

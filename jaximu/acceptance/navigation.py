@@ -22,10 +22,8 @@ from jaximu.ground.errors import NotPossibleError
 from jaximu.navigation.consequences import consequences
 from jaximu.navigation.trajectory import Place, level_driving
 from jaximu.noise.stated import sensor_noise
-from jaximu.planning.information import gravity_sensitivity
 
 _LATITUDE = 45.0  # deg, of the path
-_UP = 8  # of the nine errors: the rotation about the vertical
 
 
 def navigation_items(
@@ -37,7 +35,8 @@ def navigation_items(
     """
     items, notes = [], []
     known = None if noise is None else sensor_noise(noise, "the allan.json")
-    site = Place(_LATITUDE, 0.0, calibration.gravity)
+    site, by_gravity = Place(_LATITUDE, 0.0, calibration.gravity), calibration.gravity_shift()
+    gravity_known = replace(calibration, covariance=calibration.covariance - np.outer(by_gravity, by_gravity))
     for after in dict.fromkeys(limit.after for limit in limits):
         here = [limit for limit in limits if limit.after == after]
         try:
@@ -45,9 +44,9 @@ def navigation_items(
         except NotPossibleError as error:
             items += [Item.of(limit, limit.key, reason=str(error).rstrip(".")) for limit in here]
             continue
-        exact = consequences(_gravity_known(calibration), level_driving(site, after), draws=0, files=(file, ""))
-        errors = [
-            (np.sqrt(variances[-1, :3]), np.degrees(np.sqrt(variances[-1, _UP:])))
+        exact = consequences(gravity_known, level_driving(site, after), draws=0, files=(file, ""))
+        errors = [  # of position, and of the rotation about the vertical
+            (np.sqrt(variances[-1, :3]), np.degrees(np.sqrt(variances[-1, -1:])))
             for variances in (outcome.calibration, exact.calibration, outcome.noise)
         ]
         for limit in here:
@@ -60,12 +59,6 @@ def navigation_items(
         notes.append(f"{', '.join(limit.key for limit in here)}: after {outcome.trajectory.words}.")
         notes += [] if known else [f"{here[0].key}: without --noise the sensors' noise is left out."]
     return items, notes
-
-
-def _gravity_known(calibration: Calibration) -> Calibration:
-    """Return the calibration as it were with gravity known exactly: it acts on the accelerometer's gain, K ∝ 1/g."""
-    by_gravity = gravity_sensitivity(calibration.imu, calibration.names, calibration.gravity)
-    return replace(calibration, covariance=calibration.covariance - np.outer(by_gravity, by_gravity))
 
 
 def _item(

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
 
 from jaximu.ground.array_types import FloatArray, IntArray
-from jaximu.ground.distributions import chi2_isf, chi2_sf, f_tails, normal_isf, student_cdf
-from jaximu.ground.document import Json
+from jaximu.ground.distributions import chi2_isf, chi2_sf, deviation_interval, f_tails, normal_isf, student_two_sided
+from jaximu.ground.document import Json, entries
 
 _WEIGHT = 0.2  # of the newest value in the moving average
-_MEAN_RANGE = 2 / np.sqrt(np.pi)  # mean range of two normal numbers, d2 = 1.128
 _CATEGORIES = 1.41  # AIAG's √2: a category is a 97 % interval of the gauge wide
 _POOLED = 0.25  # p-value from which AIAG takes an interaction for repeatability
 
@@ -42,17 +41,11 @@ def capability(values: FloatArray, low: float, high: float) -> Capability:
     """
     count, mean, deviation = len(values), float(np.mean(values)), float(np.std(values, ddof=1))
     with np.errstate(divide="ignore", invalid="ignore"):
-        cp = np.float64(high - low) / (6 * deviation) if np.isfinite(high - low) else np.nan
-        cpk = np.float64(min(high - mean, mean - low)) / (3 * deviation)
-    ends = [np.sqrt(chi2_isf(p, count - 1) / (count - 1)) for p in (0.975, 0.025)]
-    half = normal_isf(0.025) * np.sqrt(1 / (9 * count) + cpk**2 / (2 * (count - 1)))
-    return Capability(
-        count,
-        mean,
-        deviation,
-        (float(cp), float(cp * ends[0]), float(cp * ends[1])),
-        (float(cpk), float(cpk - half), float(cpk + half)),
-    )
+        cp = float(np.float64(high - low) / (6 * deviation)) if np.isfinite(high - low) else np.nan
+        cpk = float(np.float64(min(high - mean, mean - low)) / (3 * deviation))
+    low_end, high_end = deviation_interval(count - 1).tolist()
+    half = float(normal_isf(0.025) * np.sqrt(1 / (9 * count) + cpk**2 / (2 * (count - 1))))
+    return Capability(count, mean, deviation, (cp, cp / high_end, cp / low_end), (cpk, cpk - half, cpk + half))
 
 
 @dataclass(frozen=True)
@@ -83,7 +76,8 @@ def control_chart(values: FloatArray, level: float) -> Chart:
     """
     count = len(values)
     ranges = np.abs(np.diff(values))
-    centre, deviation = float(np.mean(values)), float(np.mean(ranges) / _MEAN_RANGE)
+    # two normal numbers have a mean range of 2/√π = 1.128 of their deviation
+    centre, deviation = float(np.mean(values)), float(np.mean(ranges) * np.sqrt(np.pi) / 2)
     bound = float(normal_isf(level / 2 / count))
     average = np.empty(count)
     running = centre
@@ -135,17 +129,13 @@ class Gauge:
 
     def document(self) -> Json:
         """Return it as JSON has it."""
-        return {
+        return entries(self, "reproducibility", "parts", "crossed", "p_value") | {
             "repeatability": with_ends(self.repeatability),
-            "reproducibility": self.reproducibility,
             "gauge": self.total,
-            "parts": self.parts,
             "ndc": self.categories,
             "units": self.count,
             "recordings": self.repetitions,
-            "crossed": self.crossed,
             "observed_over_stated": self.explained,
-            "p_value": self.p_value,
         }
 
 
@@ -156,68 +146,46 @@ def gauge(values: FloatArray, sigma: FloatArray, parts: Sequence[str], places: S
     factors, and their interaction goes to repeatability unless its p-value is below 0.25 (AIAG, Measurement Systems
     Analysis, 4th edition); else parts are the only factor, with any number of repetitions.
     """
-    part, count = np.unique(np.asarray(parts), return_inverse=True)[1], len(set(parts))
-    repeated = np.bincount(part)
-    if count < 2 or repeated.max() < 2:
+    times = Counter(parts)
+    kept = np.array([times[part] > 1 for part in parts], bool)
+    if len(set(np.asarray(parts)[kept])) < 2:  # a part measured once says nothing of the gauge
         return None
-    kept = (repeated > 1)[part]  # a part measured once says nothing of the gauge, and of the parts what others say too
-    if len(set(part[kept])) < 2:
-        return None
-    values, sigma, part = values[kept], sigma[kept], np.unique(part[kept], return_inverse=True)[1]
-    site = np.unique(np.asarray(places)[kept], return_inverse=True)[1]
-    size, sites = int(part.max()) + 1, int(site.max()) + 1
-    number = np.bincount(part).astype(float)
-    means = np.bincount(part, values) / number
-    freedom = len(values) - size
-    within = float(np.sum((values - means[part]) ** 2))
-    between = float(number @ (means - values.mean()) ** 2) / (size - 1)
-    cells = np.zeros((size, sites))
-    np.add.at(cells, (part, site), 1)
-    crossed = bool(sites > 1 and (cells == cells[0, 0]).all())
-    reproducibility = 0.0
+    values, sigma = values[kept], sigma[kept]
+    part, site = (np.unique(np.asarray(labels)[kept], return_inverse=True)[1] for labels in (parts, places))
+    size, sites, count = int(part.max()) + 1, int(site.max()) + 1, len(values)
+    cell = part * sites + site
+    number = np.bincount(cell, minlength=size * sites)
+    crossed = sites > 1 and not np.ptp(number)
+
+    def about_means(labels: IntArray, weight: FloatArray) -> float:
+        """Return the sum of squares about the mean of each label."""
+        mean = np.bincount(labels, weight * values) / np.bincount(labels, weight)
+        return float(weight @ (values - mean[labels]) ** 2)
+
+    alike, freedom = np.ones(count), count - size
+    whole, within = about_means(np.zeros_like(part), alike), about_means(part, alike)
+    error, rest, against, reproducibility = within, freedom, within / freedom, 0.0
     if crossed:
-        per_cell = cells[0, 0]
-        of_place = np.bincount(site, values) / np.bincount(site)
-        squares = size * per_cell * float(np.sum((of_place - values.mean()) ** 2))
-        cell = np.zeros((size, sites))
-        np.add.at(cell, (part, site), values / per_cell)
-        additive = means[:, None] + of_place - values.mean()
-        interaction, crossed_freedom = per_cell * float(np.sum((cell - additive) ** 2)), (size - 1) * (sites - 1)
-        error, rest = within - squares - interaction, len(values) - size * sites
-        pooled = (
-            rest == 0
-            or f_tails(interaction / crossed_freedom / max(error / max(rest, 1), 1e-300), crossed_freedom, rest)[1]
-            > _POOLED
-        )
-        if pooled:
-            error, rest = error + interaction, rest + crossed_freedom
-        variance, freedom = max(error, 0.0) / rest, rest
-        against = variance if pooled else interaction / crossed_freedom
-        reproducibility = float(
-            np.sqrt(
-                max(squares / (sites - 1) - against, 0.0) / (size * per_cell)
-                + (0.0 if pooled else max(against - variance, 0.0) / per_cell)
-            )
-        )
-        of_parts = max(between - against, 0.0) / (sites * per_cell)
-    else:
-        variance = within / freedom
-        typical = (len(values) - float(number @ number) / len(values)) / (size - 1)  # repetitions, if they differ
-        of_parts = max(between - variance, 0.0) / typical
-    low, high = (np.sqrt(freedom / chi2_isf(p, freedom)) for p in (0.025, 0.975))
-    weight = 1 / sigma**2
-    centre = np.bincount(part, weight * values) / np.bincount(part, weight)
-    square, all_freedom = float(weight @ (values - centre[part]) ** 2), len(values) - size
-    root = float(np.sqrt(variance))
+        squares, error, rest = whole - about_means(site, alike), about_means(cell, alike), count - size * sites
+        interaction, degrees = max(within - squares - error, 0.0), (size - 1) * (sites - 1)
+        against = interaction / degrees
+        if rest == 0 or f_tails(against / max(error / rest, 1e-300), degrees, rest)[1] > _POOLED:
+            error, rest = error + interaction, rest + degrees
+            against = error / rest
+        of_place = max(squares / (sites - 1) - against, 0.0) / size + max(against - error / rest, 0.0)
+        reproducibility = float(np.sqrt(of_place / number[0]))
+    root = float(np.sqrt(error / rest))
+    typical = (count - np.sum(np.bincount(part) ** 2) / count) / (size - 1)  # repetitions, if they differ
+    square = about_means(part, 1 / sigma**2)
     return Gauge(
-        (root, float(low * root), float(high * root)),
+        (root, *(root * deviation_interval(rest)).tolist()),
         reproducibility,
-        float(np.sqrt(of_parts)),
+        float(np.sqrt(max((whole - within) / (size - 1) - against, 0.0) / typical)),
         size,
-        len(values),
+        count,
         crossed,
-        float(np.sqrt(square / all_freedom)),
-        float(chi2_sf(square, all_freedom)),
+        float(np.sqrt(square / freedom)),
+        float(chi2_sf(square, freedom)),
     )
 
 
@@ -226,7 +194,7 @@ def tolerance_factor(count: int, share: float = 0.99, confidence: float = 0.95) 
 
     Howe's approximation (Journal of the American Statistical Association 64, 1969), right to a percent from ten on.
     """
-    z = -special.ndtri((1 - share) / 2)
+    z = normal_isf((1 - share) / 2)
     return float(z * np.sqrt((count - 1) * (1 + 1 / count) / chi2_isf(confidence, count - 1)))
 
 
@@ -241,11 +209,11 @@ class Drift:
 
 def drift(days: FloatArray, values: FloatArray) -> Drift | None:
     """Return the drift of values (n,) over days (n,), by least squares; None for fewer than four or a single day."""
+    if len(values) < 4 or not np.ptp(days) > 0:
+        return None
     away = days - days.mean()
     square = float(away @ away)
-    if len(values) < 4 or not square > 0:
-        return None
     slope = float(away @ values) / square
     rest = values - values.mean() - slope * away
     sigma = float(np.sqrt(rest @ rest / (len(values) - 2) / square))
-    return Drift(slope, sigma, float(2 * student_cdf(-abs(slope) / max(sigma, 1e-300), len(values) - 2)))
+    return Drift(slope, sigma, float(student_two_sided(slope / max(sigma, 1e-300), len(values) - 2)))

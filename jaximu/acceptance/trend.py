@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import chi2_sf, student_cdf, student_isf
+from jaximu.ground.distributions import chi2_sf, student_isf, student_two_sided
 from jaximu.ground.document import Json
 
 _ROUNDING = 1e-12
@@ -102,7 +102,7 @@ class StraightLine:
     @property
     def p_of_none(self) -> float:
         """The probability of a slope as steep if there is none."""
-        return float(2 * student_cdf(-abs(self.slope) / self.sigma, self.freedom))
+        return float(student_two_sided(self.slope / self.sigma, self.freedom))
 
     def until(self, low: float, high: float, multiple: float) -> float | None:
         """Return after how long, from the last value on, a value to come is within its guard band of a limit.

@@ -24,6 +24,12 @@ def chi2_isf(probability, freedom):
     return 2 * scipy.special.gammainccinv(np.asarray(freedom) / 2, probability)
 
 
+def deviation_interval(freedom, confidence=0.95):
+    """Return the ends (2, …) of the interval of a standard deviation, over its estimate with so many degrees."""
+    tail = (1 - confidence) / 2
+    return np.sqrt([freedom / chi2_isf(p, freedom) for p in (tail, 1 - tail)])
+
+
 def noncentral_chi2_sf(value, freedom, noncentrality):
     """Return the probability that noncentral χ² exceeds a value: the power of a test."""
     return 1 - scipy.special.chndtr(value, freedom, noncentrality)
@@ -77,6 +83,11 @@ def student_cdf(value, freedom):
     freedom = np.asarray(freedom, float)
     few = scipy.special.stdtr(np.where(np.isinf(freedom), 1.0, freedom), value)
     return np.where(np.isinf(freedom), scipy.special.ndtr(value), few)
+
+
+def student_two_sided(value, freedom):
+    """Return the probability that Student's t (see `student_cdf`) is as far from zero as a value."""
+    return 2 * student_cdf(-np.abs(value), freedom)
 
 
 def student_isf(probability, freedom):

@@ -27,6 +27,15 @@ def digest(document: Json) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+def entries(thing: object, *names: str) -> Json:
+    """Return attributes of a thing by their names, as a document has them: arrays and tuples as lists."""
+
+    def plain(value: Any) -> Any:
+        return list(value) if isinstance(value, tuple) else getattr(value, "tolist", lambda: value)()
+
+    return {name: plain(getattr(thing, name)) for name in names}
+
+
 def file_digest(path: FilePath) -> str:
     """Return the SHA-256 of a file. Raises `InputError` where it cannot be read."""
     with readable(path), open(path, "rb") as file:

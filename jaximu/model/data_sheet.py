@@ -79,6 +79,8 @@ _ATOMS = {
     for name in names.split()
 }
 _FACTOR = re.compile(r"(?:(sqrt|√)\s*\(?\s*([^\s()^*/·]+)\s*\)?|([^\s()^*/·√]+))(?:\^\(?(-?[0-9.]+(?:/[0-9]+)?)\)?)?")
+NUMBER_WITH_UNIT = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
+"""A number, and the text of its unit, which may be empty."""
 _SUPERSCRIPTS = str.maketrans({"²": "^2", "³": "^3"})
 
 
@@ -144,7 +146,7 @@ def parse_quantity(text: str | float, unit: str, what: str = "value") -> float:
     """
     if isinstance(text, int | float) and not isinstance(text, bool):
         return float(text)
-    match = re.fullmatch(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*", str(text))
+    match = NUMBER_WITH_UNIT.fullmatch(str(text))
     if not match:
         raise InputError(f"{what}: {text!r} is not a number with a unit such as {unit}.")
     if not match[2]:

@@ -46,8 +46,6 @@ FIGURE_TERMS = {
     "bias": "B",
 }
 """The term in whose unit `Noise.from_datasheet` takes a figure."""
-ALLAN_MINIMUM = float(np.sqrt(2 * np.log(2) / np.pi))
-"""Allan deviation of flicker noise of B = 1: 0.664."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,8 @@ class Noise:
                     "bias_instability_is must say what the sheet means by its bias (in-)stability: 'B', or "
                     "'allan-minimum' for the lowest point of the Allan deviation, which is 0.664 B."
                 )
-            processes.append(kinds.BiasInstability(value if bias_instability_is == "B" else value / ALLAN_MINIMUM))
+            share = 1.0 if bias_instability_is == "B" else np.sqrt(kinds.FLICKER_VARIANCE)
+            processes.append(kinds.BiasInstability(value / share))
         for name, kind, figure in (
             ("rate_random_walk", kinds.RandomWalk, rate_random_walk),
             ("quantisation", kinds.Quantisation, quantisation),
@@ -118,6 +117,13 @@ class Noise:
     def allan_deviation(self, tau: ArrayLike) -> FloatArray:
         """Return the Allan deviation in theory at averaging times (n,), s: variances of the processes added up."""
         return np.sqrt(sum((process.allan_variance(tau) for process in self.processes), start=np.zeros(np.shape(tau))))
+
+    def squares(self) -> dict[str, FloatArray]:
+        """Return the squares (3,) of the sizes of the terms there are, by letter, SI."""
+        squares: dict[str, FloatArray] = {}
+        for process in self.processes:
+            squares[process.letter] = squares.get(process.letter, np.zeros(3)) + process.size[..., 0] ** 2
+        return squares
 
     def figures(self, rate: float | None = None) -> list[dict[str, object]]:
         """Return each term as a data sheet would: continuous in SI and in the customary unit; discrete where it is one.

@@ -30,7 +30,7 @@ _FELT = 4.0
 """Hz: means over poses and parts of turns hardly feel what is faster."""
 _BENT = 0.05
 """Share by which a band's power may differ from the terms' before they are taken not to follow it."""
-_QUICK, _ALIKE = 20.0, 1.0
+_QUICK = 20.0
 """Correlation time (s) above which processes are slow bias: flicker noise, in which all of them are alike to a factor
 of two or so, and a random walk, which is the slowest of them."""
 
@@ -152,7 +152,7 @@ def _non_negative(expected: FloatArray, mean: FloatArray, counts: IntArray, time
 
     A mean of c ordinates of power S has the variance S²/c: Fisher scoring for their Gamma likelihood. Of processes so
     slow that few ordinates feel them, least squares would make one large and its neighbours zero. They are known
-    beforehand to be flicker noise, of one size but for `_ALIKE` times it, and a random walk, which the slowest stands
+    beforehand to be flicker noise, of one size to a factor of two or so, and a random walk, which the slowest stands
     for: two more unknowns, which the ordinates feel through these processes alone.
     """
     terms = len(expected)
@@ -168,7 +168,7 @@ def _non_negative(expected: FloatArray, mean: FloatArray, counts: IntArray, time
         columns, target = (felt * weight).T, mean * weight
         if sizes.any():
             flicker = np.sum(sizes[slow[:-1]]) / max(len(slow) - 1, 1)
-            level = _ALIKE * max(flicker, 1e-3 * np.max(sizes[2:], initial=0.0))
+            level = max(flicker, 1e-3 * np.max(sizes[2:], initial=0.0))
             columns = np.concatenate([columns, alike / level]) if level else columns
             target = np.concatenate([target, np.zeros(len(columns) - len(target))])
         scale = np.linalg.norm(columns, axis=0)

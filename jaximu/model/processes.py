@@ -271,6 +271,10 @@ class Quantisation(Process):
 RATIO = 4.0
 """Ratio of neighbouring correlation times in a bank that stands for flicker noise; its spectrum ripples by
 2 / cosh(π² / ln 4) = 0.3 %."""
+MEMBER_VARIANCE = math.log(RATIO) / math.pi
+"""Variance of each process of a bank that stands for flicker noise of B = 1."""
+FLICKER_VARIANCE = 2 * math.log(2) / math.pi
+"""Allan variance of flicker noise of B = 1: 0.664²."""
 
 
 def correlation_times(shortest: float, longest: float) -> FloatArray:
@@ -313,7 +317,7 @@ class BiasInstability(Process):
         return self.size**2 / (2 * np.pi * np.abs(np.asarray(frequency)))
 
     def allan_variance(self, tau):
-        return 2 * np.log(2) / np.pi * self.size**2 * np.ones_like(np.asarray(tau, float))
+        return FLICKER_VARIANCE * self.size**2 * np.ones_like(np.asarray(tau, float))
 
 
 @lru_cache(maxsize=64)
@@ -327,8 +331,7 @@ def _innovations(correlation_times: tuple[float, ...], interval: float):
     spread.
     """
     pole = interval / np.sort(correlation_times)
-    variance = np.log(RATIO) / np.pi
-    excess, weight = 2 * np.sinh(pole / 2) ** 2, variance * np.sinh(pole)  # cosh p − 1, and the numerators
+    excess, weight = 2 * np.sinh(pole / 2) ** 2, MEMBER_VARIANCE * np.sinh(pole)  # cosh p − 1, and the numerators
 
     def imbalance(logarithm: float) -> float:
         return float(np.sum(weight / (excess - np.exp(logarithm))))
@@ -346,3 +349,7 @@ def _innovations(correlation_times: tuple[float, ...], interval: float):
     values, vectors = np.linalg.eigh(np.outer(gain, gain) / -np.expm1(-np.add.outer(pole, pole)))
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
     return np.diag(decay), gain[:, None], np.ones(len(pole)), np.array([deviation]), root
+
+
+TERM_PROCESSES = {kind.letter: kind for kind in (Quantisation, White, BiasInstability, RandomWalk, RateRamp)}
+"""The process of each term of the Allan deviation, of its size alone."""

@@ -48,6 +48,10 @@ class Stimulus(eqx.Module):
         values = {field: getattr(self, field) for field in fields}
         return replace(self, **{field: change(value) for field, value in values.items() if value is not None})
 
+    def beside_motion(self) -> "Stimulus":
+        """Return what a model that corrects the output knows: temperature and the like, not the true force and rate."""
+        return replace(self, specific_force=None, angular_rate=None, angular_acceleration=None)
+
     def on_a_path(self) -> bool:
         """Return whether there are stamps along a path, not one instant."""
         return self.time is not None and self.time.ndim > 0

@@ -25,14 +25,16 @@ from jaximu.calibration import Calibration
 from jaximu.data.preintegration import increments
 from jaximu.estimation.problem import Name, names_of
 from jaximu.ground.array_types import BoolArray, FloatArray
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.stored import compiled
 from jaximu.ground.units import INERTIAL_QUANTITIES
-from jaximu.model import BiasInstability, BiasRepeatability, Noise, Process, RandomWalk, White
+from jaximu.model import BiasRepeatability, Noise, Process
+from jaximu.model.data_sheet import TERM_NAMES
+from jaximu.model.processes import TERM_PROCESSES
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
 from jaximu.navigation import Navigation, deviation, linearised, mechanise, noise_covariance
@@ -42,18 +44,9 @@ from jaximu.planning.goals import group_of
 from jaximu.planning.information import root_of
 
 SCHEMA = "jaximu.consequences/1"
-_PROCESSES: dict[str, Callable[[FloatArray], Process]] = {
-    "N": White,
-    "B": BiasInstability,
-    "K": RandomWalk,
-    "repeatability": BiasRepeatability,
-}
-NOISE_WORDS = {
-    "N": "white noise N",
-    "B": "bias instability B",
-    "K": "rate random walk K",
-    "repeatability": "bias repeatability",
-}
+_PROCESSES: Mapping[str, Callable[[FloatArray], Process]] = TERM_PROCESSES | {"repeatability": BiasRepeatability}
+NOISE_WORDS = {term: f"{TERM_NAMES[term]} {term}" for term in "NBK"} | {"repeatability": "bias repeatability"}
+"""The terms of a noise file that navigation feels, in English."""
 _TOGETHER = 25
 """Draws that are mechanised side by side; more do not fit into the caches."""
 
@@ -156,7 +149,7 @@ class Consequences(Result, Document, page="consequences"):
         known = self.known | {"the whole calibration": np.zeros_like(self.noise)}
         return {
             "schema": SCHEMA,
-            "times": self.times.tolist(),
+            **entries(self, "times", "calibration_file", "notes"),
             **tracks(np.sqrt(self.total)),
             "budget": listed({name: position(variances) for name, variances in self.terms.items()}),
             "calibration": {"position": position(self.calibration).tolist()},
@@ -171,9 +164,7 @@ class Consequences(Result, Document, page="consequences"):
                 "position_sigma": track(np.sqrt(against.total), 0),
                 "position_apart": track(self.apart, 0),
             },
-            "calibration_file": self.calibration_file,
             "path": self.trajectory.words,
-            "notes": list(self.notes),
             "software": SOFTWARE,
         }
 
@@ -324,7 +315,7 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
     return Run(
         imu,
         trajectory.start,
-        replace(stimulus, specific_force=None, angular_rate=None, angular_acceleration=None),
+        stimulus.beside_motion(),
         trajectory.intervals,
         compiled(Imu.respond)(imu, stimulus),
         covariance,
@@ -393,7 +384,7 @@ def _draw(run: Run, path: Trajectory, reference: Navigation, noise: SensorNoise,
     root = root_of(run.covariance)
     streams = [
         Noise(
-            tuple(_PROCESSES[term](figure) for term, figure in noise.get(triad, {}).items() if term in _PROCESSES),
+            tuple(_PROCESSES[term](figure) for term, figure in noise.get(triad, {}).items() if term in NOISE_WORDS),
             INERTIAL_QUANTITIES[triad],
         )
         for triad in ("gyroscope", "accelerometer")

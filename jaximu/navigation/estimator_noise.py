@@ -35,7 +35,8 @@ from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.data.preintegration import preintegrate_samples
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import interpolated
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.distributions import rms
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import Gravity
 from jaximu.ground.page import Result
@@ -114,6 +115,12 @@ class ModelledErrors:
         """What it is."""
         return f"expected from the calibration's covariance along {self.trajectory.words}"
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What its errors lack."""
+        unrecorded = "vibration, sampling and time stamps are not in the multipliers: they need a recorded motion."
+        return () if self.trajectory.recorded else (unrecorded,)
+
     def over(self, length: float) -> Stretches:
         """Return stretches of one length (s), one after the other."""
         stimulus, intervals = self.trajectory.stimulus, self.trajectory.intervals
@@ -182,9 +189,7 @@ class MeasuredErrors:
         data, known = measurement.intervals, measurement.attitude
         mounting = Mounting.of(fitted.imu)
         middle = (np.asarray(data.since) + np.asarray(data.until)) / 2
-        beside = replace(
-            measurement.around(fitted.imu), specific_force=None, angular_rate=None, angular_acceleration=None
-        )
+        beside = measurement.around(fitted.imu).beside_motion()
         force, rate = compiled(Imu.recover)(replace(fitted.imu, setup=()), data.force, data.rate, beside)
         tilt = scipy.spatial.transform.Rotation.from_rotvec(np.append(mounting.tilt, 0.0))
         whole = replace(known, quaternion=np.asarray(mounting.unit_attitude(known.quaternion))).rotation()
@@ -272,11 +277,8 @@ class MeasuredErrors:
             errors.append(np.asarray(integrated[2]) - at_start.inv().apply(away + up * time[:, None] ** 2 / 2))
         edges = self.stamp[first][:, None] + np.cumulative_sum(held, axis=1, include_initial=True)
         edges = np.clip(edges, self.stamp[0], self.stamp[-1])
-        path = scipy.spatial.transform.Slerp(self.stamp, known)(edges.ravel()).as_quat()
-        before, after = (
-            rotations.from_quat(path.reshape(*edges.shape, 4)[:, part].reshape(-1, 4))
-            for part in (slice(None, -1), slice(1, None))
-        )
+        path = scipy.spatial.transform.Slerp(self.stamp, known)
+        before, after = path(edges[:, :-1].ravel()), path(edges[:, 1:].ravel())
         turning = (before.inv() * after).as_rotvec().reshape(rates.shape) / np.where(held > 0, held, 1.0)[..., None]
         velocity_errors = np.asarray(_integrated(turning, forces, held)[1]) - gained
         return np.concatenate(errors, axis=1), velocity_errors
@@ -391,16 +393,14 @@ class EstimatorNoise(Result, Document, page="estimator_noise"):
         """Return it as the JSON document of schema `jaximu.estimator-noise/1`; densities are SI and continuous."""
         return {
             "schema": SCHEMA,
-            "lengths": self.lengths.tolist(),
+            **entries(self, "lengths", "notes"),
             "interval": float(self.lengths[self.chosen]),
             "stretches": list(self.count),
             **{
-                name: {
+                name: entries(triad, "multiplier", "low", "high")
+                | {
                     "noise_density": triad.white,
                     "random_walk": triad.walk.tolist(),
-                    "multiplier": triad.multiplier.tolist(),
-                    "low": triad.low.tolist(),
-                    "high": triad.high.tolist(),
                     "terms": [
                         {"term": term, "multiple": multiples.tolist()} for term, multiples in triad.terms.items()
                     ],
@@ -413,7 +413,6 @@ class EstimatorNoise(Result, Document, page="estimator_noise"):
             },
             "densities": self.densities(),
             "errors": self.words,
-            "notes": list(self.notes),
             "software": SOFTWARE,
         }
 
@@ -455,11 +454,8 @@ def estimator_noise(
     notes += [f"{interval * source.rate:.2g} samples lie between two states."] if interval * source.rate < 2 else []
     parts = {length: _part(source, noise, length) for length in kept}
     walks = {length: {triad: _walk(part, triad) for triad in INERTIAL_QUANTITIES} for length, part in parts.items()}
-    if isinstance(source, MeasuredErrors):
-        notes += source.notes
-    elif not source.trajectory.recorded:
-        notes.append("vibration, sampling and time stamps are not in the multipliers: they need a recorded motion.")
-    rng = np.random.default_rng(seed)
+    notes += source.notes
+    rng, chosen = np.random.default_rng(seed), kept.index(interval)
     triads: dict[str, TriadNoise] = {}
     turned = np.ones(len(kept))
     for triad in _OWN:  # the gyroscope first
@@ -467,21 +463,20 @@ def estimator_noise(
             _multiplier(parts[length], triad, walks[length], one, draws, rng)
             for length, one in zip(kept, turned, strict=True)
         ]
-        if rows[kept.index(interval)] is None:
+        if rows[chosen] is None:
             notes.append(f"the reference has neither velocity nor position: the {triad}'s noise is left as it is.")
             rows = [(1.0, 1.0, 1.0)] * len(kept)
-        table = np.array(rows, float)
+        multiplier, low, high = np.array(rows, float).T
         terms = [_terms(parts[length], triad) for length in kept]
         triads[triad] = TriadNoise(
-            _rms(noise[triad]["N"]),
+            rms(noise[triad]["N"]),
             np.array([walks[length][triad] for length in kept]),
-            table[:, 0],
-            table[:, 1],
-            table[:, 2],
+            multiplier,
+            low,
+            high,
             {name: np.array([term_values[name] for term_values in terms]) for name in terms[0]},
         )
         turned = triads[triad].applied
-    chosen = kept.index(interval)
     final = {triad: float(triad_noise.applied[chosen]) for triad, triad_noise in triads.items()}
     stated = dict.fromkeys(final, 1.0)
     rows = [[_nees(parts[length], multipliers, walks[interval]) for multipliers in (stated, final)] for length in kept]
@@ -544,10 +539,6 @@ def _squared(root: FloatArray) -> FloatArray:
     return root @ np.swapaxes(root, 1, 2)
 
 
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: float) -> _Length:
     stretches = source.over(length)
     if len(stretches.start) < _FEWEST:
@@ -572,7 +563,7 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
     for triad, columns in _COLUMNS.items():
         sizes = noise[triad]
         spread[triad, "N"] = np.einsum("njik,j->nik", white[:, columns], np.square(sizes["N"]))
-        spread[triad, "white"] = np.sum(white[:, columns], axis=1) * _rms(sizes["N"]) ** 2
+        spread[triad, "white"] = np.sum(white[:, columns], axis=1) * rms(sizes["N"]) ** 2
         spread[triad, "1"] = np.sum(walk[:, columns], axis=1)
         if np.any(sizes.get("K", 0.0)):
             spread[triad, "K"] = np.einsum("njik,j->nik", walk[:, columns], np.square(sizes["K"]))

@@ -23,28 +23,19 @@ def noise_covariance(
     that of the end). `reaction`: g_a in columns, per unit of noise. `system`: of the three axes, leading axis (3,).
     """
     size = reaction.shape[1]
+    identity = jnp.broadcast_to(jnp.eye(size), (3, size, size))
 
-    def step(state, sample):
-        error, cross, inner = state
+    def step(covariance, sample):  # (3, n + s, n + s): what each axis's noise adds to the error, and its states
         matrix, push = sample
-        push = push.T
-        if matrix is not None:
-            error = matrix @ error @ matrix.T
-            cross = jnp.einsum("ij,ajs->ais", matrix, cross)
-        with_output = jnp.einsum("as,ast->at", system.output, inner)
-        mixed = jnp.einsum("ais,as,aj->ij", cross, system.output, push)
-        variance = jnp.einsum("at,at->a", with_output, system.output) + jnp.sum(system.through**2, axis=-1)
-        error = error + mixed + mixed.T + jnp.einsum("ai,a,aj->ij", push, variance, push)
-        onward = jnp.einsum("at,ast->as", with_output, system.transition) + jnp.einsum(
-            "asm,am->as", system.drive, system.through
-        )
-        cross = jnp.einsum("ais,ats->ait", cross, system.transition) + push[:, :, None] * onward[:, None, :]
-        inner = system.transition @ inner @ jnp.swapaxes(system.transition, -1, -2)
-        inner = inner + system.drive @ jnp.swapaxes(system.drive, -1, -2)
-        return (error, cross, inner), jnp.diagonal(error)
+        moved = identity if matrix is None else jnp.broadcast_to(matrix, identity.shape)
+        push = push.T[:, :, None]
+        across = push * system.output[:, None, :]
+        below = jnp.zeros_like(across).swapaxes(-1, -2)
+        whole = jnp.block([[moved, across], [below, system.transition]])
+        drive = jnp.concatenate([push * system.through[:, None, :], system.drive], axis=1)
+        covariance = whole @ covariance @ whole.swapaxes(-1, -2) + drive @ drive.swapaxes(-1, -2)
+        return covariance, jnp.diagonal(covariance.sum(axis=0))[:size]
 
-    states = system.output.shape[-1]
-    root = jnp.asarray(system.root)
-    start = jnp.zeros((size, size)), jnp.zeros((3, size, states)), root @ jnp.swapaxes(root, -1, -2)
-    (error, _, _), variances = jax.lax.scan(step, start, (transition, reaction))
-    return variances, error
+    root = jnp.pad(jnp.asarray(system.root), ((0, 0), (size, 0), (0, 0)))
+    covariance, variances = jax.lax.scan(step, root @ root.swapaxes(-1, -2), (transition, reaction))
+    return variances, covariance.sum(axis=0)[:size, :size]

@@ -55,37 +55,27 @@ class Place:
 class Trajectory:
     """What a unit goes through, sample by sample, from a start that is known exactly.
 
-    stimulus: (S,) samples, means over `intervals` (S,), s. every: samples from one reported time to the next; divides
-    S. words: what it is. notes: what had to be assumed. recorded: whether the samples are a unit's own, noise included;
-    jitter: standard deviation of its stamps, s.
+    stimulus: (S,) samples, means over `intervals` (S,), s. words: what it is. notes: what had to be assumed. recorded:
+    whether the samples are a unit's own, noise included; jitter: standard deviation of its stamps, s. every: samples
+    from one reported time to the next; divides S.
     """
 
     start: Navigation
     stimulus: Stimulus
     intervals: FloatArray
-    every: int
     words: str
     notes: tuple[str, ...] = ()
     recorded: bool = False
     jitter: float = 0.0
+    every: int = 1
 
-    @classmethod
-    def of(
-        cls,
-        start: Navigation,
-        stimulus: Stimulus,
-        intervals: FloatArray,
-        words: str,
-        notes: tuple[str, ...] = (),
-        recorded: bool = False,
-        jitter: float = 0.0,
-    ) -> Trajectory:
+    def cut(self) -> Trajectory:
         """Cut a path to a whole number of reported times, a second or a twentieth of it apart.
 
         Raises `NotPossibleError` for one that is too short or too long.
         """
         require_float64()
-        count, total = len(intervals), float(np.sum(intervals))
+        count, total = len(self.intervals), float(np.sum(self.intervals))
         if count > _MOST:
             raise NotPossibleError(
                 f"the path has {count} samples, and {_MOST} are the most: shorten it with --duration "
@@ -95,8 +85,8 @@ class Trajectory:
         kept = count // apart * apart
         if kept < 2 * apart:
             raise NotPossibleError(f"the path lasts only {total:.2g} s ({count} samples): give a longer one.")
-        stimulus = jax.tree.map(lambda leaf: np.asarray(leaf)[:kept], stimulus)
-        return cls(start, stimulus, np.asarray(intervals[:kept]), apart, words, notes, recorded, jitter)
+        stimulus, intervals = jax.tree.map(lambda leaf: np.asarray(leaf)[:kept], (self.stimulus, self.intervals))
+        return replace(self, stimulus=stimulus, intervals=intervals, every=apart)
 
     @property
     def times(self) -> FloatArray:
@@ -161,7 +151,7 @@ def level_driving(
         f"{duration:g} s of level driving at {site.latitude:g}° latitude: at rest for {_REST:g} s, then up to "
         f"{_SPEED:g} m/s in {_RISE:g} s, a turn of 90° every {_TURN_EVERY:g} s from {_FIRST_TURN:g} s on"
     )
-    return Trajectory.of(start, stimulus, np.full(len(time), 1 / rate), words)
+    return Trajectory(start, stimulus, np.full(len(time), 1 / rate), words).cut()
 
 
 @compiled
@@ -219,7 +209,7 @@ def of_specification(
                 scale = case.imu.triads()[name].scales
                 limits[name] = float(getattr(artefact, name) / scale.max())
     words = f"the motion of {Path(specification.name).name}, {count / case.rate:g} s at {site.latitude:g}° latitude"
-    return Trajectory.of(start, stimulus, np.full(count, 1 / case.rate), words), limits
+    return Trajectory(start, stimulus, np.full(count, 1 / case.rate), words).cut(), limits
 
 
 def of_recording(recording: Recording, calibration: Calibration, site: Place, duration: float = 60.0) -> Trajectory:
@@ -260,9 +250,8 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
     steps = np.diff(time[kept])
     bend = np.diff(steps[steps < 2.5 * np.median(steps)])  # of white jitter its variance is six times
     jitter = float(np.sqrt(np.mean(bend**2) / 6)) if len(bend) else 0.0
-    return Trajectory.of(
-        _start(attitude, site, gravity), stimulus, np.diff(edges)[kept], words, tuple(notes), True, jitter
-    )
+    start = _start(attitude, site, gravity)
+    return Trajectory(start, stimulus, np.diff(edges)[kept], words, tuple(notes), True, jitter).cut()
 
 
 def _first_rest(

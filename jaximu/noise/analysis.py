@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.distributions import chi2_isf
-from jaximu.ground.document import SOFTWARE, Json, read_document
+from jaximu.ground.distributions import deviation_interval
+from jaximu.ground.document import SOFTWARE, Json, entries, read_document
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
@@ -80,8 +80,7 @@ class NoiseAnalysis(Result, Comparable, page="allan"):
                 for name, table in self.repeatability.items()
             }
             or None,
-            "files": list(self.files),
-            "notes": list(self.notes),
+            **entries(self, "files", "notes"),
             "software": SOFTWARE,
         }
 
@@ -151,10 +150,8 @@ def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
             signals = [getattr(recording, name) for recording in recordings]
             means = np.array([signal.si().mean(axis=0) for signal in signals if signal])
             if len(means) > 1:
-                freedom = len(means) - 1
-                spread = means.std(axis=0, ddof=1)
-                low, high = (np.sqrt(freedom / chi2_isf(p, freedom)) for p in (0.025, 0.975))
-                repeatability[name] = np.stack([spread, low * spread, high * spread], axis=1)
+                times = np.append(1.0, deviation_interval(len(means) - 1))
+                repeatability[name] = np.outer(means.std(axis=0, ddof=1), times)
         notes.append(
             f"noise is that of {longest.name}, the longest recording; all {len(recordings)} together show the "
             "repeatability of the bias. The unit must have lain alike in all, or gravity enters its spread."

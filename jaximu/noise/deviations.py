@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaximu.ground.array_types import FloatArray, IntArray
-from jaximu.ground.distributions import chi2_isf
+from jaximu.ground.distributions import deviation_interval
 from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
 
@@ -174,9 +174,8 @@ def deviation(
         m, lag, a = (int(number) for number in (grid.factor[column], grid.lag[column], alpha[row, column]))
         freedom[row, column] = degrees_of_freedom(kind, samples + 1, m, a, lag)
     freedom *= np.minimum(1.0, count / np.maximum(1, grid.count))
-    tail = (1 - confidence) / 2
     distinct, index = np.unique(freedom, return_inverse=True)
-    low, high = (np.sqrt(distinct / chi2_isf(p, distinct))[index].reshape(value.shape) for p in (tail, 1 - tail))
+    low, high = deviation_interval(distinct, confidence)[:, index.ravel()].reshape(2, *value.shape)
     shape = (*data.shape[:-1], len(tau))
     value, low, high, count, alpha, freedom = (
         array.reshape(shape) for array in (value, value * low, value * high, count, alpha, freedom)
@@ -184,16 +183,21 @@ def deviation(
     return Deviation(kind, tau, grid.factor, value, low, high, count, alpha, freedom, confidence)
 
 
-def _require_sense(data: FloatArray, rate: float, difference: _DeviationKind, phase: bool, confidence: float) -> None:
-    """Raise `InputError` or `NotPossibleError` for a signal or numbers of which no deviation can be taken."""
-    if data.ndim < 1 or data.shape[-1] < 3:
-        raise NotPossibleError(f"a deviation needs at least three samples, found shape {data.shape}.")
+def require_samples(data: FloatArray, rate: float, confidence: float) -> None:
+    """Raise `InputError` for samples, a rate (Hz) or a confidence of which no analysis makes sense."""
     if not (np.isfinite(rate) and rate > 0):
         raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
     if not 0 < confidence < 1:
         raise InputError(f"the confidence must lie between 0 and 1, found {confidence}.")
     if np.isinf(data).any():
         raise InputError("the signal holds infinite values.")
+
+
+def _require_sense(data: FloatArray, rate: float, difference: _DeviationKind, phase: bool, confidence: float) -> None:
+    """Raise `InputError` or `NotPossibleError` for a signal or numbers of which no deviation can be taken."""
+    if data.ndim < 1 or data.shape[-1] < 3:
+        raise NotPossibleError(f"a deviation needs at least three samples, found shape {data.shape}.")
+    require_samples(data, rate, confidence)
     if (difference.total or phase) and np.isnan(data).any():
         what = "the total deviation mirrors the recording at its ends" if difference.total else "a phase is one curve"
         raise InputError(f"{what} and cannot be taken over gaps (NaN).")

@@ -21,15 +21,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.distributions import rms
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.model.data_sheet import SI_UNITS
+from jaximu.model.processes import FLICKER_VARIANCE
 from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.identification import Identified, Term
 
-FLICKER = 2 * math.log(2) / math.pi
-"""Allan variance of flicker noise of B = 1: 0.664²."""
 PEAK = 1.8926
 """Averaging time, in correlation times, at which the Allan deviation of a first-order Gauss–Markov process peaks."""
 
@@ -192,7 +192,7 @@ def flat_part(terms: Mapping[str, float], shortest: float, longest: float) -> tu
     size = {letter: float(terms.get(letter, 0.0)) for letter in "QNBKR"}
     if not size["B"] > 0:
         raise InputError("there is no flat part without bias instability.")
-    level = FLICKER * size["B"] ** 2
+    level = FLICKER_VARIANCE * size["B"] ** 2
     root = math.sqrt(size["N"] ** 4 + 12 * size["Q"] ** 2 * level)  # 3Q²/τ² + N²/τ = level
     left = (size["N"] ** 2 + root) / (2 * level)
     root = math.sqrt(size["K"] ** 4 / 9 + 2 * size["R"] ** 2 * level)  # K²τ/3 + R²τ²/2 = level
@@ -281,7 +281,7 @@ def random_walk_only(analysis: NoiseAnalysis, name: str) -> Walk:
 
 def _root_mean_square(axes: Sequence[tuple[float, str]]) -> Walk:
     values, origin = zip(*axes, strict=True)
-    return Walk(float(np.sqrt(np.mean(np.square(values)))), origin)
+    return Walk(rms(values), origin)
 
 
 def white_noise_only(analysis: NoiseAnalysis, name: str) -> Walk:

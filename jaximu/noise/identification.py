@@ -26,9 +26,9 @@ from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_isf
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
-from jaximu.model.processes import BiasInstability, FirstOrderGaussMarkov
+from jaximu.model.processes import MEMBER_VARIANCE, TERM_PROCESSES, BiasInstability, FirstOrderGaussMarkov
 from jaximu.noise.cleaning import BRIDGED, PeriodicLine, filled, lowest, periodic_lines, without_line, without_outliers
-from jaximu.noise.deviations import Deviation, averaging_factors, deviation
+from jaximu.noise.deviations import Deviation, averaging_factors, deviation, require_samples
 
 TERMS = "QNBKR"
 _SHORTEST = 256
@@ -145,13 +145,8 @@ def identify(
         raise InputError(f"terms must be some of {', '.join(TERMS)}, found {terms!r}.")
     if not 0 <= gauss_markov <= 3:
         raise InputError(f"gauss_markov must be 0 to 3 processes, found {gauss_markov}.")
-    if not (np.isfinite(rate) and rate > 0):
-        raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
-    if not 0 < confidence < 1:
-        raise InputError(f"the confidence must lie between 0 and 1, found {confidence}.")
     data = np.asarray(values, float)
-    if np.isinf(data).any():
-        raise InputError("the signal holds infinite values.")
+    require_samples(data, rate, confidence)
     if data.ndim not in (1, 2):
         raise InputError(f"values must be (n,) or (axes, n), found shape {data.shape}.")
     axes = [_identify(axis, rate, terms, confidence, gauss_markov, highest) for axis in np.atleast_2d(data)]
@@ -188,14 +183,14 @@ def _identify(
         raise NotPossibleError(_CONSTANT)
     threshold = float(chi2_isf(1 - confidence, 1)) / 2
     # How far the most general model is off, octave by octave, then which of its terms are needed
-    general = _fit(_Model(spectrum, terms, _times(spectrum, terms, markov)))
+    general = _Model(spectrum, terms, _times(spectrum, terms, markov)).fit()
     misfit, freedom = general.misfit()
     excess, high_pass, offered = 0.0, None, terms
     if misfit > chi2_isf(1 - confidence, freedom) and not markov:
         high_pass = _high_pass(general, threshold)
     if high_pass is not None:
         offered = terms.replace("R", "")
-        general = _fit(replace(general.model, spectrum=replace(spectrum, high_pass=high_pass.value), terms=offered))
+        general = replace(general.model, spectrum=replace(spectrum, high_pass=high_pass.value), terms=offered).fit()
     elif misfit > chi2_isf(_UNLIKELY, freedom):
         # The terms do not describe this noise, and the high frequencies, known best, would dictate all others. Every
         # octave may then differ from the terms by a share that makes the misfit what it should be.
@@ -205,7 +200,7 @@ def _identify(
     for index, term in enumerate(best.model.letters):
         result[term] = _term(best, index, threshold)
     if best.model.ramp:
-        low, high = _bounds(best, -1, threshold)
+        low, high = _ramp_bounds(best, threshold)
         ends = sorted((abs(low), abs(high)))
         result["R"] = Term(abs(best.ramp), ends[0] if low * high > 0 else 0.0, ends[1])
     first = len(best.model.letters)
@@ -214,8 +209,7 @@ def _identify(
         for i in range(markov)
     )
     limits = {term: _limit(best, term, threshold) for term in offered if result[term] is None}
-    misfit, freedom = replace(best, model=replace(best.model, excess=0.0)).misfit()
-    quality = misfit, freedom
+    quality = replace(best, model=replace(best.model, excess=0.0)).misfit()
     return Identified(result, measured, quality, limits, excess, lines, warm_up, outliers, high_pass, processes)
 
 
@@ -234,14 +228,9 @@ def _deviation(values: FloatArray, rate: float, confidence: float) -> Deviation:
 def _basis(factors: FloatArray, rate: float, terms: Sequence[str]) -> FloatArray:
     """Allan variance (T, terms) of each term of size one, exact for samples: see `jaximu.model.processes`."""
     tau = factors / rate
-    columns = {
-        "Q": 3 / tau**2,
-        "N": 1 / tau,
-        "B": np.full_like(tau, 2 * np.log(2) / np.pi),
-        "K": tau / 3 + 1 / (6 * tau * rate**2),
-        "R": tau**2 / 2,
-    }
-    return np.stack([columns[term] for term in terms], axis=-1)
+    sampled = {"K": 1 / (6 * tau * rate**2)}  # of a walk, which its samples follow by steps
+    columns = [TERM_PROCESSES[term](1.0).allan_variance(tau) + sampled.get(term, 0.0) for term in terms]
+    return np.stack(columns, axis=-1)
 
 
 def _held_back(tau: FloatArray, rate: float, theta: dict[str, float], time_constant: float) -> FloatArray:
@@ -379,7 +368,7 @@ def _column(spectrum: _Spectrum, term: str) -> FloatArray:
         density = 1 / (4 * np.sin(half) ** 2 * rate**2)
     else:  # the flicker noise of `jaximu.model.processes`: a bank of Gauss–Markov processes
         bank = BiasInstability(1.0, longest=max(1e5, 100 * spectrum.samples / rate)).bank(1 / rate)
-        density = sum((_markov(spectrum, time) for time in bank), start=np.zeros_like(half)) * np.log(4) / np.pi
+        density = sum((_markov(spectrum, time) for time in bank), start=np.zeros_like(half)) * MEMBER_VARIANCE
     return (density * _passed(spectrum.angle * rate, spectrum.high_pass)) @ _WEIGHT
 
 
@@ -411,7 +400,7 @@ def _markov(spectrum: _Spectrum, correlation_time: float) -> FloatArray:
 # Likelihood
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Model:
     """The terms of a spectrum: parameters are the logarithms of the squares of `letters`, then of each Gauss–Markov
     process's variance and correlation time, which start at `times`. With R among the terms the mean is a ramp.
@@ -431,77 +420,55 @@ class _Model:
     def ramp(self) -> bool:
         return "R" in self.terms
 
+    @cached_property
     def weight(self) -> FloatArray:
         """Effective number (B,) of coefficients: with an excess e, that of an octave of M tells no more than 2/e²."""
         count = self.spectrum.count
         total = np.bincount(self.spectrum.octave, count)[self.spectrum.octave]
         return count / (1 + self.excess**2 * total / 2)
 
+    @cached_property
     def columns(self) -> FloatArray:
+        """Mean density (B, letters) of the coefficients of each letter's term of size one."""
         columns = [self.spectrum.columns[term] for term in self.letters]
-        return np.stack(columns, axis=1) if columns else np.zeros((len(self.spectrum.count), 0))
+        return np.reshape(columns, (-1, len(self.spectrum.count))).T
 
+    @cached_property
+    def drift(self) -> FloatArray:
+        """Coefficients (J,) of the line that was subtracted, which belongs to the noise unless the mean is a ramp."""
+        return (0.0 if self.ramp else self.spectrum.slope) * self.spectrum.ramp()
+
+    @cached_property
+    def power(self) -> FloatArray:
+        """Mean squares (B,) of the coefficients, with the drift."""
+        return self.spectrum.power + self.spectrum.products(2 * self.spectrum.coefficient + self.drift, self.drift)
+
+    @cached_property
     def regressors(self) -> list[FloatArray]:
+        """Coefficients (J,) of the drifts in the mean at a size of one."""
         return [*([self.spectrum.ramp()] if self.ramp else []), *([] if self.extra is None else [self.extra])]
 
+    @cached_property
+    def cross(self) -> FloatArray:
+        """Means (B, drifts) of the coefficients times those of the regressors."""
+        low = self.spectrum.coefficient + self.drift
+        rows = [self.spectrum.products(low, row) for row in self.regressors]
+        return np.reshape(rows, (-1, len(self.spectrum.count))).T
 
-@dataclass(frozen=True)
-class _Fit:
-    """Parameters at the maximum of the likelihood: `theta` as in `_Model`, the drifts' sizes, −log L."""
-
-    model: _Model
-    theta: FloatArray
-    sizes: FloatArray
-    loss: float
-    shares: FloatArray  # (B, parameters) of the variance; information each holds is Σ w share²/2
-    ratio: FloatArray  # (B,) power over variance
-
-    @property
-    def ramp(self) -> float:
-        """Slope, per second."""
-        return self.model.spectrum.slope + float(self.sizes[0])
-
-    def information(self) -> FloatArray:
-        return 0.5 * self.model.weight() @ self.shares**2
-
-    def misfit(self) -> tuple[float, int]:
-        """χ² (the deviance of each octave's mean ratio) and its degrees of freedom."""
-        weight, octave = self.model.weight(), self.model.spectrum.octave
-        total = np.bincount(octave, weight)
-        mean = np.bincount(octave, weight * self.ratio)[total > 0] / total[total > 0]
-        total = total[total > 0]
-        taken = int(np.sum(self.information() > 0.05)) + len(self.sizes)
-        return float(np.sum(total * (mean - 1 - np.log(mean)))), max(1, len(total) - taken)
-
-
-class _Problem:
-    """The arrays of a model, made once."""
-
-    def __init__(self, model: _Model):
-        self.model = model
-        spectrum = model.spectrum
-        self.columns = model.columns()
-        self.weight = model.weight()
-        self.power = spectrum.power
-        # What is left of the ramp after subtraction of a straight line, even where R is no term, is the mean's: then
-        # the whole ramp belongs to the noise.
-        rows = model.regressors()
-        self.drift = np.zeros_like(spectrum.coefficient)
-        if not model.ramp:
-            self.drift = spectrum.slope * spectrum.ramp()
-            self.power = self.power + spectrum.products(2 * spectrum.coefficient + self.drift, self.drift)
-        low = spectrum.coefficient + self.drift
-        bins = len(spectrum.count)
-        self.cross = np.reshape([spectrum.products(low, row) for row in rows], (-1, bins)).T
-        self.gram = np.reshape([spectrum.products(a, b) for a in rows for b in rows], (len(rows), len(rows), bins)).T
+    @cached_property
+    def gram(self) -> FloatArray:
+        """Means (B, drifts, drifts) of products of the regressors."""
+        rows, size = self.regressors, len(self.regressors)
+        products = [self.spectrum.products(a, b) for a in rows for b in rows]
+        return np.reshape(products, (size, size, len(self.spectrum.count))).T
 
     def variance(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Variance (B,), and its derivative (B, parameters) over it."""
         count = self.columns.shape[1]
         parts = [self.columns * np.exp(theta[:count])]
-        for i in range(len(self.model.times)):
+        for i in range(len(self.times)):
             log_variance, log_time = theta[count + 2 * i : count + 2 * i + 2]
-            spectrum, step = self.model.spectrum, 1e-4
+            spectrum, step = self.spectrum, 1e-4
             below, above = (_markov(spectrum, np.exp(log_time + s)) @ _WEIGHT for s in (-step, step))
             here = (below + above) / 2
             parts.append(np.exp(log_variance) * np.stack([here, (above - below) / (2 * step)], axis=1))
@@ -527,7 +494,7 @@ class _Problem:
 
     def start(self) -> FloatArray:
         """Each term as large as no octave forbids."""
-        spectrum = self.model.spectrum
+        spectrum = self.spectrum
         power = np.bincount(spectrum.octave, spectrum.count * self.power)
 
         def largest(column: FloatArray) -> float:
@@ -535,13 +502,11 @@ class _Problem:
             return float(np.log(max(np.min(power[mean > 0] / mean[mean > 0]), 1e-290)))
 
         theta = [largest(column) for column in self.columns.T]
-        for time in self.model.times:
+        for time in self.times:
             theta += [largest(_markov(spectrum, time) @ _WEIGHT), float(np.log(time))]
         return np.array(theta)
 
-    def solve(
-        self, theta: FloatArray, held: int | None = None, ramp: float | None = None, iterations: int = 80
-    ) -> _Fit:
+    def solve(self, theta: FloatArray, held: int | None = None, ramp: float | None = None) -> _Fit:
         """Maximise the likelihood by Fisher scoring; `held`: a parameter that stays, `ramp`: the ramp's size if so."""
         free = np.array([i for i in range(len(theta)) if i != held], np.int64)
         damping, theta = 1e-3, theta.copy()
@@ -553,7 +518,7 @@ class _Problem:
             return shares, sizes, ratio, 0.5 * float(self.weight @ (np.log(variance) + ratio))
 
         shares, sizes, ratio, loss = evaluate(theta)
-        for _ in range(iterations):
+        for _ in range(80):
             slope = 0.5 * shares[:, free].T @ (self.weight * (ratio - 1))
             fisher = 0.5 * shares[:, free].T @ (self.weight[:, None] * shares[:, free])
             diagonal = np.diag(fisher)
@@ -575,12 +540,56 @@ class _Problem:
                 damping = max(damping * 10, 1e-6)
                 if damping > 1e8 or np.abs(step).max() < 1e-9:
                     break
-        return _Fit(self.model, theta, sizes, loss, shares, ratio)
+        return _Fit(self, theta, sizes, loss, shares, ratio)
+
+    def fit(self) -> _Fit:
+        """Maximise the likelihood from the start."""
+        return self.solve(self.start())
 
 
-def _fit(model: _Model, theta: FloatArray | None = None) -> _Fit:
-    problem = _Problem(model)
-    return problem.solve(problem.start() if theta is None else theta)
+@dataclass(frozen=True)
+class _Fit:
+    """Parameters at the maximum of the likelihood: `theta` as in `_Model`, the drifts' sizes, −log L."""
+
+    model: _Model
+    theta: FloatArray
+    sizes: FloatArray
+    loss: float
+    shares: FloatArray  # (B, parameters) of the variance; information each holds is Σ w share²/2
+    ratio: FloatArray  # (B,) power over variance
+
+    @property
+    def ramp(self) -> float:
+        """Slope, per second."""
+        return self.model.spectrum.slope + float(self.sizes[0])
+
+    @property
+    def fisher(self) -> FloatArray:
+        """Information about the parameters (k, k)."""
+        return 0.5 * self.shares.T @ (self.model.weight[:, None] * self.shares)
+
+    @property
+    def by_variance(self) -> FloatArray:
+        """Weight of each bin (B,) over its variance."""
+        return self.model.weight / self.model.variance(self.theta)[0]
+
+    def held(self, index: int, value: float) -> float:
+        """Return by how much −log L is larger at its maximum with one parameter held at a value."""
+        theta = self.theta.copy()
+        theta[index] = value
+        return self.model.solve(theta, index).loss - self.loss
+
+    def information(self) -> FloatArray:
+        return 0.5 * self.model.weight @ self.shares**2
+
+    def misfit(self) -> tuple[float, int]:
+        """χ² (the deviance of each octave's mean ratio) and its degrees of freedom."""
+        weight, octave = self.model.weight, self.model.spectrum.octave
+        total = np.bincount(octave, weight)
+        mean = np.bincount(octave, weight * self.ratio)[total > 0] / total[total > 0]
+        total = total[total > 0]
+        taken = int(np.sum(self.information() > 0.05)) + len(self.sizes)
+        return float(np.sum(total * (mean - 1 - np.log(mean)))), max(1, len(total) - taken)
 
 
 def _times(spectrum: _Spectrum, terms: str, count: int) -> tuple[float, ...]:
@@ -588,7 +597,7 @@ def _times(spectrum: _Spectrum, terms: str, count: int) -> tuple[float, ...]:
     times: tuple[float, ...] = ()
     grid = np.geomspace(2 / spectrum.rate, spectrum.samples / spectrum.rate / 6, 16)
     for _ in range(count):
-        fits = [_fit(_Model(spectrum, terms, (*times, time))) for time in grid]
+        fits = [_Model(spectrum, terms, (*times, time)).fit() for time in grid]
         best = min(fits, key=lambda fit: fit.loss)
         times = tuple(np.exp(best.theta[len(best.model.letters) + 1 :: 2]).tolist())
     return times
@@ -606,7 +615,7 @@ def _select(general: _Model, terms: str) -> _Fit:
         for subset in combinations(terms, size):
             if set(subset) == {"R"} and not general.times:
                 continue  # a ramp alone has no noise
-            fit = _fit(replace(general, terms="".join(subset)))
+            fit = replace(general, terms="".join(subset)).fit()
             if (fit.information()[: len(fit.model.letters)] < 0.05).any():
                 continue
             criterion = 2 * fit.loss + sum(2.0 if general.excess else _PENALTY[term] for term in subset)
@@ -622,7 +631,7 @@ def _excess(general: _Fit, freedom: int) -> float:
 
     def over(logarithm: float) -> float:
         model = replace(general.model, excess=float(np.exp(logarithm)))
-        return _fit(model).misfit()[0] - freedom
+        return model.fit().misfit()[0] - freedom
 
     low, high = np.log(1e-3), np.log(2.0)
     if over(low) <= 0:
@@ -638,42 +647,38 @@ def _root(function: Callable[[float], float], low: float, high: float, tolerance
 
 
 def _bounds(fit: _Fit, index: int, threshold: float) -> tuple[float, float]:
-    """Return where the profile of −log L has risen by `threshold`, for a parameter, or the ramp (index −1)."""
-    problem = _Problem(fit.model)
-    ramp = index < 0
-    if ramp:
-        weight = problem.weight / problem.variance(fit.theta)[0]
-        centre, spread = fit.sizes[0], 1 / np.sqrt(weight @ problem.gram[:, 0, 0])
-    else:
-        fisher = 0.5 * fit.shares.T @ (problem.weight[:, None] * fit.shares)
-        scale = np.sqrt(np.diag(fisher))
-        inverse = np.linalg.pinv(fisher / np.outer(scale, scale))
-        centre, spread = fit.theta[index], min(np.sqrt(inverse[index, index]) / scale[index], 3.0)
-        # a variance known from few coefficients, 2 spread⁻² of them: −2 log L scatters more than χ² (M. S. Bartlett,
-        # Proc. R. Soc. A 160, 1937)
-        threshold = threshold * (1 + spread**2 / 6)
-    offset = fit.model.spectrum.slope if ramp else 0.0
+    """Return where the profile of −log L has risen by `threshold`, for a parameter."""
+    scale = np.sqrt(np.diag(fit.fisher))
+    inverse = np.linalg.pinv(fit.fisher / np.outer(scale, scale))
+    spread = min(np.sqrt(inverse[index, index]) / scale[index], 3.0)
+    # a variance known from few coefficients, 2 spread⁻² of them: −2 log L scatters more than χ² (M. S. Bartlett,
+    # Proc. R. Soc. A 160, 1937)
+    threshold = threshold * (1 + spread**2 / 6)
+    return _ends(lambda at: fit.held(index, at) - threshold, fit.theta[index], spread, threshold)
+
+
+def _ramp_bounds(fit: _Fit, threshold: float) -> tuple[float, float]:
+    """Return where the profile of −log L has risen by `threshold`, for the slope of the ramp, per second."""
+    spread = 1 / float(np.sqrt(fit.by_variance @ fit.model.gram[:, 0, 0]))
+    low, high = _ends(
+        lambda at: fit.model.solve(fit.theta, ramp=at).loss - fit.loss - threshold, fit.sizes[0], spread, threshold
+    )
+    return low + fit.model.spectrum.slope, high + fit.model.spectrum.slope
+
+
+def _ends(rise: Callable[[float], float], centre: float, spread: float, threshold: float) -> tuple[float, float]:
+    """Return where a rise, about a parabola of this spread, passes zero on both sides of its lowest point."""
 
     def end(sign: int) -> float:
-        def rise(distance: float) -> float:
-            at = centre + sign * distance * spread
-            if ramp:
-                return problem.solve(fit.theta, ramp=at).loss - fit.loss - threshold
-            return _held_at(problem, fit, index, at).loss - fit.loss - threshold
+        def at(distance: float) -> float:
+            return rise(centre + sign * distance * spread)
 
         far = np.sqrt(2 * threshold) * 1.2
-        while rise(far) < 0 and far < 200:
+        while at(far) < 0 and far < 200:
             far *= 1.6
-        return float(centre + sign * _root(rise, 0.0, far, 1e-3) * spread + offset)
+        return float(centre + sign * _root(at, 0.0, far, 1e-3) * spread)
 
     return end(-1), end(1)
-
-
-def _held_at(problem: _Problem, fit: _Fit, index: int, value: float) -> _Fit:
-    """Maximise the likelihood, from a fit on, with one parameter held at a value."""
-    theta = fit.theta.copy()
-    theta[index] = value
-    return problem.solve(theta, index)
 
 
 def _term(fit: _Fit, index: int, threshold: float, power: float = 0.5) -> Term:
@@ -684,14 +689,14 @@ def _term(fit: _Fit, index: int, threshold: float, power: float = 0.5) -> Term:
 
 def _limit(fit: _Fit, term: str, threshold: float) -> float:
     """How large a term could be beside those of a fit: where the profile of −log L has risen by `threshold`."""
-    beside = _fit(replace(fit.model, terms="".join(letter for letter in TERMS if letter in fit.model.terms + term)))
+    beside = replace(fit.model, terms="".join(letter for letter in TERMS if letter in fit.model.terms + term)).fit()
     if term == "R":
-        return max(map(abs, _bounds(beside, -1, threshold)))
-    problem, index = _Problem(beside.model), beside.model.letters.index(term)
-    most = problem.start()[index]
+        return max(map(abs, _ramp_bounds(beside, threshold)))
+    index = beside.model.letters.index(term)
+    most = beside.model.start()[index]
 
     def rise(at: float) -> float:
-        return _held_at(problem, beside, index, at).loss - beside.loss - threshold
+        return beside.held(index, at) - threshold
 
     return float(np.exp(_root(rise, max(beside.theta[index], most - 25), most + 12, 1e-2) / 2))
 
@@ -707,7 +712,7 @@ def _high_pass(general: _Fit, threshold: float) -> Term | None:
 
     def at(logarithm: float) -> _Fit:
         passed = replace(spectrum, high_pass=float(np.exp(logarithm)))
-        return _fit(replace(general.model, spectrum=passed, terms=general.model.terms.replace("R", "")))
+        return replace(general.model, spectrum=passed, terms=general.model.terms.replace("R", "")).fit()
 
     def loss(logarithm: float) -> float:
         return at(logarithm).loss
@@ -745,12 +750,10 @@ def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
     """
     terms = terms + "".join(term for term in "NBKR" if term not in terms)
     duration = spectrum.samples / spectrum.rate
-    without = _fit(_Model(spectrum, terms))
+    without = _Model(spectrum, terms).fit()
     grid = np.geomspace(max(20 / spectrum.rate, duration / 2000), duration / 2, 14)
-    problem = _Problem(without.model)
-    weight = problem.weight / problem.variance(without.theta)[0]
     kept, inside = spectrum.inside >= 0, spectrum.inside
-    low = np.where(kept, (weight / spectrum.count)[inside], 0.0)
+    low = np.where(kept, (without.by_variance / spectrum.count)[inside], 0.0)
     rest = spectrum.coefficient - without.sizes[0] * spectrum.ramp()
     gains = []
     for time in grid:  # at the variance without it: an upper bound is not needed to see that there is nothing
@@ -760,18 +763,18 @@ def _warm_up(spectrum: _Spectrum, terms: str) -> WarmUp | None:
         return None
 
     def loss(logarithm: float) -> float:
-        return _fit(replace(without.model, extra=spectrum.decay(np.exp(logarithm)))).loss
+        return replace(without.model, extra=spectrum.decay(np.exp(logarithm))).fit().loss
 
     losses = [loss(np.log(time)) for time in grid]
     if 2 * (without.loss - min(losses)) < _OVERWHELMING:
         return None
     time = float(np.exp(lowest(loss, _around_least(np.log(grid), losses), 1e-4)))
-    fit = _fit(replace(without.model, extra=spectrum.decay(time)))
+    fit = replace(without.model, extra=spectrum.decay(time)).fit()
     misfit, freedom = fit.misfit()
     if misfit > chi2_isf(_UNLIKELY, freedom):
         excess = _excess(fit, freedom)
-        fit = _fit(replace(fit.model, excess=excess))
-        without = _fit(replace(without.model, excess=excess))
+        fit = replace(fit.model, excess=excess).fit()
+        without = replace(without.model, excess=excess).fit()
         if 2 * (without.loss - fit.loss) < _OVERWHELMING:
             return None
     return WarmUp(float(fit.sizes[-1]), time)

@@ -15,6 +15,7 @@ from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.model import BiasInstability
 from jaximu.model.data_sheet import SI_UNITS, convert
 from jaximu.model.noise_model import AxisNoise, NoiseModel
+from jaximu.model.processes import MEMBER_VARIANCE
 from jaximu.noise.analysis import read_analysis
 from jaximu.recordings.readers.kalibr import read_noise
 
@@ -91,6 +92,5 @@ def model_of(figures: SensorNoise) -> NoiseModel:
 def _axis_noise(terms: Mapping[str, FloatArray]) -> AxisNoise:
     quantisation, white, flicker, walk = (terms.get(letter, np.zeros(3)) for letter in "QNBK")
     times = BiasInstability(1.0).bank(_SHORTEST)
-    share = np.log(times[1] / times[0]) / np.pi  # variance of each member for B = 1
-    variance = np.column_stack([np.tile(share * flicker[:, None] ** 2, len(times)), walk**2 * _LASTING / 2])
+    variance = np.column_stack([np.outer(MEMBER_VARIANCE * flicker**2, np.ones(len(times))), walk**2 * _LASTING / 2])
     return AxisNoise(white**2, quantisation**2, variance, np.append(times, _LASTING))

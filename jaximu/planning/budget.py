@@ -64,7 +64,7 @@ from jaximu.estimation.solver import solve
 from jaximu.estimation.uncertainty import UNDETERMINED, weak_directions
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, BoolArray, FloatArray
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.model.effects import CATALOGUE
@@ -112,6 +112,14 @@ class Goal:
     reached: bool
     alone: tuple[Need, ...]
     together: Need | None
+
+    def document(self) -> Json:
+        """Return the goal as JSON has it."""
+        return entries(self, "name", "unit", "reached", "worst") | {
+            "goal": self.size,
+            "alone": {need.sources[0]: need.times for need in self.alone},
+            "together": self.together and entries(self.together, "sources", "times"),
+        }
 
 
 @dataclass(frozen=True)
@@ -187,38 +195,16 @@ class Budget(Result, Document, page="budget"):
                 if self.check is not None:
                     entry["monte_carlo"] = float(self.check.rms[index])
             parameters.append(entry)
+        sources = [self.sources[row] for row in order]
         return {
             "schema": SCHEMA,
-            "source": self.source,
-            "protocol": self.protocol,
+            **entries(self, "source", "protocol", "open", "notes"),
             "sources": [
-                {
-                    "name": source.name,
-                    "words": source.words,
-                    "size": source.size,
-                    "sigma": source.value,
-                    "unit": source.unit,
-                }
-                for source in (self.sources[row] for row in order)
+                entries(source, "name", "words", "size", "unit") | {"sigma": source.value} for source in sources
             ],
             "parameters": parameters,
-            "goals": [
-                {
-                    "name": goal.name,
-                    "goal": goal.size,
-                    "unit": goal.unit,
-                    "reached": goal.reached,
-                    "worst": goal.worst,
-                    "alone": {need.sources[0]: need.times for need in goal.alone},
-                    "together": None
-                    if goal.together is None
-                    else {"sources": list(goal.together.sources), "times": goal.together.times},
-                }
-                for goal in self.goals
-            ],
-            "check": None if self.check is None else {"draws": self.check.draws, "failed": self.check.failed},
-            "open": list(self.open),
-            "notes": list(self.notes),
+            "goals": [goal.document() for goal in self.goals],
+            "check": self.check and entries(self.check, "draws", "failed"),
             "software": SOFTWARE,
         }
 

@@ -165,16 +165,10 @@ class Guide:
             for before, after in pairwise(self._ups):
                 information = information + _information(question, before, after[None])[0]
         added = _information(question, self._ups[-1], _BOX)
-        self._next = _BOX[
-            int(
-                np.argmin(
-                    [
-                        self._left(question, information + more, up @ self._ups[-1])
-                        for more, up in zip(added, _BOX, strict=True)
-                    ]
-                )
-            )
+        left = [
+            self._left(question, information + more, up @ self._ups[-1]) for more, up in zip(added, _BOX, strict=True)
         ]
+        self._next = _BOX[np.argmin(left)]
 
     def _unit(self, recording: Recording) -> Imu:
         """Return the unit as it is known by now."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 
 import jax
 import numpy as np
@@ -14,7 +15,7 @@ from jaximu.data.attitude import INTERVALS
 from jaximu.estimation.problem import TOLERANCE, Name, Parameters, names_of, without_equipment
 from jaximu.estimation.uncertainty import WeakDirection, weak_directions
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.page import Result
@@ -51,7 +52,7 @@ from jaximu.planning.poses import (
     short_order,
     up_of,
 )
-from jaximu.planning.setup_errors import white_density
+from jaximu.planning.setup_errors import noise_squares
 from jaximu.simulation import ACCELEROMETER_DENSITY, GYROSCOPE_DENSITY, Specification
 from jaximu.simulation.protocols.course import attitude_of
 from jaximu.simulation.protocols.positions import directions, spiral
@@ -92,16 +93,20 @@ class Equipment:
         return "by hand" if self.by_hand else f"on the {self.name.replace('-', ' ')}"
 
     @property
+    def robot(self) -> bool:
+        """Whether it reports the attitude."""
+        return self.accuracy is not None
+
+    @property
     def chained(self) -> bool:
         """Whether each turn leads from one pose to the next."""
-        return self.by_hand or self.in_sequence or self.accuracy is not None
+        return self.by_hand or self.in_sequence or self.robot
 
     @property
     def largest_turn(self) -> float:
         """Radians of a turn from one pose to the next at the most: a robot's rate is limited, too."""
-        if self.accuracy is None:
-            return float(np.radians(self.turn_limit))
-        return float(np.radians(min(self.turn_limit, (1 - RAMP) * self.fastest * self.turn)))
+        fastest = (1 - RAMP) * self.fastest * self.turn if self.robot else self.turn_limit
+        return float(np.radians(min(self.turn_limit, fastest)))
 
 
 EQUIPMENT = {
@@ -164,9 +169,9 @@ class Known:
         """Return the first unit of a specification as its data sheet, with its white noise; nothing calibrated yet."""
         case = specification.case(0)
         noise = {
-            name: _in_output(triad, np.diag(white))
+            name: _in_output(triad, np.diag(noise_squares(case, name)["N"]))
             for name, triad in case.imu.triads().items()
-            if (white := white_density(case, name)) is not None
+            if "N" in noise_squares(case, name)
         }
         gravity = LocalGravity(float(case.plan.motion.gravity), 0.0)
         return cls(
@@ -279,10 +284,8 @@ class Proposal(Result, Document, page="plan"):
             for pose in self.poses
         ]
         turns = [("turn", turn.axis, np.degrees(turn.angle), self.equipment.turn, 0.0) for turn in self.turns]
-        if robot:
-            entries = [
-                entry for pair in zip(entries, [*turns, None], strict=True) for entry in pair if entry is not None
-            ]
+        if robot:  # each turn follows its pose
+            entries = [entry for pair in zip_longest(entries, turns) for entry in pair if entry]
         else:
             entries += turns
         for kind, vector, angle, duration, heading in entries:
@@ -296,40 +299,26 @@ class Proposal(Result, Document, page="plan"):
         sigmas = zip(self.names, self.before.tolist(), self.after.tolist(), strict=True)
         return {
             "schema": SCHEMA,
-            "source": self.source,
+            **entries(self, "source", "rank", "notes"),
             "equipment": self.equipment.name,
-            "rest": self.equipment.rest,
-            "turn": self.equipment.turn,
+            **entries(self.equipment, "rest", "turn"),
             "accuracy": None if self.equipment.accuracy is None else {"value": self.equipment.accuracy, "unit": "deg"},
-            "poses": [
-                {"up": pose.up.tolist(), "attitude": pose.attitude.tolist(), "words": pose.words} for pose in self.poses
-            ],
+            "poses": [entries(pose, "up", "attitude", "words") for pose in self.poses],
             "turns": [
-                {
-                    "axis": turn.axis.tolist(),
-                    "angle": float(np.degrees(turn.angle)),
-                    "angle_unit": "deg",
-                    "rate": float(np.degrees(turn.rate)),
-                    "rate_unit": "deg/s",
-                    "words": turn.words,
-                }
+                entries(turn, "axis", "words")
+                | {"angle": float(np.degrees(turn.angle)), "angle_unit": "deg"}
+                | {"rate": float(np.degrees(turn.rate)), "rate_unit": "deg/s"}
                 for turn in self.turns
             ],
             "criterion": {
                 "name": self.criterion,
                 "before": self.criterion_before,
                 "after": self.criterion_after,
-                "gain": self.gain,
-                "rounding_loss": self.rounding_loss,
+                **entries(self, "gain", "rounding_loss"),
             },
             "sigma": {name: {"before": before, "after": after} for name, before, after in sigmas},
-            "rank": self.rank,
             "parameters": len(self.names),
-            "open": [
-                {"text": direction.text, "sigma": direction.sigma, "determined": direction.determined}
-                for direction in self.open
-            ],
-            "notes": list(self.notes),
+            "open": [entries(direction, "text", "sigma", "determined") for direction in self.open],
             "software": SOFTWARE,
         }
 
@@ -398,9 +387,8 @@ def _searched(
 ) -> tuple[Design, Design, DesignCovariance, bool]:
     """The best design; it rounded, or a classical one that does as well; what this leaves; whether it is classical."""
     fastest = np.radians(equipment.fastest)
-    robot = equipment.accuracy is not None
-    starts = _starts(poses, turns, equipment, seed)[: _FEW_STARTS if robot else None]
-    sought = optimise(_coarsened(question), starts, fastest, report, FEW_STEPS if robot else STEPS)
+    starts = _starts(poses, turns, equipment, seed)[: _FEW_STARTS if equipment.robot else None]
+    sought = optimise(_coarsened(question), starts, fastest, report, FEW_STEPS if equipment.robot else STEPS)
     exact = _ordered(sought, equipment)
     design = _rounded(exact, equipment)
     best = covariance(question, design)
@@ -419,14 +407,11 @@ def question_of(
     known: Known, equipment: Equipment, criterion: str, parameter: str | None, poses: int = 12
 ) -> tuple[DesignQuestion, tuple[str, ...]]:
     """Return what a design is asked for, and notes on what had to be assumed; arguments as in [`propose`]."""
-    robot = equipment.accuracy is not None
-    for name in ("rest", "turn", "step"):
+    for name, unit in {"rest": "", "turn": "", "step": "", "accuracy": " degrees"}.items():
         value = getattr(equipment, name)
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"the {name} must be greater than zero, found {value:g}.")
-    if equipment.accuracy is not None and not (np.isfinite(equipment.accuracy) and equipment.accuracy > 0):
-        raise InputError(f"the accuracy must be greater than zero degrees, found {equipment.accuracy:g}.")
-    if robot and known.imu.gyroscope is None:
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise InputError(f"the {name} must be greater than zero{unit}, found {value:g}.")
+    if equipment.robot and known.imu.gyroscope is None:
         raise InputError(
             "a robot's attitude calibrates a gyroscope, and this unit has none: plan for a table, --equipment table."
         )
@@ -446,7 +431,7 @@ def question_of(
             "a calibration by hand has the accelerometer's axes for its frame; how they lie to the table's is "
             "taken as open.",
         )
-    if robot:
+    if equipment.robot:
         notes += (
             f"the attitude's error is taken as {equipment.accuracy:g}° (1 σ, each axis), independent from stamp to "
             "stamp, and the gyroscope's bias as constant; what is off alike in all poses, such as a bent arm, is not "
@@ -465,7 +450,7 @@ def question_of(
         equipment.by_hand,
         equipment.z_up,
         criterion,
-        poses * equipment.rest + (poses - 1) * equipment.turn if robot else None,
+        poses * equipment.rest + (poses - 1) * equipment.turn if equipment.robot else None,
     )
     return question, (*notes, *more)
 
@@ -640,7 +625,7 @@ def _neighbourly(attitudes: FloatArray) -> FloatArray:
 
 def _rounded(design: Design, equipment: Equipment) -> Design:
     step, attitude = np.radians(equipment.step), np.asarray(design.attitude)
-    if equipment.accuracy is not None:
+    if equipment.robot:
         round_ = np.array([round_attitude(quaternion, step) for quaternion in attitude])
         signs = np.where(np.sum(round_ * attitude, axis=1) >= 0, 1.0, -1.0)
         return replace(design, attitude=round_ * signs[:, None])  # each turn goes the way that was sought
@@ -667,9 +652,7 @@ def _words(attitude: FloatArray, equipment: Equipment) -> str:
     if equipment.by_hand:
         return attitude_words(attitude)
     tilt = pose_words(up_of(attitude))
-    if equipment.accuracy is None:
-        return tilt
-    return f"{tilt}; heading {heading_of(attitude):.4g}°".replace(" -", " −")
+    return f"{tilt}; heading {heading_of(attitude):.4g}°".replace(" -", " −") if equipment.robot else tilt
 
 
 def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
@@ -691,7 +674,7 @@ def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
         angle = float(np.linalg.norm(vector))
         axis = vector / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
         words = f"the direct way, {np.degrees(angle):.0f}°"
-        if equipment.accuracy is not None:
+        if equipment.robot:
             about = ", ".join(f"{component + 0.0:.3f}" for component in np.round(axis, 3))
             words = f"{np.degrees(angle):.1f}° about ({about}) of the unit's axes"
         turns.append(Turn(axis, angle, angle / equipment.turn, words))

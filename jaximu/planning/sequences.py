@@ -35,6 +35,7 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import Z95
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -349,7 +350,7 @@ def _proposal(
     weak = tuple(direction for direction in weak if not {name for name, _ in direction.parameters} <= of_earth)
     unshown = [index for index in earth if after[index, index] > _SHOWN**2 * before[index, index]]
     if unshown:
-        left = spoken_amount(estimator.names[unshown[0]], 1.96 * np.sqrt(after[unshown[0], unshown[0]]), estimator.imu)
+        left = spoken_amount(estimator.names[unshown[0]], Z95 * np.sqrt(after[unshown[0], unshown[0]]), estimator.imu)
         notes += (
             "the gyroscope's noise hides the Earth's rotation from this sequence: it is known to "
             f"± {left} (95 %), and is part of how uncertain the biases are.",

@@ -26,9 +26,10 @@ from jaximu.ground.document import Json, read_toml
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError, only
 from jaximu.ground.rotation import apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
-from jaximu.model import AxisNoise, parse_quantity, processes
+from jaximu.model import AxisNoise, BiasInstability, parse_quantity
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE
+from jaximu.model.processes import MEMBER_VARIANCE
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.planning.information import root_of
@@ -336,34 +337,21 @@ def _attitude_roots(stops: _Stops, kind: str) -> dict[str, FloatArray]:
     return {name: np.asarray(root.reshape(3 * count, -1), np.float64) for name, root in roots.items()}
 
 
-def _mean_covariances(noise: tuple[processes.Process, ...], density: FloatArray, start: FloatArray, stop: FloatArray):
-    """Covariances (3, n, n), SI², of means by white noise and by slow bias, and the rate ramp R (3,)."""
+def _mean_covariances(squares: Mapping[str, FloatArray], start: FloatArray, stop: FloatArray):
+    """Covariances (3, n, n), SI², of means by white noise and by slow bias; squares: of the terms, by letter."""
     none = np.zeros(3)
-    fast, slow = AxisNoise.of_white(density).covariance(start, stop), np.zeros((3, len(start), len(start)))
-    ramp = none
-    middle = (start + stop) / 2
+    fast = replace(AxisNoise.of_white(squares["N"]), quantisation=squares.get("Q", none))
+    times = BiasInstability(1.0).bank(_FLICKER_INTERVAL)
+    flicker = np.outer(MEMBER_VARIANCE * squares.get("B", none), np.ones(len(times)))
 
-    def sized(value) -> FloatArray:
-        return np.broadcast_to(np.asarray(value, float), (3,))
+    # of a walk, the means of min(s, t) = (s + t)/2 − |s − t|/2; the latter's second integral is −|h|³/12
+    def cube(first, second):
+        return np.abs(second[None, :] - first[:, None]) ** 3 / 12
 
-    for process in noise:
-        if isinstance(process, processes.Quantisation):
-            fast = fast + AxisNoise(none, sized(process.Q) ** 2, np.zeros((3, 0)), np.zeros(0)).covariance(start, stop)
-        elif isinstance(process, processes.BiasInstability):
-            times = process.bank(_FLICKER_INTERVAL)
-            variance = np.outer(sized(process.B) ** 2 * np.log(times[1] / times[0]) / np.pi, np.ones(len(times)))
-            slow = slow + AxisNoise(none, none, variance, times).covariance(start, stop)
-        elif isinstance(process, processes.RandomWalk):
-            # the means of min(s, t) = (s + t)/2 − |s − t|/2; the latter's second integral is −|h|³/12
-            def cube(first, second):
-                return np.abs(second[None, :] - first[:, None]) ** 3 / 12
-
-            apart = cube(start, start) + cube(stop, stop) - cube(start, stop) - cube(stop, start)
-            shared = (middle[:, None] + middle) / 2 + apart / np.outer(stop - start, stop - start)
-            slow = slow + sized(process.K)[:, None, None] ** 2 * shared
-        elif isinstance(process, processes.RateRamp):
-            ramp = np.hypot(ramp, sized(process.R))
-    return fast, slow, ramp
+    apart = cube(start, start) + cube(stop, stop) - cube(start, stop) - cube(stop, start)
+    shared = np.add.outer(start + stop, start + stop) / 4 + apart / np.outer(stop - start, stop - start)
+    walk = squares.get("K", none)[:, None, None] * shared
+    return fast.covariance(start, stop), AxisNoise(none, none, flicker, times).covariance(start, stop) + walk
 
 
 def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...], tuple[str, ...]]:
@@ -439,11 +427,9 @@ def _durations(stations: Stations) -> FloatArray:
     return np.where(duration > 0, duration, 1.0)
 
 
-def white_density(case: Case, triad: str) -> FloatArray | None:
-    """Return the density N² (3,), SI² · s, of the white noise that is stated for a triad; None where none is."""
-    stated = case.noise[triad].processes if triad in case.noise else ()
-    white = [np.asarray(process.N, float) ** 2 for process in stated if isinstance(process, processes.White)]
-    return np.broadcast_to(np.sum(white, axis=0), (3,)) if white else None
+def noise_squares(case: Case, triad: str) -> dict[str, FloatArray]:
+    """Return the squares (3,), SI, of the sizes of the noise terms that are stated for a triad, by letter."""
+    return case.noise[triad].squares() if triad in case.noise else {}
 
 
 def _with_noise(case: Case, stations: Stations, intervals: Sequence[ScheduleEntry]):
@@ -455,13 +441,12 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[ScheduleEntr
     notes, ramps, fast, slow = [], {}, np.zeros((6, size, size)), np.zeros((6, size, size))
     used = {"accelerometer": stations.accelerometer_used, "gyroscope": stations.gyroscope_used}
     for number, (name, triad) in enumerate(case.imu.triads().items()):
-        stated = case.noise[name].processes if name in case.noise else ()
-        density = white_density(case, name)
-        if density is None:
-            density = getattr(TYPICAL_NOISE, name).white
+        squares = noise_squares(case, name)
+        if "N" not in squares:
+            density = squares["N"] = getattr(TYPICAL_NOISE, name).white
             unit = "m/s²/√Hz" if name == "accelerometer" else "rad/s/√Hz"
             notes.append(f"no white noise is stated for the {name}: {np.sqrt(density[0]):.2g} {unit} is assumed.")
-        *parts, ramps[name] = _mean_covariances(stated, density, *span.T)
+        parts, ramps[name] = _mean_covariances(squares, *span.T), np.sqrt(squares.get("R", np.zeros(3)))
         scale = triad.scales[:, None, None]
         there = np.asarray(used[name])[:count]
         for whole, part in zip((fast, slow), parts, strict=True):

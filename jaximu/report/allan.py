@@ -17,9 +17,9 @@ from jaximu.ground.page import Code, Page, Part, Picture, Section, Statement, Ta
 from jaximu.ground.quantities import listed, number, sentence, unit_text
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES
 from jaximu.model.data_sheet import DATASHEET_UNITS, SI_UNITS, TERM_NAMES, convert, to_discrete
+from jaximu.model.processes import TERM_PROCESSES
 from jaximu.noise.analysis import NoiseAnalysis
 from jaximu.noise.filter_noise import (
-    FLICKER,
     FilterNumbers,
     filter_numbers,
     mean_terms,
@@ -181,14 +181,7 @@ def _mean_deviation(axes: Sequence[Identified], tau: FloatArray) -> FloatArray:
 
 def _line(term: str, value: float, tau: FloatArray) -> FloatArray:
     """Return the Allan deviation of one term alone (SI)."""
-    shapes = {
-        "Q": math.sqrt(3) / tau,
-        "N": 1 / np.sqrt(tau),
-        "K": np.sqrt(tau / 3),
-        "R": tau / math.sqrt(2),
-        "B": math.sqrt(FLICKER) * np.ones_like(tau),
-    }
-    return value * shapes[term]
+    return np.sqrt(TERM_PROCESSES[term](value).allan_variance(tau))
 
 
 def allan_figure(analysis: NoiseAnalysis) -> Figure:
