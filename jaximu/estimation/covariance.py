@@ -20,7 +20,7 @@ from jaximu.ground.array_types import Array
 from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import inverse_matrix
-from jaximu.ground.tracing import array_module
+from jaximu.ground.tracing import array_module, is_traced
 
 _SMALL = 6
 """Size of a matrix up to which it is factorised by plain operations."""
@@ -101,6 +101,10 @@ class Covariance(eqx.Module):
 
     def dense(self) -> "Covariance":
         """Return the same with whole matrices."""
+        return self
+
+    def shortened(self) -> "Covariance":
+        """Return the same without rows of the end that no unit uses: there are none."""
         return self
 
     def of_rows(self, used: Float[Array, " n"]) -> "Covariance":
@@ -261,6 +265,15 @@ class Chain(eqx.Module):
         measured = _placed(block, block, self.diagonal, size) + _placed(rest, rest, self.means, size)
         beside = _placed(block, before, self.below, size)
         return Covariance(measured + beside + beside.T, factors, self.used, self.group)
+
+    def shortened(self) -> "Chain | Covariance":
+        """Return the norms alone, which are independent, where no unit uses any other row; of NumPy's arrays."""
+        norms = self.means.shape[-3]
+        if is_traced(self) or self.used[..., norms:].any():
+            return self
+        used, root = self.used[..., :norms], np.linalg.norm(self.pose[..., 0, :], axis=-1)
+        measured = self.diagonal[..., 0, 0] + 1 - used
+        return Covariance(measured, (root, 0 * root, 0 * root), used, self.group[..., :norms])
 
     def of_rows(self, used: Float[Array, " n"]) -> "Chain":
         """Return the covariance with only these rows used."""
