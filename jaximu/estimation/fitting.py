@@ -42,10 +42,9 @@ _SPARE = (12, 36, 84)
 """Numbers of effects that share a compiled pass: rows of zeros fill up to the next."""
 _STILL = 1e-2
 """Standard deviations below which a step ends the passes: what it leaves is its square."""
-_CLOSE, _LINEAR = 1e-4, 1e-3
-"""Typical sizes below which a step ends the solver of a pass, as a Newton step takes off what it leaves; and those,
-times the step's standard deviations where they are more than one, within which a problem is linear: a Newton step is
-enough, and data evaluated before it hold after it."""
+_LINEAR = 1e-3
+"""Typical sizes, times the step's standard deviations where they are more than one, within which a problem is linear: a
+Newton step is enough, and data evaluated before it hold after it. A solver's last steps are a tenth of it."""
 _SWINGING = 5
 """After this many passes, the excess is extrapolated from its last two changes."""
 _FARTHEST = 16.0
@@ -429,7 +428,7 @@ def _single_pass(how: _Solving, like: Imu, parameters: Parameters, unit: _Unit) 
     solution = jax.lax.cond(
         near,
         lambda: Solution(zero, residual, jacobian, start, jnp.array(1), finite, finite),
-        lambda: solve(problem, zero, MAX_STEPS, _CLOSE if linear else _CLOSE**2, how.solver),
+        lambda: solve(problem, zero, MAX_STEPS, _LINEAR / 10 if linear else _LINEAR**2, how.solver),
     )
     there = unit.evaluated(problem, how.estimated, solution.z, solution.residual, solution.jacobian)
     z = solution.z
@@ -653,14 +652,15 @@ class _Passes:
         imu = self.model(state, lanes)
         data = self.data if self.numerics is jnp else [kind.take(lanes) for kind in self.data]
         about = [kind.about(imu) for kind in data]
-        conditions, covariances = zip(*((kind.conditions, kind.covariance.shortened()) for kind in about), strict=True)
-        lengths = [kind.used.shape[1] for kind in covariances]
-        kinds = [np.arange(kind.columns.shape[1]) < length for kind, length in zip(about, lengths, strict=True)]
-        self.short = np.concatenate(kinds)
         columns = self.numerics.concatenate([kind.columns for kind in about], axis=1)
-        columns = columns[:, self.short][..., self.kept] * self.sizes[lanes][:, None, self.base :]
+        self.rows = columns.shape[1]
+        covariances = tuple(kind.covariance for kind in about)
+        if len(about) == 1:
+            covariances = (covariances[0].shortened(),)
+            columns = columns[:, : covariances[0].used.shape[1]]
+        columns = columns[..., self.kept] * self.sizes[lanes][:, None, self.base :]
         columns = self.numerics.pad(columns, [(0, 0), (0, 0), (0, self.spare)])
-        return conditions, covariances, columns, state.numbers
+        return tuple(kind.conditions for kind in about), covariances, columns, state.numbers
 
     def once(
         self, one: Callable, state: _State, lanes: IntArray, evaluated: tuple[Any, ...], blunt: bool | Array = False
@@ -838,16 +838,8 @@ class _Passes:
 
     def fit(self, state: _State, there: _Evaluated, cost: Array, steps: Array, converged: Array, finite: Array) -> Fit:
         """Return the fit of units whose passes have ended."""
-        size, keep, short = self.sizes, len(self.names), self.short
-
-        def whole(rows):
-            """Return rows (N, n, ...) with zeros where none were computed."""
-            if short.all():
-                return rows
-            every = np.zeros((len(rows), len(short), *rows.shape[2:]))
-            every[:, short] = rows
-            return every
-
+        size, keep = self.sizes, len(self.names)
+        missing = (0, 0), (0, self.rows - there.residual.shape[1])
         covariance = there.covariance[:, :keep, :keep] * size[:, :, None] * size[:, None]
         return Fit(
             self.model(state, np.arange(self.count)),
@@ -856,8 +848,8 @@ class _Passes:
             self.values(state.reference, state.numbers),
             covariance,
             there.magnitude[:, :keep] * size,
-            whole(there.residual),
-            whole(there.jacobian[..., :keep]),
+            self.numerics.pad(there.residual, missing),
+            self.numerics.pad(there.jacobian[..., :keep], (*missing, (0, 0))),
             state.used,
             cost,
             steps,
