@@ -42,7 +42,7 @@ _SPARE = (12, 36, 84)
 """Numbers of effects that share a compiled pass: rows of zeros fill up to the next."""
 _STILL = 1e-2
 """Standard deviations below which a step ends the passes: what it leaves is its square."""
-_LINEAR = 1e-3
+_LINEAR = 3e-4
 """Typical sizes, times the step's standard deviations where they are more than one, within which a problem is linear: a
 Newton step is enough, and data evaluated before it hold after it. A solver's last steps are a tenth of it."""
 _SWINGING = 5
