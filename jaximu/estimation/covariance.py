@@ -20,7 +20,7 @@ from jaximu.ground.array_types import Array
 from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import inverse_matrix
-from jaximu.ground.tracing import array_module
+from jaximu.ground.tracing import array_module, is_traced
 
 _SMALL = 6
 """Size of a matrix up to which it is factorised by plain operations."""
@@ -103,6 +103,10 @@ class Covariance(eqx.Module):
         """Return the same with whole matrices."""
         return self
 
+    def shortened(self) -> "Covariance":
+        """Return the same without rows of the end that no unit uses: there are none."""
+        return self
+
     def of_rows(self, used: Float[Array, " n"]) -> "Covariance":
         """Return the covariance with only these rows used; factors by blocks."""
         factors = tuple(factor.of_rows(used) for factor in self.factors)  # pyright: ignore[reportAttributeAccessIssue]
@@ -171,7 +175,7 @@ class ChainWeights(eqx.Module):
 
         def step(before, block):
             inverse, below, right = block
-            white = inverse @ (right - below @ before)
+            white = _product(inverse, right - _product(below, before))
             return white, white
 
         white = jax.lax.scan(step, jnp.zeros_like(chain[0]), (self.inverse, self.below, chain))[1]
@@ -183,8 +187,8 @@ class ChainWeights(eqx.Module):
 
         def step(after, block):
             inverse, below, right = block
-            solved = inverse.T @ (right - after)
-            return below.T @ solved, solved
+            solved = _product(inverse.T, right - after)
+            return _product(below.T, solved), solved
 
         solved = jax.lax.scan(step, jnp.zeros_like(chain[0]), (self.inverse, self.below, chain), reverse=True)[1]
         return in_order(solved, self.means.swapaxes(1, 2) @ means).reshape(rows.shape)
@@ -262,6 +266,15 @@ class Chain(eqx.Module):
         beside = _placed(block, before, self.below, size)
         return Covariance(measured + beside + beside.T, factors, self.used, self.group)
 
+    def shortened(self) -> "Chain | Covariance":
+        """Return the norms alone, which are independent, where no unit uses any other row; of NumPy's arrays."""
+        norms = self.means.shape[-3]
+        if is_traced(self) or self.used[..., norms:].any():
+            return self
+        used, root = self.used[..., :norms], np.linalg.norm(self.pose[..., 0, :], axis=-1)
+        measured = self.diagonal[..., 0, 0] + 1 - used
+        return Covariance(measured, (root, 0 * root, 0 * root), used, self.group[..., :norms])
+
     def of_rows(self, used: Float[Array, " n"]) -> "Chain":
         """Return the covariance with only these rows used."""
         chain, means = _blocks(used[:, None], len(self.means))
@@ -322,6 +335,11 @@ def _placed(rows: Int[Array, "B m"], columns: Int[Array, "B k"], values: Float[A
         np.add.at(whole, at, values)
         return whole
     return jnp.zeros((size, size)).at[at].add(values)
+
+
+def _product(one: Float[Array, "m k"], other: Float[Array, "k q"]) -> Float[Array, "m q"]:
+    """Return the product of small matrices, element by element: calls take longer than products inside a scan."""
+    return jnp.sum(one[:, :, None] * other, axis=1)
 
 
 def _squared(factor: Float[Array, "... m q"]) -> Float[Array, "... m m"]:

@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float, Int
 from jaximu.estimation.covariance import Chain, ChainWeights, Covariance, Weights, parts_of, update_excess
 from jaximu.estimation.data import Conditions, Data
 from jaximu.estimation.problem import LOSSES, TOLERANCE, Name, Parameters, flatten, names_of, typical_sizes, unflatten
-from jaximu.estimation.solver import MAX_STEPS, Failure, solve
+from jaximu.estimation.solver import MAX_STEPS, Failure, Solution, solve
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, BoolArray, Computed, FloatArray, IntArray
 from jaximu.ground.differences import value_and_jacobian
@@ -42,8 +42,9 @@ _SPARE = (12, 36, 84)
 """Numbers of effects that share a compiled pass: rows of zeros fill up to the next."""
 _STILL = 1e-2
 """Standard deviations below which a step ends the passes: what it leaves is its square."""
-_CLOSE = 1e-6
-"""Typical sizes below which a step ends a pass: a Newton step takes off what it leaves, and another pass may follow."""
+_LINEAR = 3e-4
+"""Typical sizes, times the step's standard deviations where they are more than one, within which a problem is linear: a
+Newton step is enough, and data evaluated before it hold after it. A solver's last steps are a tenth of it."""
 _SWINGING = 5
 """After this many passes, the excess is extrapolated from its last two changes."""
 _FARTHEST = 16.0
@@ -306,6 +307,7 @@ class _Whitened(eqx.Module):
     weights: tuple[Weights | ChainWeights, ...]
     used: tuple[Array, ...]
     columns: Array
+    shift: Array
     mean: Array
     root: Array
     damping: Array
@@ -315,8 +317,10 @@ class _Whitened(eqx.Module):
         count = len(self.parameters.index)
         model = self.parameters.model(self.like, z[:count])
         kinds = zip(self.weights, self.used, self.conditions, strict=True)
-        plain = jnp.concatenate([weights.whiten(used * conditions(model)) for weights, used, conditions in kinds])
-        return plain + self.columns @ z[count:]
+        plain = jnp.concatenate(
+            [weights.whiten(used * conditions(model)[: len(used)]) for weights, used, conditions in kinds]
+        )
+        return plain + self.columns @ (z[count:] + self.shift)
 
     def objective(self, z):
         beforehand = jnp.concatenate([self.root @ (z - self.mean), self.damping * z])
@@ -332,11 +336,15 @@ def _robust_excess(residual: Array, groups: Array, excess: Array) -> Array:
 
 
 class _Unit(NamedTuple):
-    """What a pass knows of one unit: what was measured, and what is known beforehand."""
+    """What a pass knows of one unit: what was measured, and what is known beforehand.
+
+    shift: of the numbers that act by columns, since the data were evaluated.
+    """
 
     conditions: tuple[Conditions, ...]
     covariances: tuple[Covariance | Chain, ...]
     columns: Array
+    shift: Array
     mean: Array
     root: Array
     damping: Array
@@ -356,6 +364,7 @@ class _Unit(NamedTuple):
             tuple(weights),
             used,
             jnp.concatenate(white),
+            self.shift,
             self.mean,
             self.root,
             self.damping,
@@ -409,21 +418,28 @@ class _Solving(NamedTuple):
 def _single_pass(how: _Solving, like: Imu, parameters: Parameters, unit: _Unit) -> _Pass:
     problem = unit.problem(how.loss, like, parameters)
     zero = jnp.zeros(len(unit.mean))
-    before = problem.objective(zero)
-    solution = solve(problem, zero, MAX_STEPS, _CLOSE, how.solver)
+    linear = how.loss == "linear"
+    (residual, known), (jacobian, by) = value_and_jacobian(problem.objective, zero)
+    start = 0.5 * (jnp.sum(residual**2) + jnp.sum(known**2))
+    step = jnp.linalg.solve(jacobian.T @ jacobian + by.T @ by, jacobian.T @ residual + by.T @ known)
+    usual = linear and how.solver is None
+    near = usual & (unit.damping == 0) & (_leaves(jnp, step, jnp.linalg.norm(jacobian @ step)) < _LINEAR)
+    finite = jnp.isfinite(jacobian).all() & jnp.isfinite(start)
+    solution = jax.lax.cond(
+        near,
+        lambda: Solution(zero, residual, jacobian, start, jnp.array(1), finite, finite),
+        lambda: solve(problem, zero, MAX_STEPS, _LINEAR / 10 if linear else _LINEAR**2, how.solver),
+    )
     there = unit.evaluated(problem, how.estimated, solution.z, solution.residual, solution.jacobian)
     z = solution.z
-    if how.loss == "linear":  # what the solver's tolerance leaves, taken off by a last Newton step
+    if linear:  # what the solver's tolerance leaves, taken off by a last Newton step
         z = jnp.where(unit.damping == 0, z - there.covariance @ there.gradient, z)
-    return _Pass(
-        z,
-        there,
-        0.5 * sum(jnp.sum(part**2) for part in before),
-        solution.cost,
-        solution.steps,
-        solution.converged,
-        solution.finite,
-    )
+    return _Pass(z, there, start, solution.cost, solution.steps, solution.converged, solution.finite)
+
+
+def _leaves(numerics: Any, step: Array, length: Array) -> Array:
+    """Return what a linear problem leaves after a step (..., p), in typical sizes; `length`: standard deviations."""
+    return numerics.abs(step).max(axis=-1, initial=0.0) * numerics.maximum(1.0, length)
 
 
 def _no_step(how: _Solving, like: Imu, parameters: Parameters, unit: _Unit) -> _Evaluated:
@@ -518,7 +534,8 @@ class _State(eqx.Module):
 
     reference: all numbers of gain and bias; numbers: of the effects; excess: to weight with next, used: the last one.
     damping: of the next step. least: cost above which a step led astray, and before: where it began. share, taken: of
-    the last change of the excess. active: units whose passes go on; settled: those that stand.
+    the last change of the excess. active: units whose passes go on; settled: those that stand; moved: those that went
+    farther than data evaluated before hold.
     """
 
     reference: Float[Array, "N m"]
@@ -532,6 +549,7 @@ class _State(eqx.Module):
     taken: Float[Array, "N k"]
     active: Bool[Array, " N"]
     settled: Bool[Array, " N"]
+    moved: Bool[Array, " N"]
 
 
 @dataclass(eq=False)
@@ -629,24 +647,31 @@ class _Passes:
         whole = whole + np.diag(np.arange(count + self.spare) >= count).astype(float)
         return mean, whole
 
-    def once(self, one: Callable, state: _State, lanes: IntArray, blunt: bool | Array = False) -> Any:
-        """Evaluate the data where the passes are, and run `_single_pass` or `_no_step`; `state` is of `lanes`."""
+    def evaluated(self, state: _State, lanes: IntArray) -> tuple[Any, ...]:
+        """Evaluate the data where the passes are: conditions, covariances and columns, and the effects' numbers."""
         imu = self.model(state, lanes)
         data = self.data if self.numerics is jnp else [kind.take(lanes) for kind in self.data]
         about = [kind.about(imu) for kind in data]
         columns = self.numerics.concatenate([kind.columns for kind in about], axis=1)
+        self.rows = columns.shape[1]
+        covariances = tuple(kind.covariance for kind in about)
+        if len(about) == 1:
+            covariances = (covariances[0].shortened(),)
+            columns = columns[:, : covariances[0].used.shape[1]]
         columns = columns[..., self.kept] * self.sizes[lanes][:, None, self.base :]
         columns = self.numerics.pad(columns, [(0, 0), (0, 0), (0, self.spare)])
-        unit = _Unit(
-            tuple(kind.conditions for kind in about),
-            tuple(kind.covariance for kind in about),
-            columns,
-            *self.known(state, lanes, blunt),
-            state.damping,
-            state.excess,
-        )
-        sizes = self.sizes[lanes][:, : self.base]
-        return _run(one, self.how, self.like, self.parameters, state.reference, sizes, unit)
+        return tuple(kind.conditions for kind in about), covariances, columns, state.numbers
+
+    def once(
+        self, one: Callable, state: _State, lanes: IntArray, evaluated: tuple[Any, ...], blunt: bool | Array = False
+    ) -> Any:
+        """Run `_single_pass` or `_no_step` on data that were evaluated; `state` and they are of `lanes`."""
+        *about, numbers = evaluated
+        sizes = self.sizes[lanes]
+        shift = (state.numbers - numbers)[:, self.kept] / sizes[:, self.base :]
+        shift = self.numerics.pad(shift, [(0, 0), (0, self.spare)])
+        unit = _Unit(*about, shift, *self.known(state, lanes, blunt), state.damping, state.excess)
+        return _run(one, self.how, self.like, self.parameters, state.reference, sizes[:, : self.base], unit)
 
     def start(self, excess: Array) -> _State:
         """Return where the passes begin."""
@@ -664,6 +689,7 @@ class _Passes:
             numerics.zeros_like(excess),
             yes,
             ~yes,
+            yes,
         )
 
     def advanced(self, state: _State, lanes: IntArray, out: _Pass, number: int | Array) -> tuple[_State, Array]:
@@ -685,6 +711,7 @@ class _Passes:
         better = numerics.clip(excess + share[:, None] * way, 0.0, self.most)
         change = (numerics.abs(better - excess) / (1 + excess)).max(axis=1, initial=0.0)
         length = numerics.linalg.norm(numerics.einsum("unp,up->un", out.there.jacobian, out.z), axis=1)
+        sharper = numerics.sqrt(((1 + excess) / (1 + better)).max(axis=1, initial=1.0))
         creep = numerics.abs(way / scale).max(axis=1, initial=0.0)
         still = (change < _SETTLED) & (length < _STILL)
         still = still | ((number >= _CREEPING) & (creep < _CREEPS[0]) & (length < _CREEPS[1]))
@@ -709,6 +736,7 @@ class _Passes:
             pick(worse, state.taken, way),
             worse | (~still & out.finite),
             fine & still,
+            worse | blunt | ~(_leaves(numerics, out.z, length * sharper) < _LINEAR),
         ), fine
 
     def moved(self, state: _State, lanes: IntArray, z: Array) -> tuple[Array, Array]:
@@ -727,11 +755,15 @@ class _Passes:
 
     def run(self, excess: FloatArray) -> Fit:
         """Alternate until nothing moves, a chunk of the units that still do after the other, and only those."""
-        state, result = jax.tree.map(np.array, self.start(excess)), None
+        state, result, about = jax.tree.map(np.array, self.start(excess)), None, None
         for number in range(self.max_passes):
+            for part, padded in self.chunks(state.active & state.moved):
+                new = _of(self.evaluated(_of(state, padded), padded), slice(len(part)))
+                about = jax.tree.map(partial(_room, self.count), new) if about is None else about
+                jax.tree.map(partial(_put, part), about, new)
             for part, padded in self.chunks(state.active):
                 here = _of(state, padded)
-                out = self.once(_single_pass, here, padded, self.blunted and number == 0)
+                out = self.once(_single_pass, here, padded, _of(about, padded), self.blunted and number == 0)
                 here, out = _of((here, out), slice(len(part)))
                 after, fine = self.advanced(here, part, out, number)
                 jax.tree.map(partial(_put, part), state, after)
@@ -760,7 +792,7 @@ class _Passes:
 
         def left(x):
             """Return what a fit brings to zero: a Newton step, and the change of the excess."""
-            there = self.once(_no_step, at(x), lanes)
+            there = self.once(_no_step, at(x), lanes, self.evaluated(at(x), lanes))
             step = jnp.einsum("upq,uq->up", there.covariance, there.gradient)[:, : len(self.names)] * self.sizes
             numbers = (x[1] - self.numbers).at[:, np.flatnonzero(self.kept)].set(step[:, self.base :])
             way = x[2] - (jnp.clip(there.excess, 0.0, self.most) if self.how.estimated else excess)
@@ -768,21 +800,26 @@ class _Passes:
 
         def passes(_, x):
             def step(loop):
-                state, number, ended = loop
-                out = self.once(_single_pass, state, lanes, (number == 0) & self.blunted)
+                state, number, ended, about = loop
+                about = jax.lax.cond(
+                    (state.active & state.moved).any(),
+                    lambda: jax.tree.map(partial(_where, jnp, state.moved), self.evaluated(state, lanes), about),
+                    lambda: about,
+                )
+                out = self.once(_single_pass, state, lanes, about, (number == 0) & self.blunted)
                 after, fine = self.advanced(state, lanes, out, number)
                 after = jax.tree.map(partial(_where, jnp, state.active), after, state)
                 after = replace(after, active=state.active & after.active)
                 ended = jax.tree.map(
                     partial(_where, jnp, state.active & fine), (out.steps, out.converged, out.finite), ended
                 )
-                return after, number + 1, ended
+                return after, number + 1, ended, about
 
             def on(loop):
                 return loop[0].active.any() & (loop[1] < self.max_passes)
 
             none = jnp.zeros(self.count, int), jnp.zeros(self.count, bool), jnp.ones(self.count, bool)
-            state, _, ended = jax.lax.while_loop(on, step, (at(x), 0, none))
+            state, _, ended, _ = jax.lax.while_loop(on, step, (at(x), 0, none, self.evaluated(at(x), lanes)))
             about = jax.tree.map(lambda leaf: leaf.astype(float), (*ended, state.settled))  # as derivatives need them
             return (state.reference[:, self.index], state.numbers, state.used), about
 
@@ -795,13 +832,14 @@ class _Passes:
         x, about = jax.lax.custom_root(left, begin, passes, undo, has_aux=True)
         steps, (converged, finite, settled) = about[0].astype(int), (leaf > 0 for leaf in about[1:])
         state = replace(at(x), settled=settled)
-        there = self.once(_no_step, state, lanes)
+        there = self.once(_no_step, state, lanes, self.evaluated(state, lanes))
         cost = 0.5 * jnp.sum(there.residual**2, axis=-1)
         return self.fit(state, there, cost, steps, converged, finite)
 
     def fit(self, state: _State, there: _Evaluated, cost: Array, steps: Array, converged: Array, finite: Array) -> Fit:
         """Return the fit of units whose passes have ended."""
         size, keep = self.sizes, len(self.names)
+        missing = (0, 0), (0, self.rows - there.residual.shape[1])
         covariance = there.covariance[:, :keep, :keep] * size[:, :, None] * size[:, None]
         return Fit(
             self.model(state, np.arange(self.count)),
@@ -810,8 +848,8 @@ class _Passes:
             self.values(state.reference, state.numbers),
             covariance,
             there.magnitude[:, :keep] * size,
-            there.residual,
-            there.jacobian[..., :keep],
+            self.numerics.pad(there.residual, missing),
+            self.numerics.pad(there.jacobian[..., :keep], (*missing, (0, 0))),
             state.used,
             cost,
             steps,

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import numpy as np
 
 from jaximu.calibration import fit_hand_held
 from jaximu.data import residual_rms
-from jaximu.data.poses import PosesAndTurns, condensed, stack
+from jaximu.data.poses import PosesAndTurns, condensed
 from jaximu.estimation.fitting import Fit
+from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.tracing import stacked
 from jaximu.model.sensor import Imu
 from jaximu.planning.chunks import in_chunks
 from jaximu.recordings.observations import Observations
@@ -66,15 +69,16 @@ def fit_units(units: Sequence[FleetUnit]) -> list[tuple[Fit, FloatArray]]:
 
 def _together(nominals: Sequence[Imu], data: Sequence[PosesAndTurns], gyroscope: bool) -> list[tuple[Fit, FloatArray]]:
     """Fit units whose arrays have one shape."""
-    starts = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, float) for leaf in leaves]), *nominals)
-    together = stack(data)
+    starts = jax.tree.map(lambda leaf: np.asarray(leaf, float), stacked(nominals))
+    together = stacked(data)
     fits = fit_hand_held(starts, together, "joint" if gyroscope else "accelerometer")
 
     def scatter(imu: Imu, observed: PosesAndTurns) -> tuple:
         reduced = condensed(imu, observed)
         return reduced.force, reduced.angle
 
-    errors = in_chunks(scatter, _SHAPE, fits.imu, together)
+    compiled = partial(stored.call, scatter, "scatter", quick=False)  # without what else is condensed
+    errors = in_chunks(compiled, _SHAPE, fits.imu, together)
     fitted = []
     for lane, unit in enumerate(data):
         fit, error = jax.tree.map(lambda leaf, lane=lane: leaf[lane], (fits, errors))
@@ -83,9 +87,7 @@ def _together(nominals: Sequence[Imu], data: Sequence[PosesAndTurns], gyroscope:
     return fitted
 
 
-def _padded(count: int, least: int) -> int:
-    """Return the next of 2 or 3 times a power of two: half more at most, and few shapes to compile."""
-    size = least
-    while size < count:
-        size += size // 2 if size & (size - 1) == 0 else size // 3
-    return size
+def _padded(count: int, step: int) -> int:
+    """Return the next multiple of a step, or of a larger one: a quarter more at most, and few shapes to compile."""
+    step = max(step, 1 << count.bit_length() >> 3)
+    return -(-count // step) * step
