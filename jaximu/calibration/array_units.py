@@ -8,7 +8,7 @@ import numpy as np
 
 from jaximu.calibration.calibration import Calibration
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import Document, Json
+from jaximu.ground.document import Document, Json, entries
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.page import Result
 
@@ -45,10 +45,7 @@ class ArrayUnit:
         """Return the unit as `array.json` has it."""
         return {
             "file": self.name,
-            "rotation": self.rotation.tolist(),
-            "rotation_sigma": self.rotation_sigma.tolist(),
-            "position": self.position.tolist(),
-            "position_sigma": self.position_sigma.tolist(),
+            **entries(self, "rotation", "rotation_sigma", "position", "position_sigma"),
             "time_offset": {"value": self.time_offset, "sigma": self.time_offset_sigma, "unit": "s"},
             "clock_scale": 1.0 + self.clock_scale,
             "residual": {"rate": self.residual[0], "force": self.residual[1]},

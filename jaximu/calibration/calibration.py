@@ -14,7 +14,7 @@ from jaximu.estimation.problem import TOLERANCE, Name, flatten, names_of, typica
 from jaximu.estimation.projection import OutputUncertainty, output_uncertainty
 from jaximu.estimation.uncertainty import WeakDirection, describe, gains_open, pose_advice, weak_directions
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import SOFTWARE, Document, Json, damage, read_document
+from jaximu.ground.document import SOFTWARE, Document, Json, damage, entries, read_document
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.page import Result
@@ -268,13 +268,11 @@ class Calibration(Result, Document, page="calibration"):
             "data": self.data,
             **({} if self.reading is None else {"reading": asdict(self.reading)}),
             "fit": {
-                "method": self.method,
-                "loss": self.loss,
+                **entries(self, "method", "loss", "rank", "solver", "notes"),
                 "rms": {
                     name: {"before": before, "after": after, "unit": unit}
                     for name, (before, after, unit) in self.rms.items()
                 },
-                "rank": self.rank,
                 "parameters": len(self.names),
                 "weak_directions": [
                     {
@@ -286,8 +284,6 @@ class Calibration(Result, Document, page="calibration"):
                     for weak in self.weak
                 ],
                 "excess_variance": self.excess,
-                "solver": self.solver,
-                "notes": list(self.notes),
             },
             "setup": {
                 "gravity": {"value": self.gravity.value, "sigma": self.gravity.sigma, "unit": "m/s^2"}

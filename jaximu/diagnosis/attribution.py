@@ -32,7 +32,7 @@ from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.differences import interpolated
 from jaximu.ground.distributions import chi2_sf
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.page import Result
@@ -148,15 +148,11 @@ class BoardRecording:
     def document(self) -> Json:
         """Return the recording as `diagnosis.json` has it."""
         return {
-            "file": self.file,
-            "unit": self.unit,
-            "session": self.session,
+            **entries(self, "file", "unit", "session", "taken_off", "chi2_heldout"),
             "verdict": self.diagnosis["verdict"],
             "verdict_alone": self.alone,
             "without_common_drift": self.without_drift,
-            "taken_off": list(self.taken_off),
             "effects": self.diagnosis["effects"],
-            "chi2_heldout": self.chi2_heldout,
         }
 
     def block(self, name: str, inner: Mapping[str, float]) -> int | None:
@@ -530,13 +526,9 @@ class Attribution(Result, Document, page="attribution"):
             "attribution": [finding.document() for finding in self.findings],
             "common_drift": [
                 {
-                    "session": drift.session,
-                    "times": drift.times.tolist(),
+                    **entries(drift, "session", "times", "share", "common", "p_value"),
                     "rate": drift.curve.tolist(),
-                    "share": drift.share,
-                    "common": drift.common,
                     "common_by_chance": drift.chance,
-                    "p_value": drift.p_value,
                     "loadings": {unit: row.tolist() for unit, row in drift.loadings.items()},
                 }
                 for drift in self.drifts

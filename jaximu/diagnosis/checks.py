@@ -12,7 +12,7 @@ from jaximu.estimation.leave_out import off
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf, holm, kolmogorov_sf
-from jaximu.ground.document import Json
+from jaximu.ground.document import Json, entries
 
 _KINDS = {
     "gravity_norm": ("gravity norm at rest", "the magnitude of the specific force in the poses"),
@@ -38,13 +38,7 @@ class Check:
 
     def document(self) -> Json:
         """Return the check as `diagnosis.json` has it."""
-        return {
-            "name": self.name,
-            "statistic": self.statistic,
-            "p_value": self.p_value,
-            "adjusted": self.adjusted,
-            "text": self.text,
-        }
+        return entries(self, "name", "statistic", "p_value", "adjusted", "text")
 
 
 def checks_of(state: State, experiment: Experiment) -> tuple[Check, ...]:

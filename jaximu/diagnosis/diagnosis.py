@@ -32,7 +32,7 @@ from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import fit
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError, nearest
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.page import Result
@@ -148,17 +148,12 @@ class Named:
             for name, parameter in self.effect.inner.items()
         }
         return {
-            "name": self.name,
+            **entries(self, "name", "p_value", "weak", "sigma", "unit", "evidence"),
             "indistinguishable_from": list(self.rivals),
-            "p_value": self.p_value,
-            "weak": self.weak,
             "scope": self.effect.scope,
             "coefficients": np.asarray(self.effect.coefficients).tolist(),
             "inner": inner,
-            "sigma": self.sigma.tolist(),
-            "unit": self.unit,
             "improvement": None if self.gain is None else self._improvement(self.gain),
-            "evidence": self.evidence,
         }
 
     def _improvement(self, gain: Gain) -> Json:
@@ -234,26 +229,18 @@ class Diagnosis(Result, Document, page="diagnosis"):
         """Return the diagnosis as the JSON document of schema `jaximu.diagnosis/1`."""
         return {
             "schema": SCHEMA,
-            "verdict": self.verdict,
+            **entries(self, "verdict", "not_observable", "suggestion", "p_value", "notes", "shape"),
             "effects": [effect.document() for effect in self.effects],
             "preflight": [finding.document() for finding in self.preflight],
             "detection_limits": {
                 name: {"value": value, "unit": unit} for name, (value, unit) in self.detection_limits.items()
             },
-            "hidden": [
-                {"name": cause.name, "limit": cause.limit, "unit": cause.unit, "shift": cause.shift}
-                for cause in self.hidden
-            ],
-            "not_observable": self.not_observable,
+            "hidden": [entries(cause, "name", "limit", "unit", "shift") for cause in self.hidden],
             "checks": [check.document() for check in self.checks],
-            "suggestion": self.suggestion,
             "next": [
                 {"record": option.text, "power": option.powers, "power_now": option.before} for option in self.options
             ],
-            "p_value": self.p_value,
             "noise_scale": self.unit,
-            "notes": list(self.notes),
-            "shape": self.shape,
             "learned": None if self.learned is None else self.learned.document(),
             "data": self.calibration.data,
             "software": SOFTWARE,

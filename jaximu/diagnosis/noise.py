@@ -23,7 +23,7 @@ from jaximu.diagnosis.learned import curves
 from jaximu.diagnosis.selection import Selection
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_median, f_tails, normal_isf, normal_sf
-from jaximu.ground.document import Json
+from jaximu.ground.document import Json, entries
 from jaximu.ground.quantities import number, with_interval
 from jaximu.mistakes.titles import effect_title
 from jaximu.model.noise_model import AxisNoise, NoiseModel, fit_bank
@@ -112,18 +112,11 @@ class NoiseFinding:
     def document(self) -> Json:
         """Return the finding as `diagnosis.json` has it among the effects."""
         return {
-            "name": self.name,
+            **entries(self, "name", "p_value", "weak", "scope", "axes", "sigma", "unit", "evidence"),
             "indistinguishable_from": list(self.rivals),
-            "p_value": self.p_value,
-            "weak": self.weak,
-            "scope": self.scope,
             "coefficients": self.factor.tolist(),
-            "axes": list(self.axes),
             "inner": {},
-            "sigma": self.sigma.tolist(),
-            "unit": self.unit,
             "improvement": None,
-            "evidence": self.evidence,
         }
 
 
@@ -165,10 +158,10 @@ def quick_noise(experiment: Experiment, noise: NoiseModel, level: float) -> tupl
         elif wrong["noise.white"]:
             changed[triad] = _scaled(known, high / many, length)
     findings = []
-    for name, entries in rows.items():
-        hit = [float(p) for *_, p, off in entries if off]
+    for name, axes_off in rows.items():
+        hit = [float(p) for *_, p, off in axes_off if off]
         if hit:
-            axes, factor, sigma, *_ = zip(*entries, strict=True)
+            axes, factor, sigma, *_ = zip(*axes_off, strict=True)
             what = "means over 1/8 s" if name == "noise.white" else "what is slower than half a second"
             text = f"{what} in the still parts against the noise model, {len(hit)} of {len(axes)} axes off"
             findings.append(

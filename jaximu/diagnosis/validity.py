@@ -12,7 +12,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.uncertainty import describe
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import probability, size, with_interval
 from jaximu.mistakes.titles import effect_title
@@ -84,17 +84,11 @@ class Shift:
             else {"value": self.in_si, "sigma": self.sigma_in_si, "unit": self.si_unit, "at": self.at}
         )
         return {
-            "name": self.name,
-            "old": self.old,
+            **entries(self, "name", "old", "sigma", "unit", "z", "moved", "allowed"),
             "new": self.old + self.difference,
             "shift": self.difference,
-            "sigma": self.sigma,
-            "unit": self.unit,
-            "z": self.z,
             "si": si,
             "p_value": self.p_value if self.tested else None,
-            "moved": self.moved,
-            "allowed": self.allowed,
         }
 
 
@@ -137,13 +131,8 @@ class Cause:
     def document(self) -> Json:
         """Return the cause as `check.json` has it."""
         return {
-            "name": self.name,
-            "scope": self.scope,
+            **entries(self, "name", "scope", "p_value", "coefficients", "inner", "unit"),
             "indistinguishable_from": list(self.rivals),
-            "p_value": self.p_value,
-            "coefficients": self.coefficients.tolist(),
-            "inner": self.inner,
-            "unit": self.unit,
         }
 
 
@@ -262,9 +251,8 @@ class Validity(Result, Document, page="validity"):
         statistic, freedom, p_value = self.difference
         return {
             "schema": SCHEMA,
-            "verdict": self.verdict,
+            **entries(self, "verdict", "p_value", "scatter", "nis", "notes", "data"),
             "sentence": self.headline(),
-            "p_value": self.p_value,
             "prediction": {
                 "chi_squared": self.chi_squared,
                 "degrees_of_freedom": self.freedom,
@@ -278,13 +266,9 @@ class Validity(Result, Document, page="validity"):
             "errors": {
                 name: {"old": old, "fresh": fresh, "unit": unit} for name, (old, fresh, unit) in self.errors.items()
             },
-            "scatter": self.scatter,
             "by": "poses" if self.history is None else "filter in use",
-            "nis": self.nis,
             "alone": {name: {"value": value, "sigma": sigma} for name, (value, sigma) in self.alone.items()},
-            "notes": list(self.notes),
             "calibration": self.calibration.data,
-            "data": self.data,
             "software": SOFTWARE,
         }
 

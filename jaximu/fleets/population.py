@@ -26,7 +26,7 @@ from jaximu.fleets.rows import COLUMN_PLACES, PARAMETERS, SCHEMA, covariances, f
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
 from jaximu.ground.distributions import robust_sigma
-from jaximu.ground.document import Document, Json
+from jaximu.ground.document import Document, Json, entries
 from jaximu.ground.errors import FilePath, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.mistakes.titles import effect_title
@@ -200,11 +200,7 @@ class Fleet(Result, Document, page="fleet"):
             ],
             "differences": [
                 {
-                    "kind": difference.kind,
-                    "group": difference.group,
-                    "count": difference.count,
-                    "p_value": difference.p_value,
-                    "text": difference.text,
+                    **entries(difference, "kind", "group", "count", "p_value", "text"),
                     "parameters": [{"name": n, "amount": a, "sigma": s} for n, a, s in difference.parameters],
                 }
                 for difference in self.differences
@@ -513,8 +509,8 @@ def _lots_and_dates(units: _Units) -> tuple[list[Difference], Shifts]:
             else:
                 shifts.lots.setdefault(groups.names[cause], np.zeros(size))[k] = amount
     differences = []
-    for cause, entries in findings.items():
-        entries.sort(key=lambda one: one[0])
+    for cause, parameters in findings.items():
+        parameters.sort(key=lambda one: one[0])
         if cause == len(groups.names):
             known = groups.years[np.isfinite(groups.years)]
             first, last = (
@@ -526,7 +522,7 @@ def _lots_and_dates(units: _Units) -> tuple[list[Difference], Shifts]:
         else:
             kind, group, count = "lot", groups.names[cause], int(np.sum(groups.lot == cause))
             text = f"lot {group} ({count} units) differs from the other lots"
-        differences.append(Difference(kind, group, count, entries[0][0], tuple(one for _, one in entries), text))
+        differences.append(Difference(kind, group, count, parameters[0][0], tuple(one for _, one in parameters), text))
     return differences, shifts
 
 

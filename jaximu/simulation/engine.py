@@ -15,7 +15,7 @@ import numpy as np
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.atomic import atomic_write
-from jaximu.ground.document import SOFTWARE, Document, Json
+from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
@@ -155,11 +155,7 @@ class Truth(Document):
             "magnetic_field": np.asarray(motion.field).tolist(),
             "schedule": [
                 {
-                    "start": entry.start,
-                    "stop": entry.stop,
-                    "kind": entry.kind,
-                    "vector": entry.vector.tolist(),
-                    "angle": entry.angle,
+                    **entries(entry, "start", "stop", "kind", "vector", "angle"),
                     "heading": entry.heading or 0.0,
                 }
                 for entry in self.schedule
@@ -168,10 +164,7 @@ class Truth(Document):
                 {"name": artefact.name} | {k: None if v == np.inf else v for k, v in asdict(artefact).items()}
                 for artefact in case.artefacts
             ],
-            "rate": case.rate,
-            "samples": case.samples,
-            "seed": list(case.seed),
-            "power_on": case.power_on,
+            **entries(case, "rate", "samples", "seed", "power_on"),
             "notes": list(self.notes),
             "software": SOFTWARE,
         }
