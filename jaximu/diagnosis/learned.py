@@ -101,8 +101,7 @@ def learn(
     """
     for interleaved in (False, True):
         best = _best(experiment, state, interleaved)
-        of_recording = best is not None and best[0].scope == "session"
-        if best is not None and of_recording == interleaved and best[2].log_likelihood > (0 if interleaved else _PAYS):
+        if best is not None and best[2].log_likelihood > (0 if interleaved else _PAYS):
             break
     else:
         return None
@@ -128,6 +127,7 @@ def _best(experiment: Experiment, state: State, interleaved: bool) -> tuple[Curv
     """Return the curve that predicts best what is left out, what its coefficients are a priori (q,), and its gain.
 
     Where that is `interleaved`, only curves that belong to the recording are asked: all others are used beyond it.
+    None where there is none, or one that is to be asked in the other way.
     """
     folds = {way: _predicted_folds(experiment, way, state) for way in (False, True)}
     if not folds[interleaved]:
@@ -146,7 +146,7 @@ def _best(experiment: Experiment, state: State, interleaved: bool) -> tuple[Curv
             gained = gain(size * columns, interleaved)
             if best is None or gained.log_likelihood > best[3].log_likelihood:
                 best = effect, size * root, size * columns, gained
-    if best is None:
+    if best is None or (best[0].scope == "session") != interleaved:
         return None
     effect, spread, columns, gained = best
     return effect, spread, replace(gained, otherwise=gain(columns, not interleaved)) if interleaved else gained

@@ -666,11 +666,13 @@ class _Passes:
         self, one: Callable, state: _State, lanes: IntArray, evaluated: tuple[Any, ...], blunt: bool | Array = False
     ) -> Any:
         """Run `_single_pass` or `_no_step` on data that were evaluated; `state` and they are of `lanes`."""
-        *about, numbers = evaluated
+        conditions, covariances, columns, numbers = evaluated
         sizes = self.sizes[lanes]
         shift = (state.numbers - numbers)[:, self.kept] / sizes[:, self.base :]
         shift = self.numerics.pad(shift, [(0, 0), (0, self.spare)])
-        unit = _Unit(*about, shift, *self.known(state, lanes, blunt), state.damping, state.excess)
+        unit = _Unit(
+            conditions, covariances, columns, shift, *self.known(state, lanes, blunt), state.damping, state.excess
+        )
         return _run(one, self.how, self.like, self.parameters, state.reference, sizes[:, : self.base], unit)
 
     def start(self, excess: Array) -> _State:
