@@ -351,7 +351,7 @@ def _gain_table(diagnosis: Diagnosis, what: str, gain: Gain) -> Table:
     for way in (gain, gain.otherwise):
         if way is not None:
             before, after = (part.chi_squared / part.count for part in (way.before, way.after))
-            caption += f"{'Otherwise measured' if caption else 'Measured'} on {way.data}: "
+            caption += f"{'On' if caption else 'Measured on'} {way.data}: "
             caption += f"χ² per condition {before:.2f} → {after:.2f}, log-likelihood {way.log_likelihood:+.1f}. "
     return Table(
         ("error, rms", f"base model → {what}"),
