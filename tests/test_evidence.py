@@ -7,8 +7,9 @@ import pytest
 import scipy.linalg
 import scipy.stats
 
+from jaximu.diagnosis import improvement
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, EffectBlock, Evidence, detection_limit, limit_noncentrality
-from jaximu.diagnosis.improvement import _beside_open, _by_parts, _likelihood
+from jaximu.diagnosis.improvement import Gain, Prediction, _beside_open, _by_parts, _likelihood
 from jaximu.diagnosis.selection import select, strength_needed
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
 
@@ -461,6 +462,20 @@ def left_out(seed, times, interleaved=False):
     experiment = SimpleNamespace(real=rows, folds=lambda *parts: rows.folds(rows.parts(*parts)))
     base = SimpleNamespace(weights=weights, evidence=Evidence(residual, weights @ jacobian, blocks))
     return _by_parts(experiment, base, interleaved)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_way_that_predicts_nothing_is_not_stated(monkeypatch):
+    """Where every part leaves too little, the other way stands alone, and nothing is divided by no conditions."""
+
+    def by_parts(experiment, base, interleaved):
+        some = Prediction({"rest": (1.0, "rad/s")}, 5.0, 0 if interleaved else 5, -1.0)
+        return Gain(some, some, "dealt out" if interleaved else "stretches")
+
+    monkeypatch.setattr(improvement, "_by_parts", by_parts)
+    fitted = SimpleNamespace(effects=[SimpleNamespace(scope="session")])
+    gain = improvement.cross_validated(None, None, fitted)  # pyright: ignore[reportArgumentType]
+    assert (gain.data, gain.otherwise) == ("stretches", None)
+    assert gain.document()["heldout_chi_squared_after"] == 1.0
 
 
 @pytest.mark.parametrize("interleaved", [False, True])

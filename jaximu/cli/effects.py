@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from jaximu.cli import options
 from jaximu.cli.options import option
-from jaximu.ground.document import Json
+from jaximu.ground.document import Json, entries
 from jaximu.ground.errors import InputError
 from jaximu.ground.page import Page, Section, Table
 from jaximu.ground.quantities import joined, plain, unit_text
@@ -59,21 +59,12 @@ class EffectsCommand:
 
 
 def _entry(kind: type[Effect]) -> Json:
-    return {
-        "name": kind.name,
+    plain = "name", "formula", "unit", "scope", "needs", "excited_by", "look_alikes", "typical", "recovery", "source"
+    return entries(kind, *plain) | {
         "description": inspect.getdoc(kind),
-        "formula": kind.formula,
         "coefficients": kind.size,
-        "unit": kind.unit,
         "inner": {name: parameter._asdict() for name, parameter in kind.inner.items()},
-        "scope": kind.scope,
         "acts_on": "set-up" if kind.owner == "setup" else kind.refers_to,
-        "needs": list(kind.needs),
-        "excited_by": kind.excited_by,
-        "look_alikes": list(kind.look_alikes),
-        "typical": kind.typical,
-        "recovery": kind.recovery,
-        "source": kind.source,
     }
 
 

@@ -159,17 +159,14 @@ def cross_validated(experiment: Experiment, base: State, extended: State | None 
 
     A fifth is one stretch of it: what belongs to a unit holds beyond what it was fitted to. Effects of the `extended`
     fit that belong to the recording are only ever used within it: of these it is every fifth pose. The other way stands
-    beside it.
+    beside it, or for it where that leaves too little to predict anything from.
     """
     if extended is None:
         return _by_parts(experiment, base, interleaved=False)
-    gain, otherwise = (_by_parts(experiment, base, way) for way in (within(extended), not within(extended)))
-    return replace(gain, otherwise=otherwise)
-
-
-def within(state: State) -> bool:
-    """Return whether all effects of a fit belong to its recording, and are never used beyond it."""
-    return all(effect.scope == "session" for effect in state.effects)
+    within = all(effect.scope == "session" for effect in extended.effects)
+    gains = [_by_parts(experiment, base, interleaved) for interleaved in (within, not within)]
+    gain, *others = [gain for gain in gains if gain.before.count] or gains[:1]
+    return replace(gain, otherwise=others[0] if others else None)
 
 
 def _by_parts(experiment: Experiment, base: State, interleaved: bool) -> Gain:

@@ -110,8 +110,7 @@ def learn(
         fitted = _fitted(experiment, state, effect, spread)
     except NotPossibleError:  # a curve that leads a fit to nothing explains nothing
         return None
-    blocks = gain if gain.otherwise is None else gain.otherwise
-    gained, alone = gain.log_likelihood, blocks.after.log_likelihood
+    gained, alone = gain.log_likelihood, (gain.otherwise or gain).after.log_likelihood
     if held is not None and effect.scope == "device":
         gain = on_held_out(held, state, fitted)
         if gain.log_likelihood <= 0:
@@ -129,7 +128,7 @@ def _best(experiment: Experiment, state: State, interleaved: bool) -> tuple[Curv
     Where that is `interleaved`, only curves that belong to the recording are asked: all others are used beyond it.
     None where there is none, or one that is to be asked in the other way.
     """
-    folds = {way: _predicted_folds(experiment, way, state) for way in (False, True)}
+    folds = {way: _predicted_folds(experiment, way, state) for way in {False, interleaved}}
     if not folds[interleaved]:
         return None
     plain = {way: _left_out(experiment, state, folds[way]) for way in folds}
@@ -149,7 +148,8 @@ def _best(experiment: Experiment, state: State, interleaved: bool) -> tuple[Curv
     if best is None or (best[0].scope == "session") != interleaved:
         return None
     effect, spread, columns, gained = best
-    return effect, spread, replace(gained, otherwise=gain(columns, not interleaved)) if interleaved else gained
+    both = interleaved and plain[False].count > 0
+    return effect, spread, replace(gained, otherwise=gain(columns, False) if both else None)
 
 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:

@@ -158,10 +158,10 @@ def quick_noise(experiment: Experiment, noise: NoiseModel, level: float) -> tupl
         elif wrong["noise.white"]:
             changed[triad] = _scaled(known, high / many, length)
     findings = []
-    for name, axes_off in rows.items():
-        hit = [float(p) for *_, p, off in axes_off if off]
+    for name, tested in rows.items():
+        hit = [float(p) for *_, p, off in tested if off]
         if hit:
-            axes, factor, sigma, *_ = zip(*axes_off, strict=True)
+            axes, factor, sigma, *_ = zip(*tested, strict=True)
             what = "means over 1/8 s" if name == "noise.white" else "what is slower than half a second"
             text = f"{what} in the still parts against the noise model, {len(hit)} of {len(axes)} axes off"
             findings.append(
