@@ -10,8 +10,6 @@ import zlib
 from decimal import Decimal, localcontext
 from functools import lru_cache
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
@@ -43,7 +41,6 @@ from jaximu.model.state_space import combine, run
 FLICKER_LEVEL = math.sqrt(2 * math.log(2) / math.pi)  # Allan deviation of flicker noise of B = 1
 
 
-filtered = jax.jit(run)  # one compilation for a shape
 legendre = lru_cache(np.polynomial.legendre.leggauss)
 
 
@@ -354,11 +351,11 @@ def test_first_order_without_decay_is_the_random_walk():
     np.testing.assert_allclose(still.allan_variance(tau), walk.allan_variance(tau), rtol=1e-15)
     np.testing.assert_allclose(still.density(frequency), walk.density(frequency), rtol=1e-15)
     # on the way there, with the same draws and from zero
-    draws, start = jnp.asarray(np.random.default_rng(0).standard_normal((1, 1024))), jnp.zeros(1)
-    reference = np.asarray(filtered(walk.system(0.01).blocked(), start, draws)[0])
+    draws, start = np.random.default_rng(0).standard_normal((1, 1024)), np.zeros(1)
+    reference = run(walk.system(0.01).blocked(), start, draws)[0]
     apart = []
     for beta in (1e-2, 1e-4, 1e-6):
-        found = np.asarray(filtered(FirstOrderGaussMarkov(0.3, beta).system(0.01).blocked(), start, draws)[0])
+        found = run(FirstOrderGaussMarkov(0.3, beta).system(0.01).blocked(), start, draws)[0]
         apart.append(np.abs(found - reference).max() / np.abs(reference).max())
     assert apart[0] > 1e-3  # they do differ
     np.testing.assert_allclose(np.divide(apart[1:], apart[:-1]), 1e-2, rtol=0.1)  # by β T
@@ -501,7 +498,7 @@ def test_block_filter_is_the_loop_over_samples(leading, states, inputs, length, 
     draws = generator.standard_normal((*leading, inputs, length * blocks))
     state = generator.standard_normal((*leading, states))
     expected, final = stepped(system, state, draws)
-    found, after = filtered(system.blocked(length), jnp.asarray(state), jnp.asarray(draws))
+    found, after = run(system.blocked(length), state, draws)
     assert found.shape == (*leading, length * blocks)
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
     np.testing.assert_allclose(after, final, rtol=1e-12, atol=1e-12 * np.abs(final).max())
@@ -517,7 +514,7 @@ def test_combined_system_is_the_sum(leading):
     expected = sum(stepped(*each)[0] for each in zip(systems, starts, draws, strict=True))
     whole = combine(systems)
     joined = np.concatenate(draws, axis=-2), np.concatenate(starts, axis=-1)
-    found, _ = filtered(whole.blocked(), jnp.asarray(joined[1]), jnp.asarray(joined[0]))
+    found, _ = run(whole.blocked(), joined[1], joined[0])
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
     # the start: mean joined, spread independent
     np.testing.assert_array_equal(whole.start, np.concatenate([each.start for each in systems], axis=-1))

@@ -121,11 +121,11 @@ class Covariance(eqx.Module):
         factor = self.factors[number]
         if isinstance(factor, BlockFactor):
             return factor.component(len(self.used))
-        return jnp.diag(factor**2) if factor.ndim == 1 else factor @ factor.T
+        return array_module(factor).diag(factor**2) if factor.ndim == 1 else factor @ factor.T
 
     def total(self, excess: Float[Array, " k"]) -> Float[Array, "n n"]:
         """Return the covariance at the given excess, with ones on the diagonal of padding rows."""
-        total = self.measured + jnp.diag(1 - self.used)
+        total = self.measured + array_module(self.used).diag(1 - self.used)
         for number, size in enumerate(excess):
             total = total + size * self.component(number)
         return total

@@ -10,8 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -31,7 +29,7 @@ from jaximu.model.data_sheet import (
 )
 from jaximu.model.noise_model import AxisNoise
 from jaximu.model.processes import FirstOrderGaussMarkov, Process, White
-from jaximu.model.state_space import BLOCK, BlockSystem, LinearSystem, combine, linear_system, run
+from jaximu.model.state_space import BLOCK, LinearSystem, combine, linear_system, run
 
 Generators = list[np.random.Generator]
 """A stream of draws for every unit and axis, in their order."""
@@ -186,8 +184,8 @@ class NoiseStream:
     """A triad's noise, block after block: `take(n)` returns the next n samples (*shape, n, 3).
 
     Draws come from NumPy, a stream of its own for every unit, process and axis, so that a sample depends neither on the
-    lengths taken nor on which other processes there are; JAX filters them. Takes other than the last one must be of a
-    multiple of 64 samples.
+    lengths taken nor on which other processes there are. Takes other than the last one must be of a multiple of 64
+    samples.
     """
 
     def __init__(self, noise: Noise, rate: float, seed: int | Sequence[int], power_on: int, shape: tuple[int, ...]):
@@ -215,7 +213,7 @@ class NoiseStream:
             starts.append(np.asarray(system.start) + np.einsum("...sr,...r->...s", system.root, initial))
             self._moving.append((system, generators))
         self._blocks = combine([system for system, _ in self._moving]).blocked() if starts else None
-        self._state = jnp.asarray(np.concatenate(starts, axis=-1)) if starts else None
+        self._state = np.concatenate(starts, axis=-1) if starts else np.zeros(0)
         self._ended = False
 
     def take(self, samples: int) -> FloatArray:
@@ -224,10 +222,14 @@ class NoiseStream:
             raise ValueError("the stream has ended: an earlier take was not of a multiple of the block")
         self._ended = samples % BLOCK != 0
         padded = -(-samples // BLOCK) * BLOCK
-        still = [(through, self._draw(draws, through.shape[-1], padded)) for through, draws in self._still]
-        moving = [self._draw(draws, system.drive.shape[-1], padded) for system, draws in self._moving]
-        output, self._state = _advance(still, self._blocks, self._state, moving, (*self.shape, 3, padded))
-        return np.asarray(output)[..., :samples, :]
+        total = np.zeros((*self.shape, 3, padded))
+        for through, generators in self._still:
+            total += np.sum(through[..., None] * self._draw(generators, through.shape[-1], padded), axis=-2)
+        if self._blocks is not None:
+            draws = [self._draw(generators, system.drive.shape[-1], padded) for system, generators in self._moving]
+            output, self._state = run(self._blocks, self._state, np.concatenate(draws, axis=-2))
+            total += output
+        return np.moveaxis(total, -2, -1)[..., :samples, :]
 
     def _draw(self, generators: Generators, inputs: int, samples: int) -> FloatArray:
         """Unit normals (*shape, 3, inputs, samples), by as many threads as there are processors."""
@@ -243,17 +245,6 @@ class NoiseStream:
 @cache
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="jaximu-noise")
-
-
-@eqx.filter_jit
-def _advance(still, blocks: BlockSystem | None, state, moving_draws, shape):
-    total = jnp.zeros(shape)
-    for through, draws in still:
-        total = total + jnp.sum(through[..., None] * draws, axis=-2)
-    if blocks is not None:
-        output, state = run(blocks, state, jnp.concatenate(moving_draws, axis=-2))
-        total = total + output
-    return jnp.moveaxis(total, -2, -1), state
 
 
 def drawn_noise(noise: AxisNoise, count: int, rate: float, seed: Sequence[int]) -> FloatArray:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaximu.ground.array_types import Array
+from jaximu.ground.array_types import Array, FloatArray
 
 BLOCK = 64
 """Samples that are computed by one matrix product; between blocks the state is carried step by step."""
@@ -94,27 +92,20 @@ class BlockSystem(eqx.Module):
     through: Float[Array, "... m b b"]
 
 
-def run(
-    system: BlockSystem, state: Float[Array, "... s"], draws: Float[Array, "... m n"]
-) -> tuple[Float[Array, "... n"], Float[Array, "... s"]]:
-    """Return the output and the state after it of unit white noise `draws`; n must be a multiple of the block.
+def run(system: BlockSystem, state: FloatArray, draws: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the output (..., n) and the state (..., s) after it of unit white noise `draws` (..., m, n).
 
+    n must be a multiple of the block. On the host: a program would take longer to compile than most recordings to draw.
     The local part of all blocks is one matrix product, and only the state runs from block to block, so that an hour of
     samples costs a few thousand short steps.
     """
-    length, inputs = system.output.shape[-2], draws.shape[-2]
-    blocks = draws.shape[-1] // length
-    shaped = draws.reshape(*draws.shape[:-1], blocks, length)
-    local, pushes = 0.0, 0.0
-    for m in range(inputs):
-        local = local + jnp.matmul(shaped[..., m, :, :], jnp.swapaxes(system.through[..., m, :, :], -1, -2))
-        pushes = pushes + jnp.matmul(shaped[..., m, :, :], jnp.swapaxes(system.drive[..., m, :, :], -1, -2))
-    if not inputs:
-        pushes = jnp.zeros((*state.shape[:-1], blocks, state.shape[-1]))
-
-    def advance(state, push):
-        return jnp.einsum("...st,...t->...s", system.transition, state) + push, state
-
-    final, states = jax.lax.scan(advance, state, jnp.moveaxis(pushes, -2, 0))
-    free = jnp.matmul(jnp.moveaxis(states, 0, -2), jnp.swapaxes(system.output, -1, -2))
-    return (local + free).reshape(*draws.shape[:-2], blocks * length), final
+    length = system.output.shape[-2]
+    shaped = draws.reshape(*draws.shape[:-1], draws.shape[-1] // length, length)
+    local = np.sum(shaped @ np.swapaxes(system.through, -1, -2), axis=-3)
+    pushes = np.sum(shaped @ np.swapaxes(system.drive, -1, -2), axis=-3)
+    states = np.empty((pushes.shape[-2], *state.shape))
+    for block, push in enumerate(np.moveaxis(pushes, -2, 0)):
+        states[block] = state
+        state = (system.transition @ state[..., None])[..., 0] + push
+    free = np.moveaxis(states, 0, -2) @ np.swapaxes(system.output, -1, -2)
+    return (local + free).reshape(*draws.shape[:-2], -1), state
