@@ -59,6 +59,7 @@ from jaximu.ground.rotation import (
     rotate,
     unit_vectors,
 )
+from jaximu.ground.tracing import array_module
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import NoiseModel
@@ -503,7 +504,7 @@ def first_field(intervals: MotionIntervals, imu: Imu) -> FloatArray:
 
 def sees_earth(errors: Disturbances) -> Bool[Array, ""]:
     """Whether a gyroscope sees the Earth's rotation in rests of a few seconds."""
-    return jnp.sqrt(jnp.mean(errors.rest[:3])) < _GYROCOMPASS
+    return array_module(errors).mean(errors.rest[:3]) < _GYROCOMPASS**2
 
 
 def _first_root(heading: float) -> FloatArray:

@@ -35,7 +35,8 @@ _SMALL = 1e-8  # squared angle (rad²) below which a series to second order is e
 def apply_matrix(matrix: Matrix, vector: Vector) -> Vector:
     """Return `matrix @ vector`, broadcast over leading axes, written element by element."""
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    return jnp.stack([matrix[..., i, 0] * x + matrix[..., i, 1] * y + matrix[..., i, 2] * z for i in range(3)], axis=-1)
+    rows = [matrix[..., i, 0] * x + matrix[..., i, 1] * y + matrix[..., i, 2] * z for i in range(3)]
+    return array_module(matrix, vector).stack(rows, axis=-1)
 
 
 def inverse_matrix(matrix: Matrix) -> Matrix:

@@ -27,6 +27,7 @@ from jaxtyping import Float
 from jaximu.ground.array_types import Array
 from jaximu.ground.gravity import EQUATOR_RADIUS, SQUARED_ECCENTRICITY, normal_gravity
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, product, rotation_rows
+from jaximu.ground.tracing import array_module
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.navigation.by_component import cross, matvec, right_jacobian, transpose, turn
 
@@ -51,8 +52,9 @@ class Navigation(NamedTuple):
     @classmethod
     def at(cls, attitude, velocity, latitude: float, height: float, gravity: float) -> Navigation:
         """Return a start at a latitude (rad) and height (m) where gravity (m/s²) has been stated; longitude zero."""
-        numbers = (latitude, 0.0, height, gravity - normal_gravity(jnp.sin(latitude) ** 2, height))
-        return cls(jnp.asarray(attitude), jnp.asarray(velocity), *(jnp.asarray(number, float) for number in numbers))
+        numerics = array_module(attitude, velocity, latitude, height, gravity)
+        numbers = (latitude, 0.0, height, gravity - normal_gravity(numerics.sin(latitude) ** 2, height))
+        return cls(*map(numerics.asarray, (attitude, velocity)), *(numerics.asarray(one, float) for one in numbers))
 
 
 def _radii(sine: Array, height: Array) -> tuple[Array, Array]:
