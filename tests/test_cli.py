@@ -320,6 +320,16 @@ def test_usage_loads_nothing_heavy(arguments, status):
     assert not loaded & (heavy if arguments.startswith("check") else {*heavy, "typeguard"})
 
 
+def test_only_the_first_run_compiles(log, calibration):
+    """What is computed eagerly would be compiled again by each command."""
+    for arguments in (["calibrate", str(log), "--json"], ["consequences", str(calibration / "calibration.json"),
+                                                          "--json"]):  # fmt: skip
+        first, second = (process(*arguments, JAX_LOG_COMPILES="1") for _ in range(2))
+        assert first.returncode == second.returncode == 0 and first.stdout == second.stdout
+        compiled = [line for line in second.stderr.splitlines() if "XLA compilation" in line]
+        assert not compiled and "jax" in second.stderr
+
+
 def test_the_library_loads_what_is_used():
     """The four ways and the check stand at the top; none of it is loaded by the import alone."""
     text = "import jaximu, sys; print([name for name in ('jax', 'numpy') if name in sys.modules])"
