@@ -184,7 +184,7 @@ _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis u
 def _of_setup(imu: Imu) -> Callable[[Name], bool]:
     """Return whether a number is the set-up's, the lever arm included."""
     fixture = {key for key, effect in imu.all_effects().items() if effect.scope == "fixture"}
-    return lambda name: name.owner == "setup" or (name.owner, name.effect) in fixture
+    return lambda name: name.owner == "setup" or name.key in fixture
 
 
 def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatArray:
@@ -199,7 +199,7 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     spread = abs(float(Mounting.of(imu).filter_variance))
     delay = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
     effects = imu.all_effects()
-    delayed = [isinstance(effects.get((name.owner, name.effect)), SetupReferenceDelay) for name in calibration.names]
+    delayed = [isinstance(effects.get(name.key), SetupReferenceDelay) for name in calibration.names]
     return delay**2 * np.diag(delayed)
 
 
@@ -228,7 +228,7 @@ def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: Array) -> tuple
     effects = imu.all_effects()
 
     def of(kind):
-        rows = [row for row, name in enumerate(names) if isinstance(effects.get((name.owner, name.effect)), kind)]
+        rows = [row for row, name in enumerate(names) if isinstance(effects.get(name.key), kind)]
         return covariance[np.ix_(rows, rows)] if rows else np.zeros((kind.size, kind.size))
 
     return Mounting.of(imu), Mounting(*map(of, MOUNTING_EFFECTS))

@@ -542,7 +542,7 @@ def _parameters_of(calibration: Calibration) -> ParameterTable:
     def parameter(name: Name, sigma: float) -> Parameter:
         output = "" if name.owner == "setup" else triads[name.owner].output_unit
         if name.effect is not None:
-            effect = effects[name.owner, name.effect]
+            effect = effects[name.key]
             value = effect.coefficients[name.axes] if name.part == "coefficients" else getattr(effect, name.part)
             unit = effect.coefficient_unit(output) if name.part == "coefficients" else effect.inner[name.part].unit
         else:

@@ -398,9 +398,9 @@ def _kept_numbers(base: Calibration, fits: Mapping[str, TriadFit]) -> tuple[list
     def fixed(name: Name) -> bool:
         return name.owner not in fits or name.effect is None
 
-    rest = base.of_numbers(lambda name: fixed(name) or (name.owner, name.effect) in places)
+    rest = base.of_numbers(lambda name: fixed(name) or name.key in places)
     names = [
-        name if fixed(name) else Name(name.owner, name.part, name.axes, places[name.owner, name.effect])
+        name if fixed(name) else Name(name.owner, name.part, name.axes, places[name.key])
         for name in rest.names
     ]
     return names, rest.covariance

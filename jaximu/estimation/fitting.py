@@ -582,7 +582,7 @@ class _Passes:
         names, self.numbers, sizes = nothing if inside else effect_numbers(imu)
         effects = imu.all_effects()
         self.kept = np.array(
-            [free(name) and name.part != effects[name.owner, name.effect].beginning() for name in names], bool
+            [free(name) and name.part != effects[name.key].beginning() for name in names], bool
         )
         chosen = tuple(name for name, kept in zip(names, self.kept, strict=True) if kept)
         self.names = (*self.parameters.names, *chosen)
@@ -626,7 +626,7 @@ class _Passes:
         effects = self.full.all_effects()
         width = np.full(len(self.names), TOLERANCE)
         width[self.base :] = [
-            effects[name.owner, name.effect].plausible if name.part == "coefficients" else TOLERANCE
+            effects[name.key].plausible if name.part == "coefficients" else TOLERANCE
             for name in self.names[self.base :]
         ]
         of_base = np.arange(len(width)) < self.base

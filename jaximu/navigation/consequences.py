@@ -54,7 +54,7 @@ _TOGETHER = 25
 def kind_of(name: Name, model: Imu) -> str:
     """Return what a term of the budget calls a number of the unit: "accelerometer scale", or an effect's name."""
     if name.effect is not None:
-        return model.all_effects()[name.owner, name.effect].english
+        return model.all_effects()[name.key].english
     return group_of(name).replace(".", " ")
 
 
@@ -326,7 +326,7 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
 
 
 def _identity(name: Name, model: Imu) -> tuple:
-    effect = None if name.effect is None else model.all_effects()[name.owner, name.effect].name
+    effect = None if name.effect is None else model.all_effects()[name.key].name
     return name.owner, effect, name.part, name.axes
 
 

@@ -396,7 +396,7 @@ def _truth(scheme: ErrorScheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
     for effect in scheme.effects:
         same = [key for key, fitted in unit.all_effects().items() if fitted.name == effect.name]
         for row, name in enumerate(names):
-            if name.part == "coefficients" and (name.owner, name.effect) in same:
+            if name.part == "coefficients" and name.key in same:
                 truth[row, first + name.axes[0]] = 1.0
         first += effect.size
     return truth

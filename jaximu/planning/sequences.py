@@ -220,7 +220,7 @@ def filter_of(
     information[np.ix_(inside, inside)] = np.asarray(question.prior) / np.outer(base.size, base.size)
     for index, name in enumerate(free.names):
         if name.effect is not None:
-            effect = imu.all_effects()[name.owner, name.effect]
+            effect = imu.all_effects()[name.key]
             information[index, index] = 1 / np.broadcast_to(spread[effect.name], effect.size)[name.axes[0]] ** 2
     information[-1, -1] = 1 / max(known.gravity.sigma, 1e-6) ** 2
     scale = np.sqrt(np.diagonal(information))
