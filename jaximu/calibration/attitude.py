@@ -464,11 +464,10 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
     step = max(attitude.period, 1 / recording.accelerometer.rate) / 2
     best: _Start | None = None
     for shift in np.arange(-4, 4.5) * step:
-        unit, reference, time = _rates(recording, attitude, delay + shift)
-        if len(unit) < 16:
+        common = _in_common(recording, attitude, delay + shift)
+        if common is None:
             continue
-        force, up = _forces(recording, attitude, time, delay + shift)
-        turning, rotating = unit - unit.mean(axis=0), reference - reference.mean(axis=0)
+        turning, rotating, force, up = common
         weight = np.sum(turning**2) / np.sum(force**2)
         matrix = turning_best(turning.T @ rotating + weight * STANDARD.value * (force.T @ up))
         explained = 1 - np.sum((turning - rotating @ matrix.T) ** 2) / np.sum(turning**2)
@@ -483,11 +482,17 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
     return best
 
 
-def _forces(recording: Recording, attitude: Attitude, time: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
-    """Return the accelerometer's output and upwards in the reference's body, (n, 3) each, at times (n,)."""
+def _in_common(recording: Recording, attitude: Attitude, delay: float) -> tuple[FloatArray, ...] | None:
+    """Return the unit's and the reference's rates about their means, the accelerometer's output and upwards in the
+    reference's body, (n, 3) each, at the stamps in common; None where these are fewer than sixteen.
+    """
+    unit, reference, time = _rates(recording, attitude, delay)
+    if len(unit) < 16:
+        return None
     force = interpolated(recording.accelerometer.time, _smooth(recording), time)
     known = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay)
-    return force, known.inv().apply([0.0, 0.0, 1.0])
+    up = known.inv().apply([0.0, 0.0, 1.0])
+    return unit - unit.mean(axis=0), reference - reference.mean(axis=0), force, up
 
 
 def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Start | None:
@@ -497,11 +502,10 @@ def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Star
     reference's.
     """
     gyroscope = recording.signals["gyroscope"]
-    unit, reference, time = _rates(recording, attitude, delay)
-    if len(unit) < 16:
+    common = _in_common(recording, attitude, delay)
+    if common is None:
         return None
-    force, up = _forces(recording, attitude, time, delay)
-    turning, rotating = unit - unit.mean(axis=0), reference - reference.mean(axis=0)
+    turning, rotating, force, up = common
     read = np.linalg.lstsq(rotating, turning, rcond=None)[0].T
     if np.sum((turning - rotating @ read.T) ** 2) > (1 - _CLEAR) * np.sum(turning**2):
         return None

@@ -54,8 +54,6 @@ _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
 _MOST_DISTURBED = 0.3
 """Share of windows of which more are not left out: then it is the model that is wrong."""
-_CALM = 0.1
-"""Share of gravity by which the specific force may be off where it stands for the vertical."""
 _BESIDE, _BETWEEN = 3.0, 3
 """The same beside a stretch, and how many windows from one such window the next is for all between to be left out."""
 _ROUNDS = 3
@@ -237,6 +235,12 @@ def _calibrated(
         notes.append(_ALIKE_ERRORS)
     fit = informed(fit, _data_sheet(fit, start))
     spreads, headings = _left_out(fit, start, windows, field, full, _samples(logs, parts))
+    dip, dip_sigma = _dip(windows, fit)
+    notes += stretches
+    if headings is not None and headings["after"] > _WORSE * headings["before"]:
+        notes.append(_NO_BETTER.format(**headings))
+    if dip is not None and dip < 0 and southern is None:
+        notes.append(_UPWARD)
     readings = (log.reading if log.recording is None else log.recording.reading for log in logs)
     calibration = concluded(
         fit,
@@ -248,14 +252,9 @@ def _calibrated(
         data=_data(logs, windows),
         nominal=start,
         advice=field_advice,
-        notes=[*notes_of(*logs), *notes, *stretches],
+        notes=[*notes_of(*logs), *notes],
         reading=next(filter(None, readings), None if base is None else base.reading),
     )
-    dip, dip_sigma = _dip(windows, fit)
-    if headings is not None and headings["after"] > _WORSE * headings["before"]:
-        calibration = replace(calibration, notes=(*calibration.notes, _NO_BETTER.format(**headings)))
-    if dip is not None and dip < 0 and southern is None:
-        calibration = replace(calibration, notes=(*calibration.notes, _UPWARD))
     heading = None if dip is None else heading_errors(calibration, start, known, dip)
     measurement = _measured(windows, field)
     magnetic: Json = {
@@ -456,7 +455,7 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
     if windows.alone:
         return np.eye(3)
     field = windows.output - centre
-    calm = windows.level & (windows.off < _CALM)
+    calm = windows.calm
     costs = []
     for turn in ARRANGEMENTS:
         body = field @ turn  # turnᵀ applied to every row
@@ -582,7 +581,7 @@ def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> BoolArra
     size = np.zeros(len(whole))
     for values, known, least in (
         (length, whole.used, noise),
-        (dip, whole.level & (whole.off < _CALM), noise / np.median(length)),
+        (dip, whole.calm, noise / np.median(length)),
     ):
         usual = known & windows.used
         if usual.any():
@@ -711,7 +710,7 @@ def carried_headings(windows: FieldWindows, imu: Imu, rows: IntArray) -> FloatAr
     joints = np.flatnonzero((windows.swept[rows[:-1]] == 0).all(axis=(1, 2))) + 1  # nothing carries to another log
     field, errors = windows.field(imu), [np.zeros(0)]
     for part in np.split(rows, joints):
-        up, calm = windows.up[part], (windows.used & windows.level & (windows.off < _CALM))[part]
+        up, calm = windows.up[part], (windows.used & windows.calm)[part]
         if not windows.turn.any() or calm.sum() < _FEWEST_HEADINGS:
             continue
         east = unit_vectors(np.cross(field[part], up))
@@ -739,7 +738,7 @@ def coverage(imu: Imu, windows: FieldWindows) -> float:
 
 def _dip(windows: FieldWindows, fit: Fit) -> tuple[float | None, float]:
     """The angle (rad) of the field below the level, and its standard deviation."""
-    calm = windows.level & (windows.off < _CALM)
+    calm = windows.calm
     if not calm.any():
         return None, 0.0
     field = windows.field(fit.imu)

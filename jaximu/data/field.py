@@ -51,6 +51,8 @@ _MOST, _MOST_ALONE = 160, 480
 _MEAN, _MEAN_ALONE = 0.5, 0.06
 """Seconds at the most over which a window is averaged, with a gyroscope and without."""
 _SMOOTHED = 0.2  # s
+_CALM = 0.1
+"""Share of gravity by which the specific force may be off where it stands for the vertical."""
 _STEADY = 0.02
 """rad of the field's path that a second at rest counts for, when windows are placed along it."""
 
@@ -204,6 +206,11 @@ class FieldWindows:
         slope = np.array(self.slope)
         slope[..., :3] -= np.asarray(self.samples.mean_added(imu))
         return replace(self, slope=slope)
+
+    @property
+    def calm(self) -> BoolArray:
+        """Which windows (n,) have a specific force that stands for the vertical."""
+        return self.level & (self.off < _CALM)
 
     def bent(self, field: FloatArray) -> FloatArray:
         """Return how the sine (n,) of the angle from up to a field (n, 3) reacts to what `vertical` is of, (n, 12)."""

@@ -31,13 +31,13 @@ from jaximu.data.gravity_direction import gravity_direction_error
 from jaximu.data.gravity_norm import gravity_norm_error
 from jaximu.data.poses_covariance import Sensitivities, condition_covariance, sensitivities, turned_by
 from jaximu.data.preintegration import Turned, linear_slope
-from jaximu.data.tracks_by_hand import SamplesByHand, during_turns, pose_means, samples_by_hand, tracks_by_hand
+from jaximu.data.tracks_by_hand import SamplesByHand, during_turns, samples_by_hand, tracks_by_hand
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
 from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
-from jaximu.estimation.track import Track, added, mean_outputs
+from jaximu.estimation.track import Track, added, mean_outputs, means_by
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.distributions import rms
@@ -302,7 +302,7 @@ class PosesAndTurns(Observations, Data):
         """
         means, turned, parts = [], self.turns.output, []
         for part, change in zip(self.samples, changes, strict=True):
-            means.append([pose_means(change[name], pose, len(self.poses.mask))[0] for name, pose in part.pose.items()])
+            means.append([means_by(pose, change[name], len(self.poses.mask))[0] for name, pose in part.pose.items()])
             turned = turned + during_turns(change["gyroscope"], part.sample)
             parts.append(replace(part, outputs={name: part.outputs[name] + change[name] for name in part.outputs}))
         force, rate = (sum(of_part) for of_part in zip(*means, strict=True))

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaximu.data.gravity_direction import level
-from jaximu.estimation.track import TRIADS, Recorded, Track
+from jaximu.estimation.track import TRIADS, Recorded, Track, means_by
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.rotation import multiply
@@ -139,7 +139,7 @@ def tracks_by_hand(imu: Imu, samples: SamplesByHand, running: Float[Array, "T S 
     poses, pose = len(running) + 1, samples.pose
     triads = imu.with_effects().triads()
     force, rate = (triads[name].recover(samples.outputs[name]) for name in TRIADS)
-    means, counts = pose_means(force, pose["accelerometer"], poses)
+    means, counts = means_by(pose["accelerometer"], force, poses)
     rate = jnp.where((pose["gyroscope"] < poses)[:, None], 0.0, rate)
     attitudes = _attitudes(means, counts > 0, running[:, -1])
 
@@ -169,12 +169,6 @@ def _pose_of(signal: Signal, intervals: FloatArray, first: int) -> IntArray:
     pose = np.searchsorted(intervals[:, 0], signal.time, side="right") - 1
     inside = (pose >= 0) & (signal.time < intervals[np.maximum(pose, 0), 1])
     return np.where(inside, first + pose, _NONE)
-
-
-def pose_means(values: Float[Array, "n 3"], pose: Int[Array, " n"], poses: int) -> tuple[Array, Array]:
-    """Return the means (P, 3) of values over the poses that samples lie in, and of how many samples each is (P,)."""
-    counts = jax.ops.segment_sum(jnp.ones(len(values)), pose, poses)
-    return jax.ops.segment_sum(values, pose, poses) / jnp.maximum(counts, 1.0)[:, None], counts
 
 
 def _attitudes(force: Float[Array, "P 3"], real: Array, turned: Float[Array, "T 4"]) -> Float[Array, "P 4"]:
