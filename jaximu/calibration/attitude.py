@@ -25,6 +25,7 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.tracing import on_host
+from jaximu.ground.vectors import dot_rows, lengths_of, sigmas_of, submatrix
 from jaximu.mistakes import prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_delay import SetupReferenceDelay
@@ -229,7 +230,7 @@ def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: Array) -> tuple
 
     def of(kind):
         rows = [row for row, name in enumerate(names) if isinstance(effects.get(name.key), kind)]
-        return covariance[np.ix_(rows, rows)] if rows else np.zeros((kind.size, kind.size))
+        return submatrix(covariance, rows) if rows else np.zeros((kind.size, kind.size))
 
     return Mounting.of(imu), Mounting(*map(of, MOUNTING_EFFECTS))
 
@@ -241,7 +242,7 @@ def reference_summary(calibration: Calibration) -> Json:
     matrix = turned.as_matrix()
     arm = {
         "value": (matrix @ mounting.lever_arm).tolist(),
-        "sigma": np.sqrt(np.diag(matrix @ covariance.lever_arm @ matrix.T)).tolist(),
+        "sigma": sigmas_of(matrix @ covariance.lever_arm @ matrix.T).tolist(),
         "unit": "m",
     }
     return {
@@ -273,7 +274,7 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
             f"{attitude.name} lies from {attitude.time[0]:.6g} to {attitude.time[-1]:.6g} s and {name} from "
             f"{span[0]:.6g} to {span[1]:.6g} s: they do not overlap. Put both on one clock, or let both begin at zero."
         )
-    rate = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
+    rate = lengths_of(attitude.turned()) / np.diff(attitude.time)
     if np.sqrt(np.nanmean(rate**2)) < _LEAST:
         raise NotPossibleError(
             f"{attitude.name} hardly turns ({np.degrees(np.sqrt(np.nanmean(rate**2))):.2g} °/s, rms): {_RECORD}"
@@ -420,7 +421,7 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
 
 def _delays(recording: Recording, attitude: Attitude) -> list[float]:
     """Return by how much (s) the reference's stamps may be late, likeliest first, from the sizes of both rates."""
-    turned = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
+    turned = lengths_of(attitude.turned()) / np.diff(attitude.time)
     good, middle = ~np.isnan(turned), midpoints(attitude.time)
     return delays_of_speeds(recording.signals["gyroscope"], middle[good], turned[good], attitude.period)
 
@@ -431,7 +432,7 @@ def delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, 
     The likeliest first, then others at which both are nearly as much alike.
     """
     rate = gyroscope.si()
-    size = np.linalg.norm(rate - np.median(rate, axis=0), axis=1)
+    size = lengths_of(rate - np.median(rate, axis=0))
     step = max(period, 1 / gyroscope.rate, 5e-3)
     first, last = min(gyroscope.time[0], stamps[0]), max(gyroscope.time[-1], stamps[-1])
     grid = np.arange(first, last, step)
@@ -471,7 +472,7 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
         weight = np.sum(turning**2) / np.sum(force**2)
         matrix = turning_best(turning.T @ rotating + weight * STANDARD.value * (force.T @ up))
         explained = 1 - np.sum((turning - rotating @ matrix.T) ** 2) / np.sum(turning**2)
-        upright = np.mean(np.sum(force * (up @ matrix.T), axis=1)) / np.mean(np.linalg.norm(force, axis=1))
+        upright = np.mean(dot_rows(force, up @ matrix.T)) / np.mean(lengths_of(force))
         if best is None or explained > best.explained:
             best = _Start(attitude, float(delay + shift), matrix, float(explained), float(upright))
     if best is None:

@@ -42,6 +42,7 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
 from jaximu.ground.tracing import on_host
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
+from jaximu.ground.vectors import root_or_zero, submatrix
 from jaximu.model.effects import Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
@@ -399,10 +400,7 @@ def _kept_numbers(base: Calibration, fits: Mapping[str, TriadFit]) -> tuple[list
         return name.owner not in fits or name.effect is None
 
     rest = base.of_numbers(lambda name: fixed(name) or name.key in places)
-    names = [
-        name if fixed(name) else Name(name.owner, name.part, name.axes, places[name.key])
-        for name in rest.names
-    ]
+    names = [name if fixed(name) else Name(name.owner, name.part, name.axes, places[name.key]) for name in rest.names]
     return names, rest.covariance
 
 
@@ -416,7 +414,7 @@ def _numbers(fit: TriadFit, with_bias: bool, signal: Signal, levels: int) -> tup
     coefficients = [name for name in effect_numbers(fit.fit.imu)[0] if name in fitted or name.part == "coefficients"]
     names = list(dict.fromkeys((*coefficients, *fitted)))
     rows = [fitted.get(name, -1) for name in names]
-    covariance = np.pad(fit.fit.covariance, (0, 1))[np.ix_(rows, rows)]
+    covariance = submatrix(np.pad(fit.fit.covariance, (0, 1)), rows)
     if with_bias and levels > 1:
         covariance[-3:, -3:] += np.diag(np.var(fit.level, axis=1, ddof=1) * signal.nominal_scale**2 / levels)
     return names, covariance
@@ -453,7 +451,7 @@ def change(
     numbers = [Name(owner, name.part, name.axes, rows[name.effect]) for name in alone if name.effect is not None]
     slopes = slopes - origin_slopes
     variance = np.einsum("mak,kl,mal->ma", slopes, calibration.covariance_of(numbers), slopes)
-    return values - origin, np.sqrt(np.maximum(variance, 0.0))
+    return values - origin, root_or_zero(variance)
 
 
 def steady(

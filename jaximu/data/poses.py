@@ -55,6 +55,7 @@ from jaximu.ground.rotation import (
     unit_vectors,
 )
 from jaximu.ground.tracing import array_module, first, lifted, on_host, one_by_one, repeated, stacked
+from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import NoiseModel
@@ -429,7 +430,7 @@ def pose_rows(imu: Imu, observations: Observations) -> Rows:
     forces = imu.accelerometer.recover_on_host(poses.accelerometer_mean)
     covariates |= by_axis("specific force", "m/s²", placed(forces, np.full((len(turn), 3), np.nan)))
     covariates |= {
-        "angle [°]": placed(unknown[0], np.sum(speed * turns.interval, axis=1)),
+        "angle [°]": placed(unknown[0], dot_rows(speed, turns.interval)),
         "rate [°/s]": placed(unknown[0], speed.max(axis=1)),
         "duration [s]": placed(unknown[0], turns.interval.sum(axis=1)),
     }
@@ -478,7 +479,7 @@ def residual_rms(
     """
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
     force, angle = forces_and_angles(imu, observations) if known is None else known
-    norm = np.linalg.norm(force[poses], axis=1) - float(observations.gravity)
+    norm = lengths_of(force[poses]) - float(observations.gravity)
     sizes = {"gravity_norm": (rms(norm), "m/s^2")}
     if imu.gyroscope is None or not gyroscope:
         return sizes
@@ -486,7 +487,7 @@ def residual_rms(
         sizes["gravity_direction"] = (rms(np.degrees(angle)[turns]), "deg")
     rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
     scale = imu.gyroscope.scales
-    sizes["static_gyroscope"] = (rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
+    sizes["static_gyroscope"] = (rms(lengths_of(rest / scale)), "rad/s")
     return sizes
 
 

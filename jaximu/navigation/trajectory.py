@@ -21,6 +21,7 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import conjugate, rotate
 from jaximu.ground.stored import compiled
+from jaximu.ground.vectors import lengths_of
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.navigation import Navigation
 from jaximu.recordings.recording import Recording
@@ -267,8 +268,8 @@ def _first_rest(
     force_mean, rate_mean = means(force), means(rate)
     spread = np.stack([means(values**2) - mean**2 for values, mean in ((force, force_mean), (rate, rate_mean))])
     still = np.sqrt(np.maximum(spread.sum(axis=-1), 0)) < np.array(_STILL)[:, None]
-    level = np.abs(np.linalg.norm(force_mean, axis=1) - gravity) < _STILL[0]
-    calm = still.all(axis=0) & level & (np.linalg.norm(rate_mean, axis=1) < _STILL[1])
+    level = np.abs(lengths_of(force_mean) - gravity) < _STILL[0]
+    calm = still.all(axis=0) & level & (lengths_of(rate_mean) < _STILL[1])
     if not calm.any():
         quiet = int(np.argmin(spread.sum(axis=(0, 2))))
         raise NotPossibleError(

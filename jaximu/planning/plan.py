@@ -20,6 +20,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
+from jaximu.ground.vectors import dot_rows, sigmas_of, submatrix
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.planning.information import (
@@ -253,12 +254,12 @@ class Proposal(Result, Document, page="plan"):
     @property
     def before(self) -> FloatArray:
         """The standard deviations of the parameters (p,), own units, without the poses."""
-        return np.sqrt(np.diagonal(self.covariances[0]))
+        return sigmas_of(self.covariances[0])
 
     @property
     def after(self) -> FloatArray:
         """The standard deviations of the parameters (p,), own units, with the poses."""
-        return np.sqrt(np.diagonal(self.covariances[1]))
+        return sigmas_of(self.covariances[1])
 
     @property
     def gain(self) -> float:
@@ -516,7 +517,7 @@ def _prior(known: Known, imu: Imu, parameters: Parameters, by_gravity: FloatArra
             covariance = _in_hand_frame(covariance, known.names, imu)
         indices = [index for index, name in enumerate(names) if name in known.names]
         rows = [known.names.index(names[index]) for index in indices]
-        total[np.ix_(indices, indices)] = covariance[np.ix_(rows, rows)] / size[indices][:, None] / size[indices]
+        total[np.ix_(indices, indices)] = submatrix(covariance, rows) / size[indices][:, None] / size[indices]
         if upper and by_hand:
             # by hand the accelerometer's axes are the frame; how they lie to a table's is open, for both triads alike
             frame = _frame(imu, names) / size[:, None]
@@ -619,7 +620,7 @@ def _attitudes(up: FloatArray, heading: FloatArray | float = 0.0) -> FloatArray:
 
 def _neighbourly(attitudes: FloatArray) -> FloatArray:
     """Attitudes in which neighbours have one sign: the shortest way leads from one to the next."""
-    signs = np.where(np.sum(attitudes[1:] * attitudes[:-1], axis=1) >= 0, 1.0, -1.0)
+    signs = np.where(dot_rows(attitudes[1:], attitudes[:-1]) >= 0, 1.0, -1.0)
     return attitudes * np.cumprod([1.0, *signs])[:, None]
 
 
@@ -627,7 +628,7 @@ def _rounded(design: Design, equipment: Equipment) -> Design:
     step, attitude = np.radians(equipment.step), np.asarray(design.attitude)
     if equipment.robot:
         round_ = np.array([round_attitude(quaternion, step) for quaternion in attitude])
-        signs = np.where(np.sum(round_ * attitude, axis=1) >= 0, 1.0, -1.0)
+        signs = np.where(dot_rows(round_, attitude) >= 0, 1.0, -1.0)
         return replace(design, attitude=round_ * signs[:, None])  # each turn goes the way that was sought
     if equipment.by_hand:
         zero = first_heading(attitude[0])

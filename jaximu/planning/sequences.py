@@ -36,6 +36,7 @@ from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import Z95
+from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -161,7 +162,7 @@ class Filter:
     def value(self, known: Knowledge, criterion: str, weights: FloatArray) -> float:
         """Return the logarithm of a criterion of all free numbers but the Earth's rotation."""
         kept = [index for index in range(len(self.names)) if index not in self.earth]
-        spread = (self.numbers(known) / self.size[:, None] / self.size)[np.ix_(kept, kept)]
+        spread = submatrix(self.numbers(known) / self.size[:, None] / self.size, kept)
         return float(stored.call(CRITERIA[criterion], f"sequence's {criterion}", spread, weights[kept]))
 
     def _rows(self, measurement: IntervalsOfMotion, part: slice) -> tuple[WhiteRows, Rotation]:
@@ -223,7 +224,7 @@ def filter_of(
             effect = imu.all_effects()[name.key]
             information[index, index] = 1 / np.broadcast_to(spread[effect.name], effect.size)[name.axes[0]] ** 2
     information[-1, -1] = 1 / max(known.gravity.sigma, 1e-6) ** 2
-    scale = np.sqrt(np.diagonal(information))
+    scale = sigmas_of(information)
     root = np.linalg.cholesky(information / np.outer(scale, scale)).T * scale
     prior = Knowledge(root, np.zeros(len(root)))
     return Filter(
