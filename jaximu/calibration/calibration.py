@@ -245,14 +245,11 @@ class Calibration(Result, Document, page="calibration"):
         def triad(name: str, model: Triad) -> Json:
             gain_sigma, bias_sigma = self.sigma(name)
             return {
-                "output_unit": model.output_unit,
-                "gain": np.asarray(model.gain).tolist(),
-                "bias": np.asarray(model.bias).tolist(),
+                **entries(model, "output_unit", "gain", "bias"),
                 "gain_sigma": gain_sigma.tolist(),
                 "bias_sigma": bias_sigma.tolist(),
                 "bias_sigma_recording": np.asarray(self.bias_sigma_recording.get(name, bias_sigma)).tolist(),
-                "temperature_reference": model.temperature_reference,
-                "time_reference": model.time_reference,
+                **entries(model, "temperature_reference", "time_reference"),
                 "effects": self._effects(name, model),
             }
 
@@ -276,18 +273,15 @@ class Calibration(Result, Document, page="calibration"):
                 },
                 "parameters": len(self.names),
                 "weak_directions": [
-                    {
-                        "text": weak.text,
-                        "sigma": weak.sigma,
-                        "determined": weak.determined,
-                        "parameters": [{"name": name, "weight": weight} for name, weight in weak.parameters],
-                    }
+                    entries(weak, "text", "sigma", "determined")
+                    | {"parameters": [{"name": name, "weight": weight} for name, weight in weak.parameters]}
                     for weak in self.weak
                 ],
                 "excess_variance": self.excess,
             },
             "setup": {
-                "gravity": {"value": self.gravity.value, "sigma": self.gravity.sigma, "unit": "m/s^2"}
+                "gravity": entries(self.gravity, "value", "sigma")
+                | {"unit": "m/s^2"}
                 | ({} if self.gravity.latitude is None else {"latitude": self.gravity.latitude}),
                 "effects": {effect.name: effect.document("") for effect in self.imu.setup},
             },

@@ -34,7 +34,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import Document, Json
+from jaximu.ground.document import Document, Json, entries
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.page import Result
@@ -134,8 +134,7 @@ class ThermalCalibration(Result, Document, page="thermal"):
             "rate_window": TEMPERATURE_WINDOW,
             "rate_bandwidth": RATE_BANDWIDTH,
             "legs": [
-                {"begin": leg.begin, "end": leg.end, "rate": leg.rate, "blocks": len(leg.blocks)}
-                for leg in self.identifiability.legs
+                entries(leg, "begin", "end", "rate") | {"blocks": len(leg.blocks)} for leg in self.identifiability.legs
             ],
             "told": list(self.identifiability.told),
             "separable": {

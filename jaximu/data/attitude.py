@@ -30,6 +30,7 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.differences import interpolated, midpoints, value_and_jacobian
 from jaximu.ground.rotation import (
+    UP,
     Number,
     conjugate,
     exponential,
@@ -101,7 +102,7 @@ class AttitudeConditions(Conditions):
         error = logarithm(multiply(conjugate(self.target), multiply(self.rotation, exponential(moved))))
         force = jnp.einsum("wijk,jk->wi", self.force, imu.accelerometer.inverse()) - self.gain
         force = force + jnp.einsum("wijk,jk->wi", self.swung, change)
-        force = force - self.magnitude * jnp.array([0.0, 0.0, 1.0])
+        force = force - self.magnitude * UP
         error, force = error * self.turn[:, None], force * self.window[:, None]
         return jnp.concatenate([error.reshape(-1), force.reshape(-1)])
 

@@ -48,6 +48,8 @@ from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import midpoints, value_and_jacobian
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.rotation import (
+    IDENTITY,
+    UP,
     Number,
     Numbers,
     Quaternion,
@@ -184,7 +186,7 @@ def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
     """Return attitude and velocity after an interval of motion."""
     pushed = rotate(attitude, gained)
     pushed = pushed - jnp.cross(earth, pushed) * duration / 2
-    fallen = 2 * jnp.cross(earth, velocity) + jnp.array([0.0, 0.0, 1.0]) * gravity
+    fallen = 2 * jnp.cross(earth, velocity) + UP * gravity
     return (
         multiply(exponential(-earth * duration), multiply(attitude, rotation)),
         velocity + pushed - fallen * duration,
@@ -402,7 +404,7 @@ def _measured(
 
     def still(change):  # attitude, earth, gravity
         back = conjugate(multiply(after.attitude, exponential(change[:3])))
-        up = rotate(back, jnp.array([0.0, 0.0, 1.0]))
+        up = rotate(back, UP)
         return means.mean - jnp.concatenate([rotate(back, means.earth + change[3:6]), up * (gravity + change[6])])
 
     value, slopes = value_and_jacobian(still, jnp.zeros(7))
@@ -494,7 +496,7 @@ def first_field(intervals: MotionIntervals, imu: Imu) -> FloatArray:
     part = jax.tree.map(lambda leaf: np.asarray(leaf)[at], intervals)
     before = part.time.shape[-1] - part.length.shape[-1]
     mean = part.length @ part.accelerometer[before:] / part.length.sum()
-    attitude = level(jnp.array([1.0, 0.0, 0.0, 0.0]), imu.with_effects().accelerometer.recover(mean))
+    attitude = level(IDENTITY, imu.with_effects().accelerometer.recover(mean))
     for other in part.sightings:
         if other.absolute and other.measured > 0:
             attitude = other.placed(attitude, Mounting.of(imu))
@@ -910,7 +912,7 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
     def reckoned(start, sighted):
         return jax.lax.scan(partial(step, sighted), start, (means, intervals))[1]
 
-    start = level(jnp.array([1.0, 0.0, 0.0, 0.0]), means.mean[0, 3:])
+    start = level(IDENTITY, means.mean[0, 3:])
     for sightings in intervals.sightings:  # the heading at the first sighting is the heading of all
         k = jnp.argmax(sightings.measured > 0)
         sighting, numbers = jax.tree.map(lambda leaf, k=k: leaf[k], (sightings, means.mounting))

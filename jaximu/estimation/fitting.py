@@ -581,9 +581,7 @@ class _Passes:
         nothing = (), numerics.zeros((self.count, 0)), numerics.zeros((self.count, 0))
         names, self.numbers, sizes = nothing if inside else effect_numbers(imu)
         effects = imu.all_effects()
-        self.kept = np.array(
-            [free(name) and name.part != effects[name.key].beginning() for name in names], bool
-        )
+        self.kept = np.array([free(name) and name.part != effects[name.key].beginning() for name in names], bool)
         chosen = tuple(name for name, kept in zip(names, self.kept, strict=True) if kept)
         self.names = (*self.parameters.names, *chosen)
         self.base = len(self.parameters.names)

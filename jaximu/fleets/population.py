@@ -175,8 +175,7 @@ class Fleet(Result, Document, page="fleet"):
         population = self.population
         return {
             "schema": "jaximu.fleet/1",
-            "table": self.table,
-            "recordings": self.recordings,
+            **entries(self, "table", "recordings"),
             "statuses": dict(sorted(self.statuses.items())),
             "verdicts": dict(sorted(self.verdicts.items())),
             "effects": dict(self.effects.most_common()),
@@ -186,15 +185,11 @@ class Fleet(Result, Document, page="fleet"):
             else {
                 "units": population.count,
                 "parameters": list(population.names),
-                "mean": population.mean.tolist(),
-                "spread": population.spread.tolist(),
-                "covariance": population.covariance.tolist(),
+                **entries(population, "mean", "spread", "covariance"),
             },
             "strangers": [
                 {
-                    "device": stranger.device,
-                    "file": stranger.file,
-                    "p_value": stranger.p_value,
+                    **entries(stranger, "device", "file", "p_value"),
                     "parameters": [{"name": n, "value": v, "deviations": z} for n, v, z in stranger.parameters],
                 }
                 for stranger in self.strangers

@@ -19,7 +19,7 @@ from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
-from jaximu.ground.rotation import conjugate, rotate
+from jaximu.ground.rotation import UP, conjugate, rotate
 from jaximu.ground.stored import compiled
 from jaximu.ground.vectors import lengths_of
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
@@ -173,8 +173,8 @@ def _felt_on_the_road(time, turns, earth, latitude, gravity):
         (v, change), (angle, turning) = (jax.jvp(course, (time,), (1.0,)) for course in (velocity, heading))
         moving = jnp.stack([-v[1], v[0], v[0] * jnp.tan(latitude)]) / radius
         attitude = jnp.stack([jnp.cos(angle / 2), 0.0, 0.0, jnp.sin(angle / 2)])
-        force = change + jnp.cross(2 * earth + moving, v) + jnp.array([0.0, 0.0, 1.0]) * gravity
-        rate = earth + moving + turning * jnp.array([0.0, 0.0, 1.0])
+        force = change + jnp.cross(2 * earth + moving, v) + UP * gravity
+        rate = earth + moving + turning * UP
         back = conjugate(attitude)
         return rotate(back, force), rotate(back, rate), attitude
 

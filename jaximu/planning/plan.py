@@ -20,6 +20,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import UP
 from jaximu.ground.vectors import dot_rows, sigmas_of, submatrix
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
@@ -673,7 +674,7 @@ def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
     turns = []
     for vector in np.asarray(turn_vectors(design.attitude)):
         angle = float(np.linalg.norm(vector))
-        axis = vector / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
+        axis = vector / angle if angle > 0 else UP
         words = f"the direct way, {np.degrees(angle):.0f}°"
         if equipment.robot:
             about = ", ".join(f"{component + 0.0:.3f}" for component in np.round(axis, 3))

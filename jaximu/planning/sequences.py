@@ -36,6 +36,7 @@ from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import Z95
+from jaximu.ground.rotation import UP
 from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
@@ -53,7 +54,7 @@ from jaximu.simulation.protocols.rotations import NINETEEN, rotation_vector
 FILTERED = replace(EQUIPMENT["table"], rest=20.0, turn=8.0, setting=0.0, in_sequence=True)
 """A table that turns a unit from one position to the next while it is recorded."""
 _CHOICES = [f"{axis}{angle}" for angle in (90, -90, 180) for axis in "xyz"]
-_UPRIGHT = attitude_of(np.array([0.0, 0.0, 1.0]))
+_UPRIGHT = attitude_of(UP)
 _WIDTH = 12
 """Sequences that are kept at every length."""
 _RATE = 50.0

@@ -24,7 +24,7 @@ from jaximu.data.observe_stations import TYPICAL_NOISE, scheme_stations
 from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.document import Json, read_toml
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError, only
-from jaximu.ground.rotation import apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
+from jaximu.ground.rotation import UP, apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
 from jaximu.model import AxisNoise, BiasInstability, parse_quantity
 from jaximu.model.effects import CATALOGUE, Effect
@@ -246,7 +246,7 @@ class ErrorScheme(eqx.Module):
         middle = (edges[:, 1:] + edges[:, :-1]) / 2
         attitude = self.motion.attitude_at(middle.ravel()).reshape(*middle.shape, 4)
         rate = logarithm(multiply(conjugate(edge[:, :-1]), edge[:, 1:])) / step[:, None, None]
-        up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), rate.shape)
+        up = jnp.broadcast_to(UP, rate.shape)
 
         begin, end = turned[self.ends[:, 0]][:, None], turned[self.ends[:, 1]][:, None]
         off = begin + self.done[..., None] * (end - begin)

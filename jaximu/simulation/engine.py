@@ -131,11 +131,7 @@ class Truth(Document):
 
         triads = {
             name: {
-                "output_unit": triad.output_unit,
-                "gain": np.asarray(triad.gain).tolist(),
-                "bias": np.asarray(triad.bias).tolist(),
-                "temperature_reference": triad.temperature_reference,
-                "time_reference": triad.time_reference,
+                **entries(triad, "output_unit", "gain", "bias", "temperature_reference", "time_reference"),
                 "effects": documents(triad.effects, triad.output_unit),
                 "noise": [
                     {"process": type(process).__name__}
