@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
-import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +21,7 @@ from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import Name, without_equipment
 from jaximu.ground.precision import require_float64
-from jaximu.ground.tracing import stacked
+from jaximu.ground.tracing import part_of, stacked
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
@@ -106,7 +105,7 @@ def _observed(array: Array) -> Observations:
 def _units(fitted: Fit) -> tuple[Imu, ...]:
     """Return the units of a fit along a leading axis."""
     count = len(fitted.values)
-    return tuple(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], fitted.imu) for k in range(count))
+    return tuple(part_of(fitted.imu, k) for k in range(count))
 
 
 def _most_in_common(alone: Fit, observations: Observations) -> float:

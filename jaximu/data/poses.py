@@ -54,7 +54,7 @@ from jaximu.ground.rotation import (
     rotate,
     unit_vectors,
 )
-from jaximu.ground.tracing import array_module, first, lifted, on_host, one_by_one, repeated, stacked
+from jaximu.ground.tracing import array_module, first, lifted, on_host, one_by_one, part_of, repeated, stacked
 from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
@@ -236,7 +236,7 @@ class PosesAndTurns(Observations, Data):
 
     def take(self, lanes: IntArray) -> Self:
         """Return the data of some of the units."""
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self._by_unit())
+        return part_of(self._by_unit(), lanes)
 
     def widened(self, poses: int, samples: int, lengths: Sequence[Mapping[str, int]] = ()) -> Self:
         """Return the data of a unit with padding up to so many poses, and samples in a turn, and of each recording."""

@@ -18,7 +18,7 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import Array, IntArray
 from jaximu.ground.distributions import rms
 from jaximu.ground.rotation import Number
-from jaximu.ground.tracing import lifted, on_host
+from jaximu.ground.tracing import lifted, on_host, part_of
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 
@@ -135,7 +135,7 @@ class KnownStations(Data):
 
     def take(self, lanes: IntArray) -> KnownStations:
         """Return the measurement of some of the units."""
-        return KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self.stations))
+        return KnownStations(part_of(self.stations, lanes))
 
     def about(self, imu: Imu) -> About:
         """Return the errors, whatever the unit."""

@@ -21,6 +21,7 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import UP, conjugate, rotate
 from jaximu.ground.stored import compiled
+from jaximu.ground.tracing import part_of
 from jaximu.ground.vectors import lengths_of
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.navigation import Navigation
@@ -86,7 +87,7 @@ class Trajectory:
         kept = count // apart * apart
         if kept < 2 * apart:
             raise NotPossibleError(f"the path lasts only {total:.2g} s ({count} samples): give a longer one.")
-        stimulus, intervals = jax.tree.map(lambda leaf: np.asarray(leaf)[:kept], (self.stimulus, self.intervals))
+        stimulus, intervals = part_of((self.stimulus, self.intervals), slice(kept))
         return replace(self, stimulus=stimulus, intervals=intervals, every=apart)
 
     @property
@@ -201,7 +202,7 @@ def of_specification(
     whole = motion.stimulus(case.rate)
     longest = motion.samples(case.rate)
     count = longest if duration is None else min(longest, round(duration * case.rate))
-    stimulus = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], whole)
+    stimulus = part_of(whole, slice(count))
     start = _start(np.asarray(motion.attitude[0]), site, float(motion.gravity))
     limits = {}
     for artefact in case.artefacts:
