@@ -31,6 +31,7 @@ from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.stored import compiled
+from jaximu.ground.tracing import on_host
 from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.ground.vectors import lengths_of, submatrix
 from jaximu.model import BiasRepeatability, Noise, Process
@@ -279,7 +280,7 @@ def consequences(
     return Consequences(
         files[0],
         trajectory,
-        jax.tree.map(np.asarray, reference),
+        on_host(reference),
         trajectory.times,
         terms,
         whole,
@@ -312,7 +313,7 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
             f"{file} states no covariance, so what it leaves open is not known: calibrate the log again with "
             "`jaximu calibrate LOG -o DIR`."
         )
-    imu, stimulus = jax.tree.map(np.asarray, imu), trajectory.stimulus
+    imu, stimulus = on_host(imu), trajectory.stimulus
     return Run(
         imu,
         trajectory.start,

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 
-import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -21,6 +20,7 @@ from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import UP
+from jaximu.ground.tracing import on_host
 from jaximu.ground.vectors import dot_rows, sigmas_of, submatrix
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
@@ -475,7 +475,7 @@ def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
             dormant.append(CATALOGUE[effect.name].dormant(**inner))
         else:
             notes.append(f"{effect.title} is left as it is: poses and turns at one temperature do not determine it.")
-    return jax.tree.map(np.asarray, imu.with_effects(*dormant)), tuple(notes)
+    return on_host(imu.with_effects(*dormant)), tuple(notes)
 
 
 def _in_output(triad: Triad, density: FloatArray) -> FloatArray:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-import jax
 import numpy as np
 from scipy.linalg import qr
 from scipy.spatial.transform import Rotation
@@ -37,6 +36,7 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import Z95
 from jaximu.ground.rotation import UP
+from jaximu.ground.tracing import on_host
 from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
@@ -212,7 +212,7 @@ def filter_of(
         duration = positions * equipment.rest + (positions - 1) * equipment.turn
         noise = with_usual_drift(NoiseModel(white[0], white[1]), equipment.rest, duration)
         notes += ("the drift of the biases that is usual of MEMS sensors is assumed.",)
-    imu = jax.tree.map(np.asarray, question.imu.with_effects(*chosen, GyroEarthRotation.dormant()))
+    imu = on_host(question.imu.with_effects(*chosen, GyroEarthRotation.dormant()))
     free = Parameters.select(imu, without_equipment_or_effects)
     size = np.asarray(free.size)
     spread = plausible_sizes(imu) | {GyroEarthRotation.name: np.full(3, EARTH_RATE)}

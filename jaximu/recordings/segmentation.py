@@ -72,7 +72,7 @@ class Segmentation(Comparable):
         return ", ".join(f"{count} at {factor:g}x" for factor, count, _, _ in self.tried)
 
 
-class _Moments:
+class Moments:
     """Running sums of a signal in SI and of its square, from which mean and variance over any samples follow."""
 
     def __init__(self, signal: Signal) -> None:
@@ -94,14 +94,14 @@ class _Moments:
         return (mean + self._origin).T, np.maximum(variance, 0.0).T, count
 
 
-def _windows(moments: _Moments, centres: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
+def _windows(moments: Moments, centres: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
     """Mean (W, 3) and summed variance (W,) over windows around `centres`; a gap is not rest."""
     mean, variance, count = moments.between(centres - width / 2 - 1e-9, centres + width / 2 - 1e-9)
     enough = count >= max(3, 0.5 * width * moments.signal.rate)
     return mean, np.where(enough, variance.sum(axis=1), np.inf)
 
 
-def _floor(variance: FloatArray, moments: _Moments) -> float:
+def _floor(variance: FloatArray, moments: Moments) -> float:
     """The variance of windows at rest: the median of those near the lowest."""
     floor = floor_of(variance[np.isfinite(variance)])
     # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
@@ -130,7 +130,7 @@ class _Scan:
 
     width: float
     centres: FloatArray
-    moments: tuple[_Moments, ...]
+    moments: tuple[Moments, ...]
     means: tuple[FloatArray, ...]
     ratio: FloatArray
     floor: float
@@ -150,7 +150,7 @@ class _Scan:
             )
         step = width / 8
         centres = np.arange(start, end + step / 2, step)
-        moments = tuple(_Moments(signal) for signal in signals)
+        moments = tuple(Moments(signal) for signal in signals)
         means, variances = zip(*(_windows(running, centres, width) for running in moments), strict=True)
         for signal, variance, name in zip(signals, variances, INERTIAL_QUANTITIES, strict=False):
             if not np.isfinite(variance).any():
@@ -280,7 +280,7 @@ def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:
     return deviation / max(limit, 6 * np.median(deviation[quiet]))
 
 
-def _drop_rotating(moments: Sequence[_Moments], intervals: FloatArray) -> tuple[FloatArray, list[str]]:
+def _drop_rotating(moments: Sequence[Moments], intervals: FloatArray) -> tuple[FloatArray, list[str]]:
     """Drop intervals that turn slowly: gravity drifts between their halves, or the mean rate is off all others'."""
     if not len(intervals):
         return intervals, []
@@ -373,7 +373,7 @@ def _of_blocks(signal: Signal, columns: Sequence[FloatArray], size: int) -> tupl
 
 def _rounding(signal: Signal, part: Segmentation) -> FloatArray:
     """(3, P) variance, in output units, by which rounding shifts the means of a recording's poses."""
-    variances = _Moments(signal).between(*part.intervals.T)[1]
+    variances = Moments(signal).between(*part.intervals.T)[1]
     return np.square(signal.nominal_scale)[:, None] * _rounding_of_means(signal, variances)
 
 
