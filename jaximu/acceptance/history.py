@@ -20,8 +20,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaximu.acceptance.decision import Rule
-from jaximu.acceptance.epochs import Epoch, Scales, epochs_of, over_temperature, owner_of, require_apart
-from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits
+from jaximu.acceptance.epochs import Epoch, epochs_of, over_temperature, owner_of, require_apart
+from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits, Scales
 from jaximu.acceptance.quantities import output_stimulus
 from jaximu.acceptance.trend import Sameness, StraightLine, sameness
 from jaximu.acceptance.words import si_unit

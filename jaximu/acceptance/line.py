@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jaximu.acceptance.acceptance import SCHEMA, Judged, judge
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
 from jaximu.acceptance.item import Item
-from jaximu.acceptance.limits import OF_ONE_UNIT, Limit, Limits
+from jaximu.acceptance.limits import OF_ONE_UNIT, Limit, Limits, Scales
 from jaximu.acceptance.quantities import Measured, Units, measure, share_of
 from jaximu.acceptance.statistics import (
     Capability,
@@ -84,7 +84,7 @@ class Batch:
     days: FloatArray
     lots: tuple[str, ...]
     stations: tuple[str, ...]
-    nominal: dict[str, tuple[FloatArray, FloatArray]]
+    nominal: Scales
 
 
 @dataclass(frozen=True)
@@ -337,7 +337,7 @@ def population_limits(path: FilePath, rule: Rule) -> Limits:
     return Limits(tuple(limits), rule, nominal, table.file, file_digest(path))
 
 
-def _in_counts(table: Batch, nominal: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict:
+def _in_counts(table: Batch, nominal: Scales) -> dict:
     """Return the nominal scales of the triads that were logged in counts."""
     triads = table.units.like.triads()
     return {owner: scales for owner, scales in nominal.items() if triads[owner].output_unit == "count"}

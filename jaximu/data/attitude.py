@@ -24,7 +24,7 @@ from jaximu.data.preintegration import increments, linear_slope, preintegrate_sa
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, Observed, OfOneUnit, free_columns
 from jaximu.estimation.problem import Parameters
-from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
+from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, Sizes, by_axis
 from jaximu.estimation.track import TRIADS, Track, added, stimuli
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
@@ -540,7 +540,7 @@ class AgainstAttitude(OfOneUnit):
         """Return the recording with a window of the force left out, and the rotations in it."""
         return replace(self, left_out=(*self.left_out, observation))
 
-    def rms(self, imu: Imu, details: AttitudeDetails, conditions: FloatArray) -> dict[str, tuple[float, str]]:
+    def rms(self, imu: Imu, details: AttitudeDetails, conditions: FloatArray) -> Sizes:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
         sizes = super().rms(imu, details, conditions)
         return sizes | {"rotation": (float(np.degrees(sizes["rotation"][0])), "deg/s")}

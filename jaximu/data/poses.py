@@ -36,7 +36,7 @@ from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
-from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
+from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, Sizes, by_axis
 from jaximu.estimation.track import Track, added, mean_outputs, means_by
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
@@ -472,7 +472,7 @@ def residual_rms(
     observations: Observations,
     gyroscope: bool = True,
     known: tuple[FloatArray, FloatArray] | None = None,
-) -> dict[str, tuple[float, str]]:
+) -> Sizes:
     """Return the rms of each kind of residual in units a person knows: m/s², degrees, rad/s (all unweighted).
 
     `known`: forces and angles of the unit, where at hand.

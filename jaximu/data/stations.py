@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaximu.data.station_error import turntable_error
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.data import About, Conditions, Data
-from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
+from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, Sizes, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, IntArray
 from jaximu.ground.distributions import rms
@@ -189,7 +189,7 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
     return errors
 
 
-def station_rms(imu: Imu, stations: Stations) -> dict[str, tuple[float, str]]:
+def station_rms(imu: Imu, stations: Stations) -> Sizes:
     """Return the rms of each kind of error, as vectors, with its unit."""
     return {
         kind.name: (rms(np.linalg.norm(kind.error, axis=0)), kind.unit)

@@ -102,6 +102,10 @@ _WORDS = {
 }
 
 
+StatedErrors = Mapping[str, tuple[Any, str]]
+"""By name, sizes of errors in SI and the text that stated them."""
+
+
 @dataclass(frozen=True)
 class Task:
     """A specification read for a budget: the unit and its scheme, sizes of errors in SI with the text that stated them,
@@ -110,7 +114,7 @@ class Task:
 
     case: Case
     environment: Environment
-    errors: Mapping[str, tuple[Any, str]]
+    errors: StatedErrors
     fitted: tuple[str, ...]
     goals: tuple[tuple[str, str], ...]
     name: str
@@ -146,7 +150,7 @@ def task(document: Mapping[str, Any], name: str = "specification") -> Task:
     return Task(specification.case(0), environment, errors, tuple(fitted), stated, name)
 
 
-def _stated(errors: Mapping[str, tuple[Any, str]], name: str) -> dict[str, float]:
+def _stated(errors: StatedErrors, name: str) -> dict[str, float]:
     """The sizes of a table of errors, SI; empty where it is not stated."""
     return errors.get(name, ({}, ""))[0]
 
@@ -415,7 +419,7 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
     return scheme, tuple(_source(errors, name, root) for name, root in roots.items() if root.size), notes
 
 
-def _source(errors: Mapping[str, tuple[Any, str]], name: str, root: FloatArray) -> ErrorSource:
+def _source(errors: StatedErrors, name: str, root: FloatArray) -> ErrorSource:
     value, text = errors.get(name, (None, "by the noise"))
     single = value if name in _SINGLE else None
     return ErrorSource(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), root)
@@ -458,7 +462,7 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[ScheduleEntr
     return stations, fast, slow, ramps, tuple(notes)
 
 
-def _effects_by_source(errors: Mapping[str, tuple[Any, str]], unit: Imu, ramps: Mapping[str, FloatArray]):
+def _effects_by_source(errors: StatedErrors, unit: Imu, ramps: Mapping[str, FloatArray]):
     """By source: effects that make its errors, each with the sizes of its coefficients."""
     gains = {name: triad.scales for name, triad in unit.triads().items()}
 
@@ -503,7 +507,7 @@ def _scheme(
     stations: Stations,
     intervals: Sequence[ScheduleEntry],
     stops: _Stops,
-    errors: Mapping[str, tuple[Any, str]],
+    errors: StatedErrors,
 ) -> ErrorScheme:
     count, size = len(intervals), stations.turn.shape[0]
     ends, axis, angle = np.zeros((size, 2), np.int64), np.zeros((size, 3)), np.full(size, np.inf)
