@@ -92,6 +92,11 @@ class Name(str):
         """Owner and effect, under which `Imu.all_effects` has the effect."""
         return self.owner, self.effect
 
+    @property
+    def is_scale(self) -> bool:
+        """Whether it is the gain of an axis by itself, not of one across another."""
+        return self.part == "gain" and self.axes[0] == self.axes[1]
+
 
 def names_of(model: Imu) -> tuple[Name, ...]:
     """Return the names of all numbers of a model, in the order of `flatten`."""

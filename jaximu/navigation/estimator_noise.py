@@ -34,7 +34,7 @@ import scipy
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.data.preintegration import preintegrate_samples
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
-from jaximu.ground.differences import interpolated
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.distributions import rms
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -287,7 +287,7 @@ class MeasuredErrors:
 
 def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> BoolArray:
     """Whether a reference's velocity (T, 3) changes at each stamp (T,) about as the unit's acceleration (T, 3) says."""
-    mean = (acceleration[1:] + acceleration[:-1]) / 2
+    mean = midpoints(acceleration)
     off = lengths_of(np.diff(velocity, axis=0) / np.diff(stamp)[:, None] - mean)
     leap = off > _LEAP * np.median(off)
     near = np.convolve(leap, np.ones(4), "full") > 0  # a difference of positions reaches two stamps

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaximu.calibration import Calibration, compensate
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.differences import midpoints
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
@@ -243,7 +244,7 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
         rate = rate - rate[resting].mean(axis=0) + attitude_of(up).inv().apply(earth)
         notes.append(f"the motion starts at the log's first rest, {first:.1f} s in, levelled there; heading unknown.")
     kept = (time >= first) & (time < first + duration)
-    middle = (time[1:] + time[:-1]) / 2
+    middle = midpoints(time)
     edges = np.concatenate([[2 * time[0] - middle[0]], middle, [2 * time[-1] - middle[-1]]])
     temperature = ready.temperature
     warm = None if temperature is None else np.interp(time, temperature.time, temperature.values[:, 0])[kept]

@@ -194,7 +194,7 @@ def recording_of(calibration: Calibration) -> Figure:
                 axes.axvline(shift, color="black", linewidth=1.2, linestyle=":")
         spans += [(start + offset, stop - start) for start, stop in intervals]
         still += np.sum(intervals[:, 1] - intervals[:, 0])
-        shift += time[-1] - time[0]
+        shift += np.ptp(time)
     for axes, label in zip(grid, ("specific force (m/s²)", "angular rate (rad/s)"), strict=False):
         axes.broken_barh(
             spans,
@@ -328,11 +328,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
                 line(index + 0.5, color="black", linewidth=1.4 if before.owner != after.owner else 0.5)
     figure.colorbar(image, cax=scale, label="correlation (−1 to 1)")
     # scales of the accelerometer share the uncertainty of gravity: no pair of them is named as the closest
-    scales = [
-        index
-        for index, name in enumerate(parameters)
-        if name.startswith("accelerometer.gain") and name.axes[0] == name.axes[1]
-    ]
+    scales = [index for index, name in enumerate(parameters) if name.owner == "accelerometer" and name.is_scale]
     others = matrix - np.eye(count)
     others[np.ix_(scales, scales)] = 0.0
     first, second = sorted(np.unravel_index(int(np.argmax(np.abs(others))), others.shape))

@@ -122,7 +122,7 @@ def page_of(calibration: Calibration, history: History) -> Page:
     bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
     scale = np.mean(calibration.triads()["gyroscope"].scales)
     worst = np.degrees(Z95 * max(bias) / scale)
-    minutes = (history.time[-1] - history.time[0]) / 60
+    minutes = np.ptp(history.time) / 60
     verdict = "diverged" if calibration.filter.get("diverged") else "followed the unit"
     return calibration_page(
         calibration,
