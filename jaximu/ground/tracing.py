@@ -30,7 +30,7 @@ def array_module(*trees: Any) -> Any:
     return numpy
 
 
-def part_of(tree: Tree, places: Any) -> Tree:
+def part_of(tree: Any, places: Any) -> Any:
     """Return the entries at some places along the leading axis of every array: a number, numbers or a slice."""
     import jax
 
