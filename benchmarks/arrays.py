@@ -17,9 +17,10 @@ import numpy as np
 from common import Table, arguments, finish, share
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from turns_left_out import leave_out_turns
 
 from jaximu import LocalGravity, Recording, wgs84_gravity
-from jaximu.calibration import calibrate_array, leave_out_turns
+from jaximu.calibration import calibrate_array, fit_together
 from jaximu.ground.errors import NotPossibleError
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Signal
@@ -68,7 +69,7 @@ def together(seeds, folder, sessions, gravity):
 
     def add(name, found):
         try:
-            left = leave_out_turns(found)
+            left = leave_out_turns(found, fit_together(found))
         except NotPossibleError as error:
             why = str(error).partition(": ")[2].partition(":")[0]  # without the files' names, and what is usually done
             figures[name] = {"refused": why}

@@ -16,6 +16,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax
 import numpy as np
+from accelerometer_norms import calibrate_norms
 from common import Table, arguments, finish, share
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -24,7 +25,6 @@ import temperature_histories as histories
 from jaximu.calibration import calibrate_thermal, compensate
 from jaximu.calibration.identifiability import identifiable
 from jaximu.calibration.thermal_linear import Whitened
-from jaximu.calibration.thermal_norms import calibrate_norms
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.calibration.thermal_triad import fit_triad
 from jaximu.data.rest_blocks import own_noise, rest_blocks

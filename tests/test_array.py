@@ -1,8 +1,10 @@
 """Units on one rigid body: truth of an outside simulator, whose noise it is, what is refused, the command."""
 
 import json
+import sys
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import array_motion
 import jax
@@ -11,7 +13,7 @@ import pytest
 import scipy.spatial.transform
 
 from jaximu import InputError, LocalGravity, NotPossibleError, Recording
-from jaximu.calibration import calibrate_array, fit_together, leave_out_turns
+from jaximu.calibration import calibrate_array, fit_together
 from jaximu.cli.app import main
 from jaximu.data.array import UnitsOnOneBody
 from jaximu.data.poses import condensed
@@ -20,6 +22,9 @@ from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Signal
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from turns_left_out import leave_out_turns
 
 GRAVITY = LocalGravity(array_motion.GRAVITY, 0.0)
 
@@ -103,8 +108,8 @@ def test_what_an_effect_adds_is_taken_off_before_units_are_fitted_together(found
     assert none < 1e-6 < 10.0 < some
 
 
-def test_turns_left_out_are_met_better_together(found):
-    left = leave_out_turns(found)
+def test_turns_left_out_are_met_better_together(found, together):
+    left = leave_out_turns(found, together)
     assert left.count == 3 * 16 and left.gravity[1] < left.gravity[0] and left.apart[1] < left.apart[0] / 1.5
 
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaximu.acceptance.limits import Scales
 from jaximu.acceptance.quantities import measure, of_calibration
 from jaximu.calibration import Calibration
 from jaximu.estimation.fitting import effect_numbers
@@ -26,9 +27,6 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.units import SENSOR_QUANTITIES
 from jaximu.model.conventions import lower_triangular_frame
 from jaximu.model.effects import CATALOGUE
-
-Scales = Mapping[str, tuple[FloatArray, FloatArray]]
-"""By triad in counts, counts per SI unit (3,) and counts at zero input (3,)."""
 
 
 class Measurand(NamedTuple):

@@ -20,8 +20,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaximu.acceptance.decision import Rule
-from jaximu.acceptance.epochs import Epoch, Scales, epochs_of, over_temperature, owner_of, require_apart
-from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits
+from jaximu.acceptance.epochs import Epoch, epochs_of, over_temperature, owner_of, require_apart
+from jaximu.acceptance.limits import OF_ONE_UNIT, OUTPUTS, Limit, Limits, Scales
 from jaximu.acceptance.quantities import output_stimulus
 from jaximu.acceptance.trend import Sameness, StraightLine, sameness
 from jaximu.acceptance.words import si_unit
@@ -38,6 +38,7 @@ from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.units import INERTIAL_QUANTITIES, SENSOR_QUANTITIES, SENSOR_UNITS, STANDARD_GRAVITY
+from jaximu.ground.vectors import lengths_of, submatrix
 from jaximu.model.effects import CATALOGUE, Effect
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
@@ -422,7 +423,7 @@ def _together(movements: Sequence[Movement], values: FloatArray, covariance: Flo
 
     def test(chosen: list[int]) -> Sameness:
         rows = [epoch * size + column for epoch in range(count) for column in chosen]
-        return sameness(values[:, chosen], covariance[np.ix_(rows, rows)])
+        return sameness(values[:, chosen], submatrix(covariance, rows))
 
     kinds = [_kind(movement.name) for movement in movements]
     groups = {kind: [index for index, other in enumerate(kinds) if other == kind] for kind in dict.fromkeys(kinds)}
@@ -489,7 +490,7 @@ def _output(first: Epoch, last: Epoch, owner: str, over: float) -> OutputChange:
         common.append(free @ epoch.by_gravity)
     for shift in [common[0] + common[1]] if first.gravity == last.gravity else common:
         spread += shift[:, :, None] * shift[:, None, :]
-    length = np.linalg.norm(values, axis=1)
+    length = lengths_of(values)
     worst = int(np.argmax(length))
     along = values[worst] / (length[worst] or 1.0)
     return OutputChange(

@@ -32,6 +32,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +46,9 @@ from jaximu.ground.units import SENSOR_QUANTITIES, SENSOR_UNITS, unit
 from jaximu.model.data_sheet import NUMBER_WITH_UNIT, SI_UNITS, parse_quantity
 from jaximu.model.effects import CATALOGUE
 from jaximu.recordings.columns.nominal import parse_offset, parse_scale
+
+Scales = Mapping[str, tuple[FloatArray, FloatArray]]
+"""By triad in counts, counts per SI unit (3,) and counts at zero input (3,)."""
 
 TYPICAL = 3.0
 """Limit of what a data sheet calls typical, in typical values: 99.7 % of a normal population lie within."""
@@ -106,7 +110,7 @@ class Limits:
 
     limits: tuple[Limit, ...]
     rule: Rule
-    nominal: dict[str, tuple[FloatArray, FloatArray]]
+    nominal: Scales
     file: str
     sha256: str
 
@@ -256,7 +260,7 @@ def _range(stated: Any, where: str) -> tuple[float, float]:
     return temperatures[0], temperatures[1]
 
 
-def _nominal(stated: Any, name: str) -> dict[str, tuple[FloatArray, FloatArray]]:
+def _nominal(stated: Any, name: str) -> Scales:
     if not isinstance(stated, dict):
         raise InputError(f'{name}: below [nominal] stand scales such as accelerometer = "2048 count/g".')
     only(stated, (*_NAMES, *(f"{owner}_offset" for owner in _NAMES)), f"{name}, [nominal]")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jaximu.acceptance.acceptance import SCHEMA, Judged, judge
 from jaximu.acceptance.decision import FAIL, PASS, UNDECIDED, Rule, worst
 from jaximu.acceptance.item import Item
-from jaximu.acceptance.limits import OF_ONE_UNIT, Limit, Limits
+from jaximu.acceptance.limits import OF_ONE_UNIT, Limit, Limits, Scales
 from jaximu.acceptance.quantities import Measured, Units, measure, share_of
 from jaximu.acceptance.statistics import (
     Capability,
@@ -41,6 +41,7 @@ from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import Z95
 from jaximu.ground.units import SENSORS
+from jaximu.ground.vectors import root_or_zero
 from jaximu.model.sensor import Imu
 
 _SHOWN_ITEMS = 1000  # of a table, that its document holds
@@ -83,7 +84,7 @@ class Batch:
     days: FloatArray
     lots: tuple[str, ...]
     stations: tuple[str, ...]
-    nominal: dict[str, tuple[FloatArray, FloatArray]]
+    nominal: Scales
 
 
 @dataclass(frozen=True)
@@ -269,7 +270,7 @@ def read_table(path: FilePath) -> Batch:
     scales = [0, 4, 8]
     variances = np.diagonal(covariance, axis1=1, axis2=2)[:, [free.index(index) for index in scales]]
     added = numbers("accel_gain_sigma")[:, scales] ** 2 - variances
-    gravity = np.sqrt(np.maximum(np.mean(added / values[:, scales] ** 2, axis=1), 0.0))
+    gravity = root_or_zero(np.mean(added / values[:, scales] ** 2, axis=1))
     by_gravity = np.where(np.array(free) < 9, values[:, free], 0.0) * gravity[:, None]
     units = Units(
         like,
@@ -336,7 +337,7 @@ def population_limits(path: FilePath, rule: Rule) -> Limits:
     return Limits(tuple(limits), rule, nominal, table.file, file_digest(path))
 
 
-def _in_counts(table: Batch, nominal: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict:
+def _in_counts(table: Batch, nominal: Scales) -> dict:
     """Return the nominal scales of the triads that were logged in counts."""
     triads = table.units.like.triads()
     return {owner: scales for owner, scales in nominal.items() if triads[owner].output_unit == "count"}
@@ -385,7 +386,7 @@ def follow(table: Batch, limits: Limits | None = None, golden: str = "") -> Line
     followed, alarms = [], []
     for column in shown:
         name, values = measured.names[column], measured.value[:, column]
-        recording = np.sqrt(np.maximum(measured.sigma[:, column] ** 2 - measured.gravity[:, column] ** 2, 0.0))
+        recording = root_or_zero(measured.sigma[:, column] ** 2 - measured.gravity[:, column] ** 2)
         charts = {}
         for station in stations:
             some = first[np.array(table.stations)[first] == station]

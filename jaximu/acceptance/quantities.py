@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaximu.acceptance.limits import Limit
+from jaximu.acceptance.limits import Limit, Scales
 from jaximu.calibration import Calibration
 from jaximu.estimation.problem import Name, flatten, names_of, typical_sizes, unflatten
 from jaximu.estimation.projection import output_error
@@ -106,7 +106,7 @@ def share_of(excess: FloatArray) -> FloatArray:
     return excess / (1 + excess)
 
 
-def measure(units: Units, nominal: Mapping[str, tuple[FloatArray, FloatArray]], outputs: Sequence[Limit]) -> Measured:
+def measure(units: Units, nominal: Scales, outputs: Sequence[Limit]) -> Measured:
     """Return all parameters of units, and the outputs that limits ask for, with their uncertainty.
 
     **Arguments:** `nominal`: by triad in counts, scale (3,) and offset (3,); `outputs`: limits of outputs.

@@ -6,7 +6,7 @@ from jaximu.ground.reexport import lazily
 
 if TYPE_CHECKING:
     from jaximu.calibration.array import calibrate_array
-    from jaximu.calibration.array_together import LeftOutTurns, Together, fit_together, leave_out_turns
+    from jaximu.calibration.array_together import Together, fit_together
     from jaximu.calibration.array_units import Array, ArrayUnit
     from jaximu.calibration.attitude import calibrate_against_attitude
     from jaximu.calibration.calibration import Calibration, load_calibration
@@ -37,7 +37,6 @@ __all__ = [
     "Heading",
     "History",
     "Identifiability",
-    "LeftOutTurns",
     "MagneticLog",
     "Method",
     "Scheme",
@@ -59,7 +58,6 @@ __all__ = [
     "fit_together",
     "fit_turntable",
     "followed_in_use",
-    "leave_out_turns",
     "linear_least_squares",
     "load_calibration",
     "nominal_imu",
@@ -73,7 +71,7 @@ __getattr__ = lazily(
     __name__,
     {
         "jaximu.calibration.array": "calibrate_array",
-        "jaximu.calibration.array_together": "LeftOutTurns, Together, fit_together, leave_out_turns",
+        "jaximu.calibration.array_together": "Together, fit_together",
         "jaximu.calibration.array_units": "Array, ArrayUnit",
         "jaximu.calibration.attitude": "calibrate_against_attitude",
         "jaximu.calibration.calibration": "Calibration, load_calibration",

@@ -32,6 +32,7 @@ from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import right_jacobian
 from jaximu.ground.tracing import on_host
+from jaximu.ground.vectors import lengths_of, root_or_zero, sigmas_of
 from jaximu.mistakes import prepare
 from jaximu.model.mounting import Mounting
 from jaximu.model.noise_model import NoiseModel
@@ -151,7 +152,7 @@ class _Shared:
         near = _NEAR / slowest
         measured = np.searchsorted(unseen, start - near) == np.searchsorted(unseen, start + length + near)
         start = start[~still & measured]
-        speed = np.linalg.norm(means_over(gyroscopes[0], np.stack([start, start + length], axis=1)), axis=1)
+        speed = lengths_of(means_over(gyroscopes[0], np.stack([start, start + length], axis=1)))
         start, speed = start[speed > _SLOW], speed[speed > _SLOW]
         if len(start) < _FEWEST or len(rests) < 3:
             raise NotPossibleError(
@@ -174,7 +175,7 @@ class _Shared:
 def _coarse_delay(recording: Recording, first: Recording) -> float:
     """Return by how much (s) the first's stamps are late, to a sample."""
     gyroscope, later = first.signals["gyroscope"], later_zero(first.start, recording.start)
-    speed = np.linalg.norm(gyroscope.values, axis=1)
+    speed = lengths_of(gyroscope.values)
     delays = delays_of_speeds(recording.signals["gyroscope"], gyroscope.time + later, speed, 1 / gyroscope.rate)
     return delays[0] - later
 
@@ -282,9 +283,9 @@ def _unit(
         name,
         calibration,
         turned.inv().as_quat(canonical=True, scalar_first=True),
-        np.sqrt(np.diagonal(slope @ covariance.rotation @ slope.T)),
+        sigmas_of(slope @ covariance.rotation @ slope.T),
         back @ mounting.lever_arm,
-        np.sqrt(np.diagonal(back @ covariance.lever_arm @ back.T)),
+        sigmas_of(back @ covariance.lever_arm @ back.T),
         -(delay + float(mounting.delay)),
         float(np.sqrt(covariance.delay[0, 0])),
         float(mounting.clock_scale),
@@ -313,7 +314,7 @@ def _scatter(errors: Sequence[FloatArray]) -> list[tuple[float | None, float | N
     scatter = []
     for columns in (slice(3, 6), slice(3)):
         variances = [np.mean((whole[i] - whole[j])[:, columns] ** 2) for i, j in pairs]
-        scatter.append(np.sqrt(np.maximum(np.linalg.lstsq(design, np.array(variances), rcond=None)[0], 0.0)).tolist())
+        scatter.append(root_or_zero(np.linalg.lstsq(design, np.array(variances), rcond=None)[0]).tolist())
     return list(zip(*scatter, strict=True))
 
 

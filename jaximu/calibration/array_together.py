@@ -1,6 +1,6 @@
 """Units on one rigid body calibrated together: from rest to rest all turn alike, which each of them measures anew.
 
-What the shared motion adds to each unit's own poses and turns, and what that is worth on turns that were not fitted.
+What the shared motion adds to each unit's own poses and turns.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
-import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -18,21 +17,15 @@ from jaximu.calibration.hand_held import fit_hand_held
 from jaximu.calibration.refusals import require_solved
 from jaximu.data.array import UnitsOnOneBody
 from jaximu.data.by_hand import RecordedByHand
-from jaximu.data.poses import EXCESS_NAMES, condensed
+from jaximu.data.poses import EXCESS_NAMES
 from jaximu.estimation.fitting import Fit, fit
 from jaximu.estimation.problem import Name, without_equipment
-from jaximu.ground.array_types import FloatArray, IntArray
-from jaximu.ground.distributions import rms
-from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
-from jaximu.ground.tracing import stacked
+from jaximu.ground.tracing import part_of, stacked
 from jaximu.model.effects.reference_rotation import SetupReferenceRotation
 from jaximu.model.sensor import Board, Imu
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.segmentation import observed_poses
-
-_FEWEST = 6
-"""Turns that all units measured, without which nothing is left to fit once half of them are left out."""
 
 
 @dataclass(frozen=True)
@@ -63,20 +56,6 @@ class Together:
         return float(common / max(turns + common, 1e-300))
 
 
-@dataclass(frozen=True)
-class LeftOutTurns:
-    """Errors (rms, rad) in turns that were not fitted, of units calibrated alone and of units calibrated together.
-
-    count: turns times units. gravity: angle between gravity as carried over a turn and as measured after it. apart:
-    angle between a turn as the first unit measured it and as another did. in_common: as of `Together`, the parts' mean.
-    """
-
-    count: int
-    gravity: tuple[float, float]
-    apart: tuple[float, float]
-    in_common: float
-
-
 def fit_together(found: Array, left_out: Sequence[int] = ()) -> Together:
     """Fit the units of an array in one problem: each one's poses and turns, and that all turn alike.
 
@@ -87,37 +66,21 @@ def fit_together(found: Array, left_out: Sequence[int] = ()) -> Together:
     `NotPossibleError` where the fit does not converge.
     """
     require_float64()
-    return _fitted(found, _observed(found), left_out)
-
-
-def leave_out_turns(found: Array, parts: int = 2) -> LeftOutTurns:
-    """Fit an array's units alone and together with every second turn left out, and compare both on these; then others.
-
-    **Arguments:** `found`: of [`jaximu.calibration.calibrate_array`][]; `parts`: of which each is left out once, its
-    turns spread evenly in time.
-
-    Raises `NotPossibleError` where less than six turns are measured by all units, or a fit does not converge.
-    """
-    require_float64()
     observations = _observed(found)
-    measured = np.flatnonzero(np.all(observations.turns.mask, axis=0))
-    if len(measured) < _FEWEST:
-        raise NotPossibleError(
-            f"{found.units[0].name}: all units measured {len(measured)} turns from rest to rest; leaving some out "
-            f"takes {_FEWEST} or more."
-        )
-    known = np.array([unit.rotation for unit in found.units[1:]])
-    errors, common = [], []
-    for part in range(parts):
-        turns = measured[part::parts]
-        fitted = _fitted(found, observations, turns)
-        together = fitted.units_together()
-        met = (*_met(fitted.units_alone(), known, observations), *_met(together, _mountings(together), observations))
-        errors.append([angle[:, turns].ravel() for angle in met])
-        common.append(fitted.in_common)
-    whole = [np.concatenate(angles) for angles in zip(*errors, strict=True)]
-    alone, apart_alone, together, apart = map(rms, whole)
-    return LeftOutTurns(len(whole[0]), (alone, together), (apart_alone, apart), float(np.mean(common)))
+    mask = np.array(observations.turns.mask)
+    mask[:, list(left_out)] = False
+    observations = eqx.tree_at(lambda tree: tree.turns.mask, observations, mask)
+    alone = fit_hand_held(stacked([unit.calibration.imu.with_effects() for unit in found.units]), observations)
+    back = Rotation.from_quat([unit.rotation for unit in found.units], scalar_first=True).inv()
+    turned = [
+        unit.with_effects(SetupReferenceRotation.make(vector))
+        for unit, vector in zip(_units(alone), back.as_rotvec(), strict=True)
+    ]
+    begin, most = np.append(np.median(alone.excess, axis=0), 1.0), np.full(4, np.inf)
+    most[-1] = _most_in_common(alone, observations)
+    together = fit(Board.of(turned), UnitsOnOneBody(observations), _free, excess=begin, most=most, follow=True)
+    require_solved(together, ", ".join(unit.name for unit in found.units))
+    return Together(observations, alone, together)
 
 
 def _observed(array: Array) -> Observations:
@@ -139,27 +102,10 @@ def _observed(array: Array) -> Observations:
     return stacked(observed)
 
 
-def _fitted(array: Array, observations: Observations, left_out: Sequence[int] | IntArray) -> Together:
-    mask = np.array(observations.turns.mask)
-    mask[:, list(left_out)] = False
-    observations = eqx.tree_at(lambda tree: tree.turns.mask, observations, mask)
-    alone = fit_hand_held(stacked([unit.calibration.imu.with_effects() for unit in array.units]), observations)
-    back = Rotation.from_quat([unit.rotation for unit in array.units], scalar_first=True).inv()
-    turned = [
-        unit.with_effects(SetupReferenceRotation.make(vector))
-        for unit, vector in zip(_units(alone), back.as_rotvec(), strict=True)
-    ]
-    begin, most = np.append(np.median(alone.excess, axis=0), 1.0), np.full(4, np.inf)
-    most[-1] = _most_in_common(alone, observations)
-    together = fit(Board.of(turned), UnitsOnOneBody(observations), _free, excess=begin, most=most, follow=True)
-    require_solved(together, ", ".join(unit.name for unit in array.units))
-    return Together(observations, alone, together)
-
-
 def _units(fitted: Fit) -> tuple[Imu, ...]:
     """Return the units of a fit along a leading axis."""
     count = len(fitted.values)
-    return tuple(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], fitted.imu) for k in range(count))
+    return tuple(part_of(fitted.imu, k) for k in range(count))
 
 
 def _most_in_common(alone: Fit, observations: Observations) -> float:
@@ -176,23 +122,3 @@ def _free(name: Name) -> bool:
     """Return whether a number of a board is free: each unit's as by hand, and how it is turned."""
     triad = name.owner.rpartition(".")[2]
     return triad == "setup" or without_equipment(Name(triad, name.part, name.axes))
-
-
-def _met(units: Sequence[Imu], mounted: FloatArray, observations: Observations) -> tuple[FloatArray, FloatArray]:
-    """Return by how much (rad) gravity as carried over turns is off (U, T), and turns are off the first's (U − 1, T).
-
-    mounted: quaternions (U − 1, 4), w first, from the first unit's axes to the others'.
-    """
-    carried = condensed(stacked([unit.with_effects() for unit in units]), observations)
-    turned = [Rotation.from_quat(turns, scalar_first=True) for turns in np.asarray(carried.conditions.rotation)]
-    apart = []
-    for other, quaternion in zip(turned[1:], mounted, strict=True):
-        back = Rotation.from_quat(quaternion, scalar_first=True)
-        apart.append(((back * turned[0] * back.inv()).inv() * other).magnitude())
-    return carried.angle, np.stack(apart)
-
-
-def _mountings(units: Sequence[Imu]) -> FloatArray:
-    """Return quaternions (U − 1, 4), w first, from the first unit's axes to the others'."""
-    vectors = [unit.coefficients(SetupReferenceRotation) for unit in units[1:]]
-    return Rotation.from_rotvec(vectors).inv().as_quat(scalar_first=True)

@@ -25,6 +25,7 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.tracing import on_host
+from jaximu.ground.vectors import dot_rows, lengths_of, sigmas_of, submatrix
 from jaximu.mistakes import prepared
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_delay import SetupReferenceDelay
@@ -184,7 +185,7 @@ _RECORD = "Turn the unit about each of its axes, both ways, and hold each axis u
 def _of_setup(imu: Imu) -> Callable[[Name], bool]:
     """Return whether a number is the set-up's, the lever arm included."""
     fixture = {key for key, effect in imu.all_effects().items() if effect.scope == "fixture"}
-    return lambda name: name.owner == "setup" or (name.owner, name.effect) in fixture
+    return lambda name: name.owner == "setup" or name.key in fixture
 
 
 def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatArray:
@@ -199,7 +200,7 @@ def _of_shape(calibration: Calibration, measurement: AgainstAttitude) -> FloatAr
     spread = abs(float(Mounting.of(imu).filter_variance))
     delay = spread**1.5 / 3 * np.sum(slope**2) / np.sum(rate**2)
     effects = imu.all_effects()
-    delayed = [isinstance(effects.get((name.owner, name.effect)), SetupReferenceDelay) for name in calibration.names]
+    delayed = [isinstance(effects.get(name.key), SetupReferenceDelay) for name in calibration.names]
     return delay**2 * np.diag(delayed)
 
 
@@ -228,8 +229,8 @@ def fitted_mounting(imu: Imu, names: Sequence[Name], covariance: Array) -> tuple
     effects = imu.all_effects()
 
     def of(kind):
-        rows = [row for row, name in enumerate(names) if isinstance(effects.get((name.owner, name.effect)), kind)]
-        return covariance[np.ix_(rows, rows)] if rows else np.zeros((kind.size, kind.size))
+        rows = [row for row, name in enumerate(names) if isinstance(effects.get(name.key), kind)]
+        return submatrix(covariance, rows) if rows else np.zeros((kind.size, kind.size))
 
     return Mounting.of(imu), Mounting(*map(of, MOUNTING_EFFECTS))
 
@@ -241,7 +242,7 @@ def reference_summary(calibration: Calibration) -> Json:
     matrix = turned.as_matrix()
     arm = {
         "value": (matrix @ mounting.lever_arm).tolist(),
-        "sigma": np.sqrt(np.diag(matrix @ covariance.lever_arm @ matrix.T)).tolist(),
+        "sigma": sigmas_of(matrix @ covariance.lever_arm @ matrix.T).tolist(),
         "unit": "m",
     }
     return {
@@ -273,7 +274,7 @@ def _coarse(recording: Recording, attitude: Attitude) -> _Start:
             f"{attitude.name} lies from {attitude.time[0]:.6g} to {attitude.time[-1]:.6g} s and {name} from "
             f"{span[0]:.6g} to {span[1]:.6g} s: they do not overlap. Put both on one clock, or let both begin at zero."
         )
-    rate = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
+    rate = lengths_of(attitude.turned()) / np.diff(attitude.time)
     if np.sqrt(np.nanmean(rate**2)) < _LEAST:
         raise NotPossibleError(
             f"{attitude.name} hardly turns ({np.degrees(np.sqrt(np.nanmean(rate**2))):.2g} °/s, rms): {_RECORD}"
@@ -420,7 +421,7 @@ def _rates(recording: Recording, attitude: Attitude, delay: float) -> tuple[Floa
 
 def _delays(recording: Recording, attitude: Attitude) -> list[float]:
     """Return by how much (s) the reference's stamps may be late, likeliest first, from the sizes of both rates."""
-    turned = np.linalg.norm(attitude.turned(), axis=1) / np.diff(attitude.time)
+    turned = lengths_of(attitude.turned()) / np.diff(attitude.time)
     good, middle = ~np.isnan(turned), midpoints(attitude.time)
     return delays_of_speeds(recording.signals["gyroscope"], middle[good], turned[good], attitude.period)
 
@@ -431,7 +432,7 @@ def delays_of_speeds(gyroscope: Signal, stamps: FloatArray, speeds: FloatArray, 
     The likeliest first, then others at which both are nearly as much alike.
     """
     rate = gyroscope.si()
-    size = np.linalg.norm(rate - np.median(rate, axis=0), axis=1)
+    size = lengths_of(rate - np.median(rate, axis=0))
     step = max(period, 1 / gyroscope.rate, 5e-3)
     first, last = min(gyroscope.time[0], stamps[0]), max(gyroscope.time[-1], stamps[-1])
     grid = np.arange(first, last, step)
@@ -464,15 +465,14 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
     step = max(attitude.period, 1 / recording.accelerometer.rate) / 2
     best: _Start | None = None
     for shift in np.arange(-4, 4.5) * step:
-        unit, reference, time = _rates(recording, attitude, delay + shift)
-        if len(unit) < 16:
+        common = _in_common(recording, attitude, delay + shift)
+        if common is None:
             continue
-        force, up = _forces(recording, attitude, time, delay + shift)
-        turning, rotating = unit - unit.mean(axis=0), reference - reference.mean(axis=0)
+        turning, rotating, force, up = common
         weight = np.sum(turning**2) / np.sum(force**2)
         matrix = turning_best(turning.T @ rotating + weight * STANDARD.value * (force.T @ up))
         explained = 1 - np.sum((turning - rotating @ matrix.T) ** 2) / np.sum(turning**2)
-        upright = np.mean(np.sum(force * (up @ matrix.T), axis=1)) / np.mean(np.linalg.norm(force, axis=1))
+        upright = np.mean(dot_rows(force, up @ matrix.T)) / np.mean(lengths_of(force))
         if best is None or explained > best.explained:
             best = _Start(attitude, float(delay + shift), matrix, float(explained), float(upright))
     if best is None:
@@ -483,11 +483,17 @@ def _matched(recording: Recording, attitude: Attitude, delay: float) -> _Start:
     return best
 
 
-def _forces(recording: Recording, attitude: Attitude, time: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:
-    """Return the accelerometer's output and upwards in the reference's body, (n, 3) each, at times (n,)."""
+def _in_common(recording: Recording, attitude: Attitude, delay: float) -> tuple[FloatArray, ...] | None:
+    """Return the unit's and the reference's rates about their means, the accelerometer's output and upwards in the
+    reference's body, (n, 3) each, at the stamps in common; None where these are fewer than sixteen.
+    """
+    unit, reference, time = _rates(recording, attitude, delay)
+    if len(unit) < 16:
+        return None
     force = interpolated(recording.accelerometer.time, _smooth(recording), time)
     known = scipy.spatial.transform.Slerp(attitude.time, attitude.rotation())(time + delay)
-    return force, known.inv().apply([0.0, 0.0, 1.0])
+    up = known.inv().apply([0.0, 0.0, 1.0])
+    return unit - unit.mean(axis=0), reference - reference.mean(axis=0), force, up
 
 
 def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Start | None:
@@ -497,11 +503,10 @@ def _rearranged(recording: Recording, attitude: Attitude, delay: float) -> _Star
     reference's.
     """
     gyroscope = recording.signals["gyroscope"]
-    unit, reference, time = _rates(recording, attitude, delay)
-    if len(unit) < 16:
+    common = _in_common(recording, attitude, delay)
+    if common is None:
         return None
-    force, up = _forces(recording, attitude, time, delay)
-    turning, rotating = unit - unit.mean(axis=0), reference - reference.mean(axis=0)
+    turning, rotating, force, up = common
     read = np.linalg.lstsq(rotating, turning, rcond=None)[0].T
     if np.sum((turning - rotating @ read.T) ** 2) > (1 - _CLEAR) * np.sum(turning**2):
         return None

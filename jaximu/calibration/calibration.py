@@ -25,6 +25,7 @@ from jaximu.ground.reexport import later
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.tracing import on_host
 from jaximu.ground.units import SENSOR_UNITS
+from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.effects.base import Effect
 from jaximu.model.sensor import Imu, Triad
 from jaximu.model.stimulus import Stimulus
@@ -161,7 +162,7 @@ class Calibration(Result, Document, page="calibration"):
         """Return the same with some of its numbers alone in the covariance, and what else changes with that."""
         rows = [row for row, name in enumerate(self.names) if kept(name)]
         names = tuple(self.names[row] for row in rows)
-        return replace(self, names=names, covariance=self.covariance[np.ix_(rows, rows)], **changes)
+        return replace(self, names=names, covariance=submatrix(self.covariance, rows), **changes)
 
     def _of_data_sheet(self) -> tuple[Name, ...]:
         """Return the numbers of gains and biases that no recording determined."""
@@ -211,7 +212,7 @@ class Calibration(Result, Document, page="calibration"):
         there = [index for index, name in enumerate(names) if name in self.names]
         rows = [self.names.index(names[index]) for index in there]
         whole = np.zeros((len(names), len(names)))
-        whole[np.ix_(there, there)] = self.covariance[np.ix_(rows, rows)]
+        whole[np.ix_(there, there)] = submatrix(self.covariance, rows)
         return whole
 
     def gravity_shift(self) -> FloatArray:
@@ -227,7 +228,7 @@ class Calibration(Result, Document, page="calibration"):
 
     def _effects(self, owner: str, model: Triad) -> Json:
         """Return the effects of a triad as the JSON document has them."""
-        sigmas = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)).tolist(), strict=True))
+        sigmas = dict(zip(self.names, sigmas_of(self.covariance).tolist(), strict=True))
 
         def entry(position: int, effect: Effect) -> Json:
             sigma = [sigmas.get(Name(owner, "coefficients", (i,), position)) for i in range(effect.size)]
@@ -244,14 +245,11 @@ class Calibration(Result, Document, page="calibration"):
         def triad(name: str, model: Triad) -> Json:
             gain_sigma, bias_sigma = self.sigma(name)
             return {
-                "output_unit": model.output_unit,
-                "gain": np.asarray(model.gain).tolist(),
-                "bias": np.asarray(model.bias).tolist(),
+                **entries(model, "output_unit", "gain", "bias"),
                 "gain_sigma": gain_sigma.tolist(),
                 "bias_sigma": bias_sigma.tolist(),
                 "bias_sigma_recording": np.asarray(self.bias_sigma_recording.get(name, bias_sigma)).tolist(),
-                "temperature_reference": model.temperature_reference,
-                "time_reference": model.time_reference,
+                **entries(model, "temperature_reference", "time_reference"),
                 "effects": self._effects(name, model),
             }
 
@@ -275,18 +273,15 @@ class Calibration(Result, Document, page="calibration"):
                 },
                 "parameters": len(self.names),
                 "weak_directions": [
-                    {
-                        "text": weak.text,
-                        "sigma": weak.sigma,
-                        "determined": weak.determined,
-                        "parameters": [{"name": name, "weight": weight} for name, weight in weak.parameters],
-                    }
+                    entries(weak, "text", "sigma", "determined")
+                    | {"parameters": [{"name": name, "weight": weight} for name, weight in weak.parameters]}
                     for weak in self.weak
                 ],
                 "excess_variance": self.excess,
             },
             "setup": {
-                "gravity": {"value": self.gravity.value, "sigma": self.gravity.sigma, "unit": "m/s^2"}
+                "gravity": entries(self.gravity, "value", "sigma")
+                | {"unit": "m/s^2"}
                 | ({} if self.gravity.latitude is None else {"latitude": self.gravity.latitude}),
                 "effects": {effect.name: effect.document("") for effect in self.imu.setup},
             },
@@ -542,7 +537,7 @@ def _parameters_of(calibration: Calibration) -> ParameterTable:
     def parameter(name: Name, sigma: float) -> Parameter:
         output = "" if name.owner == "setup" else triads[name.owner].output_unit
         if name.effect is not None:
-            effect = effects[name.owner, name.effect]
+            effect = effects[name.key]
             value = effect.coefficients[name.axes] if name.part == "coefficients" else getattr(effect, name.part)
             unit = effect.coefficient_unit(output) if name.part == "coefficients" else effect.inner[name.part].unit
         else:
@@ -550,5 +545,5 @@ def _parameters_of(calibration: Calibration) -> ParameterTable:
             unit = output if name.part == "bias" else "1" if output == si else f"{output} per {unit_text(si)}"
         return Parameter(str(name), describe(name, model), float(value), sigma, unit, name in weak)
 
-    sigmas = np.sqrt(np.diagonal(calibration.covariance)).tolist()
+    sigmas = sigmas_of(calibration.covariance).tolist()
     return ParameterTable([parameter(*entry) for entry in zip(calibration.names, sigmas, strict=True)])

@@ -83,7 +83,7 @@ def _second_step(first: Fit, observations: Observations, method: str, loss: str)
 
 def _two_step_covariance(model: Imu, observations: Observations, excess: Array) -> Array:
     """Return the covariance (N, p, p) of both steps together, in the numbers' units."""
-    like = jax.tree.map(lambda leaf: leaf[0], model)
+    like = first_of(model)
     parameters = Parameters.select(like, without_equipment)
     first = sum(name.owner == "accelerometer" for name in parameters.names)
     count = len(excess)

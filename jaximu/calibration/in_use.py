@@ -152,9 +152,9 @@ class FilterInUse:
             for key, effect in self.imu.all_effects().items()
             if isinstance(effect, (GyroEarthRotation, *MOUNTING_EFFECTS))
         }
-        free = Parameters.select(self.imu, lambda name: name in known.names or (name.owner, name.effect) in beside)
+        free = Parameters.select(self.imu, lambda name: name in known.names or name.key in beside)
         self.names, self._index = free.names, np.asarray(free.index, int)
-        spread = [0.0 if name in known.names else beside[name.owner, name.effect] for name in free.names]
+        spread = [0.0 if name in known.names else beside[name.key] for name in free.names]
         covariance = np.pad(known.covariance_of(free.names), (0, 1)) + np.diag(np.square([*spread, 0.0]))
         for row, name in enumerate(free.names):
             if name.part == "bias":

@@ -27,6 +27,7 @@ from jaximu.ground.differences import midpoints
 from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import conjugate, multiply, rotate, unit_vectors
 from jaximu.ground.tracing import first, lifted
+from jaximu.ground.vectors import dot_rows, lengths_of, submatrix
 from jaximu.mistakes import without_rows
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Turns
@@ -148,7 +149,7 @@ class _Turned:
         """Return the same with some turns, by place, free."""
         free = np.ravel(2 * turns[:, None] + np.arange(2))
         size = np.sqrt(_FREE)
-        return self.beside(size * self.gram[:, free], _FREE * self.gram[np.ix_(free, free)], size * self.pull[free])
+        return self.beside(size * self.gram[:, free], _FREE * submatrix(self.gram, free), size * self.pull[free])
 
     def evidence(self, share: float) -> tuple[float, float]:
         """Return the logarithm of the probability of the turns where a share of the samples was lost, and the excess.
@@ -255,7 +256,7 @@ class _Recorded:
         for signal in self.signals:
             difference = np.diff(self.gyroscope.recover_on_host(signal.values), axis=0)
             bend = np.zeros(len(difference))
-            bend[1:-1] = np.linalg.norm(difference[1:-1] - (difference[2:] + difference[:-2]) / 2, axis=1)
+            bend[1:-1] = lengths_of(difference[1:-1] - (difference[2:] + difference[:-2]) / 2)
             gaps = np.flatnonzero(np.diff(signal.time) > 1.6 / signal.rate)
             bend[np.clip(gaps[:, None] + np.arange(-1, 2), 0, len(bend) - 1)] = 0.0
             bends.append(bend)
@@ -285,14 +286,14 @@ class _Recorded:
         )
         rate = self.gyroscope.recover_on_host(self.output[real][: len(running)])
         middle = midpoints(rate)
-        speed = np.maximum(np.linalg.norm(middle, axis=1), 1e-9)
+        speed = np.maximum(lengths_of(middle), 1e-9)
         axis = middle / speed[:, None]
-        along = np.sum((wanted - carried) * axis, axis=1)
-        left = np.abs(along) / np.maximum(np.linalg.norm(wanted - carried, axis=1), 1e-12)
+        along = dot_rows(wanted - carried, axis)
+        left = np.abs(along) / np.maximum(lengths_of(wanted - carried), 1e-12)
         carried, wanted = (
             gravity - axis * np.sum(gravity * axis, axis=1, keepdims=True) for gravity in (carried, wanted)
         )
-        angle = -np.arctan2(np.sum(axis * np.cross(carried, wanted), axis=1), np.sum(carried * wanted, axis=1))
+        angle = -np.arctan2(dot_rows(axis, np.cross(carried, wanted)), dot_rows(carried, wanted))
         return angle / speed, left
 
 

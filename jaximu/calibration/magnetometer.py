@@ -29,6 +29,7 @@ from jaximu.ground.quantities import listed
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.tracing import on_host
 from jaximu.ground.units import SENSOR_UNITS
+from jaximu.ground.vectors import dot_rows, lengths_of, root_or_zero, submatrix
 from jaximu.mistakes import Prepared, prepare, prepared
 from jaximu.model.effects import Effect
 from jaximu.model.sensor import Imu, Triad
@@ -54,8 +55,6 @@ _DISTURBED = 5.0
 """Standard deviations, by medians, of the strength from which on a stretch is left out."""
 _MOST_DISTURBED = 0.3
 """Share of windows of which more are not left out: then it is the model that is wrong."""
-_CALM = 0.1
-"""Share of gravity by which the specific force may be off where it stands for the vertical."""
 _BESIDE, _BETWEEN = 3.0, 3
 """The same beside a stretch, and how many windows from one such window the next is for all between to be left out."""
 _ROUNDS = 3
@@ -237,6 +236,12 @@ def _calibrated(
         notes.append(_ALIKE_ERRORS)
     fit = informed(fit, _data_sheet(fit, start))
     spreads, headings = _left_out(fit, start, windows, field, full, _samples(logs, parts))
+    dip, dip_sigma = _dip(windows, fit)
+    notes += stretches
+    if headings is not None and headings["after"] > _WORSE * headings["before"]:
+        notes.append(_NO_BETTER.format(**headings))
+    if dip is not None and dip < 0 and southern is None:
+        notes.append(_UPWARD)
     readings = (log.reading if log.recording is None else log.recording.reading for log in logs)
     calibration = concluded(
         fit,
@@ -248,14 +253,9 @@ def _calibrated(
         data=_data(logs, windows),
         nominal=start,
         advice=field_advice,
-        notes=[*notes_of(*logs), *notes, *stretches],
+        notes=[*notes_of(*logs), *notes],
         reading=next(filter(None, readings), None if base is None else base.reading),
     )
-    dip, dip_sigma = _dip(windows, fit)
-    if headings is not None and headings["after"] > _WORSE * headings["before"]:
-        calibration = replace(calibration, notes=(*calibration.notes, _NO_BETTER.format(**headings)))
-    if dip is not None and dip < 0 and southern is None:
-        calibration = replace(calibration, notes=(*calibration.notes, _UPWARD))
     heading = None if dip is None else heading_errors(calibration, start, known, dip)
     measurement = _measured(windows, field)
     magnetic: Json = {
@@ -403,7 +403,7 @@ def field_start(
         centre, radius = shape[1], 1 / np.cbrt(np.linalg.det(shape[0]))
     else:
         centre = carried if carried is not None else output.mean(axis=0)
-        radius = float(np.median(np.linalg.norm(output - centre, axis=1)))
+        radius = float(np.median(lengths_of(output - centre)))
     if unit == "uT":
         if not LOWEST < radius < HIGHEST:
             _refuse_size(radius, strength, where)
@@ -456,21 +456,21 @@ def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> F
     if windows.alone:
         return np.eye(3)
     field = windows.output - centre
-    calm = windows.level & (windows.off < _CALM)
+    calm = windows.calm
     costs = []
     for turn in ARRANGEMENTS:
         body = field @ turn  # turnᵀ applied to every row
-        length = np.linalg.norm(body, axis=1)
+        length = lengths_of(body)
         cost = 0.0
         if windows.turn.any():
             moved = (np.einsum("nij,nj->ni", windows.carried, np.roll(body, -1, axis=0)) - body)[windows.turn]
             cost += float(np.mean(np.sum(moved**2, axis=1))) / float(np.mean(length**2))
         if calm.any():
-            cost += float(np.var(np.sum(windows.up[calm] * body[calm], axis=1) / length[calm]))
+            cost += float(np.var(dot_rows(windows.up[calm], body[calm]) / length[calm]))
         costs.append(cost)
     best = ARRANGEMENTS[0 if min(costs) > 0.8 * costs[0] else int(np.argmin(costs))]
     if southern is not None and windows.level.any():
-        dip = np.median(np.sum(windows.up * (field @ best), axis=1)[windows.level])
+        dip = np.median(dot_rows(windows.up, field @ best)[windows.level])
         best = -best if (dip > 0) != southern else best
     return best
 
@@ -525,7 +525,7 @@ def _scale_of(imu: Imu) -> float:
 
 def _strengths(imu: Imu, output: FloatArray) -> FloatArray:
     """Strength (n,) of the field, µT, that outputs (n, 3) mean."""
-    return np.linalg.norm(_magnetometer(imu).recover_on_host(output), axis=1)
+    return lengths_of(_magnetometer(imu).recover_on_host(output))
 
 
 def _white(imu: Imu, windows: FieldWindows) -> float:
@@ -534,7 +534,7 @@ def _white(imu: Imu, windows: FieldWindows) -> float:
 
 
 def _spread(imu: Imu, windows: FieldWindows, strength: float) -> float:
-    return rms(np.linalg.norm(windows.field(imu)[windows.used], axis=1) - strength)
+    return rms(lengths_of(windows.field(imu)[windows.used]) - strength)
 
 
 def _contradicted(fit: Fit, windows: FieldWindows, field: FieldStrength) -> bool:
@@ -576,13 +576,13 @@ def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> BoolArra
     turns past the field changes for a moment neither.
     """
     field = whole.field(imu)
-    length = np.linalg.norm(field, axis=1)
+    length = lengths_of(field)
     noise = _white(imu, whole)
-    dip = np.sum(whole.up * field, axis=1) / length
+    dip = dot_rows(whole.up, field) / length
     size = np.zeros(len(whole))
     for values, known, least in (
         (length, whole.used, noise),
-        (dip, whole.level & (whole.off < _CALM), noise / np.median(length)),
+        (dip, whole.calm, noise / np.median(length)),
     ):
         usual = known & windows.used
         if usual.any():
@@ -594,7 +594,7 @@ def _disturbed(imu: Imu, windows: FieldWindows, whole: FieldWindows) -> BoolArra
 
 def _refuse_changed(fit: Fit, windows: FieldWindows, field: FieldStrength, where: str) -> None:
     """Refuse a field that was of one strength first and of another then, as two places have it."""
-    strength = np.linalg.norm(windows.field(fit.imu), axis=1)[windows.used]
+    strength = lengths_of(windows.field(fit.imu))[windows.used]
     least = max(len(strength) // 10, 2)
     if not np.isfinite(strength).all() or len(strength) < 4 * least:
         return
@@ -637,7 +637,7 @@ def _require_covered(fit: Fit, windows: FieldWindows, where: str) -> None:
     covariance = relative_covariance(fit)
     iron = [row for row, name in enumerate(fit.names) if name.owner == "magnetometer" and name.part == "bias"]
     iron_open, left = (
-        int(np.sum(np.linalg.eigvalsh(part) > UNDETERMINED**2)) for part in (covariance[np.ix_(iron, iron)], covariance)
+        int(np.sum(np.linalg.eigvalsh(part) > UNDETERMINED**2)) for part in (submatrix(covariance, iron), covariance)
     )
     share = 100 * coverage(fit.imu, windows)
     if iron_open or (windows.alone and left > len(fit.names) // 3) or (not fit.converged and share < 50):
@@ -692,7 +692,7 @@ def _left_out(
             output = (windows.samples.output - windows.added(model))[inside][measured]
         strengths["after"].append(_strengths(model, output))
         if (shape := ellipsoid(others)) is not None:
-            strengths["algebraic"].append(np.linalg.norm((output - shape[1]) @ shape[0], axis=1))
+            strengths["algebraic"].append(lengths_of((output - shape[1]) @ shape[0]))
     spreads: dict[str, float | None] = {"before": 0.0, "after": 0.0, "algebraic": None}
     for name, parts in strengths.items():
         if parts:
@@ -711,7 +711,7 @@ def carried_headings(windows: FieldWindows, imu: Imu, rows: IntArray) -> FloatAr
     joints = np.flatnonzero((windows.swept[rows[:-1]] == 0).all(axis=(1, 2))) + 1  # nothing carries to another log
     field, errors = windows.field(imu), [np.zeros(0)]
     for part in np.split(rows, joints):
-        up, calm = windows.up[part], (windows.used & windows.level & (windows.off < _CALM))[part]
+        up, calm = windows.up[part], (windows.used & windows.calm)[part]
         if not windows.turn.any() or calm.sum() < _FEWEST_HEADINGS:
             continue
         east = unit_vectors(np.cross(field[part], up))
@@ -739,11 +739,11 @@ def coverage(imu: Imu, windows: FieldWindows) -> float:
 
 def _dip(windows: FieldWindows, fit: Fit) -> tuple[float | None, float]:
     """The angle (rad) of the field below the level, and its standard deviation."""
-    calm = windows.level & (windows.off < _CALM)
+    calm = windows.calm
     if not calm.any():
         return None, 0.0
     field = windows.field(fit.imu)
-    sine = -np.sum(windows.up * field, axis=1)[calm] / np.linalg.norm(field, axis=1)[calm]
+    sine = -dot_rows(windows.up, field)[calm] / lengths_of(field)[calm]
     dip = float(np.arcsin(np.clip(np.median(sine), -1, 1)))
     spread = robust_sigma(sine - np.median(sine)) / max(np.cos(dip), 0.05)
     bent = windows.bent(field)[calm].mean(axis=0)
@@ -764,7 +764,7 @@ def heading_errors(calibration: Calibration, start: Imu, strength: float, dip: f
     attitude = scipy.spatial.transform.Rotation.from_euler("ZYX", angles, degrees=True)
     known = calibration.of_numbers(_of_iron)
     body, slope = _heading_slopes(known.names, triad, attitude, strength, dip)
-    sigma = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", slope, known.covariance, slope), 0.0))
+    sigma = root_or_zero(np.einsum("ni,ij,nj->n", slope, known.covariance, slope))
     level = attitude.apply(np.linalg.solve(before.gain, (body @ triad.gain.T + triad.bias).T).T)
     off = np.abs(np.arctan2(level[:, 0], level[:, 1]))
     scatter = np.sqrt(calibration.excess.get(EXCESS_NAMES[0], 0.0)) * 0.1 / (strength * np.cos(dip))
@@ -820,7 +820,7 @@ def next_directions(calibration: Calibration, measurement: MagneticField, dip: f
     before, chosen = accuracy(), []
     for _ in range(count):
         moved = reaction @ spread
-        gains = np.sum((moved @ heading.T) ** 2, axis=1) / (1 + np.sum(moved * reaction, axis=1))
+        gains = np.sum((moved @ heading.T) ** 2, axis=1) / (1 + dot_rows(moved, reaction))
         best = int(np.argmax(gains))
         chosen.append(grid[best].tolist())
         spread = spread - np.outer(moved[best], moved[best]) / (1 + moved[best] @ reaction[best])

@@ -21,6 +21,7 @@ from jaximu.data.poses import EXCESS_NAMES, condensed, residual_rms, with_gyrosc
 from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import Prior, fit, linearise
 from jaximu.estimation.problem import Loss
+from jaximu.estimation.rows import Sizes
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
@@ -180,7 +181,7 @@ def require_gravity(data: Data, gravity: LocalGravity) -> None:
         )
 
 
-def errors_of(kinds: Sequence[Data], imu: Imu) -> dict[str, tuple[float, str]]:
+def errors_of(kinds: Sequence[Data], imu: Imu) -> Sizes:
     """Return the rms of each kind of residual of all data, with its unit."""
     sizes: list[tuple[str, tuple[float, str]]] = []
     for kind in kinds:

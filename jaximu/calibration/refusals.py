@@ -92,7 +92,7 @@ def refuse_undetermined(fitted: Fit, prior: Prior | None = None, wholly: bool = 
     known = set() if prior is None else set(prior.names)
     jacobian = np.asarray(fitted.jacobian)
     for (owner, position), effect in fitted.imu.all_effects().items():
-        members = np.array([(name.owner, name.effect) == (owner, position) for name in fitted.names])
+        members = np.array([name.key == (owner, position) for name in fitted.names])
         if not members.any() or any(name in known for name, mine in zip(fitted.names, members, strict=True) if mine):
             continue
         columns, others = jacobian[:, members], jacobian[:, ~members]

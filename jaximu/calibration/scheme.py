@@ -14,6 +14,7 @@ import numpy as np
 from jaximu.estimation.problem import Name
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
+from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.recordings.observations import Stations
 
 _OPEN = 1e-6  # singular value, as a share of the largest, below which nothing is determined
@@ -41,7 +42,7 @@ def describe_scheme(stations: Stations) -> tuple[Scheme, ...]:
     weight = np.asarray(stations.weight)[..., None]
     stimulus = stations.stimulus
     return tuple(
-        _scheme(triad, np.sum(weight * np.asarray(quantity), axis=1)[np.asarray(used)])
+        _scheme(triad, dot_rows(weight, np.asarray(quantity))[np.asarray(used)])
         for triad, quantity, used in (
             ("accelerometer", stimulus.specific_force, stations.accelerometer_used),
             ("gyroscope", stimulus.angular_rate, stations.gyroscope_used),
@@ -56,7 +57,7 @@ def _spectrum(design: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _scheme(triad: str, inputs: FloatArray) -> Scheme:
-    size = np.linalg.norm(inputs, axis=1).max(initial=0.0)
+    size = lengths_of(inputs).max(initial=0.0)
     design = np.column_stack([inputs / (size or 1.0), np.ones(len(inputs))]).reshape(-1, 4)
     values, right = _spectrum(design)
     rank = int(np.sum(values > _OPEN * values[0]))

@@ -354,7 +354,7 @@ def state_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, m
     share: dict[str, float] = {}
     for name, weight in zip(names, vector, strict=True):
         if name.effect is not None:
-            effect = model.all_effects()[name.owner, name.effect]
+            effect = model.all_effects()[name.key]
             share[effect.excited_by] = share.get(effect.excited_by, 0.0) + float(weight) ** 2
     if sum(share.values()) < 0.5:
         return pose_advice(vector, names, sizes, model)
@@ -437,4 +437,4 @@ def _history(measurement: IntervalsOfMotion, followed: FilterPass, free: Paramet
 def places_of(kind: type[Effect], imu: Imu, names: Sequence[Name]) -> tuple[int, ...]:
     """Return where the numbers of a unit's effect are among some names."""
     keys = {key for key, effect in imu.all_effects().items() if isinstance(effect, kind)}
-    return tuple(row for row, name in enumerate(names) if (name.owner, name.effect) in keys)
+    return tuple(row for row, name in enumerate(names) if name.key in keys)

@@ -34,7 +34,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.solver import Failure
 from jaximu.estimation.track import TEMPERATURE_WINDOW, Track
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.document import Document, Json
+from jaximu.ground.document import Document, Json, entries
 from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD
 from jaximu.ground.page import Result
@@ -42,6 +42,7 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import size
 from jaximu.ground.tracing import on_host
 from jaximu.ground.units import PREFIXES, SENSOR_UNITS
+from jaximu.ground.vectors import root_or_zero, submatrix
 from jaximu.model.effects import Effect
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
@@ -133,8 +134,7 @@ class ThermalCalibration(Result, Document, page="thermal"):
             "rate_window": TEMPERATURE_WINDOW,
             "rate_bandwidth": RATE_BANDWIDTH,
             "legs": [
-                {"begin": leg.begin, "end": leg.end, "rate": leg.rate, "blocks": len(leg.blocks)}
-                for leg in self.identifiability.legs
+                entries(leg, "begin", "end", "rate") | {"blocks": len(leg.blocks)} for leg in self.identifiability.legs
             ],
             "told": list(self.identifiability.told),
             "separable": {
@@ -398,11 +398,8 @@ def _kept_numbers(base: Calibration, fits: Mapping[str, TriadFit]) -> tuple[list
     def fixed(name: Name) -> bool:
         return name.owner not in fits or name.effect is None
 
-    rest = base.of_numbers(lambda name: fixed(name) or (name.owner, name.effect) in places)
-    names = [
-        name if fixed(name) else Name(name.owner, name.part, name.axes, places[name.owner, name.effect])
-        for name in rest.names
-    ]
+    rest = base.of_numbers(lambda name: fixed(name) or name.key in places)
+    names = [name if fixed(name) else Name(name.owner, name.part, name.axes, places[name.key]) for name in rest.names]
     return names, rest.covariance
 
 
@@ -416,7 +413,7 @@ def _numbers(fit: TriadFit, with_bias: bool, signal: Signal, levels: int) -> tup
     coefficients = [name for name in effect_numbers(fit.fit.imu)[0] if name in fitted or name.part == "coefficients"]
     names = list(dict.fromkeys((*coefficients, *fitted)))
     rows = [fitted.get(name, -1) for name in names]
-    covariance = np.pad(fit.fit.covariance, (0, 1))[np.ix_(rows, rows)]
+    covariance = submatrix(np.pad(fit.fit.covariance, (0, 1)), rows)
     if with_bias and levels > 1:
         covariance[-3:, -3:] += np.diag(np.var(fit.level, axis=1, ddof=1) * signal.nominal_scale**2 / levels)
     return names, covariance
@@ -453,7 +450,7 @@ def change(
     numbers = [Name(owner, name.part, name.axes, rows[name.effect]) for name in alone if name.effect is not None]
     slopes = slopes - origin_slopes
     variance = np.einsum("mak,kl,mal->ma", slopes, calibration.covariance_of(numbers), slopes)
-    return values - origin, np.sqrt(np.maximum(variance, 0.0))
+    return values - origin, root_or_zero(variance)
 
 
 def steady(

@@ -74,7 +74,7 @@ def fit_turntable(start: Imu, stations: Stations, free: Sequence[str] = (), loss
 def free_on_table(imu: Imu, free: Sequence[str] = ()) -> Callable[[Name], bool]:
     """Return which numbers of a unit are free: gains, biases, and those of the effects named in `free`."""
     effects = imu.all_effects()
-    return lambda name: name.effect is None or effects[name.owner, name.effect].name in free
+    return lambda name: name.effect is None or effects[name.key].name in free
 
 
 def calibrate_turntable(

@@ -28,6 +28,7 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.quantities import Z95
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.tracing import on_host
+from jaximu.ground.vectors import lengths_of, sigmas_of
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.recordings.recording import Signal
@@ -237,8 +238,8 @@ def _followed(
         estimated, covariance = estimate(known)
         whole = np.hstack([states, np.eye(3)])
         estimates.append(whole @ estimated)
-        sigmas.append(np.sqrt(np.diag(whole @ covariance @ whole.T)))
-        drifts.append([states @ estimated[:size], np.sqrt(np.diag(states @ covariance[:size, :size] @ states.T))])
+        sigmas.append(sigmas_of(whole @ covariance @ whole.T))
+        drifts.append([states @ estimated[:size], sigmas_of(states @ covariance[:size, :size] @ states.T)])
         innovations.append(innovation)
     of_rate = np.pad(np.swapaxes(np.array(drifts), 0, 1) / scale, ((0, 0), (0, 0), (0, 3)))
     resting, freedom = np.ones(count, bool), np.where(np.arange(count) > 0, 3.0, 0.0)
@@ -295,8 +296,8 @@ def _mounted(
     slopes = (np.array(moved[:3]) - moved[3:]).T / (2 * _STEP)
     quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a turn about one direction moves up along the other
     whole = scipy.linalg.block_diag(quarter @ covariance @ quarter.T, np.nan_to_num(sigma) ** 2)
-    sigmas = np.sqrt(np.diag(slopes @ whole @ slopes.T))
-    norm = np.linalg.norm(force, axis=1)
+    sigmas = sigmas_of(slopes @ whole @ slopes.T)
+    norm = lengths_of(force)
     scatter = _of_mean(norm[:, None])
     return {
         "stops": [

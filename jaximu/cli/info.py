@@ -354,9 +354,9 @@ def _tilt(signal: Signal, intervals: FloatArray) -> float:
     import numpy as np
 
     from jaximu.ground.rotation import unit_vectors
+    from jaximu.recordings.segmentation import Moments
 
-    values = signal.si()
-    up = unit_vectors(np.stack([values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in intervals]))
+    up = unit_vectors(Moments(signal).between(*intervals.T)[0])
     middle = up.mean(axis=0)
     return float(np.degrees(np.arccos(np.clip(up @ middle / max(np.linalg.norm(middle), 1e-9), -1.0, 1.0))).max())
 
@@ -367,24 +367,19 @@ def _still_seconds(recording: Recording) -> tuple[float, BoolArray, FloatArray]:
     """
     import numpy as np
 
+    from jaximu.recordings.segmentation import Moments
+
     limits = {"accelerometer": _STILL_FORCE, "gyroscope": _STILL_RATE}
     sensors = [(signal, limits[name]) for name, signal in recording.signals.items() if name in limits]
     start, rates = max(signal.time[0] for signal, _ in sensors), np.zeros((0, 3))
-    seconds = int(min(signal.time[-1] for signal, _ in sensors) - start)
-    still = np.ones(max(seconds, 0), bool)
+    begins = start + np.arange(max(int(min(signal.time[-1] for signal, _ in sensors) - start), 0))
+    still = np.ones(len(begins), bool)
     for signal, limit in sensors:
-        edges = np.searchsorted(signal.time, start + np.arange(seconds + 1))
-        middle = np.median(signal.si(), axis=0)
-        values = signal.si() - middle
-        sums, squares = (np.cumulative_sum(values**power, axis=0, include_initial=True) for power in (1, 2))
-        count = np.diff(edges)
-        safe = np.maximum(count, 1)[:, None]
-        mean = np.diff(sums[edges], axis=0) / safe
-        scatter = np.sqrt(np.maximum(np.sum(np.diff(squares[edges], axis=0) / safe - mean**2, axis=1), 0.0))
-        still &= (scatter < limit) & (count > 1)
-        if signal is recording.accelerometer and seconds > 1:
+        mean, variance, count = Moments(signal).between(begins, begins + 1)
+        still &= (np.sqrt(variance.sum(axis=1)) < limit) & (count > 1)
+        if signal is recording.accelerometer:
             still[1:] &= np.linalg.norm(np.diff(mean, axis=0), axis=1) < _MIDDLE
         if len(sensors) == 1 and signal is recording.gyroscope:  # a table's steady turn scatters as little
-            still &= np.linalg.norm(mean + middle, axis=1) < _BIAS
-        rates = mean + middle if signal is recording.gyroscope else rates
+            still &= np.linalg.norm(mean, axis=1) < _BIAS
+        rates = mean if signal is recording.gyroscope else rates
     return float(start), still, rates

@@ -24,12 +24,13 @@ from jaximu.data.preintegration import increments, linear_slope, preintegrate_sa
 from jaximu.estimation.covariance import Covariance
 from jaximu.estimation.data import About, Conditions, Observed, OfOneUnit, free_columns
 from jaximu.estimation.problem import Parameters
-from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
+from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, Sizes, by_axis
 from jaximu.estimation.track import TRIADS, Track, added, stimuli
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.differences import interpolated, midpoints, value_and_jacobian
 from jaximu.ground.rotation import (
+    UP,
     Number,
     conjugate,
     exponential,
@@ -101,7 +102,7 @@ class AttitudeConditions(Conditions):
         error = logarithm(multiply(conjugate(self.target), multiply(self.rotation, exponential(moved))))
         force = jnp.einsum("wijk,jk->wi", self.force, imu.accelerometer.inverse()) - self.gain
         force = force + jnp.einsum("wijk,jk->wi", self.swung, change)
-        force = force - self.magnitude * jnp.array([0.0, 0.0, 1.0])
+        force = force - self.magnitude * UP
         error, force = error * self.turn[:, None], force * self.window[:, None]
         return jnp.concatenate([error.reshape(-1), force.reshape(-1)])
 
@@ -539,7 +540,7 @@ class AgainstAttitude(OfOneUnit):
         """Return the recording with a window of the force left out, and the rotations in it."""
         return replace(self, left_out=(*self.left_out, observation))
 
-    def rms(self, imu: Imu, details: AttitudeDetails, conditions: FloatArray) -> dict[str, tuple[float, str]]:
+    def rms(self, imu: Imu, details: AttitudeDetails, conditions: FloatArray) -> Sizes:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
         sizes = super().rms(imu, details, conditions)
         return sizes | {"rotation": (float(np.degrees(sizes["rotation"][0])), "deg/s")}

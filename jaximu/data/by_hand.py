@@ -24,7 +24,7 @@ from jaximu.data.poses import (
 from jaximu.data.tracks_by_hand import rest_shifts, samples_by_hand
 from jaximu.data.twin_by_hand import twin_recordings
 from jaximu.estimation.data import About, Handling, Observed, OfOneUnit, OutputMeans
-from jaximu.estimation.rows import Rows
+from jaximu.estimation.rows import Rows, Sizes
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import pose_advice
 from jaximu.ground.array_types import Array, FloatArray
@@ -37,6 +37,9 @@ from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording
 from jaximu.recordings.segmentation import Segmentation, observed_poses
+
+Swings = Mapping[str, tuple[FloatArray, FloatArray]]
+"""By triad, as in `RecordedByHand`."""
 
 
 @dataclass
@@ -51,7 +54,7 @@ class RecordedByHand(OfOneUnit):
     segmentations: tuple[Segmentation, ...]
     observations: Observations
     known: Imu | None = None
-    swings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    swings: Swings = field(default_factory=dict)
 
     excess_names = EXCESS_NAMES
     coarse = COARSE_EXCESS
@@ -130,11 +133,11 @@ class RecordedByHand(OfOneUnit):
         left = data.along(self.known, tuple(self.known.all_effects().values())).observations
         return replace(data, observations=left)
 
-    def without_swings(self, swings: Mapping[str, tuple[FloatArray, FloatArray]]) -> RecordedByHand:
+    def without_swings(self, swings: Swings) -> RecordedByHand:
         """Return the recordings with what lines add to the means at rest, see `swings`, taken off."""
         return replace(self, swings=swings, observations=_steadied(self.observations, swings))
 
-    def rms(self, imu: Imu, details: Along, conditions: FloatArray) -> dict[str, tuple[float, str]]:
+    def rms(self, imu: Imu, details: Along, conditions: FloatArray) -> Sizes:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
         return residual_rms(imu, details.observations)
 
@@ -211,7 +214,7 @@ class RecordedByHand(OfOneUnit):
         return RecordedByHand(parts, observed_poses(parts, float(self.observations.gravity), noise=noise))
 
 
-def _steadied(observations: Observations, swings: Mapping[str, tuple[FloatArray, FloatArray]]) -> Observations:
+def _steadied(observations: Observations, swings: Swings) -> Observations:
     """Return observations without what lines add to means at rest, and with the variance that this leaves."""
     poses, slow = observations.poses, observations.slow
     for triad, (shift, variance) in swings.items():

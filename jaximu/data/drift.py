@@ -21,6 +21,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.quantities import size
+from jaximu.ground.vectors import submatrix
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import RATIO, correlation_times
 from jaximu.recordings.observations import Observations
@@ -123,14 +124,14 @@ def with_drift(
     residual, jacobian = unwhitened(fitted, covariance)
     whole, excess = covariance.dense(), np.asarray(fitted.excess)
     used = whole.used > 0
-    weighted = whole.total(excess)[np.ix_(used, used)]
+    weighted = submatrix(whole.total(excess), used)
     total, sizes = np.asarray(fitted.covariance, np.float64), np.asarray(fitted.sizes)
     by_conditions = np.zeros((len(total), len(used)))
     by_conditions[:, used] = -total / sizes @ np.linalg.solve(weighted, jacobian[used]).T
     sentences: tuple[str, ...] = ()
     if noise is None:
-        present = [whole.component(k)[np.ix_(used, used)] for k in range(len(excess)) if np.any(whole.group[used] == k)]
-        bare = whole.measured[np.ix_(used, used)]
+        present = [submatrix(whole.component(k), used) for k in range(len(excess)) if np.any(whole.group[used] == k)]
+        bare = submatrix(whole.measured, used)
         estimated = estimated_drift(residual[used], jacobian[used], bare, present, means, used)
         total = total + by_conditions[:, used] @ (estimated.covariance - weighted) @ by_conditions[:, used].T
         noise, sentences = estimated.noise, estimated.notes

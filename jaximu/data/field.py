@@ -31,6 +31,7 @@ from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
 from jaximu.ground.distributions import rms, robust_sigma
 from jaximu.ground.rotation import Number, exponential, inverse_matrix, rotate, unit_vectors
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.recordings.recording import Recording, Signal
@@ -51,6 +52,8 @@ _MOST, _MOST_ALONE = 160, 480
 _MEAN, _MEAN_ALONE = 0.5, 0.06
 """Seconds at the most over which a window is averaged, with a gyroscope and without."""
 _SMOOTHED = 0.2  # s
+_CALM = 0.1
+"""Share of gravity by which the specific force may be off where it stands for the vertical."""
 _STEADY = 0.02
 """rad of the field's path that a second at rest counts for, when windows are placed along it."""
 
@@ -205,6 +208,11 @@ class FieldWindows:
         slope[..., :3] -= np.asarray(self.samples.mean_added(imu))
         return replace(self, slope=slope)
 
+    @property
+    def calm(self) -> BoolArray:
+        """Which windows (n,) have a specific force that stands for the vertical."""
+        return self.level & (self.off < _CALM)
+
     def bent(self, field: FloatArray) -> FloatArray:
         """Return how the sine (n,) of the angle from up to a field (n, 3) reacts to what `vertical` is of, (n, 12)."""
         along = unit_vectors(field)
@@ -267,7 +275,7 @@ def windows_of(
     if motion is not None:
         force = motion.accelerometer
         mean = np.einsum("ns,nsij,nsj->ni", weight, turned, force.at(time[index]))
-        length = np.linalg.norm(mean, axis=1)
+        length = lengths_of(mean)
         up, off = mean / length[:, None], np.abs(length / STANDARD_GRAVITY - 1)
     known = {} if motion is None else motion.signals
     known = {name: part.at(time[index]) for name, part in known.items()}
@@ -325,7 +333,7 @@ def _edges(time: FloatArray, values: FloatArray, rate: float, most: int) -> IntA
     smooth = np.asarray(scipy.ndimage.uniform_filter1d(values, max(1, round(_SMOOTHED * rate)), axis=0))
     centred = smooth - (smooth.max(axis=0) + smooth.min(axis=0)) / 2
     every = max(1, round(_SMOOTHED * rate))
-    path = np.linalg.norm(np.diff(centred[::every], axis=0), axis=1) / np.median(np.linalg.norm(centred, axis=1))
+    path = lengths_of(np.diff(centred[::every], axis=0)) / np.median(lengths_of(centred))
     path = np.cumulative_sum(path + _STEADY * np.diff(time[::every]), include_initial=True)
     count = min(most, max(8, len(time) // every))
     edges = np.interp(np.linspace(0, path[-1], count + 1), path, np.arange(len(path)) * every)
@@ -435,14 +443,14 @@ class MagneticField(OfOneUnit):
     def _covariance(self, imu: Imu, field: FloatArray, basis: FloatArray) -> Covariance:
         """White noise that is known, and components: errors of a window, of a turn, of the measured up."""
         windows, n = self.windows, len(self.windows)
-        length = np.linalg.norm(field, axis=1)
+        length = lengths_of(field)
         along = field / length[:, None]
         window = np.arange(n)
         # what a window's field reaches: its norm, the turns after and before it, its angle to the vertical
         turns, before = n + 2 * window[:, None] + np.arange(2), (window - 1) % n
         places = np.concatenate([window[:, None], turns, turns[before], 3 * n + window[:, None]], axis=1)
         carried = (basis @ windows.carried)[before]
-        level = (windows.up - np.sum(windows.up * along, axis=1)[:, None] * along) / length[:, None]
+        level = (windows.up - dot_rows(windows.up, along)[:, None] * along) / length[:, None]
         values = np.concatenate([along[:, None], -basis, carried, level[:, None]], axis=1)
         used = np.concatenate([windows.used, np.repeat(windows.turn, 2), windows.level]).astype(float)
         rows, kinds = (n, slice(1)) if windows.alone else (4 * n, slice(None))
@@ -460,7 +468,7 @@ class MagneticField(OfOneUnit):
         if not windows.alone:
             bent = windows.bent(field) * windows.level[:, None]
             # what the hand and the accelerometer's errors do to its length, they do across it, where nothing shows it
-            shaken_up = robust_sigma(windows.off) * np.linalg.norm(bent[:, 9:], axis=1)
+            shaken_up = robust_sigma(windows.off) * lengths_of(bent[:, 9:])
             measured[3 * n :, 3 * n :] += bent @ windows.vertical @ bent.T + np.diag(shaken_up**2)
         return Covariance(measured, tuple(factors), used, group)  # pyright: ignore
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaximu.estimation.data import Handling
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.finding import Finding
@@ -45,7 +46,7 @@ def handling(
     count = len(poses.mask)
     tilting, spread = np.zeros(count), np.full(count, np.inf)
     tilts, sigma = _tilts(segmentations, imu, noise.accelerometer)
-    tilting[: len(tilts)], spread[: len(tilts)] = np.linalg.norm(tilts, axis=1), sigma
+    tilting[: len(tilts)], spread[: len(tilts)] = lengths_of(tilts), sigma
     excess = np.maximum(tilting**2 - 2 * np.where(np.isfinite(spread), spread, 0.0) ** 2, 0.0)
     off = excess / 2 * ((poses.stop - poses.start) / 2) ** 2
     gyroscope = imu.triads()["gyroscope"]
@@ -80,8 +81,8 @@ def sway(segmentations: Sequence[Segmentation], imu: Imu, noise: NoiseModel) -> 
             turned.append(weight @ rate[inside] / max(float(weight.sum()), 1e-12))
     tilts, sigma = _tilts(segmentations, imu, noise.accelerometer)
     rates = np.array(turned) - np.median(turned, axis=0)
-    both = np.sum(tilts * rates, axis=1)
-    along = both / np.maximum(np.linalg.norm(rates, axis=1), 1e-300) / sigma
+    both = dot_rows(tilts, rates)
+    along = both / np.maximum(lengths_of(rates), 1e-300) / sigma
     along = np.clip(along, -_BOUND, _BOUND)  # one pose that was bumped is not all
     if np.sum(along) < _SURE * np.sqrt(len(along)):
         return []
@@ -192,4 +193,4 @@ def missed_by_sampling(turns: Turns, gyroscope: Triad, running: FloatArray) -> F
     axis = running[..., 1:]
     across = 2 * np.cross(axis, rates)
     turned = rates + running[..., :1] * across + np.cross(axis, across)
-    return np.sum(turned * (interval * sign)[..., None], axis=1)
+    return dot_rows(turned, (interval * sign)[..., None])

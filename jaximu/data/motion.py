@@ -48,6 +48,8 @@ from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import midpoints, value_and_jacobian
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.rotation import (
+    IDENTITY,
+    UP,
     Number,
     Numbers,
     Quaternion,
@@ -59,7 +61,7 @@ from jaximu.ground.rotation import (
     rotate,
     unit_vectors,
 )
-from jaximu.ground.tracing import array_module
+from jaximu.ground.tracing import array_module, part_of
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import NoiseModel
@@ -185,7 +187,7 @@ def _carried(attitude, velocity, rotation, gained, duration, earth, gravity):
     """Return attitude and velocity after an interval of motion."""
     pushed = rotate(attitude, gained)
     pushed = pushed - jnp.cross(earth, pushed) * duration / 2
-    fallen = 2 * jnp.cross(earth, velocity) + jnp.array([0.0, 0.0, 1.0]) * gravity
+    fallen = 2 * jnp.cross(earth, velocity) + UP * gravity
     return (
         multiply(exponential(-earth * duration), multiply(attitude, rotation)),
         velocity + pushed - fallen * duration,
@@ -403,7 +405,7 @@ def _measured(
 
     def still(change):  # attitude, earth, gravity
         back = conjugate(multiply(after.attitude, exponential(change[:3])))
-        up = rotate(back, jnp.array([0.0, 0.0, 1.0]))
+        up = rotate(back, UP)
         return means.mean - jnp.concatenate([rotate(back, means.earth + change[3:6]), up * (gravity + change[6])])
 
     value, slopes = value_and_jacobian(still, jnp.zeros(7))
@@ -492,10 +494,10 @@ def first_field(intervals: MotionIntervals, imu: Imu) -> FloatArray:
     """Return the magnetic field (3,) in the level frame, µT, as the first rest in which it is measured has it."""
     (sighting,) = (sighting for sighting in intervals.sightings if isinstance(sighting, FieldSeen))
     at = int(np.argmax(sighting.measured > 0))
-    part = jax.tree.map(lambda leaf: np.asarray(leaf)[at], intervals)
+    part = part_of(intervals, at)
     before = part.time.shape[-1] - part.length.shape[-1]
     mean = part.length @ part.accelerometer[before:] / part.length.sum()
-    attitude = level(jnp.array([1.0, 0.0, 0.0, 0.0]), imu.with_effects().accelerometer.recover(mean))
+    attitude = level(IDENTITY, imu.with_effects().accelerometer.recover(mean))
     for other in part.sightings:
         if other.absolute and other.measured > 0:
             attitude = other.placed(attitude, Mounting.of(imu))
@@ -845,7 +847,7 @@ class IntervalsOfMotion(OfOneUnit):
 
     def _part(self, rows: IntArray) -> MotionIntervals:
         """Return some of the intervals, without the samples that none of them has."""
-        part = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], self.intervals)
+        part = part_of(self.intervals, rows)
         before = part.time.shape[1] - part.length.shape[1]
         inside = min(_bucket(int((part.length > 0).sum(axis=1).max()) + before), part.length.shape[1])
         samples = {name: getattr(part, name)[:, : before + inside] for name in ("accelerometer", "gyroscope", "time")}
@@ -911,10 +913,10 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
     def reckoned(start, sighted):
         return jax.lax.scan(partial(step, sighted), start, (means, intervals))[1]
 
-    start = level(jnp.array([1.0, 0.0, 0.0, 0.0]), means.mean[0, 3:])
+    start = level(IDENTITY, means.mean[0, 3:])
     for sightings in intervals.sightings:  # the heading at the first sighting is the heading of all
         k = jnp.argmax(sightings.measured > 0)
-        sighting, numbers = jax.tree.map(lambda leaf, k=k: leaf[k], (sightings, means.mounting))
+        sighting, numbers = part_of((sightings, means.mounting), k)
         now = reckoned(start, False)[k]
         placed = sighting.placed(now, Mounting.from_numbers(numbers))
         heading = multiply(placed, conjugate(now)) * jnp.array([1.0, 0.0, 0.0, 1.0])
@@ -926,7 +928,7 @@ def _dead_reckoned(means: _Means, intervals: MotionIntervals, gravity: Array) ->
 def _along(
     means: _Means, intervals: MotionIntervals, errors: Disturbances, gravity: Array, path: MotionPath, anchor: Array
 ) -> WhiteRows:
-    before, after = (jax.tree.map(lambda leaf, part=part: leaf[part], path) for part in (slice(-1), slice(1, None)))
+    before, after = (part_of(path, ends) for ends in (slice(-1), slice(1, None)))
 
     def rows(part):
         means, interval, before, after, anchor = part

@@ -31,13 +31,13 @@ from jaximu.data.gravity_direction import gravity_direction_error
 from jaximu.data.gravity_norm import gravity_norm_error
 from jaximu.data.poses_covariance import Sensitivities, condition_covariance, sensitivities, turned_by
 from jaximu.data.preintegration import Turned, linear_slope
-from jaximu.data.tracks_by_hand import SamplesByHand, during_turns, pose_means, samples_by_hand, tracks_by_hand
+from jaximu.data.tracks_by_hand import SamplesByHand, during_turns, samples_by_hand, tracks_by_hand
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.data import About, Conditions, Data
 from jaximu.estimation.fitting import effect_numbers
 from jaximu.estimation.problem import Name
-from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
-from jaximu.estimation.track import Track, added, mean_outputs
+from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, Sizes, by_axis
+from jaximu.estimation.track import Track, added, mean_outputs, means_by
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.distributions import rms
@@ -54,7 +54,8 @@ from jaximu.ground.rotation import (
     rotate,
     unit_vectors,
 )
-from jaximu.ground.tracing import array_module, first, lifted, on_host, one_by_one, repeated, stacked
+from jaximu.ground.tracing import array_module, first, lifted, on_host, one_by_one, part_of, repeated, stacked
+from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
 from jaximu.model.noise_model import NoiseModel
@@ -235,7 +236,7 @@ class PosesAndTurns(Observations, Data):
 
     def take(self, lanes: IntArray) -> Self:
         """Return the data of some of the units."""
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self._by_unit())
+        return part_of(self._by_unit(), lanes)
 
     def widened(self, poses: int, samples: int, lengths: Sequence[Mapping[str, int]] = ()) -> Self:
         """Return the data of a unit with padding up to so many poses, and samples in a turn, and of each recording."""
@@ -302,7 +303,7 @@ class PosesAndTurns(Observations, Data):
         """
         means, turned, parts = [], self.turns.output, []
         for part, change in zip(self.samples, changes, strict=True):
-            means.append([pose_means(change[name], pose, len(self.poses.mask))[0] for name, pose in part.pose.items()])
+            means.append([means_by(pose, change[name], len(self.poses.mask))[0] for name, pose in part.pose.items()])
             turned = turned + during_turns(change["gyroscope"], part.sample)
             parts.append(replace(part, outputs={name: part.outputs[name] + change[name] for name in part.outputs}))
         force, rate = (sum(of_part) for of_part in zip(*means, strict=True))
@@ -429,7 +430,7 @@ def pose_rows(imu: Imu, observations: Observations) -> Rows:
     forces = imu.accelerometer.recover_on_host(poses.accelerometer_mean)
     covariates |= by_axis("specific force", "m/s²", placed(forces, np.full((len(turn), 3), np.nan)))
     covariates |= {
-        "angle [°]": placed(unknown[0], np.sum(speed * turns.interval, axis=1)),
+        "angle [°]": placed(unknown[0], dot_rows(speed, turns.interval)),
         "rate [°/s]": placed(unknown[0], speed.max(axis=1)),
         "duration [s]": placed(unknown[0], turns.interval.sum(axis=1)),
     }
@@ -471,14 +472,14 @@ def residual_rms(
     observations: Observations,
     gyroscope: bool = True,
     known: tuple[FloatArray, FloatArray] | None = None,
-) -> dict[str, tuple[float, str]]:
+) -> Sizes:
     """Return the rms of each kind of residual in units a person knows: m/s², degrees, rad/s (all unweighted).
 
     `known`: forces and angles of the unit, where at hand.
     """
     poses, turns = np.asarray(observations.poses.mask), np.asarray(observations.turns.mask)
     force, angle = forces_and_angles(imu, observations) if known is None else known
-    norm = np.linalg.norm(force[poses], axis=1) - float(observations.gravity)
+    norm = lengths_of(force[poses]) - float(observations.gravity)
     sizes = {"gravity_norm": (rms(norm), "m/s^2")}
     if imu.gyroscope is None or not gyroscope:
         return sizes
@@ -486,7 +487,7 @@ def residual_rms(
         sizes["gravity_direction"] = (rms(np.degrees(angle)[turns]), "deg")
     rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
     scale = imu.gyroscope.scales
-    sizes["static_gyroscope"] = (rms(np.linalg.norm(rest / scale, axis=1)), "rad/s")
+    sizes["static_gyroscope"] = (rms(lengths_of(rest / scale)), "rad/s")
     return sizes
 
 

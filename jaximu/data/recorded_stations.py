@@ -17,7 +17,7 @@ from jaximu.data.stations import KnownStations, StationConditions, station_covar
 from jaximu.data.twin_signal import twin_signal
 from jaximu.estimation.data import About, Observed, OfOneUnit, OutputMeans
 from jaximu.estimation.problem import Name
-from jaximu.estimation.rows import Rows
+from jaximu.estimation.rows import Rows, Sizes
 from jaximu.estimation.track import TRIADS, Track, added, mean_outputs, stimuli
 from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import interpolated, midpoints
@@ -164,7 +164,7 @@ class RecordedStations(OfOneUnit):
         used = {name: getattr(stations, name) & kept for name in ("accelerometer_used", "gyroscope_used")}
         return replace(self, stations=replace(stations, **used))
 
-    def rms(self, imu: Imu, details: AtStations, conditions: FloatArray) -> dict[str, tuple[float, str]]:
+    def rms(self, imu: Imu, details: AtStations, conditions: FloatArray) -> Sizes:
         """Return the rms of each kind of residual, with its unit, as a calibration has it."""
         return station_rms(imu, details.stations)
 

@@ -290,7 +290,7 @@ def rest_blocks(recordings: Recording | Sequence[Recording], block: float | None
 def _of_ready(logs: Sequence[Recording], block: float | None) -> RestBlocks:
     """The blocks of recordings that were looked over."""
     used = [without_startup(recording) for recording in logs]
-    span = sum(float(part.accelerometer.time[-1] - part.accelerometer.time[0]) for part in used)
+    span = sum(float(np.ptp(part.accelerometer.time)) for part in used)
     rate = min(part.accelerometer.rate for part in used)
     if block is None:
         block = max(span / _MOST_BLOCKS, 8 / rate, 1.0)

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
-from jaximu.ground.rotation import Number, Numbers, conjugate, exponential, logarithm, multiply, rotate
+from jaximu.ground.rotation import UP, Number, Numbers, conjugate, exponential, logarithm, multiply, rotate
 from jaximu.model.mounting import Mounting
 
 SIZE = 9
@@ -49,7 +49,7 @@ class Standing(NamedTuple):
 
     def after(self, ahead: Number) -> Standing:
         """Return where it is after some seconds, less than a sample."""
-        pushed = rotate(self.attitude, self.force) - jnp.array([0.0, 0.0, 1.0]) * self.gravity
+        pushed = rotate(self.attitude, self.force) - UP * self.gravity
         turned = multiply(self.attitude, exponential(self.rate * ahead))
         return self._replace(attitude=turned, velocity=self.velocity + pushed * ahead)
 
@@ -128,4 +128,4 @@ class FieldSeen(Sighting):
         along, across = eastward * east + northward * north, northward * east - eastward * north
         known = jnp.hypot(along, across) > 0
         angle = jnp.where(known, jnp.arctan2(across, jnp.where(known, along, 1.0)), 0.0)
-        return multiply(exponential(jnp.array([0.0, 0.0, 1.0]) * angle), attitude)
+        return multiply(exponential(UP * angle), attitude)

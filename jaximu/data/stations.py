@@ -13,12 +13,12 @@ from jaxtyping import Float
 from jaximu.data.station_error import turntable_error
 from jaximu.estimation.covariance import Covariance, inverse_cholesky
 from jaximu.estimation.data import About, Conditions, Data
-from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, by_axis
+from jaximu.estimation.rows import TEMPERATURE, TIME, ResidualKind, Rows, Sizes, by_axis
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, IntArray
 from jaximu.ground.distributions import rms
 from jaximu.ground.rotation import Number
-from jaximu.ground.tracing import lifted, on_host
+from jaximu.ground.tracing import lifted, on_host, part_of
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Stations
 
@@ -135,7 +135,7 @@ class KnownStations(Data):
 
     def take(self, lanes: IntArray) -> KnownStations:
         """Return the measurement of some of the units."""
-        return KnownStations(jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], self.stations))
+        return KnownStations(part_of(self.stations, lanes))
 
     def about(self, imu: Imu) -> About:
         """Return the errors, whatever the unit."""
@@ -189,7 +189,7 @@ def station_errors(imu: Imu, stations: Stations, excess: np.ndarray) -> list[Sta
     return errors
 
 
-def station_rms(imu: Imu, stations: Stations) -> dict[str, tuple[float, str]]:
+def station_rms(imu: Imu, stations: Stations) -> Sizes:
     """Return the rms of each kind of error, as vectors, with its unit."""
     return {
         kind.name: (rms(np.linalg.norm(kind.error, axis=0)), kind.unit)

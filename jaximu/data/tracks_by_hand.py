@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaximu.data.gravity_direction import level
-from jaximu.estimation.track import TRIADS, Recorded, Track
+from jaximu.estimation.track import TRIADS, Recorded, Track, means_by
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray, IntArray
-from jaximu.ground.rotation import multiply
+from jaximu.ground.rotation import IDENTITY, UP, multiply
 from jaximu.ground.tracing import array_module
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
@@ -139,16 +139,15 @@ def tracks_by_hand(imu: Imu, samples: SamplesByHand, running: Float[Array, "T S 
     poses, pose = len(running) + 1, samples.pose
     triads = imu.with_effects().triads()
     force, rate = (triads[name].recover(samples.outputs[name]) for name in TRIADS)
-    means, counts = pose_means(force, pose["accelerometer"], poses)
+    means, counts = means_by(pose["accelerometer"], force, poses)
     rate = jnp.where((pose["gyroscope"] < poses)[:, None], 0.0, rate)
     attitudes = _attitudes(means, counts > 0, running[:, -1])
 
-    identity = jnp.array([1.0, 0.0, 0.0, 0.0])
     before = jnp.minimum(pose["gyroscope"], samples.turn)  # the pose that a sample lies in, or the one before its turn
     attitude = attitudes.at[before].get(mode="fill", fill_value=0.0)
     turned = running.at[samples.turn, samples.order].get(mode="fill", fill_value=0.0)
-    attitude = multiply(attitude, jnp.where(samples.turn[:, None] < poses, turned, identity))
-    attitude = jnp.where(before[:, None] < poses, attitude, identity)
+    attitude = multiply(attitude, jnp.where(samples.turn[:, None] < poses, turned, IDENTITY))
+    attitude = jnp.where(before[:, None] < poses, attitude, IDENTITY)
     tracks = {}
     for name, known in samples.recorded.stimuli(force, rate).items():
         assert known.specific_force is not None and known.angular_acceleration is not None
@@ -171,19 +170,12 @@ def _pose_of(signal: Signal, intervals: FloatArray, first: int) -> IntArray:
     return np.where(inside, first + pose, _NONE)
 
 
-def pose_means(values: Float[Array, "n 3"], pose: Int[Array, " n"], poses: int) -> tuple[Array, Array]:
-    """Return the means (P, 3) of values over the poses that samples lie in, and of how many samples each is (P,)."""
-    counts = jax.ops.segment_sum(jnp.ones(len(values)), pose, poses)
-    return jax.ops.segment_sum(values, pose, poses) / jnp.maximum(counts, 1.0)[:, None], counts
-
-
 def _attitudes(force: Float[Array, "P 3"], real: Array, turned: Float[Array, "T 4"]) -> Float[Array, "P 4"]:
     """The attitude in each pose that is real: carried over the turn from the one before, and levelled by its force."""
-    identity = jnp.array([1.0, 0.0, 0.0, 0.0])
 
     def step(carried, pose):
         force, real, turned = pose
-        attitude = level(carried, jnp.where(real, force, jnp.array([0.0, 0.0, 1.0])))
-        return jnp.where(real, multiply(attitude, turned), identity), attitude
+        attitude = level(carried, jnp.where(real, force, UP))
+        return jnp.where(real, multiply(attitude, turned), IDENTITY), attitude
 
-    return jax.lax.scan(step, identity, (force, real, jnp.concatenate([turned, identity[None]])))[1]
+    return jax.lax.scan(step, IDENTITY, (force, real, jnp.concatenate([turned, IDENTITY[None]])))[1]

@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from jaximu.estimation.covariance import Chain, Covariance
 from jaximu.estimation.problem import Name, without_equipment_or_effects
-from jaximu.estimation.rows import Rows
+from jaximu.estimation.rows import Rows, Sizes
 from jaximu.estimation.track import Track
 from jaximu.estimation.uncertainty import station_advice
 from jaximu.ground import stored
@@ -315,7 +315,7 @@ class Data(ABC):
         """Return what may lie off beforehand, as good as free: columns (count, k) at one standard deviation."""
         return np.zeros((count, 0))
 
-    def rms(self, imu: Imu, details: Any, conditions: FloatArray) -> dict[str, tuple[float, str]]:
+    def rms(self, imu: Imu, details: Any, conditions: FloatArray) -> Sizes:
         """Return the rms of each kind of residual of all conditions (n,), with its unit, as a calibration has it."""
         rows = self.rows(imu)
         return rows.real().rms(conditions[rows.used])

@@ -32,7 +32,7 @@ from jaximu.ground.array_types import Array, BoolArray, Computed, FloatArray, In
 from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
-from jaximu.ground.tracing import array_module, first, is_traced, lifted
+from jaximu.ground.tracing import array_module, first, is_traced, lifted, part_of
 from jaximu.model.effects.base import inner_owners
 from jaximu.model.sensor import Imu
 
@@ -581,9 +581,7 @@ class _Passes:
         nothing = (), numerics.zeros((self.count, 0)), numerics.zeros((self.count, 0))
         names, self.numbers, sizes = nothing if inside else effect_numbers(imu)
         effects = imu.all_effects()
-        self.kept = np.array(
-            [free(name) and name.part != effects[name.owner, name.effect].beginning() for name in names], bool
-        )
+        self.kept = np.array([free(name) and name.part != effects[name.key].beginning() for name in names], bool)
         chosen = tuple(name for name, kept in zip(names, self.kept, strict=True) if kept)
         self.names = (*self.parameters.names, *chosen)
         self.base = len(self.parameters.names)
@@ -617,7 +615,7 @@ class _Passes:
         bare = unflatten(self.like, state.reference)
         if not self.numbers.shape[1]:
             return bare
-        start = jax.tree.map(lambda leaf: leaf[lanes], self.full)
+        start = part_of(self.full, lanes)
         return bare.with_effects(*_with_numbers(start, state.numbers).all_effects().values())
 
     def known(self, state: _State, lanes: IntArray, blunt: bool | Array) -> tuple[Array, Array]:
@@ -626,7 +624,7 @@ class _Passes:
         effects = self.full.all_effects()
         width = np.full(len(self.names), TOLERANCE)
         width[self.base :] = [
-            effects[name.owner, name.effect].plausible if name.part == "coefficients" else TOLERANCE
+            effects[name.key].plausible if name.part == "coefficients" else TOLERANCE
             for name in self.names[self.base :]
         ]
         of_base = np.arange(len(width)) < self.base
@@ -752,7 +750,7 @@ class _Passes:
             return reference, state.numbers
         spread = np.zeros((wide - base, len(self.kept)))
         spread[np.arange(wide - base), np.flatnonzero(self.kept)] = 1.0
-        here = _with_numbers(jax.tree.map(lambda leaf: leaf[lanes], self.full), state.numbers)
+        here = _with_numbers(part_of(self.full, lanes), state.numbers)
         return reference, effect_numbers(_with_numbers(here, state.numbers + step[:, base:] @ spread))[1]
 
     def run(self, excess: FloatArray) -> Fit:
@@ -760,17 +758,17 @@ class _Passes:
         state, result, about = jax.tree.map(np.array, self.start(excess)), None, None
         for number in range(self.max_passes):
             for part, padded in self.chunks(state.active & state.moved):
-                new = _of(self.evaluated(_of(state, padded), padded), slice(len(part)))
+                new = part_of(self.evaluated(part_of(state, padded), padded), slice(len(part)))
                 about = jax.tree.map(partial(_room, self.count), new) if about is None else about
                 jax.tree.map(partial(_put, part), about, new)
             for part, padded in self.chunks(state.active):
-                here = _of(state, padded)
-                out = self.once(_single_pass, here, padded, _of(about, padded), self.blunted and number == 0)
-                here, out = _of((here, out), slice(len(part)))
+                here = part_of(state, padded)
+                out = self.once(_single_pass, here, padded, part_of(about, padded), self.blunted and number == 0)
+                here, out = part_of((here, out), slice(len(part)))
                 after, fine = self.advanced(here, part, out, number)
                 jax.tree.map(partial(_put, part), state, after)
                 result = jax.tree.map(partial(_room, self.count), out) if result is None else result
-                jax.tree.map(partial(_put, part[fine]), result, _of(out, fine))
+                jax.tree.map(partial(_put, part[fine]), result, part_of(out, fine))
             if not state.active.any():
                 break
         assert result is not None
@@ -877,11 +875,6 @@ def _secant(share: Array, before: Array, now: Array, leap: Array | float) -> Arr
 def _where(numerics: Any, chosen: Array, one: Array, other: Array) -> Array:
     """Return arrays unit by unit: `one` where the unit is chosen, else `other`."""
     return numerics.where(chosen.reshape(-1, *[1] * (np.ndim(one) - 1)), one, other)
-
-
-def _of(tree: Any, lanes: IntArray | slice) -> Any:
-    """Return arrays of some of the units."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], tree)
 
 
 def _room(count: int, leaf: FloatArray) -> FloatArray:

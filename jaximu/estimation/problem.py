@@ -87,6 +87,16 @@ class Name(str):
     def __getnewargs__(self):
         return self.owner, self.part, self.axes, self.effect
 
+    @property
+    def key(self) -> tuple[str, int | None]:
+        """Owner and effect, under which `Imu.all_effects` has the effect."""
+        return self.owner, self.effect
+
+    @property
+    def is_scale(self) -> bool:
+        """Whether it is the gain of an axis by itself, not of one across another."""
+        return self.part == "gain" and self.axes[0] == self.axes[1]
+
 
 def names_of(model: Imu) -> tuple[Name, ...]:
     """Return the names of all numbers of a model, in the order of `flatten`."""

@@ -10,6 +10,9 @@ import numpy as np
 
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 
+Sizes = dict[str, tuple[float, str]]
+"""Of errors, by name: a size and its unit."""
+
 TIME, TEMPERATURE = "time [s]", "temperature [°C]"
 """The covariate that all conditions have, and the one that those with a thermometer have."""
 
@@ -102,7 +105,7 @@ class Rows:
             errors.append(kind.factor * (vectors[:, 0] if kind.components == 1 else np.linalg.norm(vectors, axis=1)))
         return errors
 
-    def rms(self, conditions: FloatArray) -> dict[str, tuple[float, str]]:
+    def rms(self, conditions: FloatArray) -> Sizes:
         """Return the rms of the errors of each kind that is there, with its unit."""
         return {
             kind.name: (float(np.sqrt(np.mean(errors**2))), kind.unit)

@@ -73,8 +73,13 @@ class Track(eqx.Module):
         """
         values = values.reshape(-1, values.shape[-1])
         observation = self.observation.reshape(-1)[: len(values)]
-        samples = jax.ops.segment_sum(jnp.ones(len(values)), observation, count)
-        return jax.ops.segment_sum(values, observation, count) / jnp.maximum(samples, 1.0)[:, None]
+        return means_by(observation, values, count)[0]
+
+
+def means_by(observation: Int[Array, " n"], values: Float[Array, "n m"], count: int) -> tuple[Array, Array]:
+    """Return the means (count, m) of values over the observations that they belong to, and how many each has."""
+    samples = jax.ops.segment_sum(jnp.ones(len(values)), observation, count)
+    return jax.ops.segment_sum(values, observation, count) / jnp.maximum(samples, 1.0)[:, None], samples
 
 
 @partial(stored.compiled, quick=True)

@@ -15,7 +15,7 @@ from jaximu.data.poses import PosesAndTurns, condensed
 from jaximu.estimation.fitting import Fit
 from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.tracing import stacked
+from jaximu.ground.tracing import part_of, stacked
 from jaximu.model.sensor import Imu
 from jaximu.planning.chunks import in_chunks
 from jaximu.recordings.observations import Observations
@@ -81,7 +81,7 @@ def _together(nominals: Sequence[Imu], data: Sequence[PosesAndTurns], gyroscope:
     errors = in_chunks(compiled, _SHAPE, fits.imu, together)
     fitted = []
     for lane, unit in enumerate(data):
-        fit, error = jax.tree.map(lambda leaf, lane=lane: leaf[lane], (fits, errors))
+        fit, error = part_of((fits, errors), lane)
         rms = residual_rms(fit.imu, unit, gyroscope, error)
         fitted.append((fit, np.array([rms[kind][0] if kind in rms else 0.0 for kind in _KINDS])))
     return fitted

@@ -29,6 +29,7 @@ from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.document import Document, Json, entries
 from jaximu.ground.errors import FilePath, NotPossibleError
 from jaximu.ground.page import Result
+from jaximu.ground.vectors import root_or_zero, sigmas_of
 from jaximu.mistakes.titles import effect_title
 
 FEWEST = 8
@@ -79,7 +80,7 @@ class Population:
     @property
     def spread(self) -> FloatArray:
         """Standard deviations (p,) between units, the noise of their estimates taken off."""
-        return np.sqrt(np.diagonal(self.covariance))
+        return sigmas_of(self.covariance)
 
     def shrink(self, values: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the posterior means (n, p) and covariances (n, p, p) of estimates (n, p) with theirs (n, p, p)."""
@@ -174,8 +175,7 @@ class Fleet(Result, Document, page="fleet"):
         population = self.population
         return {
             "schema": "jaximu.fleet/1",
-            "table": self.table,
-            "recordings": self.recordings,
+            **entries(self, "table", "recordings"),
             "statuses": dict(sorted(self.statuses.items())),
             "verdicts": dict(sorted(self.verdicts.items())),
             "effects": dict(self.effects.most_common()),
@@ -185,15 +185,11 @@ class Fleet(Result, Document, page="fleet"):
             else {
                 "units": population.count,
                 "parameters": list(population.names),
-                "mean": population.mean.tolist(),
-                "spread": population.spread.tolist(),
-                "covariance": population.covariance.tolist(),
+                **entries(population, "mean", "spread", "covariance"),
             },
             "strangers": [
                 {
-                    "device": stranger.device,
-                    "file": stranger.file,
-                    "p_value": stranger.p_value,
+                    **entries(stranger, "device", "file", "p_value"),
                     "parameters": [{"name": n, "value": v, "deviations": z} for n, v, z in stranger.parameters],
                 }
                 for stranger in self.strangers
@@ -379,7 +375,7 @@ def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> Js
         values=units.values,
         shrunk=shrunk + shift,
         sigma=np.sqrt(np.diagonal(units.covariances, axis1=1, axis2=2)),
-        shrunk_sigma=np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0)),
+        shrunk_sigma=root_or_zero(np.diagonal(spread, axis1=1, axis2=2)),
         lots=tuple(_names(units)),
         shifts=shifts,
         rms=np.array(rms, float),
@@ -546,7 +542,7 @@ def _causes(
         design = np.stack([np.ones(len(values)), *map(groups.column, taken)])
         spread = np.linalg.inv((weight * design) @ design.T)
         amounts = spread @ (design @ (weight * values))
-        sigmas = np.sqrt(np.diagonal(spread))
+        sigmas = sigmas_of(spread)
         p_values = p_value((amounts / sigmas)[1:], taken)
         if (p_values >= LEVEL).any():  # what was taken after it explains it
             given_up.append(taken.pop(int(np.argmax(p_values))))
@@ -578,7 +574,7 @@ def _repeated(units: _Units) -> list[Difference]:
     for device, indices in repeated.items():
         first, last = indices[0], indices[-1]
         change = units.values[last] - units.values[first]
-        sigma = np.sqrt(np.diagonal(units.covariances[first] + units.covariances[last]))
+        sigma = sigmas_of(units.covariances[first] + units.covariances[last])
         p_values = 2 * scipy.stats.norm.sf(np.abs(change / sigma)) * len(units.names) * len(repeated)
         changed = [k for k in np.argsort(p_values) if p_values[k] < LEVEL]
         if changed:
@@ -642,7 +638,7 @@ def write_shrunk(fleet: Fleet, path: FilePath) -> None:
             mean, spread = population.shrink(units.values - moved, units.covariances)
             values, sigma = np.zeros((2, len(rows), len(PARAMETERS)))
             values[:, places] = mean + moved
-            sigma[:, places] = np.sqrt(np.maximum(np.diagonal(spread, axis1=1, axis2=2), 0.0))
+            sigma[:, places] = root_or_zero(np.diagonal(spread, axis1=1, axis2=2))
             values, sigma = values * units.factor + units.offset, sigma * units.factor
             out: dict[str, list] = {name: [row[name] for row in rows] for name in ("device", "file")}
             for name, part in COLUMN_PLACES.items():

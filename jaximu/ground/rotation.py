@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from jaximu.ground.array_types import Array
@@ -27,6 +28,8 @@ Vectors = Float[Array, "... S 3"]
 Quaternion = Float[Array, "... 4"]
 Matrix = Float[Array, "... 3 3"]
 
+UP, IDENTITY = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0, 0.0])
+"""The direction of a level frame's z axis, and the quaternion of no rotation."""
 MEAN_RATES, POINT_RATES = (7 / 120, 1 / 120), (41 / 1440, 11 / 2880)
 """p and q of coning by samples that are means over their intervals, or points; see `rotation_vectors`."""
 _SMALL = 1e-8  # squared angle (rad²) below which a series to second order is exact in double precision

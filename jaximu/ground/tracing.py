@@ -30,11 +30,16 @@ def array_module(*trees: Any) -> Any:
     return numpy
 
 
-def first(tree: Tree) -> Tree:
-    """Return the first entry along the leading axis of every array."""
+def part_of(tree: Any, places: Any) -> Any:
+    """Return the entries at some places along the leading axis of every array: a number, numbers or a slice."""
     import jax
 
-    return jax.tree.map(lambda leaf: array_module(leaf).asarray(leaf)[0], tree)
+    return jax.tree.map(lambda leaf: array_module(leaf, places).asarray(leaf)[places], tree)
+
+
+def first(tree: Tree) -> Tree:
+    """Return the first entry along the leading axis of every array."""
+    return part_of(tree, 0)
 
 
 def lifted(tree: Tree) -> Tree:

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.distributions import robust_sigma
+from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.recordings.alignment import TURN_ANGLE, BlockMeans, Clocks, clocks, gravity_turning, of_each
 from jaximu.recordings.finding import Rows
 from jaximu.recordings.recording import GAP, Recording, Signal, floor_of, runs_of, steps_of
@@ -271,7 +272,7 @@ class Samples:
         if rate is not None:
             angle = np.cumsum((rate.values - np.median(rate.values, axis=0)) * rate.period, axis=0)
             runs = runs_of(~rate.quiet)
-            far = np.linalg.norm(angle[runs[:, 1] - 1] - angle[runs[:, 0]], axis=1)
+            far = lengths_of(angle[runs[:, 1] - 1] - angle[runs[:, 0]])
             if np.max(far, initial=0.0) > TURN_ANGLE:
                 return True
         return self._reversals is None or self._reversals > 0
@@ -291,10 +292,10 @@ class Samples:
             return 0
         edges = np.searchsorted(sensor.time, rests)
         means = of_each(np.median, sensor.values, edges)
-        size = np.linalg.norm(means, axis=1)
+        size = lengths_of(means)
         if np.ptp(size) > 0.5 * np.median(size):
             return None
-        cosine = np.sum(means[1:] * means[:-1], axis=1) / np.maximum(size[1:] * size[:-1], 1e-300)
+        cosine = dot_rows(means[1:], means[:-1]) / np.maximum(size[1:] * size[:-1], 1e-300)
         return int(np.sum(cosine < np.cos(TURN_ANGLE)))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.mistakes.base import Samples, Sensor
 from jaximu.recordings.finding import Finding
 
@@ -90,13 +91,13 @@ def _dead_force(samples: Samples) -> list[Finding]:
 
 def _turned_about(mean: FloatArray, axis: int) -> bool:
     """Whether the unit was turned about a level axis: forces at rest (n, 3) lie on gravity's circle, biases apart."""
-    if np.ptp(np.quantile(np.linalg.norm(mean, axis=1), [0.05, 0.95])) < _ROUND * STANDARD_GRAVITY:
+    if np.ptp(np.quantile(lengths_of(mean), [0.05, 0.95])) < _ROUND * STANDARD_GRAVITY:
         return True
     plane = np.delete(mean, axis, axis=1)
     system = np.column_stack([2 * plane, np.ones(len(plane))])  # |p|² = 2 c·p + (r² − |c|²)
     *centre, rest = np.linalg.lstsq(system, np.sum(plane**2, axis=1))[0]
     radius = np.sqrt(max(rest + np.dot(centre, centre), 0.0)) / STANDARD_GRAVITY
-    spread = np.ptp(np.quantile(np.linalg.norm(plane - centre, axis=1), [0.05, 0.95])) / STANDARD_GRAVITY
+    spread = np.ptp(np.quantile(lengths_of(plane - centre), [0.05, 0.95])) / STANDARD_GRAVITY
     return bool(spread < _ROUND / 3 and abs(radius - 1) < _ROUND and np.linalg.norm(centre) < _OFF)
 
 
@@ -113,8 +114,8 @@ def _dead_rate(samples: Samples) -> list[Finding]:
     unexplained = blocks.change + np.cross(blocks.turned(), blocks.force)
     about = -np.cross(np.eye(3)[axis], blocks.force)  # what a rotation about the dead axis would do
     power = np.sum(about**2, axis=1)
-    good = (power > 1e-6 * np.max(power)) & (np.linalg.norm(blocks.turned(), axis=1) < _SLOW)
-    along = np.sum(np.sum(unexplained * about, axis=1)[good] ** 2 / power[good])
+    good = (power > 1e-6 * np.max(power)) & (lengths_of(blocks.turned()) < _SLOW)
+    along = np.sum(dot_rows(unexplained, about)[good] ** 2 / power[good])
     needed = _OF_REST if moved[axis] > _LEAK * others else _OF_REST / 3
     if along < 0.1 * np.sum(blocks.change[good] ** 2) or along < needed * np.sum(unexplained[good] ** 2):
         return []

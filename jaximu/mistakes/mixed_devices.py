@@ -6,6 +6,7 @@ import numpy as np
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import robust_sigma
+from jaximu.ground.vectors import lengths_of
 from jaximu.mistakes.base import Samples, Sensor, leave_out_both, spans_of
 from jaximu.mistakes.lost_samples import steps
 from jaximu.recordings.alignment import carried, of_each, turning
@@ -92,7 +93,7 @@ def _rests(accelerometer: Sensor, gyroscope: Sensor) -> FloatArray:
         # a fast phase without any rest is not the noise of another device
         floor = np.clip(floor, 1e-30, 25 * np.percentile(total, 5) + 1e-30)
         calm = total <= 5 * floor
-        moved = np.linalg.norm(np.diff(mean, axis=0), axis=1) > 6 * np.sqrt(np.minimum(floor[1:], floor[:-1]))
+        moved = lengths_of(np.diff(mean, axis=0)) > 6 * np.sqrt(np.minimum(floor[1:], floor[:-1]))
         leave_out_both(calm, moved)
         still &= sensor.by_sample(calm)[sensor.next_to(accelerometer.time)]
     return spans_of(still, accelerometer.time, 0.7)
@@ -114,7 +115,7 @@ def _changed(samples: Samples) -> list[Finding]:
         means.append(of_each(np.mean, sensor.values, edges))
         size = np.sqrt(of_each(np.mean, sensor.curvature**2, edges))
         noises.append(np.log(np.maximum(size, 1e-12)))
-    norm = np.log(np.maximum(np.linalg.norm(means[0], axis=1), 1e-9))[:, None]
+    norm = np.log(np.maximum(lengths_of(means[0]), 1e-9))[:, None]
     rate, noise = means[1], np.hstack(noises)
     distance, rest = _furthest(norm, 3, len(rests) - 2)
     factor = np.exp(np.median(norm[rest:]) - np.median(norm[:rest]))

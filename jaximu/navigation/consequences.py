@@ -31,7 +31,9 @@ from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed
 from jaximu.ground.stored import compiled
+from jaximu.ground.tracing import on_host
 from jaximu.ground.units import INERTIAL_QUANTITIES
+from jaximu.ground.vectors import lengths_of, submatrix
 from jaximu.model import BiasRepeatability, Noise, Process
 from jaximu.model.data_sheet import TERM_NAMES
 from jaximu.model.processes import TERM_PROCESSES
@@ -54,7 +56,7 @@ _TOGETHER = 25
 def kind_of(name: Name, model: Imu) -> str:
     """Return what a term of the budget calls a number of the unit: "accelerometer scale", or an effect's name."""
     if name.effect is not None:
-        return model.all_effects()[name.owner, name.effect].english
+        return model.all_effects()[name.key].english
     return group_of(name).replace(".", " ")
 
 
@@ -261,13 +263,13 @@ def consequences(
     known: dict[str, FloatArray] = {}
     for kind in dict.fromkeys(kinds):
         chosen = np.array([other == kind for other in kinds])
-        terms[kind] = _variances(slopes[..., chosen], run.covariance[np.ix_(chosen, chosen)])
+        terms[kind] = _variances(slopes[..., chosen], submatrix(run.covariance, chosen))
         known[kind] = _variances(slopes[..., ~chosen], _given(run.covariance, chosen))
     whole = _variances(slopes, run.covariance)
     notes = [*trajectory.notes, *_notes(calibration, noise)]
     terms |= _noise_terms(trajectory, noise or {})
     left_out = {
-        name: np.linalg.norm(np.asarray(_deviation(_corrected(run, model), reference))[:, :3], axis=1)
+        name: lengths_of(np.asarray(_deviation(_corrected(run, model), reference))[:, :3])
         for name, model in _simplified(run.imu).items()
     }
     check = _draw(run, trajectory, reference, noise or {}, draws, seed) if draws else None
@@ -278,7 +280,7 @@ def consequences(
     return Consequences(
         files[0],
         trajectory,
-        jax.tree.map(np.asarray, reference),
+        on_host(reference),
         trajectory.times,
         terms,
         whole,
@@ -305,13 +307,13 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
     known = {_identity(name, imu): index for index, name in enumerate(everything)}
     rows = [row for row, name in enumerate(calibration.names) if _identity(name, calibration.imu) in known]
     indices = np.array([known[_identity(calibration.names[row], calibration.imu)] for row in rows], int)
-    covariance = np.asarray(calibration.covariance)[np.ix_(rows, rows)]
+    covariance = submatrix(np.asarray(calibration.covariance), rows)
     if not rows or not np.diagonal(covariance).any():
         raise NotPossibleError(
             f"{file} states no covariance, so what it leaves open is not known: calibrate the log again with "
             "`jaximu calibrate LOG -o DIR`."
         )
-    imu, stimulus = jax.tree.map(np.asarray, imu), trajectory.stimulus
+    imu, stimulus = on_host(imu), trajectory.stimulus
     return Run(
         imu,
         trajectory.start,
@@ -326,7 +328,7 @@ def prepared(calibration: Calibration, trajectory: Trajectory, file: str) -> Run
 
 
 def _identity(name: Name, model: Imu) -> tuple:
-    effect = None if name.effect is None else model.all_effects()[name.owner, name.effect].name
+    effect = None if name.effect is None else model.all_effects()[name.key].name
     return name.owner, effect, name.part, name.axes
 
 
@@ -356,7 +358,7 @@ def _given(covariance: FloatArray, chosen: BoolArray) -> FloatArray:
     """Covariance of the others were these known exactly (normal distribution, conditioned)."""
     cross, inverse = (
         covariance[np.ix_(~chosen, chosen)],
-        np.linalg.pinv(covariance[np.ix_(chosen, chosen)], hermitian=True),
+        np.linalg.pinv(submatrix(covariance, chosen), hermitian=True),
     )
     return covariance[np.ix_(~chosen, ~chosen)] - cross @ inverse @ cross.T
 

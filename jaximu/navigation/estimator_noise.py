@@ -34,7 +34,7 @@ import scipy
 from jaximu.calibration import Calibration, calibrate_against_attitude
 from jaximu.data.preintegration import preintegrate_samples
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
-from jaximu.ground.differences import interpolated
+from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.distributions import rms
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import InputError, NotPossibleError
@@ -44,6 +44,7 @@ from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import number
 from jaximu.ground.stored import compiled
 from jaximu.ground.units import INERTIAL_QUANTITIES
+from jaximu.ground.vectors import lengths_of, submatrix
 from jaximu.model import BiasInstability
 from jaximu.model.mounting import Mounting
 from jaximu.model.sensor import Imu
@@ -286,8 +287,8 @@ class MeasuredErrors:
 
 def steady_stamps(stamp: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> BoolArray:
     """Whether a reference's velocity (T, 3) changes at each stamp (T,) about as the unit's acceleration (T, 3) says."""
-    mean = (acceleration[1:] + acceleration[:-1]) / 2
-    off = np.linalg.norm(np.diff(velocity, axis=0) / np.diff(stamp)[:, None] - mean, axis=1)
+    mean = midpoints(acceleration)
+    off = lengths_of(np.diff(velocity, axis=0) / np.diff(stamp)[:, None] - mean)
     leap = off > _LEAP * np.median(off)
     near = np.convolve(leap, np.ones(4), "full") > 0  # a difference of positions reaches two stamps
     return ~np.concatenate([near, [False]])[1 : len(stamp) + 1]
@@ -586,11 +587,11 @@ def _part(source: ModelledErrors | MeasuredErrors, noise: SensorNoise, length: f
             parts["time stamps"] = pushed
         moment[triad] = np.sum(list(parts.values()), axis=0)[:, rows, rows]
         mine = np.array([owner == triad for owner in owners])
-        roots[triad] = (moved[..., mine] @ root_of(covariance[np.ix_(mine, mine)]))[:, rows]
+        roots[triad] = (moved[..., mine] @ root_of(submatrix(covariance, mine)))[:, rows]
         for kind in dict.fromkeys(kinds):
             of_kind = mine & np.array([other == kind for other in kinds])
             if of_kind.any() and kind != f"{triad} bias":
-                parts[kind] = _squared(moved[..., of_kind] @ root_of(covariance[np.ix_(of_kind, of_kind)]))
+                parts[kind] = _squared(moved[..., of_kind] @ root_of(submatrix(covariance, of_kind)))
         terms[triad] = {name: covariances[:, rows, rows] for name, covariances in parts.items()}
     return _Length(stretches, spread, moment, roots, np.asarray(whole), moved @ root_of(covariance), terms, block)
 

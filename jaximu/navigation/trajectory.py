@@ -16,11 +16,14 @@ import numpy as np
 
 from jaximu.calibration import Calibration, compensate
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.differences import midpoints
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.precision import require_float64
-from jaximu.ground.rotation import conjugate, rotate
+from jaximu.ground.rotation import UP, conjugate, rotate
 from jaximu.ground.stored import compiled
+from jaximu.ground.tracing import part_of
+from jaximu.ground.vectors import lengths_of
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
 from jaximu.navigation import Navigation
 from jaximu.recordings.recording import Recording
@@ -85,7 +88,7 @@ class Trajectory:
         kept = count // apart * apart
         if kept < 2 * apart:
             raise NotPossibleError(f"the path lasts only {total:.2g} s ({count} samples): give a longer one.")
-        stimulus, intervals = jax.tree.map(lambda leaf: np.asarray(leaf)[:kept], (self.stimulus, self.intervals))
+        stimulus, intervals = part_of((self.stimulus, self.intervals), slice(kept))
         return replace(self, stimulus=stimulus, intervals=intervals, every=apart)
 
     @property
@@ -172,8 +175,8 @@ def _felt_on_the_road(time, turns, earth, latitude, gravity):
         (v, change), (angle, turning) = (jax.jvp(course, (time,), (1.0,)) for course in (velocity, heading))
         moving = jnp.stack([-v[1], v[0], v[0] * jnp.tan(latitude)]) / radius
         attitude = jnp.stack([jnp.cos(angle / 2), 0.0, 0.0, jnp.sin(angle / 2)])
-        force = change + jnp.cross(2 * earth + moving, v) + jnp.array([0.0, 0.0, 1.0]) * gravity
-        rate = earth + moving + turning * jnp.array([0.0, 0.0, 1.0])
+        force = change + jnp.cross(2 * earth + moving, v) + UP * gravity
+        rate = earth + moving + turning * UP
         back = conjugate(attitude)
         return rotate(back, force), rotate(back, rate), attitude
 
@@ -200,7 +203,7 @@ def of_specification(
     whole = motion.stimulus(case.rate)
     longest = motion.samples(case.rate)
     count = longest if duration is None else min(longest, round(duration * case.rate))
-    stimulus = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], whole)
+    stimulus = part_of(whole, slice(count))
     start = _start(np.asarray(motion.attitude[0]), site, float(motion.gravity))
     limits = {}
     for artefact in case.artefacts:
@@ -241,7 +244,7 @@ def of_recording(recording: Recording, calibration: Calibration, site: Place, du
         rate = rate - rate[resting].mean(axis=0) + attitude_of(up).inv().apply(earth)
         notes.append(f"the motion starts at the log's first rest, {first:.1f} s in, levelled there; heading unknown.")
     kept = (time >= first) & (time < first + duration)
-    middle = (time[1:] + time[:-1]) / 2
+    middle = midpoints(time)
     edges = np.concatenate([[2 * time[0] - middle[0]], middle, [2 * time[-1] - middle[-1]]])
     temperature = ready.temperature
     warm = None if temperature is None else np.interp(time, temperature.time, temperature.values[:, 0])[kept]
@@ -267,8 +270,8 @@ def _first_rest(
     force_mean, rate_mean = means(force), means(rate)
     spread = np.stack([means(values**2) - mean**2 for values, mean in ((force, force_mean), (rate, rate_mean))])
     still = np.sqrt(np.maximum(spread.sum(axis=-1), 0)) < np.array(_STILL)[:, None]
-    level = np.abs(np.linalg.norm(force_mean, axis=1) - gravity) < _STILL[0]
-    calm = still.all(axis=0) & level & (np.linalg.norm(rate_mean, axis=1) < _STILL[1])
+    level = np.abs(lengths_of(force_mean) - gravity) < _STILL[0]
+    calm = still.all(axis=0) & level & (lengths_of(rate_mean) < _STILL[1])
     if not calm.any():
         quiet = int(np.argmin(spread.sum(axis=(0, 2))))
         raise NotPossibleError(

@@ -26,6 +26,7 @@ from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_isf
 from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError, NotPossibleError
+from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.processes import MEMBER_VARIANCE, TERM_PROCESSES, BiasInstability, FirstOrderGaussMarkov
 from jaximu.noise.cleaning import BRIDGED, PeriodicLine, filled, lowest, periodic_lines, without_line, without_outliers
 from jaximu.noise.deviations import Deviation, averaging_factors, deviation, require_samples
@@ -483,7 +484,7 @@ class _Model:
         gram = np.einsum("b,bij->ij", weight, self.gram)
         cross = weight @ self.cross
         if fixed is None:
-            scale = np.sqrt(np.diag(gram))
+            scale = sigmas_of(gram)
             return np.linalg.solve(gram / np.outer(scale, scale), cross / scale) / scale
         return np.concatenate([[fixed], np.linalg.solve(gram[1:, 1:], cross[1:] - gram[1:, 0] * fixed)])
 
@@ -525,7 +526,7 @@ class _Model:
             live = diagonal > 1e-4  # what has vanished stays so
             if not live.any():
                 break
-            part = fisher[np.ix_(live, live)] + np.diag((damping + 1e-12) * diagonal[live])
+            part = submatrix(fisher, live) + np.diag((damping + 1e-12) * diagonal[live])
             step = np.clip(np.linalg.solve(part, slope[live]), -2.0, 2.0)
             trial = theta.copy()
             trial[free[live]] += step
@@ -648,7 +649,7 @@ def _root(function: Callable[[float], float], low: float, high: float, tolerance
 
 def _bounds(fit: _Fit, index: int, threshold: float) -> tuple[float, float]:
     """Return where the profile of −log L has risen by `threshold`, for a parameter."""
-    scale = np.sqrt(np.diag(fit.fisher))
+    scale = sigmas_of(fit.fisher)
     inverse = np.linalg.pinv(fit.fisher / np.outer(scale, scale))
     spread = min(np.sqrt(inverse[index, index]) / scale[index], 3.0)
     # a variance known from few coefficients, 2 spread⁻² of them: −2 log L scatters more than χ² (M. S. Bartlett,

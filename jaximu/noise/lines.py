@@ -21,6 +21,7 @@ import scipy
 from numpy.typing import NDArray
 
 from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
+from jaximu.ground.vectors import dot_rows, root_or_zero
 from jaximu.noise.cleaning import FALSE_LINE
 
 _OVER = 2
@@ -270,8 +271,8 @@ def _size(
     time = (np.arange(tapered.shape[1]) - (tapered.shape[1] - 1) / 2) / rate
     drift = np.gradient(frequency, times)
     phase = 2 * np.pi * (frequency[:, None] * time + drift[:, None] * time**2 / 2)
-    height = np.abs(np.sum(tapered * np.exp(-1j * phase), axis=1))
-    return float(2 * np.sqrt(np.maximum(np.mean((height**2 - noise)[visible]), 0.0)))
+    height = np.abs(dot_rows(tapered, np.exp(-1j * phase)))
+    return float(2 * root_or_zero(np.mean((height**2 - noise)[visible])))
 
 
 def swing(values: FloatArray, time: FloatArray, line: SpectralLine) -> tuple[float, float]:

@@ -27,7 +27,7 @@ _SHORTEST = 0.1
 """s: flicker noise that is quicker is white noise to means over poses."""
 
 
-def read_sensor_noise(path: FilePath) -> dict[str, dict[str, FloatArray]]:
+def read_sensor_noise(path: FilePath) -> SensorNoise:
     """Read Q, N, B, K and repeatability from an `allan.json`, or N and K from an `imu.yaml`, whose keys fix units.
 
     Raises `InputError` for anything else, or without units.
@@ -46,7 +46,7 @@ def read_sensor_noise(path: FilePath) -> dict[str, dict[str, FloatArray]]:
     return sensor_noise(read_analysis(path), name)
 
 
-def sensor_noise(document: Mapping[str, Any], name: str) -> dict[str, dict[str, FloatArray]]:
+def sensor_noise(document: Mapping[str, Any], name: str) -> SensorNoise:
     """Return Q, N, B, K and repeatability of an `allan.json` as a dictionary called `name`; as `read_sensor_noise`."""
     figures: dict[str, dict[str, FloatArray]] = {}
     for triad, quantity in INERTIAL_QUANTITIES.items():

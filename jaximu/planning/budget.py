@@ -67,6 +67,7 @@ from jaximu.ground.array_types import Array, BoolArray, FloatArray
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
+from jaximu.ground.vectors import lengths_of, root_or_zero, sigmas_of
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.planning.chunks import in_chunks
@@ -241,7 +242,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     by_means = np.asarray(_sensitivity(stations, start, parameters, excess)).reshape(len(names), -1)
     truth = _truth(scheme, start, names)
     slope = scale[:, None] * (by_means @ moved.reshape(by_means.shape[1], -1)) - truth
-    sigma = np.stack([np.linalg.norm(slope @ source.root, axis=1) for source in sources])
+    sigma = np.stack([lengths_of(slope @ source.root) for source in sources])
 
     errors = [_paired(source) for source in sources]
     means = _recorded(scheme, np.concatenate(errors))
@@ -251,7 +252,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     parts = zip(sigma, errors, np.split(solved, len(errors)), strict=True)
     actual = np.stack(
         [
-            np.sqrt(np.maximum(linear**2 + _mean_square(whole) - _mean_square(drawn @ slope.T), 0.0))
+            root_or_zero(linear**2 + _mean_square(whole) - _mean_square(drawn @ slope.T))
             for linear, drawn, whole in parts
         ]
     )
@@ -279,8 +280,8 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
 def _determined(jacobian: FloatArray, scale: FloatArray, sigma: FloatArray) -> BoolArray:
     """Which parameters (p,) the scheme determines: what the data sheet's tolerance holds is as uncertain as that."""
     known = np.linalg.inv(jacobian.T @ jacobian + np.eye(len(scale)) / TOLERANCE**2)
-    held = scale * np.linalg.norm(known, axis=1) / TOLERANCE
-    return (np.sqrt(np.diagonal(known)) <= UNDETERMINED) & (held <= _OFF * np.linalg.norm(sigma, axis=0))
+    held = scale * lengths_of(known) / TOLERANCE
+    return (sigmas_of(known) <= UNDETERMINED) & (held <= _OFF * np.linalg.norm(sigma, axis=0))
 
 
 def _mean_square(values: FloatArray) -> FloatArray:
@@ -396,7 +397,7 @@ def _truth(scheme: ErrorScheme, unit: Imu, names: Sequence[Name]) -> FloatArray:
     for effect in scheme.effects:
         same = [key for key, fitted in unit.all_effects().items() if fitted.name == effect.name]
         for row, name in enumerate(names):
-            if name.part == "coefficients" and (name.owner, name.effect) in same:
+            if name.part == "coefficients" and name.key in same:
                 truth[row, first + name.axes[0]] = 1.0
         first += effect.size
     return truth

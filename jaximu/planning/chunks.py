@@ -8,6 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaximu.ground.tracing import part_of
+
 
 def in_chunks(function: Callable[..., Any], size: int, *trees: Any) -> Any:
     """Return a function of `size` rows for all rows of its arguments' arrays, in NumPy.
@@ -18,6 +20,6 @@ def in_chunks(function: Callable[..., Any], size: int, *trees: Any) -> Any:
     results = []
     for start in range(0, count, size):
         rows = np.minimum(np.arange(start, start + size), count - 1)
-        result = function(*jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], trees))
-        results.append(jax.tree.map(lambda leaf, kept=count - start: np.asarray(leaf)[:kept], result))
+        result = function(*part_of(trees, rows))
+        results.append(part_of(result, slice(count - start)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *results)

@@ -33,7 +33,7 @@ def group_of(name: Name) -> str:
     """Return what parameters alike are called: accelerometer.scale, gyroscope.bias …; effects are by themselves."""
     if name.effect is not None:
         return name
-    kind = "bias" if name.part == "bias" else "scale" if name.axes[0] == name.axes[1] else "misalignment"
+    kind = "bias" if name.part == "bias" else "scale" if name.is_scale else "misalignment"
     return f"{name.owner}.{kind}"
 
 
@@ -41,11 +41,11 @@ def unit_of(name: Name, unit: Imu) -> str:
     """Return the unit of a parameter's standard deviation, gains being relative to their axis's scale."""
     if name.effect is not None:
         triad = unit.triads().get(name.owner)
-        effect = unit.all_effects()[name.owner, name.effect]
+        effect = unit.all_effects()[name.key]
         return effect.coefficient_unit("SI" if triad is None else triad.output_unit)
     if name.part == "bias":
         return SENSOR_UNITS[name.owner]
-    return "1" if name.axes[0] == name.axes[1] else "rad"
+    return "1" if name.is_scale else "rad"
 
 
 def goal_sigmas(what: str, text: str, names: Sequence[Name], unit: Imu, sigma: FloatArray) -> tuple[float, FloatArray]:

@@ -22,6 +22,7 @@ from jaximu.ground import stored
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, LocalGravity
+from jaximu.ground.vectors import sigmas_of
 from jaximu.model.sensor import Imu
 from jaximu.planning.chunks import in_chunks
 from jaximu.planning.goals import goal_of, goal_sigmas, parse_goal
@@ -181,7 +182,7 @@ class Guide:
         if not self.goals:
             return -float(np.linalg.slogdet(information)[1])
         covariance = np.linalg.inv(information) + np.outer(question.by_gravity, question.by_gravity)
-        sigma = np.sqrt(np.diagonal(covariance)) * np.asarray(question.parameters.size)
+        sigma = sigmas_of(covariance) * np.asarray(question.parameters.size)
         total = 0.0
         for _, what, text in self.goals:
             size, now = goal_sigmas(what, text, question.parameters.names, question.imu, sigma)
@@ -194,7 +195,7 @@ class Guide:
             if calibration is None:
                 progress.append(GoalProgress(text, 0.0, np.inf))
                 continue
-            sigma = np.sqrt(np.diagonal(calibration.covariance))
+            sigma = sigmas_of(calibration.covariance)
             wanted, now = goal_sigmas(what, size, calibration.names, calibration.imu, sigma)
             progress.append(GoalProgress(text, wanted, float(now.max())))
         return progress

@@ -25,7 +25,7 @@ from jaximu.data.poses_covariance import condition_covariance
 from jaximu.estimation.problem import Name, Parameters
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.gravity import LocalGravity
-from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotation_matrix
+from jaximu.ground.rotation import IDENTITY, UP, conjugate, exponential, logarithm, multiply, rotation_matrix
 from jaximu.ground.stored import compiled
 from jaximu.model.mounting import Mounting
 from jaximu.model.sensor import Imu
@@ -90,7 +90,7 @@ def turn_vectors(attitude: Float[Array, "P 4"]) -> Float[Array, "P-1 3"]:
     moves smoothly with the attitudes through 180°.
     """
     step = multiply(conjugate(attitude[:-1]), attitude[1:])
-    half = step + jnp.array([1.0, 0.0, 0.0, 0.0])
+    half = step + IDENTITY
     return 2 * logarithm(half / jnp.sqrt(jnp.sum(half**2, axis=-1, keepdims=True)))
 
 
@@ -192,8 +192,7 @@ def table_information(
     """
     turns = len(design.rate), SAMPLES
     course = design.rate[:, None] * accuracy.turn * (jnp.arange(SAMPLES) + 0.5) / SAMPLES
-    vertical = jnp.array([0.0, 0.0, 1.0])
-    during = multiply(exponential(course[..., None] * vertical), jnp.broadcast_to(design.axis[:, None], (*turns, 4)))
+    during = multiply(exponential(course[..., None] * UP), jnp.broadcast_to(design.axis[:, None], (*turns, 4)))
     up, axis = up_vectors(design.attitude), jnp.broadcast_to(up_vectors(design.axis)[:, None], (*turns, 3))
     at_rest = Stimulus(gravity * up, jnp.zeros_like(up), attitude=design.attitude)
     moving = Stimulus(gravity * axis, design.rate[:, None, None] * axis, attitude=during)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 
-import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +19,9 @@ from jaximu.ground.errors import InputError
 from jaximu.ground.gravity import STANDARD, LocalGravity
 from jaximu.ground.page import Result
 from jaximu.ground.precision import require_float64
+from jaximu.ground.rotation import UP
+from jaximu.ground.tracing import on_host
+from jaximu.ground.vectors import dot_rows, sigmas_of, submatrix
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu, Triad
 from jaximu.planning.information import (
@@ -253,12 +255,12 @@ class Proposal(Result, Document, page="plan"):
     @property
     def before(self) -> FloatArray:
         """The standard deviations of the parameters (p,), own units, without the poses."""
-        return np.sqrt(np.diagonal(self.covariances[0]))
+        return sigmas_of(self.covariances[0])
 
     @property
     def after(self) -> FloatArray:
         """The standard deviations of the parameters (p,), own units, with the poses."""
-        return np.sqrt(np.diagonal(self.covariances[1]))
+        return sigmas_of(self.covariances[1])
 
     @property
     def gain(self) -> float:
@@ -473,7 +475,7 @@ def _plannable(imu: Imu) -> tuple[Imu, tuple[str, ...]]:
             dormant.append(CATALOGUE[effect.name].dormant(**inner))
         else:
             notes.append(f"{effect.title} is left as it is: poses and turns at one temperature do not determine it.")
-    return jax.tree.map(np.asarray, imu.with_effects(*dormant)), tuple(notes)
+    return on_host(imu.with_effects(*dormant)), tuple(notes)
 
 
 def _in_output(triad: Triad, density: FloatArray) -> FloatArray:
@@ -516,7 +518,7 @@ def _prior(known: Known, imu: Imu, parameters: Parameters, by_gravity: FloatArra
             covariance = _in_hand_frame(covariance, known.names, imu)
         indices = [index for index, name in enumerate(names) if name in known.names]
         rows = [known.names.index(names[index]) for index in indices]
-        total[np.ix_(indices, indices)] = covariance[np.ix_(rows, rows)] / size[indices][:, None] / size[indices]
+        total[np.ix_(indices, indices)] = submatrix(covariance, rows) / size[indices][:, None] / size[indices]
         if upper and by_hand:
             # by hand the accelerometer's axes are the frame; how they lie to a table's is open, for both triads alike
             frame = _frame(imu, names) / size[:, None]
@@ -619,7 +621,7 @@ def _attitudes(up: FloatArray, heading: FloatArray | float = 0.0) -> FloatArray:
 
 def _neighbourly(attitudes: FloatArray) -> FloatArray:
     """Attitudes in which neighbours have one sign: the shortest way leads from one to the next."""
-    signs = np.where(np.sum(attitudes[1:] * attitudes[:-1], axis=1) >= 0, 1.0, -1.0)
+    signs = np.where(dot_rows(attitudes[1:], attitudes[:-1]) >= 0, 1.0, -1.0)
     return attitudes * np.cumprod([1.0, *signs])[:, None]
 
 
@@ -627,7 +629,7 @@ def _rounded(design: Design, equipment: Equipment) -> Design:
     step, attitude = np.radians(equipment.step), np.asarray(design.attitude)
     if equipment.robot:
         round_ = np.array([round_attitude(quaternion, step) for quaternion in attitude])
-        signs = np.where(np.sum(round_ * attitude, axis=1) >= 0, 1.0, -1.0)
+        signs = np.where(dot_rows(round_, attitude) >= 0, 1.0, -1.0)
         return replace(design, attitude=round_ * signs[:, None])  # each turn goes the way that was sought
     if equipment.by_hand:
         zero = first_heading(attitude[0])
@@ -672,7 +674,7 @@ def _turns(design: Design, equipment: Equipment) -> tuple[Turn, ...]:
     turns = []
     for vector in np.asarray(turn_vectors(design.attitude)):
         angle = float(np.linalg.norm(vector))
-        axis = vector / angle if angle > 0 else np.array([0.0, 0.0, 1.0])
+        axis = vector / angle if angle > 0 else UP
         words = f"the direct way, {np.degrees(angle):.0f}°"
         if equipment.robot:
             about = ", ".join(f"{component + 0.0:.3f}" for component in np.round(axis, 3))

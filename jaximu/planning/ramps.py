@@ -17,6 +17,7 @@ from jaximu.calibration.identifiability import ENOUGH, Separation, separated
 from jaximu.calibration.thermal_shapes import ThermalShapes
 from jaximu.data.rest_blocks import RestBlocks, joined
 from jaximu.estimation.track import Track
+from jaximu.ground.differences import midpoints
 from jaximu.model.stimulus import Stimulus
 
 _BLOCKS = 60  # of each way
@@ -71,7 +72,7 @@ def _with(blocks: RestBlocks, ends: Sequence[float], rate: float) -> tuple[RestB
     steps = abs(ends[1] - ends[0]) / rate * np.tile([_SOAK, 1.0], len(ends))[: 2 * len(ends) - 1]
     knots, count = np.cumulative_sum(steps, include_initial=True), _BLOCKS * (len(ends) - 1)
     edges = np.linspace(0.0, knots[-1], 8 * count + 1)
-    time = (edges[1:] + edges[:-1]) / 2
+    time = midpoints(edges)
     path = np.interp(time, knots, np.repeat(ends, 2))
     slope = np.gradient(path, time)
     celsius, rates = (values.reshape(count, 8).mean(axis=1) for values in (path, slope))

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-import jax
 import numpy as np
 from scipy.linalg import qr
 from scipy.spatial.transform import Rotation
@@ -36,6 +35,9 @@ from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import Z95
+from jaximu.ground.rotation import UP
+from jaximu.ground.tracing import on_host
+from jaximu.ground.vectors import sigmas_of, submatrix
 from jaximu.model.effects.base import Effect
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -52,7 +54,7 @@ from jaximu.simulation.protocols.rotations import NINETEEN, rotation_vector
 FILTERED = replace(EQUIPMENT["table"], rest=20.0, turn=8.0, setting=0.0, in_sequence=True)
 """A table that turns a unit from one position to the next while it is recorded."""
 _CHOICES = [f"{axis}{angle}" for angle in (90, -90, 180) for axis in "xyz"]
-_UPRIGHT = attitude_of(np.array([0.0, 0.0, 1.0]))
+_UPRIGHT = attitude_of(UP)
 _WIDTH = 12
 """Sequences that are kept at every length."""
 _RATE = 50.0
@@ -161,7 +163,7 @@ class Filter:
     def value(self, known: Knowledge, criterion: str, weights: FloatArray) -> float:
         """Return the logarithm of a criterion of all free numbers but the Earth's rotation."""
         kept = [index for index in range(len(self.names)) if index not in self.earth]
-        spread = (self.numbers(known) / self.size[:, None] / self.size)[np.ix_(kept, kept)]
+        spread = submatrix(self.numbers(known) / self.size[:, None] / self.size, kept)
         return float(stored.call(CRITERIA[criterion], f"sequence's {criterion}", spread, weights[kept]))
 
     def _rows(self, measurement: IntervalsOfMotion, part: slice) -> tuple[WhiteRows, Rotation]:
@@ -210,7 +212,7 @@ def filter_of(
         duration = positions * equipment.rest + (positions - 1) * equipment.turn
         noise = with_usual_drift(NoiseModel(white[0], white[1]), equipment.rest, duration)
         notes += ("the drift of the biases that is usual of MEMS sensors is assumed.",)
-    imu = jax.tree.map(np.asarray, question.imu.with_effects(*chosen, GyroEarthRotation.dormant()))
+    imu = on_host(question.imu.with_effects(*chosen, GyroEarthRotation.dormant()))
     free = Parameters.select(imu, without_equipment_or_effects)
     size = np.asarray(free.size)
     spread = plausible_sizes(imu) | {GyroEarthRotation.name: np.full(3, EARTH_RATE)}
@@ -220,10 +222,10 @@ def filter_of(
     information[np.ix_(inside, inside)] = np.asarray(question.prior) / np.outer(base.size, base.size)
     for index, name in enumerate(free.names):
         if name.effect is not None:
-            effect = imu.all_effects()[name.owner, name.effect]
+            effect = imu.all_effects()[name.key]
             information[index, index] = 1 / np.broadcast_to(spread[effect.name], effect.size)[name.axes[0]] ** 2
     information[-1, -1] = 1 / max(known.gravity.sigma, 1e-6) ** 2
-    scale = np.sqrt(np.diagonal(information))
+    scale = sigmas_of(information)
     root = np.linalg.cholesky(information / np.outer(scale, scale)).T * scale
     prior = Knowledge(root, np.zeros(len(root)))
     return Filter(

@@ -24,7 +24,7 @@ from jaximu.data.observe_stations import TYPICAL_NOISE, scheme_stations
 from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.document import Json, read_toml
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError, only
-from jaximu.ground.rotation import apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
+from jaximu.ground.rotation import UP, apply_matrix, conjugate, exponential, logarithm, multiply, right_jacobian, rotate
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSOR_UNITS
 from jaximu.model import AxisNoise, BiasInstability, parse_quantity
 from jaximu.model.effects import CATALOGUE, Effect
@@ -102,6 +102,10 @@ _WORDS = {
 }
 
 
+StatedErrors = Mapping[str, tuple[Any, str]]
+"""By name, sizes of errors in SI and the text that stated them."""
+
+
 @dataclass(frozen=True)
 class Task:
     """A specification read for a budget: the unit and its scheme, sizes of errors in SI with the text that stated them,
@@ -110,7 +114,7 @@ class Task:
 
     case: Case
     environment: Environment
-    errors: Mapping[str, tuple[Any, str]]
+    errors: StatedErrors
     fitted: tuple[str, ...]
     goals: tuple[tuple[str, str], ...]
     name: str
@@ -146,7 +150,7 @@ def task(document: Mapping[str, Any], name: str = "specification") -> Task:
     return Task(specification.case(0), environment, errors, tuple(fitted), stated, name)
 
 
-def _stated(errors: Mapping[str, tuple[Any, str]], name: str) -> dict[str, float]:
+def _stated(errors: StatedErrors, name: str) -> dict[str, float]:
     """The sizes of a table of errors, SI; empty where it is not stated."""
     return errors.get(name, ({}, ""))[0]
 
@@ -246,7 +250,7 @@ class ErrorScheme(eqx.Module):
         middle = (edges[:, 1:] + edges[:, :-1]) / 2
         attitude = self.motion.attitude_at(middle.ravel()).reshape(*middle.shape, 4)
         rate = logarithm(multiply(conjugate(edge[:, :-1]), edge[:, 1:])) / step[:, None, None]
-        up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), rate.shape)
+        up = jnp.broadcast_to(UP, rate.shape)
 
         begin, end = turned[self.ends[:, 0]][:, None], turned[self.ends[:, 1]][:, None]
         off = begin + self.done[..., None] * (end - begin)
@@ -415,7 +419,7 @@ def scheme_and_sources(task: Task) -> tuple[ErrorScheme, tuple[ErrorSource, ...]
     return scheme, tuple(_source(errors, name, root) for name, root in roots.items() if root.size), notes
 
 
-def _source(errors: Mapping[str, tuple[Any, str]], name: str, root: FloatArray) -> ErrorSource:
+def _source(errors: StatedErrors, name: str, root: FloatArray) -> ErrorSource:
     value, text = errors.get(name, (None, "by the noise"))
     single = value if name in _SINGLE else None
     return ErrorSource(name, _WORDS.get(name, f"{name} not modelled"), text, single, _SINGLE.get(name, ""), root)
@@ -458,7 +462,7 @@ def _with_noise(case: Case, stations: Stations, intervals: Sequence[ScheduleEntr
     return stations, fast, slow, ramps, tuple(notes)
 
 
-def _effects_by_source(errors: Mapping[str, tuple[Any, str]], unit: Imu, ramps: Mapping[str, FloatArray]):
+def _effects_by_source(errors: StatedErrors, unit: Imu, ramps: Mapping[str, FloatArray]):
     """By source: effects that make its errors, each with the sizes of its coefficients."""
     gains = {name: triad.scales for name, triad in unit.triads().items()}
 
@@ -503,7 +507,7 @@ def _scheme(
     stations: Stations,
     intervals: Sequence[ScheduleEntry],
     stops: _Stops,
-    errors: Mapping[str, tuple[Any, str]],
+    errors: StatedErrors,
 ) -> ErrorScheme:
     count, size = len(intervals), stations.turn.shape[0]
     ends, axis, angle = np.zeros((size, 2), np.int64), np.zeros((size, 3)), np.full(size, np.inf)

@@ -17,6 +17,7 @@ import scipy
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.distributions import student_isf
+from jaximu.ground.vectors import dot_rows, lengths_of
 
 _BLOCK = 0.2
 """Seconds over which the specific force is averaged."""
@@ -130,13 +131,13 @@ def gravity_turning(
     centre = force_time[: count * span].reshape(count, span).mean(axis=1)
     rate = rate - np.median(rate, axis=0)
     angle = np.cumulative_sum(turned_between(rate_time, rate), axis=0, include_initial=True)
-    length = np.linalg.norm(mean, axis=1)
+    length = lengths_of(mean)
     usual = np.median(length)
     off = np.abs(length - usual) / max(usual, 1e-300)
     off = np.maximum(off[1:], off[:-1])
     change = np.diff(mean, axis=0)
     # by the accelerometer: what the gyroscope says may be wrong by any factor
-    far = np.linalg.norm(change, axis=1) / max(usual, 1e-300)
+    far = lengths_of(change) / max(usual, 1e-300)
     weight = 1 / np.sqrt((1 + (off / _MOVED) ** 2) * (1 + (far / _FAR) ** 2))
     # across a gap nobody knows what the unit did
     apart, step = np.diff(centre), np.diff(rate_time)
@@ -277,7 +278,7 @@ def carried(
         and interval[slice(*np.searchsorted(rate_time, (start, stop)))].max(initial=0.0) < gap
         for (_, start), (stop, _), a, b in zip(rests, rests[1:], middle, middle[1:], strict=False)
     ]
-    turned = np.sum(up[1:] * up[:-1], axis=1) < np.cos(TURN_ANGLE)
+    turned = dot_rows(up[1:], up[:-1]) < np.cos(TURN_ANGLE)
     kept = [
         not _jumps(force[stop:start], *up[[at, at + 1]]) for at, ((_, stop), (start, _)) in enumerate(pairwise(edges))
     ]
@@ -325,7 +326,7 @@ def _jumps(force: FloatArray, before: FloatArray, after: FloatArray) -> bool:
     """Whether gravity jumps from one direction (3,) to another within a step of the force (n, 3): rows were cut out."""
     up = _directions(force)
     near = _JUMP * np.linalg.norm(after - before)
-    left, reached = (np.linalg.norm(up - direction, axis=1) < near for direction in (before, after))
+    left, reached = (lengths_of(up - direction) < near for direction in (before, after))
     return bool(np.any(left[:-1] & reached[1:]))
 
 
@@ -380,8 +381,8 @@ def clocks(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, rat
     blocks = gravity_turning(force_time, force, rate_time, rate)
     if blocks is None or len(blocks.change) < 6 * _FEWEST:
         return None
-    off = np.linalg.norm(blocks.force - np.median(blocks.force, axis=0), axis=1)
-    if np.quantile(off, 0.99) < _TURNED * np.median(np.linalg.norm(blocks.force, axis=1)):
+    off = lengths_of(blocks.force - np.median(blocks.force, axis=0))
+    if np.quantile(off, 0.99) < _TURNED * np.median(lengths_of(blocks.force)):
         return None
     middle = blocks.centre.mean()
     edges = np.linspace(0, len(blocks.change), min(_PARTS, len(blocks.change) // (2 * _FEWEST)) + 1).astype(int)

@@ -9,6 +9,7 @@ import scipy
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
+from jaximu.ground.vectors import dot_rows, lengths_of
 
 UNIT_LENGTH = 0.01  # off one, of a quaternion that is one
 _JUMP = 2.0  # rad; between neighbouring stamps nothing turns so far
@@ -32,7 +33,7 @@ class Attitude:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        length = np.linalg.norm(self.quaternion, axis=1)
+        length = lengths_of(self.quaternion)
         if np.mean(np.abs(length - 1) <= UNIT_LENGTH) < 0.5:
             raise InputError(
                 f"{self.name}: its quaternions have the length {np.median(length):.4g} and not 1: the columns are "
@@ -43,7 +44,7 @@ class Attitude:
 
     def usable(self) -> Attitude:
         """Return the rows whose quaternion is one, of length one and without jumps of sign."""
-        length = np.linalg.norm(self.quaternion, axis=1)
+        length = lengths_of(self.quaternion)
         kept = np.abs(length - 1) < UNIT_LENGTH
         vectors = {"velocity": self.velocity, "position": self.position}
         vectors = {name: values[kept] for name, values in vectors.items() if values is not None}
@@ -51,7 +52,7 @@ class Attitude:
         if not kept.all():
             notes += (f"{self.name}: {np.sum(~kept)} of {len(kept)} rows hold no attitude and are left out.",)
         unit = self.quaternion[kept] / length[kept, None]
-        flips = np.concatenate([[1.0], np.cumprod(np.sign(np.sum(unit[1:] * unit[:-1], axis=1) + 1e-12))])
+        flips = np.concatenate([[1.0], np.cumprod(np.sign(dot_rows(unit[1:], unit[:-1]) + 1e-12))])
         return replace(self, time=self.time[kept], quaternion=unit * flips[:, None], notes=notes, **vectors)
 
     def rotation(self) -> scipy.spatial.transform.Rotation:
@@ -62,7 +63,7 @@ class Attitude:
         """Return the rotation vector (n − 1, 3), body frame, from each stamp to the next; NaN over a jump."""
         rotation = self.rotation()
         turned = (rotation[:-1].inv() * rotation[1:]).as_rotvec()
-        turned[np.linalg.norm(turned, axis=1) > _JUMP] = np.nan
+        turned[lengths_of(turned) > _JUMP] = np.nan
         return turned
 
     @property

@@ -24,6 +24,7 @@ from jaximu.ground.parameters import data_frame
 from jaximu.ground.reexport import later
 from jaximu.ground.tracing import is_traced
 from jaximu.ground.units import INERTIAL_QUANTITIES, PREFIXES, SENSORS, STANDARD_GRAVITY
+from jaximu.ground.vectors import lengths_of
 from jaximu.recordings.alignment import CORRELATED, Turning, turning, turns_backwards
 
 if TYPE_CHECKING:
@@ -517,7 +518,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
     above absolute zero.
     """
     where, accelerometer, gyroscope = recording.name, recording.accelerometer, recording.gyroscope
-    level = np.median(np.linalg.norm(accelerometer.si(), axis=1)) / gravity.value if len(accelerometer) else 1.0
+    level = np.median(lengths_of(accelerometer.si())) / gravity.value if len(accelerometer) else 1.0
     plausible = 0.5 < level < 2.0
     if not plausible:
         _require_own_columns(recording, gravity)
@@ -538,7 +539,7 @@ def plausibility(recording: Recording, gravity: LocalGravity = STANDARD) -> tupl
             raise InputError(f"{where}: column {name} falls to {signal.values.min():.4g} °C, below absolute zero.")
     if gyroscope is None or len(gyroscope) < 2 or len(accelerometer) < 2:
         return ()
-    peak = np.percentile(np.linalg.norm(gyroscope.si(), axis=1), 99.0)
+    peak = np.percentile(lengths_of(gyroscope.si()), 99.0)
     assert recording.turning is not None
     slope, correlation = recording.turning.slope, recording.turning.correlation
     if abs(correlation) > CORRELATED and not 1.0 / 3.0 < abs(slope) < 3.0:
@@ -576,7 +577,7 @@ def _require_own_columns(recording: Recording, gravity: LocalGravity) -> None:
     gyroscope = recording.gyroscope
     if gyroscope is None or not len(gyroscope) or _no_gravity(gyroscope):
         return
-    level = np.median(np.linalg.norm(gyroscope.values, axis=1))
+    level = np.median(lengths_of(gyroscope.values))
     if any(abs(level / size - 1) < 0.1 for size in (gravity.value, 1.0, 1000.0)):  # m/s², g, mg
         raise InputError(
             f"{recording.name}: the magnitude of gyro_x, gyro_y, gyro_z stays at {level:.4g} as gravity's does, and "
@@ -594,7 +595,7 @@ def _require_one_unit(recording: Recording) -> None:
     force, parts = accelerometer.si(), np.array_split(np.arange(len(accelerometer)), _PARTS)
     if len(parts[-1]) < 2:  # means of poses: nothing to compare
         return
-    levels = {"accel_x, accel_y, accel_z": [np.median(np.linalg.norm(force[part], axis=1)) for part in parts]}
+    levels = {"accel_x, accel_y, accel_z": [np.median(lengths_of(force[part])) for part in parts]}
     if gyroscope is not None:
         rates, ratios = gyroscope.si(), []
         for part in parts:
@@ -661,7 +662,7 @@ def _time_advice(gyroscope: Signal) -> str:
 
 def _no_gravity(signal: Signal) -> bool:
     """Whether the norm varies as much as it is large: in another unit gravity's would stay the same at rest."""
-    norm = np.linalg.norm(signal.si(), axis=1)
+    norm = lengths_of(signal.si())
     low, high = np.quantile(norm, [0.2, 0.8])
     return bool(high > 1.3 * low)
 

@@ -17,6 +17,7 @@ from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.differences import interpolated
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.vectors import dot_rows, lengths_of
 from jaximu.recordings.attitude import UNIT_LENGTH
 from jaximu.recordings.entry import ScheduleEntry, times_of
 from jaximu.recordings.recording import Recording, Signal, floor_of, runs_of
@@ -146,7 +147,7 @@ def _require_clock(entries: Sequence[ScheduleEntry], rate: Integral, bias: Float
         if entry.kind == "pose":
             edges = np.linspace(entry.start, entry.stop, max(2, math.ceil(entry.stop - entry.start) + 1))
             mean = rate.over(edges[:-1], edges[1:]) / np.diff(edges)[:, None] - bias
-            if np.linalg.norm(mean, axis=1).max() > _MOVING:
+            if lengths_of(mean).max() > _MOVING:
                 moving.append(entry)
     if not moving:
         return
@@ -193,7 +194,7 @@ def _require_poses(recording: Recording, poses: Sequence[ScheduleEntry], where: 
     force = Integral(recording.accelerometer)
     read = unit_vectors(force.over(*times_of(poses).T))
     stated = np.stack([pose.vector for pose in poses])
-    off = np.degrees(np.arccos(np.clip(np.sum(read * stated, axis=1), -1, 1)))
+    off = np.degrees(np.arccos(np.clip(dot_rows(read, stated), -1, 1)))
     if not (off > _OFF).any():
         return
     if (off > 180 - _OFF).all():
@@ -261,7 +262,7 @@ def _neighbours(count: int, samples: float) -> tuple[IntArray, IntArray]:
 
 
 def _entries_of_attitude(recording: Recording, attitude: Signal) -> list[ScheduleEntry]:
-    length = np.linalg.norm(attitude.values, axis=1)
+    length = lengths_of(attitude.values)
     if (np.abs(length - 1) > UNIT_LENGTH).any():
         worst = np.argmax(np.abs(length - 1))
         raise InputError(
@@ -293,7 +294,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
     if recording.gyroscope is not None:  # a unit is mounted again while the table stands
         rate = Integral(recording.gyroscope)
         mean = rate.over(time[before], time[after]) / (time[after] - time[before])[:, None]
-        off = np.linalg.norm(mean - np.median(mean[moved < _STILL], axis=0), axis=1)
+        off = lengths_of(mean - np.median(mean[moved < _STILL], axis=0))
         moved = np.where(off > _MOVING, np.inf, moved)
     spans = _rests(time, moved, recording.name)
     if not len(recording.accelerometer):
@@ -306,7 +307,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
     size = np.abs(read)
     axis = np.argmax(size, axis=1)
     ups = np.sign(np.take_along_axis(read, axis[:, None], 1)) * np.eye(3)[axis]
-    off = np.degrees(np.arccos(np.minimum(1.0, size.max(axis=1) / np.linalg.norm(read, axis=1))))
+    off = np.degrees(np.arccos(np.minimum(1.0, size.max(axis=1) / lengths_of(read))))
     if len(tilted := np.flatnonzero(off > _OFF)):
         first = tilted[0]
         start, stop = spans[first]

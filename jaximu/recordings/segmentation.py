@@ -16,6 +16,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.units import INERTIAL_QUANTITIES
+from jaximu.ground.vectors import lengths_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE
 from jaximu.recordings.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
@@ -71,7 +72,7 @@ class Segmentation(Comparable):
         return ", ".join(f"{count} at {factor:g}x" for factor, count, _, _ in self.tried)
 
 
-class _Moments:
+class Moments:
     """Running sums of a signal in SI and of its square, from which mean and variance over any samples follow."""
 
     def __init__(self, signal: Signal) -> None:
@@ -93,14 +94,14 @@ class _Moments:
         return (mean + self._origin).T, np.maximum(variance, 0.0).T, count
 
 
-def _windows(moments: _Moments, centres: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
+def _windows(moments: Moments, centres: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
     """Mean (W, 3) and summed variance (W,) over windows around `centres`; a gap is not rest."""
     mean, variance, count = moments.between(centres - width / 2 - 1e-9, centres + width / 2 - 1e-9)
     enough = count >= max(3, 0.5 * width * moments.signal.rate)
     return mean, np.where(enough, variance.sum(axis=1), np.inf)
 
 
-def _floor(variance: FloatArray, moments: _Moments) -> float:
+def _floor(variance: FloatArray, moments: Moments) -> float:
     """The variance of windows at rest: the median of those near the lowest."""
     floor = floor_of(variance[np.isfinite(variance)])
     # Quantised output can be constant at rest; then a step's rounding variance is the least that can be claimed. And
@@ -112,7 +113,7 @@ def _floor(variance: FloatArray, moments: _Moments) -> float:
 
 def _angles(vectors: FloatArray, others: FloatArray) -> FloatArray:
     """Angle (rad) between each vector and the other of its row."""
-    return 2 * np.arcsin(np.clip(np.linalg.norm(unit_vectors(others) - unit_vectors(vectors), axis=1) / 2, 0, 1))
+    return 2 * np.arcsin(np.clip(lengths_of(unit_vectors(others) - unit_vectors(vectors)) / 2, 0, 1))
 
 
 def _samples(signal: Signal, start: float, stop: float) -> slice:
@@ -129,7 +130,7 @@ class _Scan:
 
     width: float
     centres: FloatArray
-    moments: tuple[_Moments, ...]
+    moments: tuple[Moments, ...]
     means: tuple[FloatArray, ...]
     ratio: FloatArray
     floor: float
@@ -149,7 +150,7 @@ class _Scan:
             )
         step = width / 8
         centres = np.arange(start, end + step / 2, step)
-        moments = tuple(_Moments(signal) for signal in signals)
+        moments = tuple(Moments(signal) for signal in signals)
         means, variances = zip(*(_windows(running, centres, width) for running in moments), strict=True)
         for signal, variance, name in zip(signals, variances, INERTIAL_QUANTITIES, strict=False):
             if not np.isfinite(variance).any():
@@ -219,7 +220,7 @@ def find_stops(recording: Recording) -> Segmentation | None:
     middle = np.median(force, axis=0)
     turned = np.mean(_angles(force, np.broadcast_to(middle, force.shape)) > _UPRIGHT)
     limits = (_STEADY, SegmentationOptions.rate_limit)  # of force and rate; beyond either the unit moves
-    off = [np.linalg.norm(mean - np.median(mean, axis=0), axis=1) for mean in scan.means]
+    off = [lengths_of(mean - np.median(mean, axis=0)) for mean in scan.means]
     moving = np.mean([values > limit for values, limit in zip(off, limits, strict=False)], axis=1).max()
     if turned > _TURNED or moving < _TURNED:
         return None
@@ -227,7 +228,7 @@ def find_stops(recording: Recording) -> Segmentation | None:
     quiet = (scan.ratio < np.exp(threshold)) & (parted > _PARTED)
     steady = np.zeros(len(quiet), bool)
     for first, last in runs_of(quiet):  # what vibrates at rest hides how gently motion sets in
-        off = np.linalg.norm(force[first:last] - np.median(force[first:last], axis=0), axis=1)
+        off = lengths_of(force[first:last] - np.median(force[first:last], axis=0))
         steady[first:last] = off < max(_STEADY, _CHANCE * np.median(off))
     first, last = runs_of(steady).T
     intervals = np.stack([scan.centres[first] + scan.width / 2, scan.centres[last - 1] - scan.width / 2], axis=1)
@@ -275,24 +276,24 @@ def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:
     if quiet.sum() < 4:
         return np.zeros(len(rate))
     bias = np.median(rate[quiet], axis=0)
-    deviation = np.linalg.norm(rate - bias, axis=1)
+    deviation = lengths_of(rate - bias)
     return deviation / max(limit, 6 * np.median(deviation[quiet]))
 
 
-def _drop_rotating(moments: Sequence[_Moments], intervals: FloatArray) -> tuple[FloatArray, list[str]]:
+def _drop_rotating(moments: Sequence[Moments], intervals: FloatArray) -> tuple[FloatArray, list[str]]:
     """Drop intervals that turn slowly: gravity drifts between their halves, or the mean rate is off all others'."""
     if not len(intervals):
         return intervals, []
     start, stop = intervals.T
     middle = (start + stop) / 2
     (before, *spread), (after, *later) = moments[0].between(start, middle), moments[0].between(middle, stop)
-    length = np.linalg.norm(before, axis=1)
+    length = lengths_of(before)
     noise = np.sqrt(sum(variance.sum(axis=1) / np.maximum(count, 1) for variance, count in (spread, later))) / length
     keep = _angles(before, after) < np.maximum(np.radians(0.2), 6 * noise)
     keep &= np.minimum(spread[1], later[1]) >= 3
     if len(moments) > 1 and keep.sum() > 2:
         means = moments[1].between(start, stop)[0]
-        deviation = np.linalg.norm(means - np.median(means[keep], axis=0), axis=1)
+        deviation = lengths_of(means - np.median(means[keep], axis=0))
         keep &= deviation < max(np.radians(0.1), 8 * np.median(deviation[keep]))
     dropped = intervals[~keep]
     if not len(dropped):
@@ -372,7 +373,7 @@ def _of_blocks(signal: Signal, columns: Sequence[FloatArray], size: int) -> tupl
 
 def _rounding(signal: Signal, part: Segmentation) -> FloatArray:
     """(3, P) variance, in output units, by which rounding shifts the means of a recording's poses."""
-    variances = _Moments(signal).between(*part.intervals.T)[1]
+    variances = Moments(signal).between(*part.intervals.T)[1]
     return np.square(signal.nominal_scale)[:, None] * _rounding_of_means(signal, variances)
 
 
@@ -625,7 +626,7 @@ def _across_gaps(gyroscope: Signal) -> FloatArray:
     rate = gyroscope.si()
     before = (rate[gaps] - rate[gaps - 3]) / (gyroscope.time[gaps] - gyroscope.time[gaps - 3])[:, None]
     after = (rate[gaps + 4] - rate[gaps + 1]) / (gyroscope.time[gaps + 4] - gyroscope.time[gaps + 1])[:, None]
-    error[gaps + 1] = np.square(interval[gaps]) / 12 * np.linalg.norm(after - before, axis=1)
+    error[gaps + 1] = np.square(interval[gaps]) / 12 * lengths_of(after - before)
     return error
 
 

@@ -11,6 +11,7 @@ from jaximu.calibration import Calibration
 from jaximu.data import forces_and_angles
 from jaximu.data.poses import EXCESS_NAMES
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.vectors import lengths_of
 from jaximu.simulation.protocols.positions import spiral
 
 
@@ -45,7 +46,7 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
     used = turns if "gyroscope" in calibration.triads() else np.zeros_like(turns)
     force_before, angle_before = forces_and_angles(nominal, observations)
     force, angle_after = forces_and_angles(fit.imu, observations)
-    length = np.linalg.norm(force, axis=1)
+    length = lengths_of(force)
     directions = force / length[:, None]
     gravity = float(observations.gravity)
     of_poses, of_turns = (calibration.excess.get(name, 0.0) for name in EXCESS_NAMES[:2])
@@ -76,7 +77,7 @@ def evidence(calibration: Calibration) -> PoseAndTurnErrors | None:
 
     return PoseAndTurnErrors(
         directions=directions[poses],
-        norm_before=np.linalg.norm(force_before[poses], axis=1) - gravity,
+        norm_before=lengths_of(force_before[poses]) - gravity,
         norm_after=length[poses] - gravity,
         norm_noise=np.sqrt(along(covariance)[poses]),
         norm_sigma=np.sqrt(along(extended)[poses]),

@@ -19,6 +19,7 @@ from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import number, raised, readable, size, unit_text
 from jaximu.ground.units import SENSOR_UNITS
+from jaximu.ground.vectors import lengths_of, root_or_zero, sigmas_of
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.report.evidence import PoseAndTurnErrors, evidence
 from jaximu.report.tables import short_name
@@ -193,7 +194,7 @@ def recording_of(calibration: Calibration) -> Figure:
                 axes.axvline(shift, color="black", linewidth=1.2, linestyle=":")
         spans += [(start + offset, stop - start) for start, stop in intervals]
         still += np.sum(intervals[:, 1] - intervals[:, 0])
-        shift += time[-1] - time[0]
+        shift += np.ptp(time)
     for axes, label in zip(grid, ("specific force (m/s²)", "angular rate (rad/s)"), strict=False):
         axes.broken_barh(
             spans,
@@ -307,7 +308,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
     """Draw which parameters the data can only tell together."""
     parameters = calibration.names
     names = [short_name(name, calibration.imu) for name in parameters]
-    sigma = np.sqrt(np.diagonal(calibration.covariance))
+    sigma = sigmas_of(calibration.covariance)
     sigma = np.where(sigma > 0, sigma, 1.0)
     matrix, count = calibration.covariance / sigma[:, None] / sigma, len(names)
     height = max(4.6, 0.36 * count + 1.0)
@@ -327,11 +328,7 @@ def correlation_figure(calibration: Calibration) -> Figure:
                 line(index + 0.5, color="black", linewidth=1.4 if before.owner != after.owner else 0.5)
     figure.colorbar(image, cax=scale, label="correlation (−1 to 1)")
     # scales of the accelerometer share the uncertainty of gravity: no pair of them is named as the closest
-    scales = [
-        index
-        for index, name in enumerate(parameters)
-        if name.startswith("accelerometer.gain") and name.axes[0] == name.axes[1]
-    ]
+    scales = [index for index, name in enumerate(parameters) if name.owner == "accelerometer" and name.is_scale]
     others = matrix - np.eye(count)
     others[np.ix_(scales, scales)] = 0.0
     first, second = sorted(np.unravel_index(int(np.argmax(np.abs(others))), others.shape))
@@ -353,8 +350,8 @@ def correlation_figure(calibration: Calibration) -> Figure:
 
 def _flat(directions: FloatArray) -> FloatArray:
     """Map a half sphere about ±z to a disc of radius one; equal areas stay equal (Lambert)."""
-    across = np.linalg.norm(directions[:, :2], axis=1)
-    radius = np.sqrt(np.maximum(1 - np.abs(directions[:, 2]), 0.0))
+    across = lengths_of(directions[:, :2])
+    radius = root_or_zero(1 - np.abs(directions[:, 2]))
     return directions[:, :2] * (radius / np.maximum(across, 1e-12))[:, None]
 
 

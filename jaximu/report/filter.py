@@ -122,7 +122,7 @@ def page_of(calibration: Calibration, history: History) -> Page:
     bias = history.sigmas[-1, _places(history, "gyroscope", "bias")]
     scale = np.mean(calibration.triads()["gyroscope"].scales)
     worst = np.degrees(Z95 * max(bias) / scale)
-    minutes = (history.time[-1] - history.time[0]) / 60
+    minutes = np.ptp(history.time) / 60
     verdict = "diverged" if calibration.filter.get("diverged") else "followed the unit"
     return calibration_page(
         calibration,
@@ -171,7 +171,7 @@ def _effects(calibration: Calibration, history: History) -> Iterable[tuple[str, 
     groups: dict[str, list[_Line]] = {}
     units = {name: triad.output_unit for name, triad in calibration.triads().items()}
     for state, name in enumerate(history.names):
-        effect = calibration.imu.all_effects().get((name.owner, name.effect))
+        effect = calibration.imu.all_effects().get(name.key)
         if effect is not None and state not in history.earth:
             title = f"{sentence(effect.english)} [{effect.coefficient_unit(units.get(name.owner, ''))}]"
             lines = groups.setdefault(title, [])

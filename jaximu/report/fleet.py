@@ -245,7 +245,7 @@ def _prior(fleet: Fleet) -> Iterator[Section]:
     alone, prior = (np.quantile(sigma, 0.9, axis=0) for sigma in (fleet.sigma, fleet.shrunk_sigma))
     rows = []
     for k, name in enumerate(fleet.population.names):
-        mean = fleet.population.mean[k] - (name.part == "gain" and name.axes[0] == name.axes[1])
+        mean = fleet.population.mean[k] - name.is_scale
         sizes = (mean, fleet.population.spread[k], alone[k], prior[k])
         rows.append((describe(name), *(amount(name, float(size)) for size in sizes)))
     helped = np.flatnonzero(prior < 0.8 * alone).tolist()

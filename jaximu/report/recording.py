@@ -61,7 +61,7 @@ def signal_facts(signal: Signal, used: Signal | None = None) -> Json:
         "rate": float(used.rate) if several else 0.0,
         "jitter": float(np.std(interval)) if several else 0.0,
         "longest_gap": float(interval.max()) if several else 0.0,
-        "duration": float(used.time[-1] - used.time[0]) if several else 0.0,
+        "duration": float(np.ptp(used.time)) if several else 0.0,
         "minimum": signal.values.min(axis=0).tolist() if len(signal) else [],
         "maximum": signal.values.max(axis=0).tolist() if len(signal) else [],
     }

@@ -48,7 +48,7 @@ def short_name(name: Name, model: Imu | None = None) -> str:
     """
     if name.effect is not None and model is not None:
         return label(name, model)
-    symbol = "b" if name.part == "bias" else "s" if name.axes[0] == name.axes[1] else "m"
+    symbol = "b" if name.part == "bias" else "s" if name.is_scale else "m"
     return f"{name.owner[0]}.{symbol}_{''.join('xyz'[axis] for axis in dict.fromkeys(name.axes))}"
 
 

@@ -268,7 +268,7 @@ class Jitter(Artefact):
             return kept
         # by the row numbers: other artefacts may have taken rows away
         rows = samples.row[-1] - samples.row[0]
-        interval = (samples.time[-1] - samples.time[0]) / rows if rows else (kept or self.sigma)
+        interval = np.ptp(samples.time) / rows if rows else (kept or self.sigma)
         scatter = self.sigma * rng.standard_normal(len(samples.time))
         samples.time = samples.time + np.clip(scatter, -0.45 * interval, 0.45 * interval)
         return interval

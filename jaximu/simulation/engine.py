@@ -19,7 +19,7 @@ from jaximu.ground.document import SOFTWARE, Document, Json, entries
 from jaximu.ground.errors import FilePath, InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import rotate
-from jaximu.ground.tracing import is_traced
+from jaximu.ground.tracing import is_traced, part_of
 from jaximu.ground.units import SENSOR_UNITS
 from jaximu.model import Noise
 from jaximu.model.effects import Effect
@@ -131,11 +131,7 @@ class Truth(Document):
 
         triads = {
             name: {
-                "output_unit": triad.output_unit,
-                "gain": np.asarray(triad.gain).tolist(),
-                "bias": np.asarray(triad.bias).tolist(),
-                "temperature_reference": triad.temperature_reference,
-                "time_reference": triad.time_reference,
+                **entries(triad, "output_unit", "gain", "bias", "temperature_reference", "time_reference"),
                 "effects": documents(triad.effects, triad.output_unit),
                 "noise": [
                     {"process": type(process).__name__}
@@ -190,16 +186,14 @@ def _respond_batch(length: int, halo: int, columns: tuple[str, ...], imus, motio
     """Of units stacked along a leading axis: outputs of one block, the columns beside them, what effects remember."""
 
     def one(imu: Imu, motion: Motion, memory):
-        def crop(stimulus):
-            return jax.tree.map(lambda leaf: leaf[halo : halo + length], stimulus)
-
+        inside = slice(halo, halo + length)
         whole = motion.block(first - halo, rate, length + 2 * halo)
         values, kept = {}, {}
         for name, triad in imu.triads().items():
-            felt = replace(crop(imu.acted(whole, triad.quantity)), memory=memory)
+            felt = replace(part_of(imu.acted(whole, triad.quantity), inside), memory=memory)
             values[name] = triad.respond(felt)
             kept |= triad.memory(felt)
-        intended = crop(whole)
+        intended = part_of(whole, inside)
         beside = {
             "temperature": intended.temperature[:, None],
             "current": intended.current[:, None],

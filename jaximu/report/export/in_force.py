@@ -20,6 +20,7 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.page import Section, Table
 from jaximu.ground.quantities import Z95, plain, size, with_interval
+from jaximu.ground.vectors import lengths_of, root_or_zero
 from jaximu.recordings.readers.parameters import ParameterFile
 from jaximu.recordings.recording import Reading
 from jaximu.report.export.autopilot import MARKS, Firmware
@@ -112,7 +113,7 @@ class Composition:
             (offset, scale), (new_offset, new_scale) = (self._correction(name, of) for of in (self.file, self._new))
             change = gravity * (new_scale / scale - 1.0) * up + new_scale * (offset - new_offset)
             level = change - np.sum(change * up, axis=1, keepdims=True) * up
-            most, tilted = (float(np.linalg.norm(part, axis=1).max()) for part in (change, level))
+            most, tilted = (float(lengths_of(part).max()) for part in (change, level))
             amounts |= _at_rest(name, most, tilted / gravity)
         return amounts
 
@@ -197,7 +198,7 @@ class Composition:
         slopes = [(values(row, small) - values(row, -small)) / (2 * small) for row in map(names.index, free)]
         slope = np.reshape(slopes, (len(free), len(self._new.values)))
         variances = np.einsum("ik,ij,jk->k", slope, calibration.covariance_of(free), slope)
-        return dict(zip(self._new.values, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
+        return dict(zip(self._new.values, root_or_zero(variances).tolist(), strict=True))
 
 
 def _firmware(to: str) -> Firmware:

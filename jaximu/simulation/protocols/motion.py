@@ -19,6 +19,7 @@ from jaxtyping import Float
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
+from jaximu.ground.tracing import on_host
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.stimulus import Stimulus
 
@@ -92,7 +93,7 @@ class Motion(eqx.Module):
     def stimulus(self, rate: float) -> Stimulus:
         """Return the whole motion at `rate` (Hz), as NumPy arrays."""
         samples = self.samples(rate)
-        length, motion = block_length(samples), jax.tree.map(np.asarray, self)
+        length, motion = block_length(samples), on_host(self)
         blocks = [_block(motion, np.asarray(float(k)), np.asarray(rate), length) for k in range(0, samples, length)]
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:samples], *blocks)
 

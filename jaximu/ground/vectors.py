@@ -1,0 +1,30 @@
+"""Rows of vectors, and covariances: their lengths, products, standard deviations and parts."""
+
+import numpy as np
+
+from jaximu.ground.array_types import FloatArray
+
+
+def lengths_of(vectors) -> FloatArray:
+    """Return the lengths (n,) of vectors (n, m)."""
+    return np.linalg.norm(vectors, axis=1)
+
+
+def dot_rows(one, other) -> FloatArray:
+    """Return the scalar products (n,) of vectors (n, m) with others."""
+    return np.sum(one * other, axis=1)
+
+
+def sigmas_of(covariance) -> FloatArray:
+    """Return the standard deviations (n,) of a covariance (n, n)."""
+    return np.sqrt(np.diagonal(covariance))
+
+
+def submatrix(matrix, places):
+    """Return the rows and columns of a matrix (n, n) at places (k,): (k, k)."""
+    return matrix[np.ix_(places, places)]
+
+
+def root_or_zero(values):
+    """Return the square roots of numbers that rounding may have made negative: of these, zero."""
+    return np.sqrt(np.maximum(values, 0.0))
