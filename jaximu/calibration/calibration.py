@@ -12,7 +12,14 @@ import numpy as np
 from jaximu.estimation.fitting import Fit
 from jaximu.estimation.problem import TOLERANCE, Name, flatten, names_of, typical_sizes, without_equipment
 from jaximu.estimation.projection import OutputUncertainty, output_uncertainty
-from jaximu.estimation.uncertainty import WeakDirection, describe, gains_open, pose_advice, weak_directions
+from jaximu.estimation.uncertainty import (
+    WeakDirection,
+    describe,
+    gains_open,
+    open_numbers,
+    pose_advice,
+    weak_directions,
+)
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, Json, damage, entries, read_document
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError
@@ -143,6 +150,11 @@ class Calibration(Result, Document, page="calibration"):
         """The kinds of residual that the fit passes through exactly: no degrees of freedom are left of them."""
         return tuple(name for name, (before, after, _) in self.rms.items() if after < EXACT * before)
 
+    @property
+    def open_numbers(self) -> frozenset[str]:
+        """The names of the numbers that the recording does not determine; their sigmas are the data sheet's."""
+        return open_numbers(self.weak)
+
     def gains_determined(self) -> bool:
         """Return whether the recording determined all gains that were estimated."""
         return not gains_open(self.weak)
@@ -228,6 +240,7 @@ class Calibration(Result, Document, page="calibration"):
     def _effects(self, owner: str, model: Triad) -> Json:
         """Return the effects of a triad as the JSON document has them."""
         sigmas = dict(zip(self.names, np.sqrt(np.diagonal(self.covariance)).tolist(), strict=True))
+        sigmas = {name: sigma for name, sigma in sigmas.items() if name not in self.open_numbers}
 
         def entry(position: int, effect: Effect) -> Json:
             sigma = [sigmas.get(Name(owner, "coefficients", (i,), position)) for i in range(effect.size)]
@@ -239,17 +252,23 @@ class Calibration(Result, Document, page="calibration"):
         return {effect.name: entry(position, effect) for position, effect in enumerate(model.effects)}
 
     def document(self) -> Json:
-        """Return the calibration as the JSON document of schema `jaximu.calibration/1`."""
+        """Return the calibration as the JSON document of schema `jaximu.calibration/1`; sigmas left open are null."""
 
         def triad(name: str, model: Triad) -> Json:
             gain_sigma, bias_sigma = self.sigma(name)
+            recorded = self.bias_sigma_recording.get(name, bias_sigma)
+
+            def known(sigma: FloatArray, part: str) -> Json:
+                left = [Name(name, part, axes) in self.open_numbers for axes in np.ndindex(sigma.shape)]
+                return np.ma.masked_array(sigma, np.reshape(left, sigma.shape)).tolist()
+
             return {
                 "output_unit": model.output_unit,
                 "gain": np.asarray(model.gain).tolist(),
                 "bias": np.asarray(model.bias).tolist(),
-                "gain_sigma": gain_sigma.tolist(),
-                "bias_sigma": bias_sigma.tolist(),
-                "bias_sigma_recording": np.asarray(self.bias_sigma_recording.get(name, bias_sigma)).tolist(),
+                "gain_sigma": known(gain_sigma, "gain"),
+                "bias_sigma": known(bias_sigma, "bias"),
+                "bias_sigma_recording": known(recorded, "bias"),
                 "temperature_reference": model.temperature_reference,
                 "time_reference": model.time_reference,
                 "effects": self._effects(name, model),
@@ -493,10 +512,17 @@ def _from_document(document: Json) -> Calibration:
     )
     known = {str(name): name for name in names_of(imu)}
     names = tuple(known[name] for name in document["covariance"]["parameters"])
+    covariance = _numbers(document["covariance"]["matrix"], (len(names), len(names)))
+    sigmas = dict(zip(names, np.sqrt(np.diagonal(covariance)), strict=True))
+
+    def recorded(name: str) -> FloatArray:
+        entries = enumerate(document[name]["bias_sigma_recording"])
+        return _numbers([sigmas[Name(name, "bias", (i,))] if x is None else x for i, x in entries], (3,))
+
     return Calibration(
         imu=imu,
         names=names,
-        covariance=_numbers(document["covariance"]["matrix"], (len(names), len(names))),
+        covariance=covariance,
         gravity=LocalGravity(gravity["value"], gravity["sigma"], gravity.get("latitude")),
         method=fit["method"],
         loss=fit["loss"],
@@ -524,9 +550,7 @@ def _from_document(document: Json) -> Calibration:
         absent=("accelerometer",) if accelerometer is None else (),
         reading=None if document.get("reading") is None else Reading.from_document(document["reading"]),
         bias_sigma_recording={
-            name: _numbers(document[name]["bias_sigma_recording"], (3,))
-            for name in sensors
-            if "bias_sigma_recording" in (document.get(name) or {})
+            name: recorded(name) for name in sensors if "bias_sigma_recording" in (document.get(name) or {})
         },
         magnetic=None
         if magnetometer is None
@@ -548,7 +572,15 @@ def _parameters_of(calibration: Calibration) -> ParameterTable:
         else:
             value, si = getattr(triads[name.owner], name.part)[name.axes], SENSOR_UNITS[name.owner]
             unit = output if name.part == "bias" else "1" if output == si else f"{output} per {unit_text(si)}"
-        return Parameter(str(name), describe(name, model), float(value), sigma, unit, name in weak)
+        return Parameter(
+            str(name),
+            describe(name, model),
+            float(value),
+            sigma,
+            unit,
+            name in weak,
+            name not in calibration.open_numbers,
+        )
 
     sigmas = np.sqrt(np.diagonal(calibration.covariance)).tolist()
     return ParameterTable([parameter(*entry) for entry in zip(calibration.names, sigmas, strict=True)])
