@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaximu import InputError, NotPossibleError, calibrate, check
+from jaximu.calibration.arrangement import axes_unlike
 from jaximu.calibration.refusals import require_carried
 from jaximu.cli import main
 from jaximu.mistakes import inspect, prepare
@@ -238,6 +239,37 @@ def test_a_check_names_axes_that_are_not_those_of_the_calibration():
     mirrored = replace(other, accelerometer=replace(signal, values=signal.values * [-1, 1, 1]))
     with pytest.raises(InputError, match=r"Against the calibration, .*its x axis has the wrong sign"):
         check(calibration, mirrored)
+
+
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        ([0, 1, 2, 3, 4, 5, 6], ""),
+        ([0, 1, 2, 3, 5, 4, 6], "gyroscope: its x and y axes are exchanged"),
+        ([0, 3, 2, 1, 4, 5, 6], "axes are exchanged"),
+    ],
+)
+def test_compensate_notes_axes_that_are_not_those_of_the_calibration(tmp_path, capsys, order, words):
+    calibrate(by_hand(seed=4)).save(tmp_path / "calibration.json")
+    values = columns(by_hand(seed=6, unit=4, rate=25.0))
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values[:, order]))
+    assert main(["compensate", str(tmp_path / "calibration.json"), str(path), "-o", str(tmp_path / "out.csv")]) == 0
+    printed = capsys.readouterr()
+    said = (printed.out + printed.err).partition("Against the calibration, ")[2]
+    assert words in said and bool(said) == bool(words)
+    assert "--axes" not in said  # which a calibration's reading refuses
+
+
+def test_axes_are_compared_with_those_that_the_calibration_has():
+    """A unit whose own accelerometer and gyroscope are in other axes is like itself in all of them."""
+    recording, imu = by_hand(seed=4), draw_imu(4)
+    for arranged in (np.diag([-1.0, 1.0, 1.0]), np.eye(3)[[1, 2, 0]], np.eye(3)[[1, 0, 2]]):
+        force, rate = recording.accelerometer, recording.gyroscope
+        turned = replace(recording, accelerometer=replace(force, values=force.values @ arranged.T))
+        unit = replace(imu, accelerometer=replace(imu.accelerometer, gain=arranged @ imu.accelerometer.gain))
+        assert axes_unlike(turned, unit) == "" != axes_unlike(turned, imu)
+        swapped = replace(turned, gyroscope=replace(rate, values=rate.values[:, [0, 2, 1]]))
+        assert "gyroscope: its y and z axes are exchanged" in axes_unlike(swapped, unit)
 
 
 def test_a_page_of_exchanged_axes(tmp_path, capsys):
