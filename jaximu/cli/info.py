@@ -73,6 +73,8 @@ class InfoCommand:
         options.require_files(*self.logs)
         with progress("looking at what is in it"):
             described = [describe(*read_openly(*pair)) for pair in zip(stated, self.logs, strict=True)]
+        for path, (document, _) in zip(self.logs, described, strict=True):
+            document["findings"] += [] if "accelerometer" in document["signals"] else _of_the_other(path)
         if self.as_json:
             documents = [document for document, _ in described]
             options.print_json(documents[0] if len(documents) == 1 else documents)
@@ -126,6 +128,14 @@ def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice 
             "from gravity, given poses all around)"
         )
     return recording, advice, notes
+
+
+def _of_the_other(path: Path) -> Iterator[str]:
+    """Name the accelerometer's file that lies beside a gyroscope's, and the line that reads both."""
+    for other in sorted(path.parent.iterdir()):
+        if options.LogOptions().with_gyroscope(other).gyro_log == path:
+            both = f"{shlex.quote(str(other))} --gyro-log {shlex.quote(str(path))}"
+            yield f"its accelerometer's file lies beside it; both are one log: jaximu info {both}"
 
 
 def in_other_units(log: options.LogOptions, path: Path) -> tuple[options.LogOptions, Advice, str] | None:
