@@ -8,7 +8,7 @@ import pytest
 import scipy.stats
 from vehicle import about, drive
 
-from jaximu.calibration import calibrate_by_filter, compensate, load_calibration
+from jaximu.calibration import calibrate, calibrate_by_filter, compensate, load_calibration
 from jaximu.calibration.vehicle import calibrate_at_stops
 from jaximu.cli import main
 from jaximu.ground.errors import NotPossibleError
@@ -210,6 +210,15 @@ def test_other_verbs_lead_to_it(log, capsys):
     assert main([path, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["verbs"] == ["filter"] and "8 stops" in document["verdict"] and not document["refused"]
+
+
+@pytest.mark.parametrize("verb", ["calibrate", "diagnose"])
+def test_verbs_by_poses_name_the_filter_where_they_refuse_a_drive(log, tmp_path, capsys, verb):
+    _, path = log
+    assert main([verb, path, "-o", str(tmp_path)]) == 1
+    assert "a drive with 8 stops: `jaximu filter LOG`" in capsys.readouterr().err
+    with pytest.raises(NotPossibleError, match=r"one orientation throughout[^`]*$"):
+        calibrate(simulate(draw_imu(1), Static(60.0), consumer_noise(), seed=1)[0])
 
 
 def test_the_simulated_mounting_is_the_one_that_is_asked_for():
