@@ -284,6 +284,23 @@ def test_a_page_of_exchanged_axes(tmp_path, capsys):
 # --- info
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_info_says_which_sign_it_takes_for_up(tmp_path, capsys, sign):
+    """With all signs of the accelerometer turned round the calibration is as good: only the person knows."""
+    values = columns(by_hand(rate=25.0, poses=12)) * [1, sign, sign, sign, 1, 1, 1]
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values))
+    rms = []
+    for options in ([], ["--axes=-f"]):
+        assert main(["info", str(path), "--json", *options]) == 0
+        findings = json.loads(capsys.readouterr().out)["findings"]
+        first = values[:20, 1:4].mean(axis=0) * (-1 if options else 1)
+        axis = int(np.argmax(np.abs(first)))
+        words = f"{'xyz'[axis]} points {'up' if first[axis] > 0 else 'down'}, as the accelerometer has it"
+        assert any(words in text for text in findings)
+        rms.append(calibrate(read_recording(path, options=ReadOptions(axes="-f" if options else None))).rms)
+    assert rms[0]["gravity_direction"][1] == pytest.approx(rms[1]["gravity_direction"][1], rel=1e-3)
+
+
 def test_info_of_a_gyroscope_alone(tmp_path, capsys):
     """At rest its noise can be identified; a table's steady turn is no rest."""
     time = np.arange(6000) / 50

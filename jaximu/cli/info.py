@@ -333,12 +333,20 @@ def _noise_uses(length: float, rest: float, longest: float, begin: float) -> Ite
 
 def _poses(recording: Recording, findings: list[str]) -> int:
     """Return how many poses there are, 0 where all are alike; what is noticed is added to `findings`."""
+    import numpy as np
+
     from jaximu.recordings.segmentation import segment
 
     intervals = segment(recording).intervals
     poses, still = len(intervals), (intervals[:, 1] - intervals[:, 0]).sum()
     findings.append(f"{poses} static poses, {still:.0f} s in all")
-    tilt = _tilt(recording.accelerometer, intervals)
+    force = _means(recording.accelerometer, intervals)
+    axis = int(np.argmax(np.abs(force[0])))
+    findings.append(
+        f"in the first of them {'xyz'[axis]} points {'up' if force[0, axis] > 0 else 'down'}, as the accelerometer has "
+        "it; poses and turns look the same with all its signs turned round: if it was the other way, add --axes=-f"
+    )
+    tilt = _tilt(force)
     if poses > 1 and tilt < _TILTED:
         findings.append(
             f"all {poses} poses are of one orientation, within {tilt:.2g}°: a calibration by poses needs nine or more, "
@@ -359,14 +367,21 @@ def _stops(recording: Recording) -> int:
     return 0 if stops is None else len(stops.intervals)
 
 
-def _tilt(signal: Signal, intervals: FloatArray) -> float:
-    """Return the largest angle, degrees, of the force in a pose from its mean over all poses."""
+def _means(signal: Signal, intervals: FloatArray) -> FloatArray:
+    """Return the mean (P, 3) of a signal in each pose, SI."""
+    import numpy as np
+
+    values = signal.si()
+    return np.stack([values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in intervals])
+
+
+def _tilt(force: FloatArray) -> float:
+    """Return the largest angle, degrees, of the force (P, 3) in a pose from its mean over all poses."""
     import numpy as np
 
     from jaximu.ground.rotation import unit_vectors
 
-    values = signal.si()
-    up = unit_vectors(np.stack([values[(signal.time >= a) & (signal.time < b)].mean(axis=0) for a, b in intervals]))
+    up = unit_vectors(force)
     middle = up.mean(axis=0)
     return float(np.degrees(np.arccos(np.clip(up @ middle / max(np.linalg.norm(middle), 1e-9), -1.0, 1.0))).max())
 
