@@ -281,6 +281,59 @@ def test_a_page_of_exchanged_axes(tmp_path, capsys):
     assert printed.count("its axes are exchanged") == 6 and "its x and y axes are exchanged. --axes" in printed
 
 
+# --- layouts, words and units
+
+
+@pytest.mark.parametrize("sep", ["|", ";"])
+@pytest.mark.parametrize(("unit", "size"), [("rev/s", 2 * np.pi), ("U/min", np.pi / 30), ("tr/min", np.pi / 30)])
+def test_bars_between_cells_and_turns_in_a_time(tmp_path, sep, unit, size):
+    values = columns(by_hand(rate=25.0, poses=6)) / [1, *[1] * 3, *[size] * 3]
+    head = HEAD.replace("rad/s", unit).replace(",", sep)
+    same(read_recording(save(tmp_path / "log.csv", f"time [s]{sep}{head}", *lines(values, "{:.7f}", sep))),
+         values * [1, *[1] * 3, *[size] * 3])  # fmt: skip
+
+
+@pytest.mark.parametrize("every", [1, 40, 10**6])
+def test_a_header_that_is_repeated_between_rows(tmp_path, every):
+    """An app that was started again, or files that were joined: also where the second header stands far behind."""
+    values = columns(by_hand(rate=25.0, poses=6))
+    head, rows = f"time [s],{HEAD}", lines(values)
+    parts = [rows[at : at + every] for at in range(0, len(rows), every)] if every < len(rows) else [rows, []]
+    recording = read_recording(save(tmp_path / "log.csv", *(line for part in parts for line in (head, *part))))
+    same(recording, values)
+    assert any(f"{len(parts) - 1} line" in note and "repeated the header" in note for note in recording.notes)
+
+
+def test_vectors_in_brackets_whose_commas_do_not_part_cells(tmp_path):
+    values = columns(by_hand(rate=25.0, poses=6))
+    rows = [f"{row[0]:.4f};[{', '.join(f'{x:.6f}' for x in row[1:4])}];[{', '.join(f'{x:.6f}' for x in row[4:])}]"
+            for row in values]  # fmt: skip
+    same(read_recording(save(tmp_path / "log.csv", "time [s];accel [m/s^2];gyro [rad/s]", *rows)), values)
+
+
+def test_a_stated_unit_goes_before_that_of_a_program_with_such_names(tmp_path):
+    """ "X Accel" and "X Gyro" are names of MIP Monitor, which writes rad/s, and of anybody else."""
+    values = columns(by_hand(rate=25.0, poses=6)) * [1, *[1 / 9.80665] * 3, *[np.degrees(1)] * 3]
+    head = [f"{axis} {name}" for name in ("Accel (Gs)", "Gyro (degrees per second)") for axis in "XYZ"]
+    recording = read_recording(save(tmp_path / "log.csv", ",".join(["Time (s)", *head]), *lines(values)))
+    same(recording, values * [1, *[9.80665] * 3, *[np.radians(1)] * 3])
+
+
+@pytest.mark.parametrize(
+    ("force", "rate"),
+    [("acelerómetro", "giroscopio"), ("accéléromètre", "gyromètre"), ("Beschleunigungssensor", "Drehratensensor"),
+     ("加速度计", "陀螺仪")],
+)  # fmt: skip
+def test_rows_of_sensors_that_are_named_in_other_languages(tmp_path, force, rate):
+    values = columns(by_hand(rate=25.0, poses=6))
+    rows = [f"{row[0]:.4f},{name},{x:.6f},{y:.6f},{z:.6f}"
+            for row in values for name, (x, y, z) in ((force, row[1:4]), (rate, row[4:]))]  # fmt: skip
+    path = save(tmp_path / "log.csv", "time [s],sensor,x,y,z", *rows)
+    advice = advise_reading(path)
+    assert advice is not None and not advice.questions
+    same(read_recording(path, options=ReadOptions(columns=advice.columns)), values)
+
+
 # --- info
 
 
