@@ -251,24 +251,24 @@ class Calibration(Result, Document, page="calibration"):
 
         return {effect.name: entry(position, effect) for position, effect in enumerate(model.effects)}
 
+    def _known(self, sigma: FloatArray, owner: str, part: str) -> Json:
+        """Return standard deviations as the JSON document has them: null where the recording leaves a number open."""
+        left = [Name(owner, part, axes) in self.open_numbers for axes in np.ndindex(sigma.shape)]
+        return np.ma.masked_array(sigma, np.reshape(left, sigma.shape)).tolist()
+
     def document(self) -> Json:
-        """Return the calibration as the JSON document of schema `jaximu.calibration/1`; sigmas left open are null."""
+        """Return the calibration as the JSON document of schema `jaximu.calibration/1`."""
 
         def triad(name: str, model: Triad) -> Json:
             gain_sigma, bias_sigma = self.sigma(name)
             recorded = self.bias_sigma_recording.get(name, bias_sigma)
-
-            def known(sigma: FloatArray, part: str) -> Json:
-                left = [Name(name, part, axes) in self.open_numbers for axes in np.ndindex(sigma.shape)]
-                return np.ma.masked_array(sigma, np.reshape(left, sigma.shape)).tolist()
-
             return {
                 "output_unit": model.output_unit,
                 "gain": np.asarray(model.gain).tolist(),
                 "bias": np.asarray(model.bias).tolist(),
-                "gain_sigma": known(gain_sigma, "gain"),
-                "bias_sigma": known(bias_sigma, "bias"),
-                "bias_sigma_recording": known(recorded, "bias"),
+                "gain_sigma": self._known(gain_sigma, name, "gain"),
+                "bias_sigma": self._known(bias_sigma, name, "bias"),
+                "bias_sigma_recording": self._known(recorded, name, "bias"),
                 "temperature_reference": model.temperature_reference,
                 "time_reference": model.time_reference,
                 "effects": self._effects(name, model),

@@ -232,7 +232,7 @@ def calibrate_ready(
 def _of_a_vehicle(recording: Recording) -> str:
     """Name the verb for a vehicle that stops; nothing for other recordings."""
     with suppress(NotPossibleError):
-        if recording.gyroscope is not None and (stops := find_stops(recording)) is not None:
+        if "gyroscope" in recording.signals and (stops := find_stops(recording)):
             return (
                 f" It looks like a drive with {counted(len(stops.intervals), 'stop')}: `jaximu filter LOG` determines "
                 "the gyroscope's bias and the mounting from them."

@@ -174,12 +174,12 @@ def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np
 
     A column may be of any types.
     """
-    body, rows, again = _body(data, layout)
+    body, rows, notes = _body(data, layout)
     with suppress(pa.ArrowInvalid):
-        return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, again
-    body, rows, notes = _without_remarks(body, layout, rows, path)
+        return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, notes
+    body, rows, remarks = _without_remarks(body, layout, rows, path)
     try:
-        return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, again + notes
+        return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, notes + remarks
     except pa.ArrowInvalid as error:
         raise InputError(f"{path}: cannot be read as a table: {str(error).splitlines()[0][:200]}") from None
 
@@ -217,8 +217,7 @@ _MARKS = ("#", "//", "%")
 """Signs that a line is a remark, or the header behind such a sign."""
 _RULE = re.compile(r"[-=_+|\s]*")
 """A line that only separates others, or an empty one."""
-_STYLES = (("\t", "."), (",", "."), (";", "."), (" ", "."), (";", ","), ("\t", ","), (",", ","), (" ", ","),
-           ("|", "."), ("|", ","))  # fmt: skip
+_STYLES = [(delimiter, decimal) for decimal, order in ((".", "\t,; |"), (",", ";\t, |")) for delimiter in order]
 """Delimiters and decimal signs, the likelier first."""
 
 
@@ -312,8 +311,8 @@ def _body(data: bytes, layout: _Layout) -> tuple[bytes, np.ndarray, tuple[str, .
         at for at in range(layout.first, len(lines)) if (line := lines[at].strip()) and not line.startswith(marks)
     ]
     kept = [at for at in filled if lines[at].strip() not in above]
-    again = len(filled) - len(kept)
-    notes = (f"{counted(again, 'line')} between rows repeated the header: left out.",) * (again > 0)
+    repeated = len(filled) - len(kept)
+    notes = (f"{counted(repeated, 'line')} between rows repeated the header: left out.",) * (repeated > 0)
     data = b"\n".join(lines[at] for at in kept)
     if layout.delimiter == " ":
         data = data.replace(b"\t", b" ")
