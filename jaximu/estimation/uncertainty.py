@@ -28,7 +28,7 @@ class WeakDirection:
 
     sigma: standard deviation along it, as a share of the parameters' typical size. determined: False where the data say
     next to nothing. parameters: the names that make up most of it, with their weights (unit vector in typical sizes);
-    where it is open also the numbers whose uncertainty lies mostly in open directions, and in this one most.
+    where it is open also the numbers that are known no better than from a data sheet, mostly for it.
     text: the same in words, and what to record.
     """
 
@@ -99,7 +99,7 @@ def weak_directions(
     sigmas, variance = np.linalg.norm(spread, axis=1), np.sum(spread**2, axis=0)
     known = sigmas <= UNDETERMINED
     basis = _of_few_numbers(right[~known])
-    lost = (variance >= WEAK**2) & (np.sum(spread[~known] ** 2, axis=0) > MOSTLY * variance)
+    lost = (variance > UNDETERMINED**2) & (np.sum(spread[~known] ** 2, axis=0) > MOSTLY * variance)
     holder = np.argmax(np.abs(basis), axis=0) if len(basis) else np.full(len(names), -1)
     weak = []
     for index, vector in enumerate([*basis, *right[known & (sigmas >= WEAK)][::-1]]):
