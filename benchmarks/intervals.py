@@ -123,11 +123,11 @@ def errors(kind, protocol, recipe, at_rest, units):
         static = noise_of(resting(kind, long, rng)) if at_rest else None
         recording, during, after = drifted(recording, imu, kind, rng)
         calibration = recipe(recording, truth, static)
-        open_numbers = {name for weak in calibration.weak if not weak.determined for name, _ in weak.parameters}
+        left = calibration.open_numbers
         for name, triad in calibration.triads().items():
             gain, bias = calibration.sigma(name)
-            known = (gain > 0) & [[f"{name}.gain[{i},{j}]" not in open_numbers for j in range(3)] for i in range(3)]
-            sure = np.array([f"{name}.bias[{i}]" not in open_numbers for i in range(3)])
+            known = (gain > 0) & [[f"{name}.gain[{i},{j}]" not in left for j in range(3)] for i in range(3)]
+            sure = np.array([f"{name}.bias[{i}]" not in left for i in range(3)])
             found, recorded = np.asarray(triad.bias), calibration.bias_sigma_recording[name]
             groups = {
                 "gains": ((np.asarray(triad.gain) - np.asarray(getattr(imu, name).gain)) / np.where(known, gain, 1))[

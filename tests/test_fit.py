@@ -12,8 +12,8 @@ from synthetic import GRAVITY, POSES, recording, simulated, spread_directions, u
 
 from jaximu.calibration import calibrate, fit_hand_held
 from jaximu.calibration.nominal import nominal_imu
-from jaximu.estimation.problem import Name, Parameters, flatten, names_of, without_equipment
-from jaximu.estimation.uncertainty import allowing_for_neighbours, describe, weak_directions
+from jaximu.estimation.problem import TOLERANCE, Name, Parameters, flatten, names_of, without_equipment
+from jaximu.estimation.uncertainty import allowing_for_neighbours, describe, open_numbers, weak_directions
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
@@ -205,6 +205,30 @@ def test_fewer_residuals_than_parameters_are_no_rank():
     assert rank == 2
     assert len(weak) == 7
     assert not any(direction.determined for direction in weak)
+
+
+def test_an_open_subspace_names_all_its_numbers_in_directions_of_few():
+    """Three sums of four numbers are open together: however an SVD mixes them, each is stated by its own four.
+
+    A number of which an open direction holds a little, and the data the rest, is determined.
+    """
+    parameters = Parameters.select(NOMINAL, without_equipment)
+    names, sizes = parameters.names, np.asarray(parameters.size)
+    groups = np.arange(12).reshape(3, 4)
+    open_basis = np.zeros((3, len(names)))
+    for row, members in zip(open_basis, groups, strict=True):
+        row[members] = [0.5, 0.5, 0.5, -0.5]
+    open_basis[0, 13] = 1e-3  # known to 1e-3 of 5 typical sizes, whichever way
+    open_basis /= np.linalg.norm(open_basis, axis=1, keepdims=True)
+    for seed in range(5):
+        turned = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0] @ open_basis
+        jacobian = 1e4 * (np.eye(len(names)) - turned.T @ turned)
+        rank, weak = weak_directions(jacobian, names, sizes, NOMINAL)
+        assert rank == len(names) - 3 and open_numbers(weak) == set(names[:12])
+        assert {frozenset(name for name, _ in one.parameters) for one in weak} == {
+            frozenset(names[k] for k in members) for members in groups
+        }
+        assert [one.sigma for one in weak] == pytest.approx([TOLERANCE] * 3)
 
 
 def test_descriptions():

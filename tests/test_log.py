@@ -7,6 +7,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from dialects import simulate as by_makers
 
 from jaximu.cli import main, messages
 from jaximu.cli.usage import command_of
@@ -14,6 +15,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.page import Page
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording, reader
+from jaximu.recordings.readers.archive import by_sensor
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld, Static
 
@@ -263,6 +265,44 @@ def test_two_files_of_one_recording_are_one_log(phone, verbs, tmp_path, capsys):
     status, document, _ = answered(paths, capsys)
     assert status == 0 and document["verbs"] == ["calibrate", "diagnose"]
     assert verbs[0][1] == (paths[1],) and verbs[0][2]["log"].gyro_log == paths[0]
+
+
+_METAWEAR = "MetaWear_2020-09-13T12.26.40.000_C8D1A2B3_{}_{}Hz_1.4.4.csv"
+
+
+def test_files_that_a_logger_calls_alike_but_for_the_sensor_are_one_log(tmp_path, capsys):
+    """A folder of two is read; each of the two leads to the other, whatever the rates in their names."""
+    log, folder = by_makers("poses"), tmp_path / "session"
+    folder.mkdir()
+    stated = {"Accelerometer": ("100.000", "g", log.force / 9.80665), "Gyroscope": ("50.000", "deg/s", log.rate * 57.3)}
+    for sensor, (rate, unit, values) in stated.items():
+        head = f"epoch (ms),elapsed (s),{','.join(f'{axis}-axis ({unit})' for axis in 'xyz')}"
+        rows = np.column_stack([1.6e12 + 1e3 * log.time, log.time, values])
+        np.savetxt(folder / _METAWEAR.format(sensor, rate), rows, delimiter=",", header=head, comments="", fmt="%.10g")
+    (folder / "notes.txt").write_text("held by hand\n")
+    accelerometer, gyroscope = (folder / _METAWEAR.format(name, rate) for name, (rate, *_) in stated.items())
+    both = f"{accelerometer} --gyro-log {gyroscope}"
+    for path, words in ((folder, f"jaximu calibrate {folder} "), (accelerometer, f"jaximu calibrate {both} ")):
+        assert main(["info", str(path)]) == 0
+        assert words in capsys.readouterr().out
+    assert main(["info", str(gyroscope), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["findings"][-1].endswith(f"jaximu info {both}")
+    other = folder / _METAWEAR.format("Accelerometer", "100.000").replace("12.26", "13.26")
+    other.write_bytes(accelerometer.read_bytes())  # of another session: which one is meant?
+    assert main(["info", str(folder)]) == 2
+
+
+@pytest.mark.parametrize(
+    ("names", "sensors"),
+    [
+        (["walk1_accelerometer.csv", "walk1_gyro.csv"], {"accel", "gyro"}),
+        (["u1_accel.csv", "u2_gyro.csv"], set()),
+        (["accelerometer.csv", "accelerometer_gyro.csv"], set()),
+        (["a_Linear Accelerometer.csv", "a_Gyroscope.csv"], set()),
+    ],
+)
+def test_names_of_files_that_belong_together(names, sensors):
+    assert set(by_sensor(names)) == sensors
 
 
 def test_several_logs_of_poses_are_one_unit_s(folder, verbs, tmp_path, capsys):

@@ -219,6 +219,19 @@ def test_what_verbs_say_of_one_log_agrees(drawn):
     assert not contradictions(drawn)
 
 
+def test_what_nothing_confirms_and_predicts_worse_is_no_part_of_an_explanation():
+    """Twelve poses whose turns lost time: a step at the first pose fits the turns exactly, and misses those left out
+    by five times as much as without it. `check` names the quadratic term that is there.
+    """
+    drawn = Drawn(99, "accel.quadratic", 3.0, 3.0, "lost")
+    assert not contradictions(drawn)
+    diagnosed = diagnose(recorded(drawn))
+    assert diagnosed.verdict == "unexplained" and not diagnosed.named
+    assert any("predicts those worse that were not fitted" in note for note in diagnosed.notes)
+    kept = diagnose(recorded(replace(drawn, logger=None)))  # as many parameters as conditions, too, and all errors fall
+    assert [cause.name for cause in kept.named] == ["accel.quadratic"]
+
+
 @pytest.mark.parametrize(("effect", "explained"), [(None, True), ("gyro.g_sensitivity", False)])
 def test_noise_does_not_explain_innovations_of_many_times_their_size(effect, explained):
     """A filter whose noise was widened to what it met is as large as its innovations, whatever is in them."""

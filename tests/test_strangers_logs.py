@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaximu import InputError, NotPossibleError, calibrate, check
+from jaximu.calibration.arrangement import axes_unlike
 from jaximu.calibration.refusals import require_carried
 from jaximu.cli import main
 from jaximu.mistakes import inspect, prepare
@@ -240,6 +241,37 @@ def test_a_check_names_axes_that_are_not_those_of_the_calibration():
         check(calibration, mirrored)
 
 
+@pytest.mark.parametrize(
+    ("order", "words"),
+    [
+        ([0, 1, 2, 3, 4, 5, 6], ""),
+        ([0, 1, 2, 3, 5, 4, 6], "gyroscope: its x and y axes are exchanged"),
+        ([0, 3, 2, 1, 4, 5, 6], "axes are exchanged"),
+    ],
+)
+def test_compensate_notes_axes_that_are_not_those_of_the_calibration(tmp_path, capsys, order, words):
+    calibrate(by_hand(seed=4)).save(tmp_path / "calibration.json")
+    values = columns(by_hand(seed=6, unit=4, rate=25.0))
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values[:, order]))
+    assert main(["compensate", str(tmp_path / "calibration.json"), str(path), "-o", str(tmp_path / "out.csv")]) == 0
+    printed = capsys.readouterr()
+    said = (printed.out + printed.err).partition("Against the calibration, ")[2]
+    assert words in said and bool(said) == bool(words)
+    assert "--axes" not in said  # which a calibration's reading refuses
+
+
+def test_axes_are_compared_with_those_that_the_calibration_has():
+    """A unit whose own accelerometer and gyroscope are in other axes is like itself in all of them."""
+    recording, imu = by_hand(seed=4), draw_imu(4)
+    for arranged in (np.diag([-1.0, 1.0, 1.0]), np.eye(3)[[1, 2, 0]], np.eye(3)[[1, 0, 2]]):
+        force, rate = recording.accelerometer, recording.gyroscope
+        turned = replace(recording, accelerometer=replace(force, values=force.values @ arranged.T))
+        unit = replace(imu, accelerometer=replace(imu.accelerometer, gain=arranged @ imu.accelerometer.gain))
+        assert axes_unlike(turned, unit) == "" != axes_unlike(turned, imu)
+        swapped = replace(turned, gyroscope=replace(rate, values=rate.values[:, [0, 2, 1]]))
+        assert "gyroscope: its y and z axes are exchanged" in axes_unlike(swapped, unit)
+
+
 def test_a_page_of_exchanged_axes(tmp_path, capsys):
     """Their scales start from nothing: no share of it is stated."""
     values = columns(by_hand(rate=25.0, poses=12))[:, [0, 1, 2, 3, 5, 4, 6]]
@@ -249,7 +281,77 @@ def test_a_page_of_exchanged_axes(tmp_path, capsys):
     assert printed.count("its axes are exchanged") == 6 and "its x and y axes are exchanged. --axes" in printed
 
 
+# --- layouts, words and units
+
+
+@pytest.mark.parametrize("sep", ["|", ";"])
+@pytest.mark.parametrize(("unit", "size"), [("rev/s", 2 * np.pi), ("U/min", np.pi / 30), ("tr/min", np.pi / 30)])
+def test_bars_between_cells_and_turns_in_a_time(tmp_path, sep, unit, size):
+    values = columns(by_hand(rate=25.0, poses=6)) / [1, *[1] * 3, *[size] * 3]
+    head = HEAD.replace("rad/s", unit).replace(",", sep)
+    same(read_recording(save(tmp_path / "log.csv", f"time [s]{sep}{head}", *lines(values, "{:.7f}", sep))),
+         values * [1, *[1] * 3, *[size] * 3])  # fmt: skip
+
+
+@pytest.mark.parametrize("every", [1, 40, 10**6])
+def test_a_header_that_is_repeated_between_rows(tmp_path, every):
+    """An app that was started again, or files that were joined: also where the second header stands far behind."""
+    values = columns(by_hand(rate=25.0, poses=6))
+    head, rows = f"time [s],{HEAD}", lines(values)
+    parts = [rows[at : at + every] for at in range(0, len(rows), every)] if every < len(rows) else [rows, []]
+    recording = read_recording(save(tmp_path / "log.csv", *(line for part in parts for line in (head, *part))))
+    same(recording, values)
+    assert any(f"{len(parts) - 1} line" in note and "repeated the header" in note for note in recording.notes)
+
+
+def test_vectors_in_brackets_whose_commas_do_not_part_cells(tmp_path):
+    values = columns(by_hand(rate=25.0, poses=6))
+    rows = [f"{row[0]:.4f};[{', '.join(f'{x:.6f}' for x in row[1:4])}];[{', '.join(f'{x:.6f}' for x in row[4:])}]"
+            for row in values]  # fmt: skip
+    same(read_recording(save(tmp_path / "log.csv", "time [s];accel [m/s^2];gyro [rad/s]", *rows)), values)
+
+
+def test_a_stated_unit_goes_before_that_of_a_program_with_such_names(tmp_path):
+    """ "X Accel" and "X Gyro" are names of MIP Monitor, which writes rad/s, and of anybody else."""
+    values = columns(by_hand(rate=25.0, poses=6)) * [1, *[1 / 9.80665] * 3, *[np.degrees(1)] * 3]
+    head = [f"{axis} {name}" for name in ("Accel (Gs)", "Gyro (degrees per second)") for axis in "XYZ"]
+    recording = read_recording(save(tmp_path / "log.csv", ",".join(["Time (s)", *head]), *lines(values)))
+    same(recording, values * [1, *[9.80665] * 3, *[np.radians(1)] * 3])
+
+
+@pytest.mark.parametrize(
+    ("force", "rate"),
+    [("acelerómetro", "giroscopio"), ("accéléromètre", "gyromètre"), ("Beschleunigungssensor", "Drehratensensor"),
+     ("加速度计", "陀螺仪")],
+)  # fmt: skip
+def test_rows_of_sensors_that_are_named_in_other_languages(tmp_path, force, rate):
+    values = columns(by_hand(rate=25.0, poses=6))
+    rows = [f"{row[0]:.4f},{name},{x:.6f},{y:.6f},{z:.6f}"
+            for row in values for name, (x, y, z) in ((force, row[1:4]), (rate, row[4:]))]  # fmt: skip
+    path = save(tmp_path / "log.csv", "time [s],sensor,x,y,z", *rows)
+    advice = advise_reading(path)
+    assert advice is not None and not advice.questions
+    same(read_recording(path, options=ReadOptions(columns=advice.columns)), values)
+
+
 # --- info
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_info_says_which_sign_it_takes_for_up(tmp_path, capsys, sign):
+    """With all signs of the accelerometer turned round the calibration is as good: only the person knows."""
+    values = columns(by_hand(rate=25.0, poses=12)) * [1, sign, sign, sign, 1, 1, 1]
+    path = save(tmp_path / "log.csv", f"time [s],{HEAD}", *lines(values))
+    rms = []
+    for options in ([], ["--axes=-f"]):
+        assert main(["info", str(path), "--json", *options]) == 0
+        findings = json.loads(capsys.readouterr().out)["findings"]
+        first = values[:20, 1:4].mean(axis=0) * (-1 if options else 1)
+        axis = int(np.argmax(np.abs(first)))
+        words = f"{'xyz'[axis]} points {'up' if first[axis] > 0 else 'down'}, as the accelerometer has it"
+        assert any(words in text for text in findings)
+        rms.append(calibrate(read_recording(path, options=ReadOptions(axes="-f" if options else None))).rms)
+    assert rms[0]["gravity_direction"][1] == pytest.approx(rms[1]["gravity_direction"][1], rel=1e-3)
 
 
 def test_info_of_a_gyroscope_alone(tmp_path, capsys):

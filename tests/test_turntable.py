@@ -239,8 +239,31 @@ def test_a_deficient_scheme_reports_what_it_determines():
     texts = " ".join(weak.text for weak in found.weak)
     assert "a pose with this body direction up" in texts and "a full turn each way about the" in texts
     assert np.isfinite(found.covariance).all()
+    left = {str(name) for name in found.names} - found.open_numbers
+    assert left == {f"{one}.bias[{i}]" for one in found.triads() for i in range(3)} | {
+        f"accelerometer.gain[{i},2]" for i in range(3)
+    }
+    written = found.document()
+    assert np.equal(written["accelerometer"]["gain_sigma"], None).tolist() == [[True, True, False]] * 3
+    assert np.equal(written["gyroscope"]["gain_sigma"], None).all() and None not in written["gyroscope"]["bias_sigma"]
+    assert all("not determined" in row for row in found.parameters.block().rows if "misalignment x from y" in row[0])
+    assert "not determined" in str(found.summary())
     bias, sigma = found.imu.gyroscope.bias, found.sigma("gyroscope")[1]
     assert (np.abs(bias - unit(4).gyroscope.bias) < 4 * sigma).all() and (sigma < 1e-3).all()
+
+
+def test_a_rate_table_leaves_the_accelerometer_open_and_says_so_in_the_file(tmp_path):
+    """Each axis up, none down: three combinations are open, and every number of the accelerometer is in one."""
+    recording, truth = simulate(unit(4), RateTable(rates=(45.0, 90.0)), consumer_noise(), seed=2)
+    found = calibrate_turntable(recording, truth.schedule, EXACT)
+    assert found.open_numbers == {str(name) for name in found.names if name.owner == "accelerometer"}
+    found.save(tmp_path / "calibration.json")
+    again = load_calibration(tmp_path / "calibration.json")
+    written = json.loads((tmp_path / "calibration.json").read_text())
+    assert written["accelerometer"]["bias_sigma"] == written["accelerometer"]["bias_sigma_recording"] == [None] * 3
+    assert np.asarray(written["gyroscope"]["gain_sigma"], float).max() < 1e-3
+    assert again.open_numbers == found.open_numbers and again.document()["accelerometer"] == written["accelerometer"]
+    assert "(accelerometer)" not in str(found.summary()).partition("As means over the recording")[2].partition(".\n")[0]
 
 
 def test_rest_is_found_in_a_noisy_reference(box):

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.stats
+from test_no_contradiction import sentences
 from vehicle import about, drive
 
-from jaximu.calibration import calibrate_by_filter, compensate, load_calibration
+from jaximu.calibration import calibrate, calibrate_by_filter, compensate, load_calibration
 from jaximu.calibration.vehicle import calibrate_at_stops
 from jaximu.cli import main
 from jaximu.ground.errors import NotPossibleError
@@ -17,6 +18,7 @@ from jaximu.mistakes import prepare
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import find_stops
+from jaximu.report.filter import page_of
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld, Static
 
@@ -210,6 +212,28 @@ def test_other_verbs_lead_to_it(log, capsys):
     assert main([path, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["verbs"] == ["filter"] and "8 stops" in document["verdict"] and not document["refused"]
+
+
+@pytest.mark.parametrize(
+    ("tilt", "words"),
+    [((179.0, 0.0), "z axis points down"), ((3.0, -2.0), "z axis points up"), ((0.0, -88.0), "x axis points up"),
+     ((-89.0, 0.0), "y axis points down")],
+)  # fmt: skip
+def test_which_axis_points_up_is_said_in_words_for_any_axes(tilt, words):
+    """A level unit in forward, right, down axes is rolled by half a turn: its z axis points down."""
+    run = drive(3, 4, lengths=(5.0, 8.0), tilt=tilt)
+    assert (run.mounting @ [0.0, 0.0, 1.0])["xyz".index(words[0])] * (1 if words.endswith("up") else -1) > 0.9
+    calibration, history = calibrate_by_filter(recorded(run))
+    assert any(text.startswith(f"The unit's {words}.") for text in sentences(page_of(calibration, history)))
+
+
+@pytest.mark.parametrize("verb", ["calibrate", "diagnose"])
+def test_verbs_by_poses_name_the_filter_where_they_refuse_a_drive(log, tmp_path, capsys, verb):
+    _, path = log
+    assert main([verb, path, "-o", str(tmp_path)]) == 1
+    assert "a drive with 8 stops: `jaximu filter LOG`" in capsys.readouterr().err
+    with pytest.raises(NotPossibleError, match=r"one orientation throughout[^`]*$"):
+        calibrate(simulate(draw_imu(1), Static(60.0), consumer_noise(), seed=1)[0])
 
 
 def test_the_simulated_mounting_is_the_one_that_is_asked_for():

@@ -15,7 +15,7 @@ from jaximu.estimation.uncertainty import WeakDirection, gains_open
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.quantities import listed
 from jaximu.model.sensor import Imu, Triad
-from jaximu.recordings.alignment import EXPLAINED, angle_of, rotation_of, signed_permutation
+from jaximu.recordings.alignment import angle_of, rotation_of, signed_permutation
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.recording import Recording, apply_axes, spelled_axes
 
@@ -75,14 +75,22 @@ def unusual_gains(imu: Imu, weak: Sequence[WeakDirection], scales: Mapping[str, 
 
 
 def axes_unlike(recording: Recording, imu: Imu) -> str:
-    """Say which axes of a recording are not those of a calibrated unit, as gravity turns in it; else nothing."""
+    """Say which axes of a recording are not those of a calibrated unit, as gravity turns in it; else nothing.
+
+    Outputs f' = M f of an accelerometer make the rates look like det(M) M ω: so the calibration's own axes are undone.
+    """
     motion, gyroscope = recording.turning, recording.gyroscope
-    if motion is None or motion.explained < EXPLAINED or gyroscope is None or imu.gyroscope is None:
+    if motion is None or not motion.clear or gyroscope is None or imu.gyroscope is None:
         return ""
-    arranged = signed_permutation(motion.matrix @ (np.asarray(imu.gyroscope.gain) / gyroscope.nominal_scale[:, None]))
+    force = signed_permutation(np.asarray(imu.accelerometer.gain).T).T
+    rates = np.asarray(imu.gyroscope.gain) / gyroscope.nominal_scale[:, None]
+    arranged = signed_permutation(np.linalg.det(force) * force.T @ motion.matrix @ rates)
     if np.array_equal(arranged, np.eye(3)):
         return ""
-    return f" Against the calibration, {_axes(arranged.T).text.partition(';')[0]}."
+    return (
+        f" Against the calibration, {_axes(arranged.T).text.partition('. --axes')[0]}. Give the columns in the "
+        "calibration's order and signs, or calibrate this log by itself."
+    )
 
 
 def _axes(arranged: FloatArray) -> Finding:

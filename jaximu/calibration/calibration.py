@@ -12,7 +12,14 @@ import numpy as np
 from jaximu.estimation.fitting import Fit
 from jaximu.estimation.problem import TOLERANCE, Name, flatten, names_of, typical_sizes, without_equipment
 from jaximu.estimation.projection import OutputUncertainty, output_uncertainty
-from jaximu.estimation.uncertainty import WeakDirection, describe, gains_open, pose_advice, weak_directions
+from jaximu.estimation.uncertainty import (
+    WeakDirection,
+    describe,
+    gains_open,
+    open_numbers,
+    pose_advice,
+    weak_directions,
+)
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.document import SOFTWARE, Document, Json, damage, entries, read_document
 from jaximu.ground.errors import FilePath, InputError, NotPossibleError
@@ -144,6 +151,11 @@ class Calibration(Result, Document, page="calibration"):
         """The kinds of residual that the fit passes through exactly: no degrees of freedom are left of them."""
         return tuple(name for name, (before, after, _) in self.rms.items() if after < EXACT * before)
 
+    @property
+    def open_numbers(self) -> frozenset[str]:
+        """The names of the numbers that the recording does not determine; their sigmas are the data sheet's."""
+        return open_numbers(self.weak)
+
     def gains_determined(self) -> bool:
         """Return whether the recording determined all gains that were estimated."""
         return not gains_open(self.weak)
@@ -229,6 +241,7 @@ class Calibration(Result, Document, page="calibration"):
     def _effects(self, owner: str, model: Triad) -> Json:
         """Return the effects of a triad as the JSON document has them."""
         sigmas = dict(zip(self.names, sigmas_of(self.covariance).tolist(), strict=True))
+        sigmas = {name: sigma for name, sigma in sigmas.items() if name not in self.open_numbers}
 
         def entry(position: int, effect: Effect) -> Json:
             sigma = [sigmas.get(Name(owner, "coefficients", (i,), position)) for i in range(effect.size)]
@@ -239,16 +252,22 @@ class Calibration(Result, Document, page="calibration"):
 
         return {effect.name: entry(position, effect) for position, effect in enumerate(model.effects)}
 
+    def _known(self, sigma: FloatArray, owner: str, part: str) -> Json:
+        """Return standard deviations as the JSON document has them: null where the recording leaves a number open."""
+        left = [Name(owner, part, axes) in self.open_numbers for axes in np.ndindex(sigma.shape)]
+        return np.ma.masked_array(sigma, np.reshape(left, sigma.shape)).tolist()
+
     def document(self) -> Json:
         """Return the calibration as the JSON document of schema `jaximu.calibration/1`."""
 
         def triad(name: str, model: Triad) -> Json:
             gain_sigma, bias_sigma = self.sigma(name)
+            recorded = self.bias_sigma_recording.get(name, bias_sigma)
             return {
                 **entries(model, "output_unit", "gain", "bias"),
-                "gain_sigma": gain_sigma.tolist(),
-                "bias_sigma": bias_sigma.tolist(),
-                "bias_sigma_recording": np.asarray(self.bias_sigma_recording.get(name, bias_sigma)).tolist(),
+                "gain_sigma": self._known(gain_sigma, name, "gain"),
+                "bias_sigma": self._known(bias_sigma, name, "bias"),
+                "bias_sigma_recording": self._known(recorded, name, "bias"),
                 **entries(model, "temperature_reference", "time_reference"),
                 "effects": self._effects(name, model),
             }
@@ -488,10 +507,17 @@ def _from_document(document: Json) -> Calibration:
     )
     known = {str(name): name for name in names_of(imu)}
     names = tuple(known[name] for name in document["covariance"]["parameters"])
+    covariance = _numbers(document["covariance"]["matrix"], (len(names), len(names)))
+    sigmas = dict(zip(names, np.sqrt(np.diagonal(covariance)), strict=True))
+
+    def recorded(name: str) -> FloatArray:
+        entries = enumerate(document[name]["bias_sigma_recording"])
+        return _numbers([sigmas[Name(name, "bias", (i,))] if x is None else x for i, x in entries], (3,))
+
     return Calibration(
         imu=imu,
         names=names,
-        covariance=_numbers(document["covariance"]["matrix"], (len(names), len(names))),
+        covariance=covariance,
         gravity=LocalGravity(gravity["value"], gravity["sigma"], gravity.get("latitude")),
         method=fit["method"],
         loss=fit["loss"],
@@ -519,9 +545,7 @@ def _from_document(document: Json) -> Calibration:
         absent=("accelerometer",) if accelerometer is None else (),
         reading=None if document.get("reading") is None else Reading.from_document(document["reading"]),
         bias_sigma_recording={
-            name: _numbers(document[name]["bias_sigma_recording"], (3,))
-            for name in sensors
-            if "bias_sigma_recording" in (document.get(name) or {})
+            name: recorded(name) for name in sensors if "bias_sigma_recording" in (document.get(name) or {})
         },
         magnetic=None
         if magnetometer is None
@@ -543,7 +567,15 @@ def _parameters_of(calibration: Calibration) -> ParameterTable:
         else:
             value, si = getattr(triads[name.owner], name.part)[name.axes], SENSOR_UNITS[name.owner]
             unit = output if name.part == "bias" else "1" if output == si else f"{output} per {unit_text(si)}"
-        return Parameter(str(name), describe(name, model), float(value), sigma, unit, name in weak)
+        return Parameter(
+            str(name),
+            describe(name, model),
+            float(value),
+            sigma,
+            unit,
+            name in weak,
+            name not in calibration.open_numbers,
+        )
 
     sigmas = sigmas_of(calibration.covariance).tolist()
     return ParameterTable([parameter(*entry) for entry in zip(calibration.names, sigmas, strict=True)])

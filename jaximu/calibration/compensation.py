@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from jaximu.calibration.arrangement import axes_unlike
 from jaximu.calibration.calibration import Calibration, require_calibration
 from jaximu.estimation.track import TEMPERATURE_WINDOW
 from jaximu.ground.errors import InputError
@@ -81,6 +82,7 @@ def compensate(calibration: Calibration, recording: Recording) -> Recording:
         "compensated by a calibration",
         *(f"{name} was not removed: it belongs to a session" for name in left),
         *_extrapolated(calibration, recording),
+        *filter(None, [axes_unlike(recording, imu).strip()]),
     )
     return replace(recording, **changed, notes=(*recording.notes, *notes))
 

@@ -8,11 +8,9 @@ import numpy as np
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.gravity import STANDARD
 from jaximu.model.sensor import Imu
-from jaximu.recordings.alignment import EXPLAINED, Turning, angle_of, rotation_of, signed_permutation, turning
+from jaximu.recordings.alignment import Turning, angle_of, rotation_of, signed_permutation, turning
 from jaximu.recordings.recording import Recording
 
-_KNOWN = 0.2
-"""Standard deviation, of an entry, beyond which the gyroscope's matrix against gravity is not used."""
 _SAME = 0.2
 """Difference of a scale's logarithm from the data sheet's up to which that is where a fit starts."""
 _MOUNTED = np.radians(12.0)
@@ -48,7 +46,7 @@ def nominal_imu(recording: Recording) -> Imu:
     motion = recording.turning
     if (factors != 1).any():
         motion = turning(accelerometer.time, accelerometer.si() / factors, gyroscope.time, gyroscope.si())
-    if motion is None or motion.explained < EXPLAINED or not float(np.max(motion.sigma)) < _KNOWN:
+    if motion is None or not motion.clear:
         return imu
     matrix = _start(motion)
     if np.array_equal(matrix, np.eye(3)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,7 @@ from jaximu.estimation.rows import Sizes
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
+from jaximu.ground.quantities import counted
 from jaximu.ground.tracing import first, lifted, on_host
 from jaximu.mistakes import Prepared, one_or_several, prepared
 from jaximu.model.effects.base import Effect
@@ -35,7 +37,7 @@ from jaximu.noise.at_rest import noise_of
 from jaximu.recordings.finding import Finding
 from jaximu.recordings.observations import Observations
 from jaximu.recordings.recording import Recording, same_outputs
-from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, observed_poses, segment
+from jaximu.recordings.segmentation import Segmentation, SegmentationOptions, find_stops, observed_poses, segment
 
 _SAME = 1e-9
 """Share by which two statements of one gravity may differ."""
@@ -219,10 +221,24 @@ def calibrate_ready(
     ranges; with `repair` axes are mapped. `losses`: whether lost time is looked for; turns that miss for another
     reason would be taken for it.
     """
-    calibration, findings = _calibrated_in_axes(recordings, choices, repair, losses)
+    try:
+        calibration, findings = _calibrated_in_axes(recordings, choices, repair, losses)
+    except NotPossibleError as error:
+        raise NotPossibleError(f"{error}{''.join(map(_of_a_vehicle, recordings))}") from None
     if "gravity_direction" in calibration.rms and calibration.gains_determined():
         require_carried(calibration.rms["gravity_direction"][1], ", ".join(one.name for one in recordings))
     return calibration, findings
+
+
+def _of_a_vehicle(recording: Recording) -> str:
+    """Name the verb for a vehicle that stops; nothing for other recordings."""
+    with suppress(NotPossibleError):
+        if "gyroscope" in recording.signals and (stops := find_stops(recording)):
+            return (
+                f" It looks like a drive with {counted(len(stops.intervals), 'stop')}: `jaximu filter LOG` determines "
+                "the gyroscope's bias and the mounting from them."
+            )
+    return ""
 
 
 def _calibrated_in_axes(

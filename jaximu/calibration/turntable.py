@@ -191,13 +191,7 @@ def _turned_as_a_whole(calibration: Calibration) -> list[str]:
 
     The gain's polar factor (Higham, SIAM J. Sci. Stat. Comput. 7, 1986) is the rotation that comes closest to it.
     """
-    open_gains = {
-        name.partition(".")[0]
-        for weak in calibration.weak
-        if not weak.determined
-        for name, _ in weak.parameters
-        if ".gain[" in name
-    }
+    open_gains = {name.partition(".")[0] for name in calibration.open_numbers if ".gain[" in name}
     notes = []
     for sensor in sorted({name.owner for name in calibration.names if name.part == "gain"} - open_gains):
         gain = np.asarray(calibration.triads()[sensor].gain)

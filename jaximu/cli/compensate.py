@@ -54,7 +54,7 @@ class CompensateCommand:
                 write_messages(model, raw, written, self.output)
             else:
                 write_recording(written, self.output)
-        for note in (*noticed, *(note for note in written.notes if note.startswith("extrapolated"))):
+        for note in (*noticed, *(note for note in written.notes if note.startswith(("extrapolated", "Against")))):
             say(f"note: {sentence(note)}")
         if noticed:
             say("note: that is what a fit makes of the log. Here every row is corrected and written.")

@@ -18,7 +18,7 @@ from jaximu.ground.quantities import Z95, listed, sentence, with_interval
 if TYPE_CHECKING:
     from jaximu.ground.array_types import BoolArray, FloatArray
     from jaximu.recordings.columns.guess import Advice
-    from jaximu.recordings.recording import Recording, Signal
+    from jaximu.recordings.recording import Recording
 
 
 _STILL_FORCE, _STILL_RATE = 0.2, 0.03  # m/s² and rad/s: rms about the mean of a second that counts as still
@@ -73,6 +73,8 @@ class InfoCommand:
         options.require_files(*self.logs)
         with progress("looking at what is in it"):
             described = [describe(*read_openly(*pair)) for pair in zip(stated, self.logs, strict=True)]
+        for path, (document, _) in zip(self.logs, described, strict=True):
+            document["findings"] += [] if "accelerometer" in document["signals"] else _of_the_other(path)
         if self.as_json:
             documents = [document for document, _ in described]
             options.print_json(documents[0] if len(documents) == 1 else documents)
@@ -126,6 +128,14 @@ def read_openly(log: options.LogOptions, path: Path) -> tuple[Recording, Advice 
             "from gravity, given poses all around)"
         )
     return recording, advice, notes
+
+
+def _of_the_other(path: Path) -> Iterator[str]:
+    """Name the accelerometer's file that lies beside a gyroscope's, and the line that reads both."""
+    for other in sorted(path.parent.iterdir()):
+        if options.LogOptions().with_gyroscope(other).gyro_log == path:
+            both = f"{shlex.quote(str(other))} --gyro-log {shlex.quote(str(path))}"
+            yield f"its accelerometer's file lies beside it; both are one log: jaximu info {both}"
 
 
 def in_other_units(log: options.LogOptions, path: Path) -> tuple[options.LogOptions, Advice, str] | None:
@@ -323,12 +333,20 @@ def _noise_uses(length: float, rest: float, longest: float, begin: float) -> Ite
 
 def _poses(recording: Recording, findings: list[str]) -> int:
     """Return how many poses there are, 0 where all are alike; what is noticed is added to `findings`."""
-    from jaximu.recordings.segmentation import segment
+    import numpy as np
+
+    from jaximu.recordings.segmentation import Moments, segment
 
     intervals = segment(recording).intervals
     poses, still = len(intervals), (intervals[:, 1] - intervals[:, 0]).sum()
     findings.append(f"{poses} static poses, {still:.0f} s in all")
-    tilt = _tilt(recording.accelerometer, intervals)
+    force = Moments(recording.accelerometer).between(*intervals.T)[0]
+    axis = int(np.argmax(np.abs(force[0])))
+    findings.append(
+        f"in the first of them {'xyz'[axis]} points {'up' if force[0, axis] > 0 else 'down'}, as the accelerometer has "
+        "it; poses and turns look the same with all its signs turned round: if it was the other way, add --axes=-f"
+    )
+    tilt = _tilt(force)
     if poses > 1 and tilt < _TILTED:
         findings.append(
             f"all {poses} poses are of one orientation, within {tilt:.2g}°: a calibration by poses needs nine or more, "
@@ -349,14 +367,13 @@ def _stops(recording: Recording) -> int:
     return 0 if stops is None else len(stops.intervals)
 
 
-def _tilt(signal: Signal, intervals: FloatArray) -> float:
-    """Return the largest angle, degrees, of the force in a pose from its mean over all poses."""
+def _tilt(force: FloatArray) -> float:
+    """Return the largest angle, degrees, of the force (P, 3) in a pose from its mean over all poses."""
     import numpy as np
 
     from jaximu.ground.rotation import unit_vectors
-    from jaximu.recordings.segmentation import Moments
 
-    up = unit_vectors(Moments(signal).between(*intervals.T)[0])
+    up = unit_vectors(force)
     middle = up.mean(axis=0)
     return float(np.degrees(np.arccos(np.clip(up @ middle / max(np.linalg.norm(middle), 1e-9), -1.0, 1.0))).max())
 

@@ -75,6 +75,9 @@ _PLACEHOLDER = re.compile(r"(?<![\w/.-])CALIBRATION(_\d+)?(?![\w/.-])")
 """In a page's next command: a file that is being written."""
 
 
+_RATE = re.compile(r"[\d.]+ ?Hz")
+
+
 @dataclass(frozen=True)
 class LogOptions:
     """How to read a log that does not say everything itself."""
@@ -145,10 +148,15 @@ class LogOptions:
         return typed(self)
 
     def with_gyroscope(self, path: Path) -> LogOptions:
-        """Return the options with the gyroscope's file, where a phone's app wrote one beside the accelerometer's."""
-        beside = path.parent / re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name)
-        stated = self.gyro_log is not None or self.columns is not None
-        return self if stated or beside == path or not beside.is_file() else replace(self, gyro_log=beside)
+        """Return the options with the gyroscope's file, where an app or a logger wrote one beside the accelerometer's.
+
+        Rates in the two names may differ.
+        """
+        wanted = re.sub("(Total)?Accelero?(meter|ation)", "Gyroscope", path.name)
+        if wanted == path.name or self.gyro_log is not None or self.columns is not None or not path.parent.is_dir():
+            return self
+        alike = [other for other in path.parent.iterdir() if _RATE.sub("", other.name) == _RATE.sub("", wanted)]
+        return replace(self, gyro_log=alike[0]) if len(alike) == 1 and alike[0].is_file() else self
 
     def read(self, path: Path, gravity: LocalGravity = STANDARD, check: bool = True, alone: bool = False) -> Recording:
         """Read one log; with `alone` it may hold a gyroscope and nothing else."""

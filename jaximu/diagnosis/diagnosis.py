@@ -30,6 +30,7 @@ from jaximu.diagnosis.noise import NOISE_NAMES, NoiseFinding, own_noise, quick_n
 from jaximu.diagnosis.selection import Selection, select, shape_of
 from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import fit
+from jaximu.estimation.rows import ResidualKind
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import SOFTWARE, Document, Json, entries
@@ -716,11 +717,19 @@ class _Course:
                 )
         self.gain = gain
         full = _saturated(experiment, state)
+        # of these nothing but what was left out can confirm anything
+        larger = next((kind for kind in full if gain.after.rms[kind.name][0] > gain.before.rms[kind.name][0]), None)
         # where no error is smaller, the likelihood must say it beyond the nat that each number may gain by chance
         least = 0.0 if full or gain.smaller(state.effects) else _GUESSED + sum(effect.size for effect in state.effects)
-        if gain.log_likelihood <= least and not self.chosen:
-            errors = f"{gain.errors(gain.best_kind(*state.effects))}, log-likelihood {gain.log_likelihood:+.1f}"
-            if gain.log_likelihood > 0:
+        if (larger or gain.log_likelihood <= least) and not self.chosen:
+            shown = larger.name if larger else gain.best_kind(*state.effects)
+            errors = f"{gain.errors(shown)}, log-likelihood {gain.log_likelihood:+.1f}"
+            if larger:
+                gained = (
+                    f"has as many parameters then as there are conditions of {larger.words}, and predicts those worse "
+                    f"that were not fitted ({gain.data}: {errors})"
+                )
+            elif gain.log_likelihood > 0:
                 gained = f"gains no more than chance may on data that was not fitted ({gain.data}: {errors})"
             elif gain.smaller(state.effects):
                 gained = (
@@ -734,8 +743,8 @@ class _Course:
         elif full:
             self._settle(complete=False)
             self.notes.append(
-                f"with {self._names()} the model has as many parameters as there are conditions of {full[0]}: it would "
-                "fit anything, so nothing confirms it. Record more poses."
+                f"with {self._names()} the model has as many parameters as there are conditions of {full[0].words}: it "
+                "would fit anything, so nothing confirms it. Record more poses."
             )
 
     def describe(self) -> None:
@@ -919,12 +928,12 @@ def same_device(first: Calibration, other: Calibration) -> list[str]:
     return notes
 
 
-def _saturated(experiment: Experiment, state: State) -> list[str]:
-    """Return the kinds of conditions, in words, of which the parameters leave none over."""
+def _saturated(experiment: Experiment, state: State) -> list[ResidualKind]:
+    """Return the kinds of conditions of which the parameters leave none over."""
     jacobian = np.linalg.solve(state.weights, state.evidence.jacobian)
     jacobian /= np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    parts = [(kind.words, jacobian[experiment.real.kind == k]) for k, kind in enumerate(experiment.real.kinds)]
-    return [words for words, part in parts if len(part) and np.linalg.matrix_rank(part, 1e-6) == len(part)]
+    parts = [(kind, jacobian[experiment.real.kind == k]) for k, kind in enumerate(experiment.real.kinds)]
+    return [kind for kind, part in parts if len(part) and np.linalg.matrix_rank(part, 1e-6) == len(part)]
 
 
 def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None) -> Named:

@@ -4,17 +4,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from jaximu.estimation.problem import TOLERANCE, Name
 from jaximu.ground.array_types import Array, FloatArray, IntArray
 from jaximu.ground.distributions import chi2_sf
-from jaximu.ground.quantities import listed, number, size
+from jaximu.ground.quantities import counted, listed, number, size
 from jaximu.ground.units import SENSOR_UNITS, STANDARD_GRAVITY
 from jaximu.model.sensor import Imu
 
 # Standard deviations along a direction, in typical sizes (10 % of a scale, 1 m/s², 0.1 rad/s).
 UNDETERMINED = 1.0  # the data say no more than the data sheet
 WEAK = 0.05
+MOSTLY = 0.5
+"""Share of a number's variance in open directions above which the data sheet, not the data, states it."""
 _GRID = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
 _GRID /= np.linalg.norm(_GRID, axis=1, keepdims=True)
 
@@ -24,7 +27,8 @@ class WeakDirection:
     """A combination of parameters that the data leave (nearly) open.
 
     sigma: standard deviation along it, as a share of the parameters' typical size. determined: False where the data say
-    next to nothing. parameters: the names that make up most of it, with their weights (unit vector in typical sizes).
+    next to nothing. parameters: the names that make up most of it, with their weights (unit vector in typical sizes);
+    where it is open also the numbers that are known no better than from a data sheet, mostly for it.
     text: the same in words, and what to record.
     """
 
@@ -34,10 +38,14 @@ class WeakDirection:
     text: str
 
 
+def open_numbers(weak: Sequence[WeakDirection]) -> frozenset[str]:
+    """Return the names of the numbers that the data do not determine: those of open directions."""
+    return frozenset(name for direction in weak if not direction.determined for name, _ in direction.parameters)
+
+
 def gains_open(weak: Sequence[WeakDirection]) -> bool:
     """Return whether a gain is part of a combination that the data do not determine."""
-    unknown = (direction.parameters for direction in weak if not direction.determined)
-    return any(".gain[" in name for parameters in unknown for name, _ in parameters)
+    return any(".gain[" in name for name in open_numbers(weak))
 
 
 def pose_advice(vector: FloatArray, names: Sequence[Name], sizes: FloatArray, model: Imu) -> str:
@@ -82,25 +90,38 @@ def weak_directions(
 
     The Jacobian's columns are scaled by typical sizes, so a singular value is how many times better the data know a
     direction than the data sheet did: rank counts those above `1 / UNDETERMINED`, weak are those below `1 / WEAK`.
+    Together the open directions span a subspace whose singular vectors are arbitrary mixtures; it is stated by a basis
+    of few numbers each, the reduced row echelon form with columns pivoted (Businger and Golub, 1965).
     """
     _, values, right = np.linalg.svd(np.asarray(jacobian), full_matrices=jacobian.shape[0] < jacobian.shape[1])
     values = np.pad(values, (0, len(right) - len(values)))  # fewer residuals than parameters
+    spread = right / np.hypot(values, 1 / TOLERANCE)[:, None]  # covariance: spread.T @ spread
+    sigmas, variance = np.linalg.norm(spread, axis=1), np.sum(spread**2, axis=0)
+    known = sigmas <= UNDETERMINED
+    basis = _of_few_numbers(right[~known])
+    lost = (variance > UNDETERMINED**2) & (np.sum(spread[~known] ** 2, axis=0) > MOSTLY * variance)
+    holder = np.argmax(np.abs(basis), axis=0) if len(basis) else np.full(len(names), -1)
     weak = []
-    for value, vector in sorted(zip(values, right, strict=True), key=lambda pair: pair[0]):
-        sigma = 1 / np.hypot(value, 1 / TOLERANCE)
-        if sigma < WEAK:
-            break
+    for index, vector in enumerate([*basis, *right[known & (sigmas >= WEAK)][::-1]]):
+        sigma = float(np.linalg.norm(spread @ vector))
         order = np.argsort(-np.abs(vector))
         vector = vector * np.sign(vector[order[0]])  # either sign is the same direction
         main = [k for k in order[:4] if abs(vector[k]) > 0.3] or order[:4]  # many may take part a little
-        named = tuple((names[k], float(vector[k])) for k in main)
+        others = [k for k in order if lost[k] and holder[k] == index and k not in main]
+        named = tuple((names[k], float(vector[k])) for k in (*main, *others))
         amounts = 1.96 * sigma * np.abs(vector) * np.asarray(sizes)
-        moves = [(names[k], float(amounts[k])) for k in main]
-        what = _words(moves, bool(sigma <= UNDETERMINED), model)
+        determined = index >= len(basis)
+        what = _words([(names[k], float(amounts[k])) for k in main], len(others), determined, model)
         text = f"{what} What to record: {advice(vector, names, sizes, model)}"
-        weak.append(WeakDirection(float(sigma), bool(sigma <= UNDETERMINED), named, text))
-    rank = int(np.sum(1 / np.hypot(values, 1 / TOLERANCE) <= UNDETERMINED))
-    return rank, tuple(weak)
+        weak.append(WeakDirection(sigma, determined, named, text))
+    return int(np.sum(known)), tuple(weak)
+
+
+def _of_few_numbers(basis: FloatArray) -> FloatArray:
+    """Return unit vectors (k, p) that span the same as a basis (k, p), each zero at the others' pivots."""
+    pivots = scipy.linalg.qr(basis, mode="r", pivoting=True)[1][: len(basis)]
+    reduced = np.linalg.solve(basis[:, pivots], basis)
+    return reduced / np.linalg.norm(reduced, axis=1, keepdims=True)
 
 
 def describe(name: Name, model: Imu | None = None) -> str:
@@ -123,12 +144,13 @@ def label(name: Name, model: Imu) -> str:
     return f"{effect}[{name.axes[0]}]" if name.part == "coefficients" else f"{effect}.{name.part}"
 
 
-def _words(moves: list[tuple[Name, float]], determined: bool, model: Imu) -> str:
+def _words(moves: list[tuple[Name, float]], others: int, determined: bool, model: Imu) -> str:
     """Say how far (95 %) the parameters of a direction can move together; amounts in the parameters' own units."""
-    if len(moves) == 1:
+    if len(moves) + others == 1:
         known = f"{describe(moves[0][0], model)} is only known to ±{spoken_amount(*moves[0], model)} (95 %)"
         return f"{known}." if determined else f"{known}: this recording does not determine it."
     named = [f"{describe(name, model)} (±{spoken_amount(name, amount, model)})" for name, amount in moves]
+    named += [counted(others, "other")] * (others > 0)
     together = f"{listed(named)} can trade off by these amounts (95 %) without changing the fit"
     return f"{together}." if determined else f"{together}: it does not determine them."
 

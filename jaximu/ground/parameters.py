@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class Parameter:
     """One fitted number: its name in documents, its name in words, value and standard deviation in `unit`.
 
-    weak: the data hardly determine it.
+    weak: the data hardly determine it. determined: False where they do not, and `sigma` is the data sheet's.
     """
 
     name: str
@@ -31,11 +31,12 @@ class Parameter:
     sigma: float
     unit: str
     weak: bool = False
+    determined: bool = True
 
     @property
     def different_from_zero(self) -> bool:
         """Whether zero lies outside the 95 % interval."""
-        return abs(self.value) > Z95 * self.sigma
+        return self.determined and abs(self.value) > Z95 * self.sigma
 
     @property
     def group(self) -> tuple[str, str]:
@@ -49,7 +50,7 @@ class Parameter:
             factor, unit = 1e3, "mrad"
         value, _, sigma = with_interval(factor * self.value, factor * self.sigma / Z95).partition(" ± ")
         sigma, _, power = sigma.partition(")")  # (1.2 ± 0.1)·10⁻⁹
-        return self.words, value.lstrip("(") + power, sigma + power, unit
+        return self.words, value.lstrip("(") + power, sigma + power if self.determined else "not determined", unit
 
 
 class ParameterTable(Mapping[str, Parameter]):
@@ -95,7 +96,7 @@ class ParameterTable(Mapping[str, Parameter]):
         return self.block()._repr_html_()
 
     def to_arrow(self) -> pa.Table:
-        """Return name, words, value, sigma, unit and weak as an Arrow table, which polars and DuckDB read, too."""
+        """Return the fields of every parameter as an Arrow table, which polars and DuckDB read, too."""
         import pyarrow as pa
 
         return pa.table({key.name: [getattr(one, key.name) for one in self.values()] for key in fields(Parameter)})

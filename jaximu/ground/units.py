@@ -69,7 +69,8 @@ _FACTORS = {
         "mdeg/s mdps": DEGREE * 1e-3,
         "deg/h dph °/h": DEGREE / 3600.0,
         "rad/h": 1.0 / 3600.0,
-        "rpm rev/min": math.pi / 30.0,
+        "rpm rev/min r/min tr/min U/min": math.pi / 30.0,
+        "rev/s rps r/s tr/s U/s": 2 * math.pi,
     },
     "time": {
         "s sec secs seconds second": 1.0,

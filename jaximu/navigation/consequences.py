@@ -344,7 +344,7 @@ def _notes(calibration: Calibration, noise: SensorNoise | None) -> list[str]:
     effects = calibration.imu.transferable().all_effects().values()
     if not any("temperature" in effect.needs for effect in effects):
         notes.append("temperature is not in the budget: the calibration has no effect of it (see `jaximu thermal`).")
-    if any(not direction.determined for direction in calibration.weak):
+    if calibration.open_numbers:
         notes.append("the calibration leaves directions undetermined, and what they do is far from first order.")
     return notes
 

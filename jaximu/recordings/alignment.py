@@ -44,6 +44,8 @@ _SHEARS += [np.eye(3)[[a]].T @ np.eye(3)[[b]] + np.eye(3)[[b]].T @ np.eye(3)[[a]
 
 EXPLAINED = 0.5
 """Share of the turning of gravity that a gyroscope must explain for anything to be judged by it."""
+_KNOWN = 0.2
+"""Standard deviation, of an entry, beyond which the gyroscope's matrix against gravity is not used."""
 
 
 class Turning(NamedTuple):
@@ -57,6 +59,11 @@ class Turning(NamedTuple):
     explained: float
     slope: float
     correlation: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether the recording determines how the two sensors' axes lie to each other."""
+        return self.explained >= EXPLAINED and float(np.max(self.sigma)) < _KNOWN
 
 
 def signed_permutation(matrix: FloatArray) -> FloatArray:

@@ -207,16 +207,20 @@ def _biases_of_the_recording(calibration: Calibration) -> str:
     """Say what the biases are good for, and how well their means over the recording are known."""
     means = []
     for name, sigma in calibration.bias_sigma_recording.items():
-        scale = calibration.triads()[name].scales
-        means.append(f"± {size(Z95 * float(np.max(sigma / scale)), SENSOR_UNITS[name], 2)} ({name})")
+        if calibration.open_numbers.isdisjoint(f"{name}.bias[{axis}]" for axis in range(3)):
+            scale = calibration.triads()[name].scales
+            means.append(f"± {size(Z95 * float(np.max(sigma / scale)), SENSOR_UNITS[name], 2)} ({name})")
     return (
         "The biases, and their intervals, are for use after the recording, for as long again as it took and without "
-        f"another power-on. As means over the recording itself they are known to {' and '.join(means)}, worst axis."
+        "another power-on."
+        + f" As means over the recording itself they are known to {' and '.join(means)}, worst axis."
+        * bool(means)
     )
 
 
 def _effect_row(parameter: Parameter) -> tuple[str, str]:
-    return parameter.words + " *" * parameter.weak, with_interval(parameter.value, parameter.sigma, parameter.unit)
+    interval = with_interval(parameter.value, parameter.sigma, parameter.unit)
+    return parameter.words + " *" * parameter.weak, interval if parameter.determined else "not determined"
 
 
 def _equations(calibration: Calibration) -> Iterator[Part]:

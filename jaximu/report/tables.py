@@ -146,6 +146,8 @@ def rows(calibration: Calibration, name: str, triad: Triad) -> list[tuple[str, s
         shown = "0" if fixed else with_interval(value, sigma, per) if part == "gain" else with_interval(value, sigma)
         if (not counts or part == "gain") and 0 < abs(value) <= Z95 * sigma:
             meaning = f"{meaning}; not different from zero".removeprefix("; ")
+        if parameter in calibration.open_numbers:
+            shown, meaning = with_interval(value, 0.0, per if part == "gain" else ""), "not determined"
         words = describe(parameter).removeprefix(f"{name} ") + " *" * (parameter in weak)
         # a bias as it is put out: what the equation takes
         return short_name(parameter), words, shown + f" {unit}" * (part == "bias"), meaning

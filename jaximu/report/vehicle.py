@@ -92,7 +92,11 @@ def _interval(entry: Mapping[str, Any], sign: bool = False) -> str:
 def _mounting(vehicle: Mapping[str, Any]) -> str:
     slope = vehicle["slope"]
     known = "" if slope is None else f" The road at the stops sloped by {size(slope, 'rad', 2)} (rms), which is in it."
+    roll, pitch = vehicle["roll"]["value"], vehicle["pitch"]["value"]
+    up = np.array([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])  # in the unit
+    axis = int(np.argmax(np.abs(up)))
     return (
+        f"The unit's {'xyz'[axis]} axis points {'up' if up[axis] > 0 else 'down'}. "
         f"Roll {_interval(vehicle['roll'])} and pitch {_interval(vehicle['pitch'])} against the horizontal: the unit's "
         f"axes are those of the vehicle (forward, left, up) turned by yaw, pitch and roll.{known} A slope that all "
         "stops share, such as a road's fall to its side, and the accelerometer's bias (0.6° for 0.1 m/s²) are not."

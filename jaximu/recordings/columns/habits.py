@@ -15,10 +15,13 @@ from jaximu.ground.units import SENSORS, STANDARD_GRAVITY, find_unit, parse_colu
 
 _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
+    "acelerometro accelerometro accelerometre beschleunigungssensor beschleunigungsmesser versnellingsmeter "
+    "akcelerometr акселерометр 加速度计 加速度計 가속도계 "
     "beschleunigung accelerazione aceleracion aceleracao versnelling przyspieszenie ускорение 加速度 가속도 "
     "gf f fb sf force specific",
     "gyro": "g gy gyr gyro gyros gyroscope gyroscopes w wb om omega rot rotation rotational rate rates ars angvel "
     "angularvelocity angularrate rotationrate as angvelocity gyroskop gyroskope drehrate drehraten giroscopio giroskop "
+    "gyrometre drehratensensor zyroskop ジャイロ 자이로 "
     "ω winkelgeschwindigkeit hoeksnelheid гироскоп 角速度 陀螺仪 각속도",
     "mag": "m mag mags magn magneto magnetometer magnetic b field compass magnetometro magnetfeld 磁场 磁場 磁力计",
     "temperature": "temp temperature temperatures temperatur temperatura temperatuur tmp температура 温度",

@@ -9,7 +9,7 @@ from pathlib import PurePath
 
 import numpy as np
 
-from jaximu.ground.units import find_unit, parse_column
+from jaximu.ground.units import column_title, find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, last_of
 from jaximu.recordings.columns.table import LogTable
 
@@ -119,9 +119,7 @@ def known_names(table: LogTable) -> _Named | None:
     if layout is None:
         return None
     ours = tuple(
-        title
-        if (title := layout.columns.get(name)) and not (title.startswith("time") and _stated(own_name))
-        else own_name
+        own_name if (title := layout.columns.get(name)) is None else _titled(title, own_name)
         for name, own_name in zip(names, table.names, strict=True)
     )
     return ours, f"columns and units as {layout.program} has them."
@@ -187,9 +185,11 @@ _ECHOED = (
 )
 
 
-def _stated(name: str) -> bool:
-    unit = parse_column(name)[1]
-    return bool(unit and find_unit(unit, "time"))
+def _titled(title: str, name: str) -> str:
+    """A program's title for a column, in the unit that the column's own name states where that is one of its kind."""
+    (plain, usual), (_, stated) = parse_column(title), parse_column(name)
+    unit = find_unit(usual or "")
+    return column_title(plain, stated) if unit and stated and find_unit(stated, unit.quantity) else title
 
 
 def whole_stamps(table: LogTable) -> LogTable:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
@@ -145,18 +146,37 @@ def _chosen(files: Collection[str], path: Path, name: str) -> dict[str, str]:
 
 
 def by_sensor(files: Iterable[str]) -> dict[str, str]:
-    """Return by sensor the files of one folder that are called after an accelerometer and others; else nothing."""
+    """Return by sensor the files of one folder that are called after an accelerometer and others; else nothing.
+
+    A name, a time, an address that all of them have alike, and their rates, say nothing.
+    """
     paths = [PurePosixPath(file) for file in files]
-    best = {sensor: _best([file for file in paths if _rank(file)[0] == sensor]) for sensor in SENSORS}
+    words = {word for file in paths for word in _words(file)}
+    of_sensors = {word for word in words if len(word) >= _LETTERS and sensor_of((word,))[0] in SENSORS}
+    named = [set(_words(file)) for file in paths if of_sensors.intersection(_words(file))]
+    alike = set.intersection(*named) - of_sensors if len(named) > 1 else set()
+    ranks = {file: _rank(file, alike) for file in paths}
+    best = {
+        sensor: _best({file: words for file, (name, words) in ranks.items() if name == sensor}) for sensor in SENSORS
+    }
     sensors = {sensor: file for sensor, file in best.items() if file is not None}
     if "accel" not in sensors or len(sensors) < 2 or len({file.parent for file in sensors.values()}) > 1:
         return {}
     return {sensor: str(file) for sensor, file in sensors.items()}
 
 
-def _rank(file: PurePosixPath) -> tuple[str, int]:
-    """Return the sensor that a file is named after, "" for none, and how far the name is from plain."""
+def _words(file: PurePosixPath) -> list[str]:
+    return words_of(re.sub(r"[\d.]+ ?Hz", "", file.stem))
+
+
+def _rank(file: PurePosixPath, alike: Collection[str] = ()) -> tuple[str, int]:
+    """Return the sensor that a file is named after, "" for none, and how far the name is from plain.
+
+    `alike`: words that its neighbours have, too; what is left of such a name must hold no number.
+    """
     words = tuple(words_of(file.stem))
+    if rest := tuple(word for word in _words(file) if word not in alike):
+        words = words if len(rest) == len(words) or any(map(str.isdigit, rest)) else rest
     if words == _WITH_GRAVITY:
         return "accel", 0
     sensor, refusal = sensor_of(words)
@@ -164,10 +184,10 @@ def _rank(file: PurePosixPath) -> tuple[str, int]:
     return _PART if refusal else named or "", len(words)
 
 
-def _best(files: Sequence[PurePosixPath]) -> PurePosixPath | None:
+def _best(ranks: Mapping[PurePosixPath, int]) -> PurePosixPath | None:
     """Return the file with the plainest name; None where several are as plain: they are of several recordings."""
-    ranks = [_rank(file)[1] for file in files]
-    return files[ranks.index(min(ranks))] if ranks and ranks.count(min(ranks)) == 1 else None
+    plainest = [file for file, rank in ranks.items() if rank == min(ranks.values())]
+    return plainest[0] if len(plainest) == 1 else None
 
 
 def _refusal(files: Sequence[str], path: Path, name: str) -> str:

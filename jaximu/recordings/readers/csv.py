@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 
 from jaximu.ground.errors import InputError
+from jaximu.ground.quantities import counted
 from jaximu.ground.units import column_title, find_unit, parse_column
 from jaximu.recordings.columns.habits import fields_of, sensor_of, stated_rate, words_of
 from jaximu.recordings.columns.table import HEAD, LogTable, from_arrow, parse_name
@@ -138,15 +139,14 @@ def _read_straight(path: Path, layout: _Layout) -> tuple[list[np.ndarray], pa.Sc
     parts: list[list[np.ndarray]] = []
     schemas: list[pa.Schema] = []
     with suppress(pa.ArrowInvalid), path.open("rb") as file:
-        for _ in range(layout.first):
-            file.readline()
+        above = [file.readline().strip() for _ in range(layout.first)]
         while piece := file.read(_PIECE):
             table = _parse(piece + file.readline(), layout, 1 << 20)
             schemas.append(table.schema)
             parts.append([from_arrow(column) for column in table.columns])
         fields = [_common(kinds) for kinds in zip(*schemas, strict=True)]
         texts = any(pa.types.is_string(schema_field.type) for schema_field in fields if schema_field)
-        if fields and all(fields) and not (texts and _comments(path)):
+        if fields and all(fields) and not (texts and _interrupted(path, above)):
             # one after the other, so that a long file is not held twice
             columns = [np.concatenate([part.pop(0) for part in parts]) for _ in fields]
             return columns, pa.schema([schema_field for schema_field in fields if schema_field])
@@ -160,9 +160,13 @@ def _common(fields: Sequence[pa.Field]) -> pa.Field | None:
     return filled[0] if all(numbers) or all(kind.type == filled[0].type for kind in filled) else None
 
 
-def _comments(path: Path) -> bool:
+def _interrupted(path: Path, above: Sequence[bytes]) -> bool:
+    """Whether comments, or a line from above the data once more, may stand between its rows."""
     with path.open("rb") as file:
-        return any(mark.encode() in block for block in iter(partial(file.read, HEAD), b"") for mark in _MARKS)
+        blocks = iter(partial(file.read, HEAD), b"")
+        marks = [mark.encode() for mark in _MARKS]
+        counts = np.array([[*map(block.count, marks), block.count(above[-1] if above else b"\0")] for block in blocks])
+    return bool(counts[:, :-1].any() or counts[:, -1].sum() > 1)
 
 
 def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np.ndarray, tuple[str, ...]]:
@@ -170,12 +174,12 @@ def _read_cleaned(data: bytes, layout: _Layout, path: str) -> tuple[pa.Table, np
 
     A column may be of any types.
     """
-    body, rows = _body(data, layout)
+    body, rows, notes = _body(data, layout)
     with suppress(pa.ArrowInvalid):
-        return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, ()
-    body, rows, notes = _without_remarks(body, layout, rows, path)
-    try:
         return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, notes
+    body, rows, remarks = _without_remarks(body, layout, rows, path)
+    try:
+        return _parse(body, layout, min(len(body) + 1, _SINGLE_BLOCK)), rows, notes + remarks
     except pa.ArrowInvalid as error:
         raise InputError(f"{path}: cannot be read as a table: {str(error).splitlines()[0][:200]}") from None
 
@@ -196,6 +200,8 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _is_number(cell: str, decimal: str = ".") -> bool:
+    if _VECTOR.fullmatch(cell.strip()):
+        return True
     if decimal == "," and "." in cell:
         return False
     text = cell.replace(decimal, ".")
@@ -211,7 +217,7 @@ _MARKS = ("#", "//", "%")
 """Signs that a line is a remark, or the header behind such a sign."""
 _RULE = re.compile(r"[-=_+|\s]*")
 """A line that only separates others, or an empty one."""
-_STYLES = (("\t", "."), (",", "."), (";", "."), (" ", "."), (";", ","), ("\t", ","), (",", ","), (" ", ","))
+_STYLES = [(delimiter, decimal) for decimal, order in ((".", "\t,; |"), (",", ";\t, |")) for delimiter in order]
 """Delimiters and decimal signs, the likelier first."""
 
 
@@ -293,18 +299,27 @@ def _commented_header(lines: list[str], delimiter: str, width: int) -> tuple[str
     return tuple(map(parse_name, cells)) if len(cells) == width else None
 
 
-def _body(data: bytes, layout: _Layout) -> tuple[bytes, np.ndarray]:
-    """The lines of data alone, single-blank separated where blanks separate, and the line number of each row."""
+def _body(data: bytes, layout: _Layout) -> tuple[bytes, np.ndarray, tuple[str, ...]]:
+    """The lines of data alone, single-blank separated where blanks separate, the line number of each row, and a note.
+
+    Lines from above the data, such as its header, may be there again.
+    """
     lines = data.split(b"\n")
     marks = tuple(mark.encode() for mark in _MARKS)
-    kept = [at for at in range(layout.first, len(lines)) if (line := lines[at].strip()) and not line.startswith(marks)]
+    above = set(map(bytes.strip, lines[: layout.first])) - {b""}
+    filled = [
+        at for at in range(layout.first, len(lines)) if (line := lines[at].strip()) and not line.startswith(marks)
+    ]
+    kept = [at for at in filled if lines[at].strip() not in above]
+    repeated = len(filled) - len(kept)
+    notes = (f"{counted(repeated, 'line')} between rows repeated the header: left out.",) * (repeated > 0)
     data = b"\n".join(lines[at] for at in kept)
     if layout.delimiter == " ":
         data = data.replace(b"\t", b" ")
         while b"  " in data:
             data = data.replace(b"  ", b" ")
         data = data.replace(b"\n ", b"\n").replace(b" \n", b"\n").strip(b" ")
-    return data, np.array(kept) + 1
+    return data, np.array(kept) + 1, notes
 
 
 def _parse(data: bytes, layout: _Layout, block: int) -> pa.Table:
