@@ -102,9 +102,9 @@ def test_a_ramp_of_one_recording_is_named_in_it(tmp_path):
     extended = found.extended_calibration()
     extended.save(tmp_path / "calibration.json")
     read = load_calibration(tmp_path / "calibration.json")
-    (effect,) = read.imu.all_effects().values()
-    assert effect.name == "gyro.bias_ramp@2"
-    np.testing.assert_array_equal(effect.coefficients, ramp.effect.coefficients)
+    (effect,), (kept,) = (one.imu.all_effects().values() for one in (read, extended))
+    assert effect.name == kept.name == "gyro.bias_ramp@2"
+    np.testing.assert_array_equal(effect.coefficients, kept.coefficients)
     assert not read.imu.transferable().all_effects()  # no other recording is corrected by it
     corrected, plain = (compensate(one, recordings[1]) for one in (read, replace(read, imu=read.imu.with_effects())))
     np.testing.assert_array_equal(corrected.gyroscope.values, plain.gyroscope.values)
