@@ -7,8 +7,18 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from jaximu import LocalGravity, ReadOptions, calibrate, diagnose, read_recording
+from jaximu import (
+    CATALOGUE,
+    LocalGravity,
+    ReadOptions,
+    calibrate,
+    compensate,
+    diagnose,
+    load_calibration,
+    read_recording,
+)
 from jaximu.data.drift import restricted_likelihood
+from jaximu.diagnosis.diagnosis import recorded_by_hand
 
 GRAVITY = LocalGravity(hidden.GRAVITY, 0.0)
 USUAL = {name: hidden.FLICKER[short] / hidden.WHITE[short] for name, short in
@@ -62,7 +72,71 @@ def test_biases_of_another_power_on_are_no_effect(static, tmp_path):
     assert found.experiment.drift is not None
     size, relative = found.experiment.drift.sizes["accelerometer power-on"]
     assert abs(np.log(size * hidden.WHITE["accel"] / 0.03)) < 3 * max(relative, 0.3)  # six numbers tell it
-    assert "several" in found.not_observable["gyro.step"]  # it is of one recording
+    tested = {*found.detection_limits, *found.not_observable}
+    assert {f"gyro.step@{number}" for number in (1, 2, 3)} <= tested  # in each recording by itself
+    assert "gyro.step" not in tested
+
+
+def drifting_in_the_second(folder, *others):
+    """Two recordings of a unit, a ramp of the gyroscope's bias hidden in the second; `others` are hidden in both."""
+    names = ("gyro.bias_ramp", *others)
+    case = hidden.draw_case(1306, names, poses=20).with_size({"gyro.bias_ramp": 4.0, **dict.fromkeys(others, 2.0)})
+    without = replace(case, hidden=tuple(each for each in case.hidden if each.name in others))
+    biases = {"accel": 0.03, "gyro": 0.003}
+    made = without.powered_on(biases, 2)[0], case.powered_on(biases, 2)[1]
+    logs = [each.write(folder / f"{number}.parquet") for number, each in enumerate(made, 1)]
+    return case, [read_recording(log) for log in logs]
+
+
+def test_a_ramp_of_one_recording_is_named_in_it(tmp_path):
+    case, recordings = drifting_in_the_second(tmp_path)
+    found = diagnose(recordings, GRAVITY)
+    assert found.verdict == "effects"
+    (ramp,) = found.named
+    assert (ramp.name, ramp.file, ramp.effect.recording) == ("gyro.bias_ramp@2", "2.parquet", 2)
+    assert "gyroscope bias ramp in recording 2 (gyro.bias_ramp@2) of 2.parquet" in ramp.sentence()
+    assert np.all(np.abs(ramp.effect.coefficients - case.hidden[0].coefficients) < 4 * ramp.sigma)
+    assert found.gain is not None and found.gain.log_likelihood > 10
+    (written,) = found.document()["effects"]
+    assert (written["name"], written["recording"], written["scope"]) == ("gyro.bias_ramp", 2, "session")
+    extended = found.extended_calibration()
+    extended.save(tmp_path / "calibration.json")
+    read = load_calibration(tmp_path / "calibration.json")
+    (effect,), (kept,) = (one.imu.all_effects().values() for one in (read, extended))
+    assert effect.name == kept.name == "gyro.bias_ramp@2"
+    np.testing.assert_array_equal(effect.coefficients, kept.coefficients)
+    assert not read.imu.transferable().all_effects()  # no other recording is corrected by it
+    corrected, plain = (compensate(one, recordings[1]) for one in (read, replace(read, imu=read.imu.with_effects())))
+    np.testing.assert_array_equal(corrected.gyroscope.values, plain.gyroscope.values)
+
+
+def test_a_ramp_of_one_recording_stands_beside_what_the_unit_does_in_both(tmp_path):
+    _, recordings = drifting_in_the_second(tmp_path, "gyro.g_sensitivity")
+    found = diagnose(recordings, GRAVITY)
+    assert found.verdict == "effects"
+    assert {each.name for each in found.named} == {"gyro.bias_ramp@2", "gyro.g_sensitivity"}
+
+
+def test_an_effect_of_one_recording_acts_in_no_other(tmp_path):
+    """Its columns are those of the whole effect in its recording; a unit with it has none of it in the others."""
+    _, recordings = drifting_in_the_second(tmp_path)
+    calibration = calibrate(recordings, GRAVITY)
+    data, unit = recorded_by_hand(calibration), calibration.imu.with_effects()
+    details, kind = data.along(unit, ()), CATALOGUE["gyro.bias_ramp"]
+    grids = {one: [{}] for one in (kind, kind.within(1), kind.within(2))}
+    whole, first, second = (data.dormant_columns(unit, details, grids)[one][0] for one in grids)
+    np.testing.assert_allclose(first + second, whole, rtol=1e-12, atol=1e-12 * np.abs(whole).max())
+    count = len(data.segmentations[0].intervals)
+    touches = {1: data.rows(unit).first < count, 2: data.rows(unit).last >= count}
+    assert not first[~touches[1]].any() and not second[~touches[2]].any()
+    assert first[touches[1]].any() and second[touches[2]].any()
+    ramp = kind.within(2).make([1e-5, -2e-5, 3e-5])
+    affected = data.along(unit.with_effects(ramp), (ramp,)).observations.poses
+    taken = np.asarray(data.observations.poses.gyroscope_mean - affected.gyroscope_mean)
+    middle = np.asarray(affected.start + affected.stop)[:, None] / 2
+    expected = np.where(np.arange(len(taken))[:, None] < count, 0.0, ramp.coefficients * middle)
+    real = np.asarray(affected.mask)
+    np.testing.assert_allclose(taken[real], expected[real], atol=2e-7)  # a sample is stamped in the middle of it
 
 
 def test_findings_in_several_recordings_say_in_which(tmp_path):

@@ -65,6 +65,24 @@ def test_every_file_of_the_folder_is_in_the_catalogue():
     assert set(listed) == set(CATALOGUE.values())
 
 
+def test_an_effect_of_a_session_can_act_in_one_recording_alone():
+    kind = CATALOGUE["gyro.warm_up@2"]
+    whole = CATALOGUE["gyro.warm_up"]
+    assert (kind, whole) == (whole.within(2), kind.within(0))
+    assert (kind.name, kind.plain, kind.recording, whole.recording) == ("gyro.warm_up@2", "warm_up", 2, 0)
+    assert effect_title(kind.name) == "gyroscope warm-up in recording 2 (gyro.warm_up@2)"
+    effect = kind.make([1.0, 2.0, 3.0], time_constant=7.0)
+    assert effect.document("rad/s")["recording"] == 2 and "recording" not in whole.make(1.0).document("rad/s")
+    for number, factor in ((1, 0.0), (2, 1.0)):
+        there = effect.in_recording(number)
+        assert type(there) is whole and there.time_constant == 7.0
+        np.testing.assert_array_equal(there.coefficients, factor * np.array([1.0, 2.0, 3.0]))
+    for name in ("gyro.warm_up@0", "gyro.warm_up@", "gyro.g_sensitivity@2", "gyro.nothing@2"):
+        assert name not in CATALOGUE
+        with pytest.raises(KeyError):
+            CATALOGUE[name]
+
+
 @EVERY
 def test_metadata_is_complete(kind):
     assert issubclass(kind, Effect)

@@ -24,8 +24,9 @@ class DiagnoseCommand(options.Fits):
     """Find what the model misses: name the effect, add it to the model and measure the gain on data not fitted.
 
     Several LOGs are several recordings of one unit, each with its own biases: what the unit does in all of them shows
-    together where one hardly shows it. DIR receives diagnosis.json, the extended calibration.json, report.html and
-    pictures. With --by they are recordings of several units: DIR receives diagnosis.json and report.html.
+    together where one hardly shows it, and drift is tested in each by itself. DIR receives diagnosis.json, the
+    extended calibration.json, report.html and pictures. With --by they are recordings of several units: DIR receives
+    diagnosis.json and report.html.
 
     Examples:
       jaximu diagnose log.csv --static rest.csv -o results

@@ -283,6 +283,7 @@ class PosesAndTurns(Observations, Data):
         as much as the effects are small beside what the unit measures.
         """
         bare, affected = imu.with_effects(), imu.with_effects(*effects)
+        units = [affected.in_recording(number) for number in range(1, len(self.samples) + 1)]
 
         def tracks(data: PosesAndTurns) -> tuple[Condensed, list[dict[str, Track]]]:
             unit, of = lifted((bare, replace(data, samples=())))
@@ -290,7 +291,7 @@ class PosesAndTurns(Observations, Data):
             return whole, [tracks_by_hand(bare, part, whole.running) for part in data.samples]
 
         def without(data: PosesAndTurns) -> PosesAndTurns:
-            return _without_added(affected, self, tracks(data)[1])
+            return _without_added(units, self, tracks(data)[1])
 
         left = repeated(without, self, _ROUNDS, imu) if effects else self
         return Along(left, *tracks(left))
@@ -337,9 +338,10 @@ class PosesAndTurns(Observations, Data):
 
 
 @partial(stored.compiled, quick=True)
-def _without_added(imu: Imu, data: PosesAndTurns, tracks: Sequence[dict[str, Track]]) -> PosesAndTurns:
-    """Return data without what a unit's effects add along the tracks of each recording."""
-    return data.moved([{name: -values for name, values in added(imu, track).items()} for track in tracks])
+def _without_added(units: Sequence[Imu], data: PosesAndTurns, tracks: Sequence[dict[str, Track]]) -> PosesAndTurns:
+    """Return data without what a unit's effects add along the tracks of each recording, as it was in each."""
+    outputs = [added(imu, track) for imu, track in zip(units, tracks, strict=True)]
+    return data.moved([{name: -values for name, values in of.items()} for of in outputs])
 
 
 def felt_by_hand(imu: Imu) -> tuple[Effect, ...]:

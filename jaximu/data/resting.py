@@ -132,7 +132,7 @@ class Resting(OfOneUnit):
         edges = np.stack([self.blocks.start, self.blocks.stop], axis=1)
         return [edges[self.blocks.log == log] for log in range(len(self.recordings))]
 
-    def extent(self) -> Extent:
+    def extent(self, recording: int = 0) -> Extent:
         """Return what the recordings span: effects may begin with some of the blocks."""
         edges = np.sort(np.unique(self.blocks.start))[1:]
         every = -(-len(edges) // _PLACES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,7 +20,7 @@ from jaximu.data.drift import about_biases, with_usual_drift
 from jaximu.diagnosis.checks import Check, checks_of
 from jaximu.diagnosis.choice import with_open_choice
 from jaximu.diagnosis.drift import DriftComponents, drifted, estimate_drift, hands_of
-from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS, LIMIT_POWER
+from jaximu.diagnosis.evidence import FEWEST_DIMENSIONS, LIMIT_POWER, Evidence
 from jaximu.diagnosis.experiment import Experiment, KnownEffect, State
 from jaximu.diagnosis.extension import Extension, Found, extend, settled
 from jaximu.diagnosis.hidden import Hidden, hidden_causes
@@ -74,7 +75,8 @@ class Named:
     """An effect that the recording shows: fitted, with its rivals, its evidence and what it gains.
 
     p_value: of its absence, by its own test, its grid allowed for. weak: below twice its detection limit. sigma: of the
-    coefficients. gain: of the whole extension, on data that was not fitted.
+    coefficients. gain: of the whole extension, on data that was not fitted. file: of the recording where it acts in one
+    of several alone, else empty.
     """
 
     effect: Effect
@@ -88,10 +90,11 @@ class Named:
     largest: float  # that it adds to that triad's output in this recording, SI
     evidence: str
     gain: Gain | None
+    file: str = ""
 
     @property
     def name(self) -> str:
-        """The catalogue's name."""
+        """The catalogue's name, with the number of the recording where it acts in one of several."""
         return self.effect.name
 
     @property
@@ -132,7 +135,8 @@ class Named:
         """Return what it adds, for the verdict."""
         start = self.effect.since()
         since = "" if start is None else f", from {start:.4g} s on"
-        return f"{self.effect.title}, up to {self.size()}{since}"
+        file = f" of {self.file}" if self.file else ""
+        return f"{self.effect.title}{file}, up to {self.size()}{since}"
 
     def size(self) -> str:
         """Return the most that it adds, with its unit."""
@@ -149,7 +153,9 @@ class Named:
             for name, parameter in self.effect.inner.items()
         }
         return {
-            **entries(self, "name", "p_value", "weak", "sigma", "unit", "evidence"),
+            "name": self.effect.within(0).name,
+            **({"recording": self.effect.recording} if self.effect.recording else {}),
+            **entries(self, "p_value", "weak", "sigma", "unit", "evidence"),
             "indistinguishable_from": list(self.rivals),
             "scope": self.effect.scope,
             "coefficients": np.asarray(self.effect.coefficients).tolist(),
@@ -347,8 +353,9 @@ def diagnose(
     **Arguments:** as for [`jaximu.calibrate`], and
 
     - `recordings`: several of one unit show together what one hardly does. Each has its own biases, as after another
-      power-on; effects that belong to one recording (steps, ramps) are asked of one alone. Or data of another kind,
-      such as `jaximu.data.RecordedStations`, as [`jaximu.calibrate`][] takes them.
+      power-on; effects that belong to one recording (steps, ramps, warm-up, a drift along a curve) are tested in each
+      and act in that one alone: "gyro.bias_ramp@2" is a ramp in the second. Or data of another kind, such as
+      `jaximu.data.RecordedStations`, as [`jaximu.calibrate`][] takes them.
     - `start`: with data, as for [`jaximu.calibrate`][].
     - `gravity`: where it states a latitude, the Earth's rotation is no finding: it is taken off.
     - `static`: a recording of the unit at rest, or its `NoiseModel`. Without one the noise is taken from the poses
@@ -358,7 +365,7 @@ def diagnose(
     - `level`: rate of false alarms over all tests together.
     - `repair`: change what [`jaximu.mistakes.prepare`][] can put right; rows that are no measurement are left out
       in any case.
-    - `candidates`: the only effects to ask for, by name or class; a class that the catalogue lacks is registered. None
+    - `candidates`: the only effects to test, by name or class; a class that the catalogue lacks is registered. None
       asks for all of the catalogue. Noise, mistakes and shapes without a cause are asked for in any case.
     - `known`: effects that other recordings of the unit tell. They are taken off recordings, and are no findings.
 
@@ -839,7 +846,8 @@ def _with_hands(
     """Return the experiment with what hands add, and where the noise knows no drift with the drift that it shows.
 
     Its fit and the causes that stand out are returned as well. A ramp and what temperature does must not pass for
-    drift. Nor must a cause that stands out: the drift is estimated again beside it. `known`: a fit and its causes where
+    drift; of several recordings a ramp in one of them may, until it stands out, for the others show what drift is
+    usual. Nor must a cause that stands out: the drift is estimated again beside it. `known`: a fit and its causes where
     the noise knows the drift.
     """
     calibration, remade, level = examination.calibration, examination.remade, examination.level
@@ -848,7 +856,7 @@ def _with_hands(
     else:
         base, first = known
         causes = [base.evidence.blocks[cause.block] for cause in first.causes]
-    for last in (False, True):
+    for count in range(3):
         steady = [block for block in base.evidence.blocks if block.name.partition(".")[2] in _STEADY]
         none = np.zeros((len(base.weights), 0))
         columns = np.concatenate([none, *(block.columns for block in (*steady, *causes))], axis=1)
@@ -859,10 +867,20 @@ def _with_hands(
         experiment = _moved(remade, drift, drifted(noise, drift))
         base = experiment.fit()
         selection = select(base.evidence, level)
-        causes = [base.evidence.blocks[cause.block] for cause in selection.causes]
-        if last or not causes:
+        chosen = [cause.block for cause in selection.causes]
+        ramps = _ramps_beside(base.evidence, chosen, level)
+        causes = [base.evidence.blocks[k] for k in (*chosen, *ramps)]
+        if not causes or (count == 1 and not ramps) or count == 2:
             return experiment, drifted(noise, drift), base, selection
     raise AssertionError
+
+
+def _ramps_beside(evidence: Evidence, chosen: Sequence[int], level: float) -> list[int]:
+    """Return the blocks of ramps in one of several recordings that stand out beside chosen blocks."""
+    p_value = evidence.scores(chosen).p_value
+    effects = {k: CATALOGUE[block.name] for k, block in enumerate(evidence.blocks) if block.kind == "effect"}
+    ramps = [k for k, kind in effects.items() if kind.recording and kind.plain in _STEADY and k not in chosen]
+    return [k for k in ramps if evidence.family_wise(float(p_value[k])) < level]
 
 
 def _moved(remade: Callable[[NoiseModel], Experiment], drift: DriftComponents | None, noise: NoiseModel) -> Experiment:
@@ -963,6 +981,7 @@ def _named(experiment: Experiment, state: State, entry: Found, gain: Gain | None
         largest[owner],
         evidence,
         gain,
+        Path(experiment.recordings[effect.recording - 1].name).name if effect.recording else "",
     )
 
 

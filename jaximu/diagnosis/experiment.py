@@ -220,9 +220,9 @@ class Experiment(Data):
         """What is diagnosed, as it was recorded."""
         return self.data.recordings
 
-    def extent(self) -> Extent:
-        """Return what the recordings span."""
-        return self.data.extent()
+    def extent(self, recording: int = 0) -> Extent:
+        """Return what a recording spans, by its number, or all of them (0)."""
+        return self.data.extent(recording)
 
     def still_parts(self, triad: str) -> tuple[list[FloatArray], float]:
         """Return what a triad put out (k, 3) in each part at rest, in SI, and its rate, Hz."""
@@ -265,33 +265,40 @@ class Experiment(Data):
         """Return the effects that can be asked of these recordings, and why others cannot."""
         askable, refused = {}, {}
         warming, hidden = self.extent().temperature_range, self.data.hidden()
-        several = len(self.recordings) > 1 and self.data.by_hand  # each has its own time and heading
         for name, kind in CATALOGUE.items():
             if not kind.cause or kind.owner not in self.data.owners:
                 continue
+            kinds = {one.name: one for one in self.by_recording(kind)}
             if self.candidates is not None and name not in self.candidates:
+                kinds = {one: kinds[one] for one in self.candidates if one in kinds}
+            if not kinds:
                 continue
             why = self.lacking(kind, linear)
             if why:
                 refused[name] = why
             elif kind.scope == "fixture" and self.data.no_fixture:
                 refused[name] = self.data.no_fixture
-            elif kind.scope == "session" and several:
-                refused[name] = "it belongs to one recording, and these are several"
             elif "temperature" in " ".join(kind.needs) and warming < LEAST_WARMING:
                 refused[name] = "the temperature stood still"
             elif name in hidden:
                 refused[name] = hidden[name]
             else:
-                askable[name] = kind
+                askable |= kinds
         return askable, refused
+
+    def by_recording(self, kind: type[Effect]) -> list[type[Effect]]:
+        """Return an effect as it is asked: of a session once for each of several recordings, acting in it alone."""
+        count = len(self.recordings)
+        if kind.scope != "session" or count < 2 or not self.data.by_hand:  # by hand each has its own time and heading
+            return [kind]
+        return [kind.within(number) for number in range(1, count + 1)]
 
     def largest(self, state: State, effect: Effect) -> dict[str, float]:
         """Return the most (SI) that an effect adds to each triad's output in these recordings."""
         triads = state.imu.triads()
         most = dict.fromkeys(triads, 0.0)
-        for tracks in self.data.tracks(state.linear.details):
-            for name, outputs in added(state.imu.with_effects(effect), tracks).items():
+        for number, tracks in enumerate(self.data.tracks(state.linear.details), 1):
+            for name, outputs in added(state.imu.with_effects(effect.in_recording(number)), tracks).items():
                 scale = triads[name].scales
                 values = np.abs(np.asarray(outputs)[tracks[name].inside()] / scale)
                 most[name] = max(most[name], float(np.max(values)))
@@ -428,9 +435,10 @@ class Experiment(Data):
     ) -> tuple[list[EffectBlock], dict[str, str]]:
         askable, refused = self.askable(linear)
         if asking is not None:
-            askable = {name: kind for name, kind in askable.items() if kind.plain in asking}
-        extent, used, blocks = self.extent(), self.used, []
-        grids = {kind: kind.grid(extent) for kind in askable.values()}
+            askable = {name: kind for name, kind in askable.items() if name.partition(".")[2] in asking}
+        used, blocks = self.used, []
+        extents = {number: self.extent(number) for number in {kind.recording for kind in askable.values()}}
+        grids = {kind: kind.grid(extents[kind.recording]) for kind in askable.values()}
         reactions = self.dormant_columns(imu, linear.details, grids)
         for name, kind in askable.items():
             if name in fitted:

@@ -70,7 +70,7 @@ class LearnedTerm:
         kinds = {kind: (before, self.gain.after.rms[kind]) for kind, before in self.gain.before.rms.items()}
         output = getattr(self.state.imu, self.triad).output_unit
         return {
-            "name": self.effect.name,
+            "name": self.effect.within(0).name,
             "covariate": self.covariate,
             "triad": self.triad,
             **self.effect.document(output),
@@ -181,8 +181,8 @@ def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatA
         if experiment.lacking(kind, state.linear):
             continue
         still = "temperature" in kind.needs[0] and warming < LEAST_WARMING
-        effect = None if still else _spanned(experiment, kind, state)
-        effects += [] if effect is None else [effect]
+        spanned = [] if still else [_spanned(experiment, one, state) for one in experiment.by_recording(kind)]
+        effects += [effect for effect in spanned if effect is not None]
     grids = {type(effect): [{name: float(getattr(effect, name)) for name in effect.inner}] for effect in effects}
     columns = experiment.dormant_columns(state.imu, state.linear.details, grids)
     for effect in effects:
@@ -195,7 +195,9 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
     name = kind.owner
     typical = {name: parameter.typical for name, parameter in kind.inner.items()}
     values = []
-    for track in (tracks[name] for tracks in experiment.data.tracks(state.linear.details)):
+    tracks = experiment.data.tracks(state.linear.details)
+    chosen = tracks[kind.recording - 1 : kind.recording] if kind.recording else tracks
+    for track in (part[name] for part in chosen):
         rows = track.inside()
         if name == "accelerometer":  # which is compared at rest alone
             rows &= np.asarray(track.observation) < np.max(track.observation)

@@ -193,7 +193,7 @@ class Data(ABC):
         numerics = array_module(imu, details)
         effects, columns = imu.all_effects(), [numerics.zeros((rows, 0))]
         for effect in effects.values():
-            kind = type(effect)
+            kind, recording = type(effect).within(0), type(effect).recording
             if self.no_fixture and effect.scope == "fixture":
                 columns.append(numerics.zeros((rows, effect.size + len(effect.inner))))
                 continue
@@ -203,8 +203,9 @@ class Data(ABC):
 
             inner = [numerics.asarray(getattr(effect, name), float)[None] for name in effect.inner]
             numbers = numerics.concatenate([numerics.asarray(effect.coefficients, float), *inner])
+            acting = parts[recording - 1 : recording] if recording else parts
             parted = [
-                stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers) for part in parts
+                stored.call(derivatives, f"{key} {kind.name}", imu.with_effects(), part, numbers) for part in acting
             ]
             columns.append(-sum(parted[1:], start=parted[0]))
         return free_columns(effects, numerics.concatenate(columns, axis=1))
@@ -214,21 +215,18 @@ class Data(ABC):
     ) -> dict[type[Effect], FloatArray]:
         """Return the reactions (G, n, q) by the coefficients of effects at zero, each at G inner parameters.
 
+        Of an effect in one recording alone, of the part of that number; the data have a part for each recording then.
         One program for all effects: loading one from the cache takes as long as running it ten times. A diagnosis runs
         it four times and more, which pays for compiling it in full.
         """
         if not grids:
             return {}
         key, react, parts = self.reactions(details)
-        kinds, inner = list(grids), []
+        longest: dict[str, int] = {}
         for kind, grid in grids.items():
-            values = np.array([[point[name] for name in kind.inner] for point in grid]).reshape(
-                len(grid), len(kind.inner)
-            )
-            missing = -len(values) % _GRID if len(values) > _GRID else 0  # few lengths, and so few programs
-            inner.append(np.concatenate([values, np.repeat(values[-1:], missing, axis=0)]))
+            longest[kind.within(0).name] = max(longest.get(kind.within(0).name, 0), len(grid))
 
-        def derivatives(imu, part, *inner):
+        def derivatives(kinds, imu, part, *inner):
             def at(kind, values):
                 def of(coefficients):
                     return react(kind(coefficients, **dict(zip(kind.inner, values, strict=True))), imu, part)
@@ -240,10 +238,22 @@ class Data(ABC):
                 for kind, grid in zip(kinds, inner, strict=True)
             )
 
-        key = " ".join([key, "dormant", *(kind.name for kind in kinds)])
-        by_part = [stored.call(derivatives, key, imu, part, *inner, quick=False) for part in parts]
-        sums = [np.sum(slopes, axis=0) for slopes in zip(*by_part, strict=True)]
-        return {kind: total[: len(grids[kind])] for kind, total in zip(kinds, sums, strict=True)}
+        columns: dict[type[Effect], FloatArray] = {}
+        for number, part in enumerate(parts, 1):
+            acting = [kind for kind in grids if kind.recording in (0, number)]
+            kinds, inner = [kind.within(0) for kind in acting], []
+            for kind, whole in zip(acting, kinds, strict=True):
+                grid, count = grids[kind], longest[whole.name]
+                values = np.array([[point[name] for name in kind.inner] for point in grid]).reshape(
+                    len(grid), len(kind.inner)
+                )
+                count += -count % _GRID if count > _GRID else 0  # few lengths, and so few programs
+                inner.append(np.concatenate([values, np.repeat(values[-1:], count - len(values), axis=0)]))
+            words = " ".join([key, "dormant", *(kind.name for kind in kinds)])
+            slopes = stored.call(partial(derivatives, kinds), words, imu, part, *inner, quick=False)
+            for kind, slope in zip(acting, slopes, strict=True):
+                columns[kind] = columns.get(kind, 0.0) + slope[: len(grids[kind])]
+        return columns
 
     # --- what a diagnosis needs to know ---------------------------------------------------------------------------
 
@@ -280,12 +290,11 @@ class Data(ABC):
         """Return the data with the covariance that a noise of their samples makes, where samples make it."""
         return self
 
-    def extent(self) -> Extent:
-        """Return what the recordings span: effects may begin between two observations."""
-        spans = self.spans()
-        temperatures = [
-            recording.temperature.values for recording in self.recordings if recording.temperature is not None
-        ]
+    def extent(self, recording: int = 0) -> Extent:
+        """Return what a recording spans, by its number, or all of them (0): effects may begin between observations."""
+        chosen = slice(recording - 1, recording) if recording else slice(None)
+        spans = self.spans()[chosen]
+        temperatures = [log.temperature.values for log in self.recordings[chosen] if log.temperature is not None]
         return Extent(
             max(float(part[-1, 1] - part[0, 0]) for part in spans),
             tuple(float(time) for part in spans for time in (part[:-1, 1] + part[1:, 0]) / 2),

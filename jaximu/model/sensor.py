@@ -200,6 +200,10 @@ class Imu(eqx.Module):
         changed: dict[str, Any] = {name: replace(triad, effects=owned[name]) for name, triad in triads.items()}
         return replace(self, **changed, setup=owned["setup"])
 
+    def in_recording(self, number: int) -> Imu:
+        """Return the unit as it was in the recording of this number: effects of another have coefficients of zero."""
+        return self.with_effects(*(effect.in_recording(number) for effect in self.all_effects().values()))
+
     def respond(self, stimulus: Stimulus) -> tuple[Vector, Vector | None]:
         """Return the outputs of both triads to what the set-up says they go through."""
 

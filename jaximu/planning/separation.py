@@ -174,8 +174,10 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
     linear, used = experiment.linearise(imu), experiment.used
     root = np.linalg.cholesky(linear.covariance[np.ix_(used, used)])
     base = _basis(np.linalg.solve(root, linear.slope[used]))
-    extent = experiment.extent()
-    if any(experiment.lacking(type(effect), linear) for effect in effects):
+    kinds = [type(effect) for effect in effects]
+    if len(experiment.recordings) < 2:  # a recording that could be made is none of those that were
+        kinds = [kind.within(0) for kind in kinds]
+    if any(experiment.lacking(kind, linear) for kind in kinds):
         return {effect.name: 0.0 for effect in (effects[1:] or effects)}
 
     def columns(kind: type[Effect], inner: Sequence[dict[str, float]]) -> FloatArray:
@@ -183,15 +185,15 @@ def _powers(experiment: Experiment, imu: Imu, effects: Sequence[Effect]) -> dict
         return np.stack([np.linalg.solve(root, matrix[used]) for matrix in matrices])
 
     signals = []
-    for effect in effects:
+    for effect, kind in zip(effects, kinds, strict=True):
         inner = {name: float(getattr(effect, name)) for name in effect.inner}
-        signals.append(off(base, columns(type(effect), [inner])[0] @ np.asarray(effect.coefficients)))
+        signals.append(off(base, columns(kind, [inner])[0] @ np.asarray(effect.coefficients)))
     if len(effects) == 1:
         return {effects[0].name: _detected(float(signals[0] @ signals[0]), effects[0].size, LIMIT_LEVEL)}
     # a rival may take any inner parameters: the ones that imitate best count
     spans = [
-        [_basis(off(base, matrix)) for matrix in columns(type(effect), list(type(effect).grid(extent)))]
-        for effect in effects
+        [_basis(off(base, matrix)) for matrix in columns(kind, list(kind.grid(experiment.extent(kind.recording))))]
+        for kind in kinds
     ]
 
     def ruled_out(rival: int, there: int) -> float:

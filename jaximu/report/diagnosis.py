@@ -258,7 +258,7 @@ def _effect_row(effect: Named | NoiseFinding) -> tuple[str, str, str, str]:
     if isinstance(effect, NoiseFinding):
         about = "the noise model is wrong by these factors; it was corrected before anything else was tested"
         return f"{effect_title(effect.name)}\n{about}", "", numbers, evidence
-    about = f"{effect.effect.formula}; belongs to the {_SCOPES[effect.scope]}"
+    about = f"{effect.effect.formula}; belongs to the {_SCOPES[effect.scope]} {effect.file}".rstrip()
     return f"{effect.effect.title}\n{about}", f"{effect.size()}\n({effect.triad})", numbers, evidence
 
 

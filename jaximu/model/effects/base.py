@@ -6,6 +6,7 @@ import inspect
 import secrets
 import sys
 from collections.abc import Hashable, Mapping, Sequence
+from functools import cache
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -82,6 +83,7 @@ class Effect(eqx.Module):
     unit: ClassVar[str]  # of a coefficient; "output" stands for the triad's output unit
     size: ClassVar[int] = 3  # number of coefficients q: one an axis, if not stated
     scope: ClassVar[str]  # "device" (belongs to the unit), "session" (to this recording) or "fixture" (to the set-up)
+    recording: ClassVar[int] = 0  # of several, the number of the only one in which it acts; 0: it acts in all of them
     needs: ClassVar[tuple[str, ...]]  # fields of the stimulus
     excited_by: ClassVar[str]
     look_alikes: ClassVar[tuple[str, ...]] = ()
@@ -102,10 +104,12 @@ class Effect(eqx.Module):
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
         if "name" in cls.__dict__:
-            prefix, _, cls.plain = cls.name.partition(".")
+            prefix, _, rest = cls.name.partition(".")
+            cls.plain = rest.partition("@")[0]
             cls.owner = SENSORS.get(prefix, prefix)
             common = cls.common_name or cls.plain.replace("_", " ")
-            cls.english = common if prefix == "setup" else f"{cls.owner} {common}"
+            within = f" in recording {cls.recording}" if cls.recording else ""
+            cls.english = (common if prefix == "setup" else f"{cls.owner} {common}") + within
             cls.title = f"{cls.english} ({cls.name})"
             if not cls.built_in():
                 stored.tell_apart((cls.name, cls.__name__), _source(cls))
@@ -116,9 +120,26 @@ class Effect(eqx.Module):
         return cls.__module__.startswith("jaximu.")
 
     @classmethod
+    def within(cls, recording: int) -> type[Effect]:
+        """Return the effect that acts in one of several recordings alone, called "NAME@2" in the second.
+
+        In 0, all of them, it is the one of the catalogue again.
+        """
+        (whole,) = (kind for kind in cls.__mro__ if kind.__dict__.get("name") == cls.name.partition("@")[0])
+        return _within(whole, recording) if recording else whole
+
+    def in_recording(self, number: int) -> Effect:
+        """Return the effect as a recording of this number has it: with coefficients of zero where it does not act."""
+        kind = type(self)
+        if not kind.recording:
+            return self
+        acts = float(kind.recording == number)
+        return kind.within(0)(acts * self.coefficients, **{name: getattr(self, name) for name in kind.inner})
+
+    @classmethod
     def import_path(cls) -> str:
         """Return where the class is found, as "module:Class"."""
-        return f"{cls.__module__}:{cls.__qualname__}"
+        return f"{cls.__module__}:{cls.within(0).__qualname__}"
 
     @classmethod
     def make(cls, coefficients: Float[Array, " q"] | Sequence[float] | float, **inner) -> Effect:
@@ -184,6 +205,7 @@ class Effect(eqx.Module):
             },
             "unit": self.coefficient_unit(output_unit),
             "scope": self.scope,
+            **({"recording": self.recording} if self.recording else {}),
             **({} if self.built_in() else {"class": self.import_path()}),
         }
 
@@ -212,6 +234,12 @@ def inner_owners(effects: Mapping[Place, Effect]) -> dict[Place, Place]:
     """Return of each effect the place of that whose inner parameters it has: its own, or of the one it `shares`."""
     places = {(effect.owner, effect.plain): key for key, effect in effects.items()}
     return {key: places.get((effect.owner, effect.shares), key) for key, effect in effects.items()}
+
+
+@cache
+def _within(whole: type[Effect], recording: int) -> type[Effect]:
+    stated = {"name": f"{whole.name}@{recording}", "recording": recording, "__module__": whole.__module__}
+    return type(whole)(f"{whole.__name__}In{recording}", (whole,), stated)
 
 
 class BiasEffect(Effect):

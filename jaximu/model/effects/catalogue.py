@@ -1,6 +1,7 @@
 """The catalogue of effects: one line a file, each file listing its effects in `EFFECTS`; and effects of one's own."""
 
 import inspect
+from contextlib import suppress
 from importlib import import_module
 from typing import Any, TypeVar
 
@@ -47,9 +48,28 @@ _FILES = (
     "network",
 )
 
-CATALOGUE: dict[str, type[Effect]] = {
-    effect.name: effect for file in _FILES for effect in import_module(f"jaximu.model.effects.{file}").EFFECTS
-}
+
+class Catalogue(dict[str, type[Effect]]):
+    """Effects by name; those of a session also as "NAME@2", the effect in the second of several recordings alone."""
+
+    def __missing__(self, name: object) -> type[Effect]:
+        """Return an effect in one recording."""
+        whole, _, number = str(name).partition("@")
+        kind = self.get(whole)
+        if kind is None or kind.scope != "session" or not number.lstrip("0").isdecimal():
+            raise KeyError(name)
+        return kind.within(int(number))
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is such an effect, in all recordings or in one."""
+        with suppress(KeyError):
+            return bool(self[name])  # pyright: ignore[reportArgumentType]
+        return False
+
+
+CATALOGUE = Catalogue(
+    (effect.name, effect) for file in _FILES for effect in import_module(f"jaximu.model.effects.{file}").EFFECTS
+)
 """Every effect by name."""
 
 _STATED = ("formula", "unit", "scope", "needs", "excited_by", "source", "typical")
