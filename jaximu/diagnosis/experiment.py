@@ -25,7 +25,7 @@ from jaximu.ground.array_types import Array, BoolArray, FloatArray
 from jaximu.ground.document import Json
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE, Effect
-from jaximu.model.effects.base import Extent
+from jaximu.model.effects.base import Extent, Kind
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.finding import Finding
@@ -286,7 +286,7 @@ class Experiment(Data):
                 askable |= kinds
         return askable, refused
 
-    def by_recording(self, kind: type[Effect]) -> list[type[Effect]]:
+    def by_recording(self, kind: type[Kind]) -> list[type[Kind]]:
         """Return an effect as it is asked: of a session once for each of several recordings, acting in it alone."""
         count = len(self.recordings)
         if kind.scope != "session" or count < 2 or not self.data.by_hand:  # by hand each has its own time and heading

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Hashable, Mapping, Sequence
 from functools import cache
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import equinox as eqx
 import jax
@@ -25,6 +25,7 @@ from jaximu.ground.units import SENSORS
 from jaximu.model.stimulus import Stimulus
 
 Place = TypeVar("Place", bound=Hashable)
+Kind = TypeVar("Kind", bound="Effect")
 Scalar = Numbers | float
 """An inner parameter."""
 
@@ -120,12 +121,12 @@ class Effect(eqx.Module):
         return cls.__module__.startswith("jaximu.")
 
     @classmethod
-    def within(cls, recording: int) -> type[Effect]:
+    def within(cls, recording: int) -> type[Self]:
         """Return the effect that acts in one of several recordings alone, called "NAME@2" in the second.
 
         In 0, all of them, it is the one of the catalogue again.
         """
-        (whole,) = (kind for kind in cls.__mro__ if kind.__dict__.get("name") == cls.name.partition("@")[0])
+        whole: Any = next(kind for kind in cls.__mro__ if kind.__dict__.get("name") == cls.name.partition("@")[0])
         return _within(whole, recording) if recording else whole
 
     def in_recording(self, number: int) -> Effect:
@@ -237,7 +238,7 @@ def inner_owners(effects: Mapping[Place, Effect]) -> dict[Place, Place]:
 
 
 @cache
-def _within(whole: type[Effect], recording: int) -> type[Effect]:
+def _within(whole: Any, recording: int) -> Any:
     stated = {"name": f"{whole.name}@{recording}", "recording": recording, "__module__": whole.__module__}
     return type(whole)(f"{whole.__name__}In{recording}", (whole,), stated)
 
@@ -296,10 +297,7 @@ def _source(effect: type[Effect]) -> str:
         return secrets.token_hex()
 
 
-Shape = TypeVar("Shape", bound=Effect)
-
-
-def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequence[str], **changes: Any) -> type[Shape]:
+def on_triad(shape: type[Kind], name: str, typical: float, look_alikes: Sequence[str], **changes: Any) -> type[Kind]:
     """Return a class of the catalogue, "accel.…" or "gyro.…", that is `shape` on this triad.
 
     It is called as it is named, AccelBiasRamp for "accel.bias_ramp": under that the shape's module must keep it. What
@@ -322,14 +320,14 @@ def on_triad(shape: type[Shape], name: str, typical: float, look_alikes: Sequenc
 
 
 def pair(
-    shape: type[Shape], name: str, typical: tuple[float, float], *look_alikes: str, **changes: tuple[Any, Any]
-) -> tuple[type[Shape], type[Shape]]:
+    shape: type[Kind], name: str, typical: tuple[float, float], *look_alikes: str, **changes: tuple[Any, Any]
+) -> tuple[type[Kind], type[Kind]]:
     """Return an effect on both triads of one declaration; typical, changes: of the accelerometer's and the gyroscope's.
 
     `changes`: attributes of the class that the triads have each for itself, such as `excited_by`; `alike`: look-alikes.
     """
 
-    def on(triad: str, index: int) -> type[Shape]:
+    def on(triad: str, index: int) -> type[Kind]:
         differing = {attribute: values[index] for attribute, values in changes.items()}
         return on_triad(shape, f"{triad}.{name}", typical[index], differing.pop("alike", look_alikes), **differing)
 
