@@ -239,7 +239,8 @@ def inner_owners(effects: Mapping[Place, Effect]) -> dict[Place, Place]:
 @cache
 def _within(whole: type[Effect], recording: int) -> type[Effect]:
     stated = {"name": f"{whole.name}@{recording}", "recording": recording, "__module__": whole.__module__}
-    return type(whole)(f"{whole.__name__}In{recording}", (whole,), stated)
+    metaclass: Any = type(whole)
+    return metaclass(f"{whole.__name__}In{recording}", (whole,), stated)
 
 
 class BiasEffect(Effect):

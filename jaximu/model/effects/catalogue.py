@@ -63,7 +63,7 @@ class Catalogue(dict[str, type[Effect]]):
     def __contains__(self, name: object) -> bool:
         """Return whether there is such an effect, in all recordings or in one."""
         with suppress(KeyError):
-            return bool(self[name])  # pyright: ignore[reportArgumentType]
+            return bool(self[str(name)])
         return False
 
 
