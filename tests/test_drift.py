@@ -107,7 +107,7 @@ def test_a_ramp_of_one_recording_is_named_in_it(tmp_path):
     np.testing.assert_array_equal(effect.coefficients, kept.coefficients)
     assert not read.imu.transferable().all_effects()  # no other recording is corrected by it
     corrected, plain = (compensate(one, recordings[1]) for one in (read, replace(read, imu=read.imu.with_effects())))
-    np.testing.assert_array_equal(corrected.gyroscope.values, plain.gyroscope.values)
+    np.testing.assert_array_equal(corrected.signals["gyroscope"].values, plain.signals["gyroscope"].values)
 
 
 def test_a_ramp_of_one_recording_stands_beside_what_the_unit_does_in_both(tmp_path):

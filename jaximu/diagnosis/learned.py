@@ -175,14 +175,14 @@ def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatA
     """
     warming = experiment.extent().temperature_range
     effects = []
-    for kind in CATALOGUE.values():
+    for kind in (one for whole in CATALOGUE.values() for one in experiment.by_recording(whole)):
         if not issubclass(kind, Curve) or kind.owner not in state.imu.triads():
             continue
         if experiment.lacking(kind, state.linear):
             continue
         still = "temperature" in kind.needs[0] and warming < LEAST_WARMING
-        spanned = [] if still else [_spanned(experiment, one, state) for one in experiment.by_recording(kind)]
-        effects += [effect for effect in spanned if effect is not None]
+        effect = None if still else _spanned(experiment, kind, state)
+        effects += [] if effect is None else [effect]
     grids = {type(effect): [{name: float(getattr(effect, name)) for name in effect.inner}] for effect in effects}
     columns = experiment.dormant_columns(state.imu, state.linear.details, grids)
     for effect in effects:

@@ -240,7 +240,8 @@ def inner_owners(effects: Mapping[Place, Effect]) -> dict[Place, Place]:
 @cache
 def _within(whole: Any, recording: int) -> Any:
     stated = {"name": f"{whole.name}@{recording}", "recording": recording, "__module__": whole.__module__}
-    return type(whole)(f"{whole.__name__}In{recording}", (whole,), stated)
+    metaclass: Any = type(whole)
+    return metaclass(f"{whole.__name__}In{recording}", (whole,), stated)
 
 
 class BiasEffect(Effect):
