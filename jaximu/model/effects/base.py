@@ -8,7 +8,7 @@ import sys
 from collections.abc import Hashable, Mapping, Sequence
 from functools import cache
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -25,7 +25,6 @@ from jaximu.ground.units import SENSORS
 from jaximu.model.stimulus import Stimulus
 
 Place = TypeVar("Place", bound=Hashable)
-Kind = TypeVar("Kind", bound="Effect")
 Scalar = Numbers | float
 """An inner parameter."""
 
@@ -121,12 +120,12 @@ class Effect(eqx.Module):
         return cls.__module__.startswith("jaximu.")
 
     @classmethod
-    def within(cls, recording: int) -> type[Self]:
+    def within(cls, recording: int) -> Any:
         """Return the effect that acts in one of several recordings alone, called "NAME@2" in the second.
 
         In 0, all of them, it is the one of the catalogue again.
         """
-        whole: Any = next(kind for kind in cls.__mro__ if kind.__dict__.get("name") == cls.name.partition("@")[0])
+        whole = next(kind for kind in cls.__mro__ if kind.__dict__.get("name") == cls.name.partition("@")[0])
         return _within(whole, recording) if recording else whole
 
     def in_recording(self, number: int) -> Effect:
@@ -240,8 +239,7 @@ def inner_owners(effects: Mapping[Place, Effect]) -> dict[Place, Place]:
 @cache
 def _within(whole: Any, recording: int) -> Any:
     stated = {"name": f"{whole.name}@{recording}", "recording": recording, "__module__": whole.__module__}
-    metaclass: Any = type(whole)
-    return metaclass(f"{whole.__name__}In{recording}", (whole,), stated)
+    return type(whole)(f"{whole.__name__}In{recording}", (whole,), stated)
 
 
 class BiasEffect(Effect):
@@ -296,6 +294,9 @@ def _source(effect: type[Effect]) -> str:
         return inspect.getsource(sys.modules[effect.__module__])
     except (KeyError, TypeError, OSError):
         return secrets.token_hex()
+
+
+Kind = TypeVar("Kind", bound=Effect)
 
 
 def on_triad(shape: type[Kind], name: str, typical: float, look_alikes: Sequence[str], **changes: Any) -> type[Kind]:
