@@ -131,14 +131,15 @@ def test_the_band_holds_a_network_that_was_put_in():
         own = weights.copy()
         own[:, 0] *= size
         effects.append(CATALOGUE[f"{prefix}.learned_network"].make(own.ravel(), low=273.15, high=323.15, reach=0.07))
-    found = calibrate_thermal(chamber(RATES, 8, False, effects), block=40.0)
     kelvin = np.linspace(2.0, 48.0, 40)
-    for effect, (name, fit) in zip(effects, found.fits.items(), strict=True):
-        assert fit.candidate.family == "network"
-        for rate in (0.0, 0.03):
-            stimulus = Stimulus(temperature=kelvin, temperature_rate=np.full(40, rate))
-            value, sigma = found.bias(name, kelvin, rate)
-            covered.append(np.abs(value - np.asarray(effect.term(stimulus))) < 1.96 * np.maximum(sigma, 1e-12))
+    for seed in range(8, 13):  # of one draw the points of a curve are off together
+        found = calibrate_thermal(chamber(RATES, seed, False, effects), block=40.0)
+        for effect, (name, fit) in zip(effects, found.fits.items(), strict=True):
+            assert fit.candidate.family == "network"
+            for rate in (0.0, 0.03):
+                stimulus = Stimulus(temperature=kelvin, temperature_rate=np.full(40, rate))
+                value, sigma = found.bias(name, kelvin, rate)
+                covered.append(np.abs(value - np.asarray(effect.term(stimulus))) < 1.96 * np.maximum(sigma, 1e-12))
     assert 0.85 < np.mean(covered) < 1.0
 
 

@@ -733,7 +733,7 @@ class _Course:
             errors = f"{gain.errors(shown)}, log-likelihood {gain.log_likelihood:+.1f}"
             if larger:
                 gained = (
-                    f"has as many parameters then as there are conditions of {larger.words}, and predicts those worse "
+                    f"has as many parameters as there are conditions of {larger.words}, and predicts those worse "
                     f"that were not fitted ({gain.data}: {errors})"
                 )
             elif gain.log_likelihood > 0:

@@ -39,7 +39,7 @@ def apply_matrix(matrix: Matrix, vector: Vector) -> Vector:
     """Return `matrix @ vector`, broadcast over leading axes, written element by element."""
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     rows = [matrix[..., i, 0] * x + matrix[..., i, 1] * y + matrix[..., i, 2] * z for i in range(3)]
-    return array_module(matrix, vector).stack(rows, axis=-1)
+    return array_module(rows).stack(rows, axis=-1)
 
 
 def inverse_matrix(matrix: Matrix) -> Matrix:
