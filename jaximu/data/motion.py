@@ -676,7 +676,7 @@ def cut(
 
 def _padded(values, mode: Any = "constant") -> FloatArray:
     """Return values of intervals up to a bucket's number: zeros, or with mode "edge" the last one again."""
-    missing = [(0, _bucket(len(values), 64) - len(values)), *[(0, 0)] * (np.ndim(values) - 1)]
+    missing = [(0, _bucket(len(values), 2 * _TOGETHER) - len(values)), *[(0, 0)] * (np.ndim(values) - 1)]
     return np.pad(np.asarray(values, float), missing, mode=mode)
 
 
@@ -716,10 +716,13 @@ def _on_marks(parts: list[tuple[int, int]], edges: FloatArray, marks: FloatArray
 
 
 def _bucket(size: int, least: int = 8) -> int:
-    """Return a padded size, so that few shapes are compiled."""
-    bucket = least
+    """Return a padded size, so that few shapes are compiled: a quarter more than the one before, in halves of `least`.
+
+    What is computed `_TOGETHER` is divided evenly then; else a program would be compiled for the remainder, too.
+    """
+    bucket, step = least, least // 2
     while bucket < size:
-        bucket = bucket * 5 // 4 if bucket >= 16 else bucket + 4
+        bucket = -(-5 * bucket // (4 * step)) * step
     return bucket
 
 
@@ -835,7 +838,7 @@ class IntervalsOfMotion(OfOneUnit):
             rows = np.flatnonzero(chosen)
             if not len(rows):
                 continue
-            part = self._part(np.resize(rows, _bucket(len(rows), 64)))
+            part = self._part(np.resize(rows, _bucket(len(rows), 2 * _TOGETHER)))
             small = part.length.size < _LARGE
             means = stored.call(partial(_all_means, kind), kind.__name__, imu, part, self.errors, quick=small)
             if merged is None:
