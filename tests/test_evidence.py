@@ -9,7 +9,7 @@ import scipy.stats
 
 from jaximu.diagnosis import improvement
 from jaximu.diagnosis.evidence import LIMIT_LEVEL, EffectBlock, Evidence, detection_limit, limit_noncentrality
-from jaximu.diagnosis.improvement import Gain, Prediction, _beside_open, _by_parts, _likelihood
+from jaximu.diagnosis.improvement import Gain, Prediction, _beside_open, _by_parts
 from jaximu.diagnosis.selection import select, strength_needed
 from jaximu.estimation.rows import TIME, ResidualKind, Rows
 
@@ -586,8 +586,10 @@ def test_a_prediction_stands_where_the_fit_leaves_a_number_open():
     random = np.random.default_rng(31)
     root, columns, conditions = (random.standard_normal(shape) for shape in ((30, 30), (30, 4), (30,)))
     covariance, spread = root @ root.T + np.eye(30), np.diag([0.1, 1.0, 2.0, 3.0])
-    expected = _likelihood(conditions, covariance + columns @ spread @ columns.T)
-    assert _beside_open(conditions, covariance, columns, spread) == pytest.approx(expected, rel=1e-9)
+    chi_squared, likelihood = _beside_open(conditions, covariance, columns, spread)
+    together = covariance + columns @ spread @ columns.T
+    assert chi_squared == pytest.approx(conditions @ np.linalg.solve(together, conditions), rel=1e-9)
+    assert likelihood == pytest.approx(scipy.stats.multivariate_normal(cov=together).logpdf(conditions), rel=1e-9)
     spread[3, 3], spread[2, 2] = 1e24, -1e-9  # open, and rounding
     open_ = _beside_open(conditions, covariance, columns, spread)
     spread[3, 3], spread[2, 2] = 1e6, 0.0

@@ -1,8 +1,9 @@
 """What is left out is predicted as a fit to all other rows would predict it, noise that they share included."""
 
 import numpy as np
+import pytest
 
-from jaximu.estimation.leave_out import leave_out
+from jaximu.estimation.leave_out import further, leave_out, orthonormal
 
 
 def whitening(covariance):
@@ -65,3 +66,22 @@ def test_what_the_others_do_not_determine_is_not_predicted():
     np.testing.assert_allclose(part.directions.T @ level[:6], 0.0, atol=1e-6)
     (moved,) = leave_out(weights, weights @ design, weights @ (output + 7 * level), [np.arange(30) < 6])
     np.testing.assert_allclose(moved.errors, part.errors, atol=1e-6)
+
+
+@pytest.mark.parametrize("strength", [0.1, 1.0, 1e3])
+def test_further_numbers_change_what_was_predicted_as_a_fit_with_them_would(strength):
+    covariance, columns, output = drawn(4)
+    weights, more = whitening(covariance), strength * np.random.default_rng(5).normal(size=(30, 4))
+    whole, scored = np.arange(4, 15), np.arange(11) > 2
+    (part,) = leave_out(weights, weights @ columns, weights @ output, [whole])
+    basis, added = orthonormal(weights @ columns), weights @ more
+    pull, step = further(weights, basis, weights @ output, added)
+    errors, spread = part.beside(pull[whole], step)
+    design = np.vstack([weights @ np.hstack([columns, more]), np.eye(7)[3:]])
+    (anew,) = leave_out(weights, design, np.append(weights @ output, np.zeros(4)), [whole])
+    np.testing.assert_allclose(errors, anew.errors, rtol=1e-7)
+    np.testing.assert_allclose(spread, anew.covariance, rtol=1e-6)
+    some = anew.only(scored)
+    np.testing.assert_allclose(some.covariance, spread[np.ix_(scored, scored)], rtol=1e-6)
+    white = np.linalg.solve(np.linalg.cholesky(some.covariance), some.errors)
+    assert some.chi_squared == pytest.approx(white @ white, rel=1e-6)

@@ -41,7 +41,7 @@ from jaximu.ground.errors import FilePath, InputError, NotPossibleError
 from jaximu.ground.page import Result
 from jaximu.ground.quantities import Z95
 from jaximu.ground.units import SENSORS
-from jaximu.ground.vectors import root_or_zero
+from jaximu.ground.vectors import root_or_zero, variances_of
 from jaximu.model.sensor import Imu
 
 _SHOWN_ITEMS = 1000  # of a table, that its document holds
@@ -268,7 +268,7 @@ def read_table(path: FilePath) -> Batch:
     covariance = covariances(numbers("covariance"))[np.ix_(range(len(rows)), free, free)]
     # gravity's part is in the sigmas and not in the covariance; it acts on the accelerometer's gain as a whole
     scales = [0, 4, 8]
-    variances = np.diagonal(covariance, axis1=1, axis2=2)[:, [free.index(index) for index in scales]]
+    variances = variances_of(covariance)[:, [free.index(index) for index in scales]]
     added = numbers("accel_gain_sigma")[:, scales] ** 2 - variances
     gravity = root_or_zero(np.mean(added / values[:, scales] ** 2, axis=1))
     by_gravity = np.where(np.array(free) < 9, values[:, free], 0.0) * gravity[:, None]

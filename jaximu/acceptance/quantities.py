@@ -34,6 +34,7 @@ from jaximu.ground.document import Json
 from jaximu.ground.errors import InputError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.units import SENSOR_QUANTITIES, SENSORS
+from jaximu.ground.vectors import sigmas_of
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import Stimulus
 from jaximu.planning.chunks import in_chunks
@@ -154,7 +155,7 @@ def measure(units: Units, nominal: Scales, outputs: Sequence[Limit]) -> Measured
     )
     names = (*_parameter_names(units.like), *(f"{limit.key}[{axis}]" for limit, _ in ranges for axis in range(3)))
     sizes = flatten(typical_sizes(unflatten(units.like, np.median(units.numbers, axis=0))))[indices]
-    open_ = np.sqrt(np.diagonal(units.covariance, axis1=1, axis2=2)) > UNDETERMINED * sizes
+    open_ = sigmas_of(units.covariance) > UNDETERMINED * sizes
     determined = ~np.any((np.abs(slope) > 0) & open_[:, None], axis=2)
     return Measured(
         names,

@@ -144,8 +144,7 @@ def remove_curvature(inputs: Rows, outputs: Rows, order: int = 2) -> tuple[Rows,
     """
     scale = jnp.max(jnp.abs(inputs), axis=-2, keepdims=True)
     powers = jnp.stack([(inputs / scale) ** power for power in range(order + 1)], axis=-1)  # (..., S, 3, order + 1)
-    design = jnp.swapaxes(powers, -3, -2)
-    basis, upper = jnp.linalg.qr(design)
+    basis, upper = jnp.linalg.qr(jnp.swapaxes(powers, -3, -2))
     right = jnp.sum(basis * jnp.swapaxes(outputs, -1, -2)[..., None], axis=-2)
     curved = jnp.linalg.solve(upper, right[..., None])[..., 0][..., 2:]
     curvature = jnp.sum(powers[..., 2:] * curved[..., None, :, :], axis=-1)

@@ -171,7 +171,7 @@ class FilterInUse:
         self._numbers = flatten(self.imu)
         self.begun = self._numbers[self._index]
         self._known: Knowledge | None = None
-        self._path = MotionPath(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))  # pyright: ignore[reportArgumentType]
+        self._path = MotionPath(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
         self._waiting: list[_Sample] = []
         self._last: float | None = None
         self._quiet, self._resting, self._mean, self._moving, self._unseen = False, False, np.zeros(6), 0.0, 0.0
@@ -283,7 +283,7 @@ class FilterInUse:
         attitude = level(self._path.attitude, unit.with_effects().accelerometer.recover(force.mean(axis=0)))
         for sighting in sightings:
             attitude = sighting.placed(attitude, Mounting.of(unit))
-        return MotionPath(attitude, np.zeros(3))  # pyright: ignore[reportArgumentType]
+        return MotionPath(attitude, np.zeros(3))
 
     def _rests(self, rate: FloatArray, force: FloatArray, lost: float) -> tuple[bool, bool, bool, float]:
         """Return whether the unit rests in an interval, arrives at a rest, begins one; and its mean speed, rad/s."""
@@ -339,7 +339,7 @@ class FilterInUse:
             np.float64(lost),
             np.float64(1.0),
             sightings,
-        )  # pyright: ignore
+        )
         states = self.errors.states
         if self._known is None:
             self._path = self._upright(force, sightings)
@@ -360,7 +360,7 @@ class FilterInUse:
         moved[6:states] = 0.0  # drift is no part of the path
         self._known = known._replace(right=known.right - known.root @ moved)
         attitude = np.asarray(turned(after.attitude, change[:3]))
-        self._path = MotionPath(attitude, after.velocity + change[3:6])  # pyright: ignore[reportArgumentType]
+        self._path = MotionPath(attitude, after.velocity + change[3:6])
         self._numbers = self._numbers.copy()
         self._numbers[self._index] += change[states:-1]
         self.gravity += float(change[-1])
@@ -401,7 +401,7 @@ class FilterInUse:
 
 
 def _sighting(kind: type[Sighting], stamp: float, end: float, counts: bool, value: FloatArray) -> Sighting:
-    return kind(np.float64(stamp), np.float64(end), np.float64(counts), value)  # pyright: ignore[reportArgumentType]
+    return kind(np.float64(stamp), np.float64(end), np.float64(counts), value)
 
 
 def _rows_after(imu, numbers, gravity, part, errors, path) -> tuple[MotionPath, WhiteRows]:

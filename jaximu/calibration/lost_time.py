@@ -276,8 +276,7 @@ class _Recorded:
         as carried from after: by an angle about a known axis, whose closed form it has.
         """
         real = int(self.turned.real[turn])
-        force = self.force[real + 1]
-        after = unit_vectors(force)
+        after = unit_vectors(self.force[real + 1])
         before = unit_vectors(after - np.asarray(self.turns.basis)[real].T @ off)
         running = self.running[real][: self.counts[turn]]
         back = multiply(conjugate(running), np.broadcast_to(running[-1], running.shape))

@@ -100,7 +100,7 @@ def disturbances(noise: NoiseModel, scale: Mapping[str, float] | None = None) ->
     creep = 1e-2 * np.min(white[:3])
     rest, motion = (1.0, 1.0) if scale is None else (scale["rest"], scale["motion"])
     arrival = np.float64(_ARRIVAL * np.sqrt(motion))
-    return Disturbances(motion * white, rest * white, variance, times, creep, arrival, _LOST)  # pyright: ignore
+    return Disturbances(motion * white, rest * white, variance, times, creep, arrival, _LOST)
 
 
 def seen_from_outside(errors: Disturbances, mounted: Mounted | None) -> Disturbances:
@@ -383,7 +383,7 @@ def _followed(
     rows = [free.names.index(name) for name in prior.names]
     mean[rows], sigma[rows] = prior.mean - reference[rows], 1 / np.diagonal(prior.root)
     sigma = np.append(sigma, max(gravity.sigma, 1e-6))
-    known = Knowledge(np.diag(1 / sigma), np.append(mean, 0.0) / sigma)  # pyright: ignore[reportArgumentType]
+    known = Knowledge(np.diag(1 / sigma), np.append(mean, 0.0) / sigma)
     return measurement.followed(imu, index, known)
 
 

@@ -145,8 +145,7 @@ def _fitted(data: Whitened, plain: Sequence[ThermalTerm], scale: float, rated: b
         modes = _functions(data, axis, plain)[:, :_MODES]
         smooth.append(np.pad(modes.T @ data.root[axis], ((0, _MODES - modes.shape[1]), (0, 0))))
         base = orthonormal(data.design(axis, plain))
-        apart = off(base, data.root[axis])  # from levels and plain terms
-        whole.append(np.pad(apart, ((0, missing), (0, 0))))
+        whole.append(np.pad(off(base, data.root[axis]), ((0, missing), (0, 0))))
         columns = [data.shapes.column(term)[axis] for term in plain]
         basis = np.linalg.qr(np.column_stack([np.eye(data.blocks.levels)[data.blocks.level], *columns]))[0]
         size.append(max(float(np.std(off(basis, data.means[:, axis]))), _LEAST_SIZE))

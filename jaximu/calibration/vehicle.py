@@ -28,7 +28,7 @@ from jaximu.ground.gravity import LocalGravity
 from jaximu.ground.quantities import Z95
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.tracing import on_host
-from jaximu.ground.vectors import lengths_of, sigmas_of
+from jaximu.ground.vectors import lengths_of, sigmas_of, variances_of
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.noise_model import NoiseModel
 from jaximu.recordings.recording import Signal
@@ -168,7 +168,7 @@ def _rate(
     names = tuple(Name("gyroscope", "bias", (axis,)) for axis in range(3))
     ones = np.tile(np.eye(3), (count, 1))
     reaction = {"gyroscope": np.eye(3 * count).reshape(3 * count, count, 3)}
-    variance = {"gyroscope": np.diagonal(measured, axis1=1, axis2=2)}
+    variance = {"gyroscope": variances_of(measured)}
     means = OutputMeans.of(start, stop, np.zeros(count, int), reaction, {"gyroscope": scale}, variance)
     values = (mean - scale * earth).ravel()
     white = np.einsum("pq,pij->piqj", np.eye(count), measured).reshape(3 * count, -1)
@@ -188,7 +188,7 @@ def _rate(
     middle = np.repeat((start + stop) / 2, 3)[:, None]
     moved, moved_covariance, _ = _least_squares(values, np.hstack([ones, ones * (middle - middle.mean())]), covariance)
     length = float(stop[-1] - start[0])
-    change, change_sigma = (length * part / scale for part in (moved[3:], np.sqrt(np.diag(moved_covariance)[3:])))
+    change, change_sigma = (length * part / scale for part in (moved[3:], sigmas_of(moved_covariance)[3:]))
     if count < 3:
         change, change_sigma = np.full((2, 3), np.nan)
     trend = np.square(scale) * np.maximum(change**2 - np.square(Z95 * change_sigma), 0.0)
@@ -222,7 +222,7 @@ def _followed(
     size = 3 * len(drift.correlation_time)
     spread = np.maximum(np.sqrt(drift.variance.T) * scale, _SHORTEST * scale).ravel()
     states = np.tile(np.eye(3), size // 3)
-    known = Knowledge(np.diag([*1 / spread, *1 / (_BROAD * scale)]), np.zeros(size + 3))  # pyright: ignore
+    known = Knowledge(np.diag([*1 / spread, *1 / (_BROAD * scale)]), np.zeros(size + 3))
     estimates, sigmas, drifts, innovations = [], [], [], []
     gaps = np.diff((start + stop) / 2, prepend=-np.inf)
     for gap, value, sigma in zip(gaps, values, np.sqrt(variance), strict=True):
@@ -233,7 +233,7 @@ def _followed(
             np.concatenate([np.diag(driven), states / sigma[:, None]]),
             np.concatenate([np.zeros((size, 3)), np.diag(1 / sigma)]),
             np.concatenate([np.zeros(size), value / sigma]),
-        )  # pyright: ignore[reportArgumentType]
+        )
         known, _, innovation = advance(known, rows)
         estimated, covariance = estimate(known)
         whole = np.hstack([states, np.eye(3)])
@@ -264,8 +264,7 @@ def _by_site(values: FloatArray, sites: IntArray) -> FloatArray:
 
 def _mean_direction(force: FloatArray) -> FloatArray:
     """Return the direction (3,) in which forces (P, 3) point on average."""
-    mean = np.mean(unit_vectors(force), axis=0)
-    return unit_vectors(mean)
+    return unit_vectors(np.mean(unit_vectors(force), axis=0))
 
 
 def _mounted(

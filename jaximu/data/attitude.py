@@ -334,7 +334,7 @@ class AgainstAttitude(OfOneUnit):
             gained,
             np.pad(used, (0, size - count)),
             np.float64(self.gravity),
-        )  # pyright: ignore
+        )
 
     @cached_property
     def _knots(self) -> tuple[IntArray, int]:

@@ -21,7 +21,7 @@ from jaximu.estimation.problem import Name
 from jaximu.estimation.track import TRIADS
 from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.quantities import size
-from jaximu.ground.vectors import submatrix
+from jaximu.ground.vectors import submatrix, variances_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.processes import RATIO, correlation_times
 from jaximu.recordings.observations import Observations
@@ -265,7 +265,7 @@ def means_by_hand(
         if name in scales
     }
     scatter = {name: np.asarray(getattr(poses, f"{name}_covariance"))[real] for name in reactions}
-    variances = {name: np.diagonal(covariance, axis1=1, axis2=2) for name, covariance in scatter.items()}
+    variances = {name: variances_of(covariance) for name, covariance in scatter.items()}
     start, stop = np.asarray(poses.start)[real], np.asarray(poses.stop)[real]
     return OutputMeans.of(start, stop, np.repeat(np.arange(len(counts)), counts)[real], reactions, scales, variances)
 

@@ -273,14 +273,13 @@ def windows_of(
     slope = np.einsum("ns,nsij,nsk->nijk", weight, turned, with_one)
     up, off = np.zeros((len(centre), 3)), np.ones(len(centre))
     if motion is not None:
-        force = motion.accelerometer
-        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, force.at(time[index]))
+        mean = np.einsum("ns,nsij,nsj->ni", weight, turned, motion.accelerometer.at(time[index]))
         length = lengths_of(mean)
         up, off = mean / length[:, None], np.abs(length / STANDARD_GRAVITY - 1)
     known = {} if motion is None else motion.signals
     known = {name: part.at(time[index]) for name, part in known.items()}
     warm, flow = (known[name][..., 0] if name in known else None for name in ("temperature", "current"))
-    stimulus = Stimulus(time=time[index], temperature=warm, current=flow, angular_rate=known.get("gyroscope"))  # pyright: ignore
+    stimulus = Stimulus(time=time[index], temperature=warm, current=flow, angular_rate=known.get("gyroscope"))
     window = np.where(weight > 0, np.arange(len(count))[:, None], len(count))
     samples = FieldSamples(values[index], turned, Track(stimulus, window))
     everywhere = np.ones(len(centre), bool)
@@ -418,7 +417,7 @@ class MagneticField(OfOneUnit):
             np.float64(self.strength),
             np.float64(0.0 if self.dip is None else np.sin(self.dip[0])),
             windows.alone,
-        )  # pyright: ignore
+        )
         covariance, details = self._covariance(bare, field, basis), _At(conditions, windows.samples)
         return About(conditions, covariance, self.own_columns(imu, details, len(covariance.used)), details)
 
@@ -457,20 +456,20 @@ class MagneticField(OfOneUnit):
         used, places = used[:rows], places[:, kinds]
         values = values[:, kinds] * used[places][..., None]
         inverse = np.linalg.inv(imu.triads()["magnetometer"].gain)
-        shaken = BlockFactor(places, values * (windows.noise / np.sqrt(windows.count))[:, None, None] @ inverse)  # pyright: ignore
+        shaken = BlockFactor(places, values * (windows.noise / np.sqrt(windows.count))[:, None, None] @ inverse)
         turned = _UNITS[1] * (1 + _TURN_SHARE / _UNITS[1] * windows.angle) * length
         sizes = np.concatenate([np.full(n, _UNITS[0]), np.repeat(turned, 2), _UNITS[2] + windows.off])[:rows] * used
         group = np.repeat([0, 1, 2], [n, 2 * n, n])[:rows]
         level = np.where(group == 2, used, 0.0)
         roots = [np.where(group == k, sizes, 0.0) for k in range(3)]  # independent: the roots alone
-        factors = roots if windows.alone else [BlockFactor(places, _UNITS[0] * values), *roots[1:]]  # pyright: ignore
+        factors = roots if windows.alone else [BlockFactor(places, _UNITS[0] * values), *roots[1:]]
         measured = shaken.component(rows) + self._common() ** 2 * np.outer(level, level) + np.diag(1e-9 * used)
         if not windows.alone:
             bent = windows.bent(field) * windows.level[:, None]
             # what the hand and the accelerometer's errors do to its length, they do across it, where nothing shows it
             shaken_up = robust_sigma(windows.off) * lengths_of(bent[:, 9:])
             measured[3 * n :, 3 * n :] += bent @ windows.vertical @ bent.T + np.diag(shaken_up**2)
-        return Covariance(measured, tuple(factors), used, group)  # pyright: ignore
+        return Covariance(measured, tuple(factors), used, group)
 
 
 def _across(field: FloatArray) -> FloatArray:

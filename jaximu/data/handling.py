@@ -12,7 +12,7 @@ import numpy as np
 
 from jaximu.estimation.data import Handling
 from jaximu.ground.array_types import FloatArray
-from jaximu.ground.vectors import dot_rows, lengths_of
+from jaximu.ground.vectors import dot_rows, lengths_of, variances_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu, Triad
 from jaximu.recordings.finding import Finding
@@ -116,7 +116,7 @@ def moved_by_hand(
     findings = []
     poses = observations.poses
     start, stop = poses.start, poses.stop
-    variance = poses.gyroscope_covariance.diagonal(axis1=1, axis2=2)
+    variance = variances_of(poses.gyroscope_covariance)
     scale = imu.triads()["gyroscope"].scales
     noise = np.sqrt(np.mean(variance / scale**2, axis=1))
     moving = np.flatnonzero(poses.mask & (hands.tilting > _SURE * hands.noise) & (hands.tilting > noise))

@@ -62,6 +62,7 @@ from jaximu.ground.rotation import (
     unit_vectors,
 )
 from jaximu.ground.tracing import array_module, part_of
+from jaximu.ground.vectors import sigmas_of
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
 from jaximu.model.noise_model import NoiseModel
@@ -629,8 +630,7 @@ def cut(
     time, period = gyroscope.time, 1 / gyroscope.rate
     force, edges = accelerometer.at(time), gyroscope.edges
     step = np.diff(time, prepend=time[0] - period, append=time[-1] + period)
-    missing = np.where(step > 2.5 * period, step - period, 0.0)
-    lost = midpoints(missing)
+    lost = midpoints(np.where(step > 2.5 * period, step - period, 0.0))
     resting = np.searchsorted(time, rests + np.array([_SETTLING, -_SETTLING]))
     marks = np.zeros(0) if attitude is None else np.asarray((mounting or Mounting()).on_log(attitude.time))
     pieces = _Pieces.of(gyroscope, edges, lost, resting, marks, still)
@@ -670,7 +670,7 @@ def cut(
         _padded((lost[at_samples] * inside).sum(axis=1)),
         _padded(np.ones(count)),
         tuple(sightings),
-    )  # pyright: ignore[reportArgumentType]
+    )
     return intervals, notes
 
 
@@ -819,8 +819,7 @@ class IntervalsOfMotion(OfOneUnit):
                     "attitude and velocity could not be followed through this recording: the start is too far off. "
                     "Calibrate it with `jaximu calibrate` first."
                 )
-            change = _change(self.path, moved, absolute)
-            if change < _UNMOVED or number + 1 == _ROUNDS:
+            if _change(self.path, moved, absolute) < _UNMOVED or number + 1 == _ROUNDS:
                 break
             self.path = stored.call(_moved, "moved path", self.path, moved)
         return Filtered(last, self.path, float(innovations.sum()), rows)
@@ -879,7 +878,7 @@ class IntervalsOfMotion(OfOneUnit):
         final, covariance = estimate(last)
         smoothed = smooth(eliminated, final[:states], final[states:])
         variances = smoothed_variances(eliminated, covariance)
-        sigmas = np.sqrt(np.diagonal(np.array(covariances), axis1=-2, axis2=-1))
+        sigmas = sigmas_of(np.array(covariances))
         return FilterPass(innovations, self.freedom, np.array(values), sigmas, smoothed, np.sqrt(variances))
 
     def about_one(self, imu: Imu) -> About:
@@ -888,9 +887,9 @@ class IntervalsOfMotion(OfOneUnit):
         root, right = filtered.last.root[states:, states:], filtered.last.right[states:]
         free = max(int(self.freedom.sum()) - len(right), 1)
         left, gravity = np.full(free, np.sqrt(filtered.misfit / free)), np.float64(self.gravity)
-        conditions = _Triangular(root, right, flatten(imu), gravity, left, gravity)  # pyright: ignore
+        conditions = _Triangular(root, right, flatten(imu), gravity, left, gravity)
         rows = len(right) + free
-        covariance = Covariance(np.ones(rows), (np.ones(rows),), np.ones(rows), np.zeros(rows, int))  # pyright: ignore[reportArgumentType]
+        covariance = Covariance(np.ones(rows), (np.ones(rows),), np.ones(rows), np.zeros(rows, int))
         return About(conditions, covariance, np.zeros((rows, 0)), filtered)
 
 
@@ -942,7 +941,7 @@ def _along(
 
 def _change(path: MotionPath, moved: FloatArray, absolute: bool) -> float:
     """Return how far attitudes move, rad, but for the heading of all unless it is measured: it is held, and creeps."""
-    turned = np.array(rotate(path.attitude, moved[:, :3]))  # pyright: ignore[reportArgumentType]
+    turned = np.array(rotate(path.attitude, moved[:, :3]))
     turned[:, 2] -= 0.0 if absolute else turned[0, 2]
     return float(np.max(np.abs(turned)))
 

@@ -23,6 +23,7 @@ from jaximu.ground.array_types import BoolArray, FloatArray, IntArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.precision import require_float64
 from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.vectors import variances_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE, Stimulus
@@ -154,7 +155,7 @@ def _mean_covariance(signal: Signal, span: FloatArray, turn: BoolArray, name: st
         )
     density, _, in_poses = rest_statistics(signal, span[~turn])
     variance = np.diagonal(density) / np.diff(span)
-    variance[~turn] = np.diagonal(in_poses, axis1=1, axis2=2)
+    variance[~turn] = variances_of(in_poses)
     return variance.T[:, :, None] * np.eye(len(span))
 
 

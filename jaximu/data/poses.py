@@ -488,8 +488,7 @@ def residual_rms(
     if turns.any():
         sizes["gravity_direction"] = (rms(np.degrees(angle)[turns]), "deg")
     rest = np.asarray(observations.poses.gyroscope_mean)[poses] - np.asarray(imu.gyroscope.bias)
-    scale = imu.gyroscope.scales
-    sizes["static_gyroscope"] = (rms(lengths_of(rest / scale)), "rad/s")
+    sizes["static_gyroscope"] = (rms(lengths_of(rest / imu.gyroscope.scales)), "rad/s")
     return sizes
 
 

@@ -23,6 +23,7 @@ from jaximu.ground.array_types import Array, BoolArray, FloatArray, IntArray
 from jaximu.ground.differences import interpolated, midpoints
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
 from jaximu.ground.tracing import first, lifted, on_host
+from jaximu.ground.vectors import variances_of
 from jaximu.model.noise_model import NoiseModel
 from jaximu.model.sensor import Imu
 from jaximu.recordings.entry import ScheduleEntry
@@ -118,7 +119,7 @@ class RecordedStations(OfOneUnit):
         return [_spans(self.stations, _used(self.stations) & ~self.stations.turn)]
 
     @property
-    def sampled(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def sampled(self) -> bool:
         """Whether the noise of samples makes the covariance: the entries say what the samples are compared with."""
         return len(self.entries) > 0
 
@@ -213,7 +214,7 @@ def station_means(stations: Stations, recordings: Sequence[Recording]) -> Output
     scales = {name: signal.nominal_scale for name, signal in recordings[0].signals.items() if name in TRIADS}
     for name in scales:
         used[name] = np.asarray(getattr(stations, f"{name}_used"))
-        measured = np.diagonal(getattr(stations, f"{name}_covariance"), axis1=1, axis2=2).T
+        measured = variances_of(getattr(stations, f"{name}_covariance")).T
         variances[name] = np.where(used[name][kept, None], measured[kept], np.nan)
     reactions = {name: output_reaction(name, unit, used[name]).reshape(-1, len(kept), 3) for name in scales}
     start, stop, which = (np.asarray(part)[kept] for part in (stations.start, stations.stop, stations.recording))

@@ -74,8 +74,7 @@ def _correction(attitude: FloatArray, after: FloatArray, duration: float) -> Flo
     """
     matrix = rotation_matrix(attitude)  # body to level
     lab = np.array([0.0, 0.0, 1.0])
-    carried = matrix[-1].T @ lab
-    delta = np.cross(after, carried)  # turning the frame by δ moves a fixed direction by −δ × u
+    delta = np.cross(after, matrix[-1].T @ lab)  # turning the frame by δ moves a fixed direction by −δ × u
     # δ in the last frame is R_kᵀ-transported to each sample's own frame
     back = np.einsum("nji,jk,k->ni", matrix, matrix[-1], delta)
     return back / max(duration, 1e-9)

@@ -34,6 +34,7 @@ from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
 from jaximu.ground.quantities import listed, size
 from jaximu.ground.units import STANDARD_GRAVITY
+from jaximu.ground.vectors import sigmas_of
 from jaximu.mistakes import prepared
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.noise_model import NoiseModel
@@ -506,7 +507,7 @@ def _verdict(selection: Selection, causes: Sequence[Cause]) -> str:
 
 def _shifts(old: Old, fresh: Fresh, level: float) -> tuple[Shift, ...]:
     """Every parameter's difference; at level zero none counts as moved: the recording says nothing against them."""
-    difference, sigma = fresh.difference, np.sqrt(np.diag(fresh.covariance_of_difference))
+    difference, sigma = fresh.difference, sigmas_of(fresh.covariance_of_difference)
     comparable = fresh.known(old)
     raw = 2 * normal_sf(np.abs(difference) / sigma)
     tested = [k for k in range(len(raw)) if comparable[k] and k not in old.allowed]

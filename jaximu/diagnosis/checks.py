@@ -102,8 +102,7 @@ def _dependences(state: State, experiment: Experiment) -> list[Check]:
     Whitened, and freed of what the parameters imitate, the residual's squared length in their span is χ². It is not
     rescaled by what lies outside: noise taken too small is model error, too.
     """
-    root = np.linalg.inv(state.weights)
-    jacobian = root @ state.evidence.jacobian
+    jacobian = np.linalg.inv(state.weights) @ state.evidence.jacobian
     real = experiment.rows(state.imu).real()
     kinds, steady = real.kind, experiment.extent().temperature_range <= LEAST_WARMING
     names = ("gravity norm at rest", "gravity direction over turns", "rate at rest")
@@ -134,8 +133,7 @@ def _dependences(state: State, experiment: Experiment) -> list[Check]:
         add(2, name, degree, axes)
     for name in covariates:
         add(1, name, 2, jacobian[:, scales])
-    evidence = Evidence(state.evidence.residual, state.evidence.jacobian, blocks)
-    scores = evidence.scores()
+    scores = Evidence(state.evidence.residual, state.evidence.jacobian, blocks).scores()
     checks = []
     for block, scaled, freedom in zip(blocks, scores.statistic, scores.freedom, strict=True):
         if freedom:

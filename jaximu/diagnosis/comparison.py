@@ -19,6 +19,7 @@ from jaximu.estimation.uncertainty import label
 from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.vectors import sigmas_of
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.sensor import Imu
 
@@ -75,7 +76,7 @@ class Old:
             )
         covariance = np.zeros((len(names), len(names)))
         covariance[np.ix_(there, there)] = calibration.covariance[np.ix_(columns, columns)]
-        of_effects = 10 * np.maximum(np.maximum(np.abs(values), np.sqrt(np.diag(covariance))), 1e-12)
+        of_effects = 10 * np.maximum(np.maximum(np.abs(values), sigmas_of(covariance)), 1e-12)
         sizes = np.concatenate([np.asarray(parameters.size), of_effects[len(parameters.names) :]])
         scales, units = np.ones(len(names)), []
         for k, name in enumerate(names):
@@ -236,7 +237,7 @@ class Fresh:
 
     def known(self, old: Old) -> BoolArray:
         """Which parameters (p,) the recording tells at all."""
-        return np.sqrt(np.diag(self.covariance)) < _COMPARABLE * old.sizes
+        return sigmas_of(self.covariance) < _COMPARABLE * old.sizes
 
 
 def scatter_about_a_fit(old: Old, experiment: Experiment, fresh: Fresh) -> FloatArray:

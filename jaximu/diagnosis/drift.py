@@ -25,6 +25,7 @@ from jaximu.estimation.data import Data, Handling
 from jaximu.estimation.fitting import Linear
 from jaximu.estimation.leave_out import off, orthonormal
 from jaximu.ground.array_types import BoolArray, FloatArray
+from jaximu.ground.vectors import sigmas_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.sensor import Imu
 
@@ -57,7 +58,7 @@ class DriftComponents:
     @property
     def sizes(self) -> dict[str, tuple[float, float]]:
         """The standard deviation of each kind, relative to its unit, and the relative uncertainty of it."""
-        spread = np.sqrt(np.diag(self.uncertainty)) / 2
+        spread = sigmas_of(self.uncertainty) / 2
         return {
             name: (float(np.exp(half)), float(relative))
             for name, half, relative in zip(self.names, self.log_size / 2, spread, strict=True)

@@ -20,6 +20,7 @@ from jaximu.diagnosis.drift import DRAWS
 from jaximu.estimation.leave_out import off
 from jaximu.ground.array_types import FloatArray, IntArray
 from jaximu.ground.distributions import chi2_isf, chi2_sf, noncentral_chi2_sf
+from jaximu.ground.vectors import sigmas_of
 
 BLIND = 1e-4
 """Share of an effect's reach that the base parameters must leave of it; below, it is not observable."""
@@ -152,8 +153,7 @@ class Evidence:
 
     def observable(self, block: int) -> bool:
         """Whether the base parameters leave anything of the block that the recording reacts to."""
-        columns = self.place(block)
-        largest = np.max(self._reach[columns], initial=0.0)
+        largest = np.max(self._reach[self.place(block)], initial=0.0)
         return bool(largest > 0 and np.sqrt(np.max(np.diag(self.information(block)))) > BLIND * largest)
 
     def limit(self, blocks: Sequence[int]) -> float:
@@ -347,7 +347,7 @@ def detection_limit(
     rounding. `level`: the p-value that one place must reach. Infinite where too little of the effect is seen.
     """
     if places > 1:
-        return _grid_limit(information, np.sqrt(np.diag(information)) if lengths is None else lengths, places, level)
+        return _grid_limit(information, sigmas_of(information) if lengths is None else lengths, places, level)
     q = len(information)
     values = np.linalg.eigvalsh(information)
     whole = values[-1] if lengths is None else float(np.max(np.square(lengths), initial=0.0))

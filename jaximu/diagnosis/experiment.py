@@ -173,7 +173,7 @@ class Experiment(Data):
         lifted = jax.tree.map(lambda leaf: leaf[None], covariance)
         conditions: Conditions = about.conditions
         if np.any(self.shift):
-            conditions = _Shifted(conditions, np.asarray(self.shift)[None])  # pyright: ignore[reportCallIssue]
+            conditions = _Shifted(conditions, np.asarray(self.shift)[None])
         return replace(about, conditions=conditions, covariance=lifted, columns=about.columns[..., mine])
 
     def _evaluated(self, imu: Imu) -> tuple[About, FloatArray | None, FloatArray, BoolArray]:

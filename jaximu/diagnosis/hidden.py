@@ -9,6 +9,7 @@ import numpy as np
 from jaximu.diagnosis.evidence import EffectBlock
 from jaximu.diagnosis.experiment import State
 from jaximu.ground.array_types import FloatArray
+from jaximu.ground.vectors import sigmas_of
 
 _NOTHING = 0.05
 """Standard deviations below which a shift is not listed."""
@@ -51,7 +52,7 @@ def hidden_causes(state: State) -> list[Hidden]:
 
 def _shifts(state: State, name: str, limit: float) -> dict[str, float]:
     """Return the shifts by a cause, wherever on its grid it does most."""
-    sigmas = np.sqrt(np.diag(state.covariance)[state.fitted])
+    sigmas = sigmas_of(state.covariance)[state.fitted]
     largest = np.max([_spread(shift_by(state, block)) for block in state.evidence.blocks if block.name == name], axis=0)
     sizes = zip(state.fitted, limit * largest / sigmas, strict=True)
     return {str(state.names[row]): float(size) for row, size in sizes if size >= _NOTHING}

@@ -145,15 +145,6 @@ def _beside_open(
     return chi_squared, likelihood
 
 
-def _likelihood(conditions: FloatArray, covariance: FloatArray) -> tuple[float, float]:
-    """Return χ² and the log-likelihood."""
-    root = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(root, conditions)
-    chi_squared = float(white @ white)
-    likelihood = -0.5 * (chi_squared + len(white) * np.log(2 * np.pi)) - float(np.sum(np.log(np.diag(root))))
-    return chi_squared, likelihood
-
-
 def cross_validated(experiment: Experiment, base: State, extended: State | None = None) -> Gain:
     """Leave out a fifth of the recording at a time, select and fit on the rest, and predict what was left out.
 
@@ -181,35 +172,32 @@ def _by_parts(experiment: Experiment, base: State, interleaved: bool) -> Gain:
     evidence = base.evidence
     root = np.linalg.inv(base.weights)
     real = experiment.real
-    count_out = 0
-    errors = {key: np.zeros(len(real)) for key in ("before", "after")}
-    squared, likelihood = {"before": 0.0, "after": 0.0}, {"before": 0.0, "after": 0.0}
+    count_out, errors, sums = 0, np.zeros((2, len(real))), np.zeros((2, 2))  # before and after: χ² and log-likelihood
     for rows, scored in experiment.folds(_FOLDS, interleaved):
         if len(real) - len(rows) <= evidence.jacobian.shape[1]:
             continue
-        models = {"before": [(1.0, ())], "after": _models(evidence.without(base.weights[:, rows]))}
-        parts = {
-            key: [_left_out(base, blocks, rows, scored) for _, blocks in options] for key, options in models.items()
-        }
-        blind = [null_space(part.directions.T) for options in parts.values() for part, _ in options if part.blind]
+        models = [(1.0, ())], _models(evidence.without(base.weights[:, rows]))
+        parts = [[(share, *_left_out(base, blocks, rows, scored)) for share, blocks in options] for options in models]
+        blind = [null_space(part.directions.T) for options in parts for _, part, _ in options if part.blind]
         determined = null_space(np.concatenate(blind, axis=1).T, rcond=1e-6) if blind else np.eye(int(scored.sum()))
         count_out += determined.shape[1]
-        for key, options in parts.items():
-            weight = np.array([share for share, _ in models[key]])
-            estimate = np.tensordot(weight, [part.errors for part, _ in options], 1)
+        for after, options in enumerate(parts):
+            estimate = np.sum([share * part.errors for share, part, _ in options], axis=0)
             spread = sum(
                 share * (part.covariance + np.outer(part.errors - estimate, part.errors - estimate))
-                for share, (part, _) in zip(weight, options, strict=True)
+                for share, part, _ in options
             )
-            part_squared, part_likelihood = _likelihood(
-                determined.T @ estimate, determined.T @ np.asarray(spread) @ determined
+            shown = determined.T @ estimate
+            sums[after] += _beside_open(
+                shown, determined.T @ np.asarray(spread) @ determined, np.zeros((len(shown), 0)), np.eye(0)
             )
-            rest = (root @ np.tensordot(weight, [residual for _, residual in options], 1))[rows[scored]]
-            errors[key][rows[scored]] = rest - off(determined, estimate)
-            squared[key] += part_squared
-            likelihood[key] += part_likelihood
-    predictions = {key: Prediction(real.rms(errors[key]), squared[key], count_out, likelihood[key]) for key in errors}
-    return Gain(predictions["before"], predictions["after"], parts_left_out(_FOLDS, real, interleaved))
+            rest = (root @ sum(share * residual for share, _, residual in options))[rows[scored]]
+            errors[after, rows[scored]] = rest - off(determined, estimate)
+    before, after = (
+        Prediction(real.rms(error), float(squared), count_out, float(likelihood))
+        for error, (squared, likelihood) in zip(errors, sums, strict=True)
+    )
+    return Gain(before, after, parts_left_out(_FOLDS, real, interleaved))
 
 
 def parts_left_out(count: int, real: Rows, interleaved: bool) -> str:

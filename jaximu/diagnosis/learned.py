@@ -8,20 +8,21 @@ score.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from jaximu.diagnosis.experiment import LEAST_WARMING, Experiment, State
 from jaximu.diagnosis.improvement import Gain, Prediction, on_held_out, parts_left_out
 from jaximu.diagnosis.selection import LEVEL, select
 from jaximu.estimation.fitting import Prior
-from jaximu.estimation.leave_out import leave_out
+from jaximu.estimation.leave_out import LeftOut, further, leave_out, orthonormal
 from jaximu.estimation.problem import Name
-from jaximu.estimation.rows import Fold
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.document import Json
 from jaximu.ground.errors import NotPossibleError
 from jaximu.model.effects import CATALOGUE
@@ -128,14 +129,13 @@ def _best(experiment: Experiment, state: State, interleaved: bool) -> tuple[Curv
     Where that is `interleaved`, only curves that belong to the recording are asked: all others are used beyond it.
     None where there is none, or one that is to be asked in the other way.
     """
-    folds = {way: _predicted_folds(experiment, way, state) for way in {False, interleaved}}
-    if not folds[interleaved]:
+    parts = {way: _Parts.of(experiment, way, state)[0] for way in {False, interleaved}}
+    if not parts[interleaved].parts:
         return None
-    plain = {way: _left_out(experiment, state, folds[way]) for way in folds}
 
     def gain(columns: FloatArray, way: bool) -> Gain:
-        count, after = len(folds[way]), _left_out(experiment, state, folds[way], columns)
-        return Gain(plain[way], after, parts_left_out(count, experiment.real, way))
+        left = parts[way]
+        return Gain(left.plain, left.with_curve(columns), parts_left_out(len(left.parts), experiment.real, way))
 
     best: tuple[Curve, FloatArray, FloatArray, Gain] | None = None
     for effect, columns, root in curves(experiment, state):
@@ -148,13 +148,13 @@ def _best(experiment: Experiment, state: State, interleaved: bool) -> tuple[Curv
     if best is None or (best[0].scope == "session") != interleaved:
         return None
     effect, spread, columns, gained = best
-    both = interleaved and plain[False].count > 0
+    both = interleaved and parts[False].parts
     return effect, spread, replace(gained, otherwise=gain(columns, False) if both else None)
 
 
 def left_out_likelihood(experiment: Experiment, state: State) -> float:
     """Return the log-likelihood (nats) of parts left out in turn, as a fit predicts them without a smooth term."""
-    return _left_out(experiment, state, experiment.folds(_PARTS)).log_likelihood
+    return _Parts.of(experiment, False, state)[0].plain.log_likelihood
 
 
 def left_out(experiment: Experiment, before: State, after: State) -> Gain:
@@ -162,9 +162,8 @@ def left_out(experiment: Experiment, before: State, after: State) -> Gain:
 
     Only the numbers are fitted without a part; the effects, and their inner parameters, were chosen with all of it.
     """
-    folds = _predicted_folds(experiment, False, before, after)
-    predictions = [_left_out(experiment, state, folds) for state in (before, after)]
-    return Gain(predictions[0], predictions[1], parts_left_out(len(folds), experiment.real, False))
+    one, other = _Parts.of(experiment, False, before, after)
+    return Gain(one.plain, other.plain, parts_left_out(len(one.parts), experiment.real, False))
 
 
 def curves(experiment: Experiment, state: State) -> Iterator[tuple[Curve, FloatArray, FloatArray]]:
@@ -212,30 +211,51 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
     return effect
 
 
-def _predicted_folds(experiment: Experiment, interleaved: bool, *states: State) -> list[Fold]:
-    """Return the parts that all fits predict from the others: the rest are no comparison."""
-    folds = experiment.folds(_PARTS, interleaved)
-    return [fold for fold in folds if all(_left_out(experiment, state, [fold]).count for state in states)]
+@dataclass(frozen=True)
+class _Parts:
+    """Parts of a recording left out in turn, about a fit: whatever does not depend on a curve, computed once.
 
+    parts: rows left out together as the rest predicts them, and which of them count.
+    """
 
-def _left_out(
-    experiment: Experiment, state: State, folds: Sequence[Fold], columns: FloatArray | None = None
-) -> Prediction:
-    """Predict parts left out in turn, beside columns (n, q) of numbers that are a priori of variance one."""
-    jacobian, residual = state.evidence.jacobian, state.evidence.residual
-    columns = np.zeros((len(residual), 0)) if columns is None else columns
-    known = np.eye(columns.shape[1], jacobian.shape[1] + columns.shape[1], jacobian.shape[1])
-    design = np.concatenate([np.concatenate([jacobian, columns], axis=1), known])
-    parts = leave_out(state.weights, design, np.pad(residual, (0, len(known))), [rows for rows, _ in folds])
-    # where a part is blind the rest does not determine the parameters
-    predicted = [part.only(scored) for part, (_, scored) in zip(parts, folds, strict=True) if not part.blind]
-    squared, count = sum(part.chi_squared for part in predicted), sum(len(part.errors) for part in predicted)
-    # noise that looks too small is widened, or any term that makes predictions uncertain would pay
-    unit, errors = max(1.0, squared / max(count, 1)), np.zeros(len(residual))
-    for part in predicted:
-        errors[part.rows] = part.errors
-    likelihood = sum(part.log_likelihood(unit) for part in predicted)
-    return Prediction(experiment.real.rms(errors), squared / unit, count, likelihood)
+    experiment: Experiment
+    state: State
+    parts: list[tuple[LeftOut, BoolArray]]
+
+    @classmethod
+    def of(cls, experiment: Experiment, interleaved: bool, *states: State) -> list[_Parts]:
+        """Return the parts that all fits predict from the others: the rest are no comparison."""
+        folds = experiment.folds(_PARTS, interleaved)
+        fits = [
+            list(leave_out(fit.weights, fit.evidence.jacobian, fit.evidence.residual, [rows for rows, _ in folds]))
+            for fit in states
+        ]
+        predicted = [k for k in range(len(folds)) if not any(parts[k].blind for parts in fits)]
+        return [
+            cls(experiment, fit, [(parts[k], folds[k][1]) for k in predicted])
+            for fit, parts in zip(states, fits, strict=True)
+        ]
+
+    @cached_property
+    def plain(self) -> Prediction:
+        """The parts as the fit predicts them."""
+        return self.with_curve(np.zeros((len(self.state.weights), 0)))
+
+    def with_curve(self, columns: FloatArray) -> Prediction:
+        """Predict the parts beside columns (n, q) of numbers that are a priori of variance one."""
+        evidence, squared, count, volume = self.state.evidence, 0.0, 0, 0.0
+        pull, step = further(self.state.weights, orthonormal(evidence.jacobian), evidence.residual, columns)
+        errors = np.zeros(len(evidence.residual))
+        for part, scored in self.parts:
+            error, covariance = part.beside(pull[part.rows], step)
+            root = np.linalg.cholesky(covariance[np.ix_(scored, scored)])
+            errors[part.rows[scored]] = error[scored]
+            squared += float(np.sum(solve_triangular(root, error[scored], lower=True) ** 2))
+            count, volume = count + len(root), volume + float(np.sum(np.log(np.diag(root))))
+        # noise that looks too small is widened, or any term that makes predictions uncertain would pay
+        unit = max(1.0, squared / max(count, 1))
+        likelihood = -0.5 * (count * np.log(2 * np.pi * unit) + squared / unit) - volume
+        return Prediction(self.experiment.real.rms(errors), squared / unit, count, likelihood)
 
 
 def _fitted(experiment: Experiment, state: State, effect: Curve, spread: FloatArray) -> State:
@@ -255,8 +275,7 @@ def curve_of(state: State) -> Curve:
 def _curve(state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the covariate (101,), the curve (101, 3), SI, and half the width of its 95 % band."""
     effect = curve_of(state)
-    triad = state.imu.triads()[effect.owner]
-    scale = triad.scales
+    scale = state.imu.triads()[effect.owner].scales
     low, high = map(float, effect.interval())
     x = np.linspace(low, high, _POINTS)
     shapes = np.asarray(effect.shapes(x))

@@ -109,7 +109,7 @@ class Covariance(eqx.Module):
 
     def of_rows(self, used: Float[Array, " n"]) -> "Covariance":
         """Return the covariance with only these rows used; factors by blocks."""
-        factors = tuple(factor.of_rows(used) for factor in self.factors)  # pyright: ignore[reportAttributeAccessIssue]
+        factors = tuple(factor.of_rows(used) for factor in self.factors)
         return Covariance(used[:, None] * used * self.measured, factors, used, self.group)
 
     def turn_by_turn(self, excess: Float[Array, ""]) -> "Covariance":

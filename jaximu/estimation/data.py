@@ -49,7 +49,7 @@ class Conditions(eqx.Module):
 
     def at_magnitude(self, magnitude: Float[Array, ""]) -> Self:
         """Return the same with another magnitude."""
-        return replace(self, magnitude=magnitude)  # pyright: ignore[reportCallIssue]
+        return replace(self, magnitude=magnitude)
 
 
 @dataclass(frozen=True)

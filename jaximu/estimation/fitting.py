@@ -33,6 +33,7 @@ from jaximu.ground.differences import value_and_jacobian
 from jaximu.ground.errors import InputError, one_of
 from jaximu.ground.precision import require_float64
 from jaximu.ground.tracing import array_module, first, is_traced, lifted, part_of
+from jaximu.ground.vectors import sigmas_of
 from jaximu.model.effects.base import inner_owners
 from jaximu.model.sensor import Imu
 
@@ -127,7 +128,7 @@ class Fit(eqx.Module):
 
     def sigmas(self, magnitude_sigma: float = 0.0) -> Float[Array, "... p"]:
         """Return the standard deviations of the free numbers, the uncertainty of the magnitude included."""
-        return np.sqrt(np.diagonal(self.total_covariance(magnitude_sigma), axis1=-2, axis2=-1))
+        return sigmas_of(self.total_covariance(magnitude_sigma))
 
     def total_covariance(self, magnitude_sigma: float = 0.0, clock_sigma: float = 0.0) -> Float[Array, "... p p"]:
         """Return the covariance with what an uncertain magnitude (one sigma) adds, and an uncertain gyroscope's clock.
@@ -855,7 +856,7 @@ class _Passes:
             steps,
             converged & state.settled,
             finite,
-        )  # pyright: ignore[reportCallIssue]
+        )
 
 
 def _secant(share: Array, before: Array, now: Array, leap: Array | float) -> Array:

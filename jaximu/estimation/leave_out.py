@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space
+from scipy.linalg import null_space, solve_triangular
 
 from jaximu.ground.array_types import BoolArray, FloatArray
 
@@ -57,10 +57,21 @@ class LeftOut(NamedTuple):
 
     def only(self, some: BoolArray) -> LeftOut:
         """Return the same of some (m,) of the rows; the others were left out as well."""
-        unknown = null_space(self.directions.T)[some]
-        known = null_space(unknown.T, rcond=_BLIND) if unknown.size else np.eye(int(some.sum()))
+        known = np.eye(int(some.sum()))
+        if self.blind and some.any():
+            known = null_space(null_space(self.directions.T)[some].T, rcond=_BLIND)
         values, vectors = np.linalg.eigh(known.T @ self.covariance[np.ix_(some, some)] @ known)
         return LeftOut(self.rows[some], self.errors[some], 1 / values, known @ vectors, self.numbers)
+
+    def beside(self, pull: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return errors (m,) and covariance (m, m) with further numbers in the model; no direction may be blind.
+
+        **Arguments:** `pull` (m, q) at these rows, `step` (q,): of [`jaximu.estimation.leave_out.further`][]. With S
+        the covariance so far and M = I − pullᵀ S pull the new one is S + S pull M⁻¹ pullᵀ S (Woodbury).
+        """
+        spread = self.covariance @ pull
+        back = np.linalg.solve(np.eye(len(step)) - pull.T @ spread, spread.T)
+        return self.errors + (pull.T @ self.errors - step) @ back, self.covariance + spread @ back
 
 
 def leave_out(
@@ -88,6 +99,19 @@ def leave_out(
         errors = vectors @ ((vectors.T @ pull[rows]) / values)
         others = basis.T @ target - basis[:count].T @ (weighted @ errors)
         yield LeftOut(rows, errors, values, vectors, v[kept].T @ (others / s[kept]) / size)
+
+
+def further(
+    weights: FloatArray, basis: FloatArray, target: FloatArray, columns: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return how numbers that are a priori normal, of variance one, pull at rows (n, q), and their steps (q,).
+
+    **Arguments:** `weights`, `target`: of `leave_out`. `basis` (n, k): orthonormal, of its columns. `columns` (n, q):
+    whitened, of the further numbers. Q becomes Q − pull pullᵀ, and Q y becomes Q y − pull · step.
+    """
+    free = off(basis, columns)
+    scaled = solve_triangular(np.linalg.cholesky(np.eye(columns.shape[1]) + columns.T @ free), free.T, lower=True)
+    return weights.T @ scaled.T, scaled @ target
 
 
 def orthonormal(columns: FloatArray) -> FloatArray:

@@ -129,7 +129,7 @@ class Parameters(eqx.Module):
         names = names_of(model)
         index = tuple(k for k, name in enumerate(names) if keep(name))
         size = flatten(typical_sizes(model))[np.array(index, int)]
-        return cls(flatten(model), size, index, tuple(names[k] for k in index))  # pyright: ignore[reportArgumentType]
+        return cls(flatten(model), size, index, tuple(names[k] for k in index))
 
     def model(self, like: Imu, z: Float[Array, " p"]) -> Imu:
         """Return the model at z; `like` gives the structure."""

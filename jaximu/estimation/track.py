@@ -72,8 +72,7 @@ class Track(eqx.Module):
         Values of padding at the end may be left out.
         """
         values = values.reshape(-1, values.shape[-1])
-        observation = self.observation.reshape(-1)[: len(values)]
-        return means_by(observation, values, count)[0]
+        return means_by(self.observation.reshape(-1)[: len(values)], values, count)[0]
 
 
 def means_by(observation: Int[Array, " n"], values: Float[Array, "n m"], count: int) -> tuple[Array, Array]:
@@ -136,7 +135,7 @@ class Recorded(eqx.Module):
         accelerometer, known = recording.accelerometer, {}
         for name in TRIADS:
             time = recording.signals[name].time
-            known[name] = Stimulus(time=time)  # pyright: ignore[reportArgumentType]
+            known[name] = Stimulus(time=time)
             if recording.temperature is not None:
                 celsius = np.interp(time, recording.temperature.time, recording.temperature.values[:, 0])
                 slope = smoothed_slope(time, celsius, TEMPERATURE_WINDOW)

@@ -81,7 +81,7 @@ class Settings:
         stated: dict[str, str] = dict(self.options) | dict(job.options)
         gyro_log = stated.pop("gyro_log", None)
         numbers = {name: kind(stated.pop(name)) for name, kind in _NUMBERS.items() if name in stated}
-        return ReadOptions(**stated, **numbers, gravity=self.gravity), gyro_log  # pyright: ignore[reportArgumentType]
+        return ReadOptions(**stated, **numbers, gravity=self.gravity), gyro_log
 
 
 def own_effects() -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from jaximu.ground.distributions import robust_sigma
 from jaximu.ground.document import Document, Json, entries
 from jaximu.ground.errors import FilePath, NotPossibleError
 from jaximu.ground.page import Result
-from jaximu.ground.vectors import root_or_zero, sigmas_of
+from jaximu.ground.vectors import root_or_zero, sigmas_of, variances_of
 from jaximu.mistakes.titles import effect_title
 
 FEWEST = 8
@@ -218,7 +218,7 @@ def estimate_population(names: Sequence[Name], values: FloatArray, covariances: 
     if count < FEWEST:
         raise NotPossibleError(f"{count} calibrated units are too few for a population: it takes {FEWEST} or more.")
     mean = np.median(values, axis=0)
-    noise = np.median(np.diagonal(covariances, axis1=1, axis2=2), axis=0)
+    noise = np.median(variances_of(covariances), axis=0)
     scatter = np.square(robust_sigma(values - mean, axis=0))
     covariance = np.diag(np.maximum(scatter - noise, 0.01 * scatter + 1e-18))
     limit = float(scipy.stats.chi2.isf(LEVEL / count, size))
@@ -289,10 +289,10 @@ def _units(rows: Sequence[Json], gyroscope: bool) -> _Units:
     )
 
 
-def _groups(path: Path, gyroscope: bool, columns: Sequence[str] | None = None) -> Iterator[list[Json]]:
+def _groups(path: Path, gyroscope: bool) -> Iterator[list[Json]]:
     """Give the calibrated rows of a table that have (or lack) a gyroscope, some at a time."""
     with pq.ParquetFile(path) as file:
-        for batch in file.iter_batches(batch_size=1024, columns=None if columns is None else list(columns)):
+        for batch in file.iter_batches(batch_size=1024, columns=list(_COLUMNS)):
             rows = batch.to_pylist()
             rows = [row for row in rows if row["status"] == "ok" and (row["gyro_gain"] is not None) == gyroscope]
             if rows:
@@ -328,35 +328,20 @@ def read_fleet(table: FilePath) -> Fleet:
     step = max(1, -(-total // _MOST))
     kept: list[Json] = []
     passed = 0
-    for rows in _groups(path, gyroscope, _COLUMNS):
+    for rows in _groups(path, gyroscope):
         kept += [row for number, row in enumerate(rows, passed) if number % step == 0]
         passed += len(rows)
     if step > 1:
         notes.append(f"the population was estimated from {len(kept)} of {total} units, evenly taken.")
     failed = dict(sorted(failed.items(), key=lambda pair: -len(pair[1])))
-    empty = np.empty((0, 0))
-    fleet = Fleet(
-        os.fspath(table),
-        statuses.total(),
-        statuses,
-        verdicts,
-        effects,
-        failed,
-        None,
-        (),
-        (),
-        empty,
-        empty,
-        empty,
-        empty,
-        (),
-        None,
-        empty,
-        tuple(notes),
-    )
+    known: Json = dict.fromkeys(("values", "shrunk", "sigma", "shrunk_sigma", "rms"), np.empty((0, 0)))
+    known |= {"population": None, "strangers": (), "differences": (), "lots": (), "shifts": None}
     if len(kept) < FEWEST:
-        return replace(fleet, notes=(*notes, f"fewer than {FEWEST} calibrated units: no population."))
-    return replace(fleet, notes=tuple(notes), **_of_population(path, _units(kept, gyroscope), gyroscope, total))
+        notes.append(f"fewer than {FEWEST} calibrated units: no population.")
+    else:
+        known = _of_population(path, _units(kept, gyroscope), gyroscope, total)
+    table = os.fspath(table)
+    return Fleet(table, statuses.total(), statuses, verdicts, effects, failed, **known, notes=tuple(notes))
 
 
 def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> Json:
@@ -367,18 +352,17 @@ def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> Js
     population = estimate_population(units.names, centred, units.covariances)
     differences += _repeated(units) + _shared_effects(units)
     shrunk, spread = population.shrink(centred, units.covariances)
-    rms = [[row["accel_rms"], np.nan if row["gyro_rms"] is None else row["gyro_rms"]] for row in units.rows]
     return dict(
         population=population,
         strangers=_strangers(path, gyroscope, population, shifts, total),
         differences=tuple(sorted(differences, key=lambda difference: difference.p_value)),
         values=units.values,
         shrunk=shrunk + shift,
-        sigma=np.sqrt(np.diagonal(units.covariances, axis1=1, axis2=2)),
-        shrunk_sigma=root_or_zero(np.diagonal(spread, axis1=1, axis2=2)),
+        sigma=sigmas_of(units.covariances),
+        shrunk_sigma=root_or_zero(variances_of(spread)),
         lots=tuple(_names(units)),
         shifts=shifts,
-        rms=np.array(rms, float),
+        rms=np.array([[row["accel_rms"], row["gyro_rms"]] for row in units.rows], float),
     )
 
 
@@ -392,7 +376,7 @@ def _names(units: _Units) -> list[str]:
 def _strangers(path: Path, gyroscope: bool, population: Population, shifts: Shifts, total: int):
     """Units farther from the population, or from their lot and date, than one in a hundred fleets would have."""
     strangers = []
-    for rows in _groups(path, gyroscope, _COLUMNS):
+    for rows in _groups(path, gyroscope):
         units = _units(rows, gyroscope)
         centred = units.values - shifts.of(rows)
         distances = population.distances(centred, units.covariances)
@@ -579,16 +563,8 @@ def _repeated(units: _Units) -> list[Difference]:
         changed = [k for k in np.argsort(p_values) if p_values[k] < LEVEL]
         if changed:
             named = tuple((units.names[k], float(change[k]), float(sigma[k])) for k in changed)
-            differences.append(
-                Difference(
-                    "device",
-                    device,
-                    len(indices),
-                    float(p_values[changed[0]]),
-                    named,
-                    f"device {device} changed between its recordings",
-                )
-            )
+            text = f"device {device} changed between its recordings"
+            differences.append(Difference("device", device, len(indices), float(p_values[changed[0]]), named, text))
     return differences
 
 
@@ -606,7 +582,7 @@ def _shared_effects(units: _Units) -> list[Difference]:
         for group in groups:
             inside, outside = diagnosed & (lots == group), diagnosed & (lots != group)
             table = [[int(np.sum(shown & side)), int(np.sum(~shown & side))] for side in (inside, outside)]
-            p_value = float(scipy.stats.fisher_exact(table, "greater")[1]) * len(names) * len(groups)  # pyright: ignore
+            p_value = float(scipy.stats.fisher_exact(table, "greater")[1]) * len(names) * len(groups)
             if p_value < LEVEL:
                 text = (
                     f"lot {group} shares {effect_title(effect)}: found in {table[0][0]} of its {int(inside.sum())} "
@@ -632,13 +608,13 @@ def write_shrunk(fleet: Fleet, path: FilePath) -> None:
     schema = pa.schema([field for field in SCHEMA if field.name in _SHRUNK])
     places = free_places(gyroscope)
     with atomic_write(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
-        for rows in _groups(Path(fleet.table), gyroscope, _COLUMNS):
+        for rows in _groups(Path(fleet.table), gyroscope):
             units = _units(rows, gyroscope)
             moved = fleet.shifts.of(rows)
             mean, spread = population.shrink(units.values - moved, units.covariances)
             values, sigma = np.zeros((2, len(rows), len(PARAMETERS)))
             values[:, places] = mean + moved
-            sigma[:, places] = root_or_zero(np.diagonal(spread, axis1=1, axis2=2))
+            sigma[:, places] = root_or_zero(variances_of(spread))
             values, sigma = values * units.factor + units.offset, sigma * units.factor
             out: dict[str, list] = {name: [row[name] for row in rows] for name in ("device", "file")}
             for name, part in COLUMN_PLACES.items():

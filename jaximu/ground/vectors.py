@@ -15,9 +15,14 @@ def dot_rows(one, other) -> FloatArray:
     return np.sum(one * other, axis=1)
 
 
+def variances_of(covariance) -> FloatArray:
+    """Return the variances (…, n) of covariances (…, n, n)."""
+    return np.diagonal(covariance, axis1=-2, axis2=-1)
+
+
 def sigmas_of(covariance) -> FloatArray:
-    """Return the standard deviations (n,) of a covariance (n, n)."""
-    return np.sqrt(np.diagonal(covariance))
+    """Return the standard deviations (…, n) of covariances (…, n, n)."""
+    return np.sqrt(variances_of(covariance))
 
 
 def submatrix(matrix, places):

@@ -107,8 +107,7 @@ class Sensor:
     @cached_property
     def noise(self) -> FloatArray:
         """(3,) standard deviation of the noise from sample to sample where it is lowest."""
-        scale = self.local[::16]
-        lowest = np.quantile(scale, 0.2, axis=0)
+        lowest = np.quantile(self.local[::16], 0.2, axis=0)
         return np.maximum(lowest / _CURVATURE_NOISE, self.step / np.sqrt(12))
 
     @cached_property
@@ -272,8 +271,7 @@ class Samples:
         if rate is not None:
             angle = np.cumsum((rate.values - np.median(rate.values, axis=0)) * rate.period, axis=0)
             runs = runs_of(~rate.quiet)
-            far = lengths_of(angle[runs[:, 1] - 1] - angle[runs[:, 0]])
-            if np.max(far, initial=0.0) > TURN_ANGLE:
+            if np.max(lengths_of(angle[runs[:, 1] - 1] - angle[runs[:, 0]]), initial=0.0) > TURN_ANGLE:
                 return True
         return self._reversals is None or self._reversals > 0
 

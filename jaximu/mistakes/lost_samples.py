@@ -80,8 +80,7 @@ def _evidence(samples: Samples, lost: FloatArray, wanted: Rows, half: int) -> tu
     # without what is known of this interval itself
     offset = (time[rows] - centre[:, None] - side * lost[wanted][:, None]) / half
     design = np.stack([offset**0, offset, offset**2, offset**3, np.broadcast_to(side, offset.shape)], axis=2)
-    normal = np.einsum("wji,wjk->wik", design, design)
-    inverse = np.linalg.inv(normal + 1e-12 * np.eye(5))
+    inverse = np.linalg.inv(np.einsum("wji,wjk->wik", design, design) + 1e-12 * np.eye(5))
     power, product = [], []
     for sensor in samples.sensors.values():
         values = sensor.values[rows]

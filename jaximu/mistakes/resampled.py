@@ -64,8 +64,7 @@ def interpolated_at(sensor: Sensor) -> Rows | None:
         return None
     tolerance = np.maximum(1.01 * np.minimum(sensor.step, 0.1 * scale), 1e-3 * scale)
     bent = (bend > tolerance).any(axis=1)
-    share = bent.mean()
-    if not 0.01 < share < 0.6:
+    if not 0.01 < bent.mean() < 0.6:
         return None
     knots = np.flatnonzero(bent) + 1
     gaps = np.diff(knots)

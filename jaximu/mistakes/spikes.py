@@ -76,8 +76,7 @@ def _wild(celsius: FloatArray) -> Rows:
     if len(change) < _WINDOW:
         return NO_ROWS
     values = celsius[change]
-    middle = scipy.ndimage.median_filter(values, _WINDOW, mode="nearest")
-    off = values - middle
+    off = values - scipy.ndimage.median_filter(values, _WINDOW, mode="nearest")
     wild = np.abs(off) > max(_JUMP, _TIMES * robust_sigma(off))
     return np.flatnonzero(np.repeat(wild, np.diff(change, append=len(celsius))))
 

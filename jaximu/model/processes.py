@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError
+from jaximu.ground.vectors import sigmas_of
 from jaximu.model.state_space import LinearSystem, linear_system
 
 
@@ -192,7 +193,7 @@ class SecondOrderGaussMarkov(_GaussMarkov):
                 block = np.block([[-rate, np.diag([0.0, 1.0])], [np.zeros((2, 2)), rate.T]])
                 covariance = step @ scipy.linalg.expm(block * interval)[:2, 2:]
             # Cholesky with the rows scaled to one: the position's spread is far below the velocity's
-            scale = np.sqrt(np.diag(covariance))
+            scale = sigmas_of(covariance)
             transition[at], root[at] = step, q[at] * np.sqrt(stationary)
             drive[at] = q[at] * scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
         return linear_system(transition, drive, np.array([1.0, 0.0]), root=root)

@@ -66,7 +66,7 @@ def linear_system(
     pairs = [(np.asarray(part, float), rank) for part, rank in zip(parts, ranks, strict=True)]
     leading = np.broadcast_shapes(leading, *(part.shape[: part.ndim - rank] for part, rank in pairs))
     whole = (np.broadcast_to(part, leading + part.shape[part.ndim - rank :]) for part, rank in pairs)
-    return LinearSystem(*whole)  # pyright: ignore[reportArgumentType]
+    return LinearSystem(*whole)
 
 
 def combine(systems: Sequence[LinearSystem]) -> LinearSystem:

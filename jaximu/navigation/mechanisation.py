@@ -124,7 +124,7 @@ def _step(state: Navigation, sums: _Sums) -> Navigation:
         state.longitude + moved[0] / (across * cosine),
         state.height + moved[2],
         state.anomaly,
-    )  # pyright: ignore[reportArgumentType]
+    )
 
 
 def _parts(array: Array) -> list[Array]:

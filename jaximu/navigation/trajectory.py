@@ -209,8 +209,7 @@ def of_specification(
     for artefact in case.artefacts:
         for name in ("accelerometer", "gyroscope"):
             if artefact.name == "clipping" and getattr(artefact, name) is not None:
-                scale = case.imu.triads()[name].scales
-                limits[name] = float(getattr(artefact, name) / scale.max())
+                limits[name] = float(getattr(artefact, name) / case.imu.triads()[name].scales.max())
     words = f"the motion of {Path(specification.name).name}, {count / case.rate:g} s at {site.latitude:g}° latitude"
     return Trajectory(start, stimulus, np.full(count, 1 / case.rate), words).cut(), limits
 

@@ -245,8 +245,7 @@ def _full_count(samples: int, factors: IntArray, kind: _DeviationKind) -> IntArr
     """Differences there are without gaps."""
     if kind.total:
         return np.full(len(factors), samples - 1)
-    span = (kind.order + kind.modified) * factors
-    free = samples + 1 + kind.modified - span
+    free = samples + 1 + kind.modified - (kind.order + kind.modified) * factors
     return free if kind.overlapping else (free - 1) // factors + 1
 
 

@@ -644,7 +644,7 @@ def _root(function: Callable[[float], float], low: float, high: float, tolerance
     """Return where a function that has risen or fallen through zero between `low` and `high` does so, or `high`."""
     if function(low) * function(high) >= 0:
         return high
-    return float(scipy.optimize.brentq(function, low, high, xtol=tolerance))  # pyright: ignore[reportArgumentType]
+    return float(scipy.optimize.brentq(function, low, high, xtol=tolerance))
 
 
 def _bounds(fit: _Fit, index: int, threshold: float) -> tuple[float, float]:

@@ -368,8 +368,7 @@ def _check(
     indices = [names_of(unit).index(name) for name in result.names]
 
     def sheet(triad: Triad) -> Triad:
-        gain = np.diag(triad.scales)
-        return replace(triad, gain=gain, bias=np.zeros(3))
+        return replace(triad, gain=np.diag(triad.scales), bias=np.zeros(3))
 
     def many(leaf):
         return np.broadcast_to(np.asarray(leaf), (_CHUNK, *np.shape(leaf)))

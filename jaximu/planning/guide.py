@@ -123,8 +123,7 @@ class Guide:
         length = rests[:, 1] - rests[:, 0]
         long = length >= self.rest
         signal = recording.accelerometer
-        now = signal.time[-1]
-        still = float(length[-1]) if len(rests) and now - rests[-1, 1] < _REACHED else 0.0
+        still = float(length[-1]) if len(rests) and signal.time[-1] - rests[-1, 1] < _REACHED else 0.0
         taken = rests[long]
         if len(taken) != len(self._seen) or np.any(np.abs(taken[:, 0] - self._seen[:, 0]) > _REACHED):
             self._seen = taken

@@ -504,7 +504,7 @@ def _accuracy(known: Known, imu: Imu, equipment: Equipment) -> tuple[Accuracy, t
     attitude = np.asarray(np.radians(equipment.accuracy or 0.0))
     return Accuracy(
         rest[0], rest[1], densities[1], excess, np.asarray(equipment.turn), np.asarray(equipment.rest), attitude
-    ), tuple(notes)  # pyright: ignore[reportArgumentType]
+    ), tuple(notes)
 
 
 def _prior(known: Known, imu: Imu, parameters: Parameters, by_gravity: FloatArray) -> FloatArray:
@@ -595,7 +595,7 @@ def _starts(poses: int, turns: int, equipment: Equipment, seed: int) -> list[Des
         sign = np.where(np.arange(turns) // 3 % 2, -1.0, 1.0)  # about three axes one way, then the other
         attitude, axes = _attitudes(up, heading), _attitudes(axis, np.zeros(turns))
         attitude = _neighbourly(attitude) if equipment.chained else attitude
-        return Design(attitude, axes, np.radians(equipment.fastest) * sign)  # pyright: ignore[reportArgumentType]
+        return Design(attitude, axes, np.radians(equipment.fastest) * sign)
 
     made = [design(spread(poses), rng.uniform(-np.pi, np.pi, poses), spread(turns)) for _ in range(_STARTS)]
     if _classical(poses, equipment):
@@ -640,7 +640,7 @@ def _rounded(design: Design, equipment: Equipment) -> Design:
         _attitudes(np.array([round_direction(direction, step) for direction in up_of(np.asarray(part))]))
         for part in (attitude, design.axis)
     )
-    return Design(up, axis, np.radians(np.round(np.degrees(design.rate), 0)))  # pyright: ignore[reportArgumentType]
+    return Design(up, axis, np.radians(np.round(np.degrees(design.rate), 0)))
 
 
 def _poses(design: Design, equipment: Equipment) -> tuple[Pose, ...]:

@@ -120,8 +120,7 @@ class BlockMeans(NamedTuple):
 
     def turned(self, delay: FloatArray | float = 0.0) -> FloatArray:
         """Return the gyroscope's angle (n, 3) from each block to the next, its stamps (n + 1,) `delay` s late."""
-        stamps = self.centre + delay
-        return np.diff(interpolated(self.time, self.angle, stamps), axis=0)
+        return np.diff(interpolated(self.time, self.angle, self.centre + delay), axis=0)
 
 
 def gravity_turning(
@@ -175,8 +174,7 @@ def turning(force_time: FloatArray, force: FloatArray, rate_time: FloatArray, ra
     total = float(changes @ changes)
     if power == 0.0 or total == 0.0:
         return nothing
-    normal = columns.T @ columns
-    values, vectors = np.linalg.eigh(normal)
+    values, vectors = np.linalg.eigh(columns.T @ columns)
     kept = values > 1e-6 * values[-1]
     inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     matrix = inverse @ (columns.T @ changes)

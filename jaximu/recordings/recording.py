@@ -135,7 +135,7 @@ class Defect(str):
         made.name = name
         return made
 
-    def __getnewargs__(self) -> tuple[str, str]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def __getnewargs__(self) -> tuple[str, str]:
         return self.name, str(self)  # other processes get it too
 
 
@@ -662,8 +662,7 @@ def _time_advice(gyroscope: Signal) -> str:
 
 def _no_gravity(signal: Signal) -> bool:
     """Whether the norm varies as much as it is large: in another unit gravity's would stay the same at rest."""
-    norm = lengths_of(signal.si())
-    low, high = np.quantile(norm, [0.2, 0.8])
+    low, high = np.quantile(lengths_of(signal.si()), [0.2, 0.8])
     return bool(high > 1.3 * low)
 
 

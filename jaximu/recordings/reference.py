@@ -191,8 +191,7 @@ def _require_turn(entry: ScheduleEntry, turned: FloatArray, where: str) -> None:
 def _require_poses(recording: Recording, poses: Sequence[ScheduleEntry], where: str) -> None:
     if not poses or not len(recording.accelerometer):
         return
-    force = Integral(recording.accelerometer)
-    read = unit_vectors(force.over(*times_of(poses).T))
+    read = unit_vectors(Integral(recording.accelerometer).over(*times_of(poses).T))
     stated = np.stack([pose.vector for pose in poses])
     off = np.degrees(np.arccos(np.clip(dot_rows(read, stated), -1, 1)))
     if not (off > _OFF).any():
@@ -302,8 +301,7 @@ def _entries_of_table(recording: Recording, time: FloatArray, angle: FloatArray)
             f"{recording.name}: holds a gyroscope alone, and table columns do not say about which of its axes the "
             "table turns; write a schedule."
         )
-    force = Integral(recording.accelerometer)
-    read = force.over(*spans.T)
+    read = Integral(recording.accelerometer).over(*spans.T)
     size = np.abs(read)
     axis = np.argmax(size, axis=1)
     ups = np.sign(np.take_along_axis(read, axis[:, None], 1)) * np.eye(3)[axis]

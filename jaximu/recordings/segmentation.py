@@ -16,7 +16,7 @@ from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import unit_vectors
 from jaximu.ground.units import INERTIAL_QUANTITIES
-from jaximu.ground.vectors import lengths_of
+from jaximu.ground.vectors import lengths_of, variances_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
 from jaximu.model.stimulus import REFERENCE_TEMPERATURE
 from jaximu.recordings.observations import POWER_ON, Observations, Poses, SlowNoise, Turns
@@ -563,7 +563,7 @@ def _with_noise(
         return whole
 
     def of_poses(covariance: FloatArray) -> FloatArray:
-        return np.diagonal(covariance, axis1=1, axis2=2)[:, :padded].T[:, :, None] * np.eye(3)
+        return variances_of(covariance)[:, :padded].T[:, :, None] * np.eye(3)
 
     def by_model(
         name: str, signal: Signal, start: FloatArray, stop: FloatArray, same: BoolArray

@@ -63,8 +63,7 @@ def _drawn(figure: Figure, name: str) -> tuple[Drawing, bytes]:
     """Return a figure as a drawing and as a PNG; a fragment without pictures need not load what draws."""
     from jaximu.report import figures, vector
 
-    png = figures.png(figure)
-    return vector.drawing(figure, name), png
+    return vector.drawing(figure, name), figures.png(figure)
 
 
 def _pictures(parts: Iterable[Part]) -> Iterator[Picture]:

@@ -14,6 +14,7 @@ from jaximu.estimation.uncertainty import WeakDirection
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.page import Statement
 from jaximu.ground.quantities import Z95, listed, number, sentence, size
+from jaximu.ground.vectors import sigmas_of
 from jaximu.report.evidence import PoseAndTurnErrors, largest_gap
 
 BEYOND = 2.0  # scatter in multiples of the noise from which a cause beyond noise is named
@@ -162,7 +163,7 @@ def gravity_statements(calibration: Calibration) -> Iterator[Statement]:
         yield Statement("Gravity", text)
         return
     share = 100 * Z95 * gravity.sigma / gravity.value
-    sigmas = np.sqrt(np.diag(calibration.covariance_of([Name("accelerometer", "gain", (k, k)) for k in range(3)])))
+    sigmas = sigmas_of(calibration.covariance_of([Name("accelerometer", "gain", (k, k)) for k in range(3)]))
     if np.all(100 * Z95 * sigmas < 0.9 * share * np.diag(triads["accelerometer"].gain)):  # what was felt is not gravity
         return
     text = (

@@ -110,8 +110,7 @@ def scaled_gyroscope(
         zero = parse_offset(offset, "--gyro-offset")
     else:
         windows = _windows(signal, 1.0)
-        quietest = windows[np.argmin(windows.var(1).sum(1))]
-        zero = np.median(quietest, 0)
+        zero = np.median(windows[np.argmin(windows.var(1).sum(1))], 0)
         listed = ", ".join(f"{value:.1f}" for value in zero)
         notes.append(f"gyroscope offset from its quietest second: {listed} count.")
     return replace(signal, nominal_scale=counts, nominal_offset=zero), tuple(notes)

@@ -143,8 +143,7 @@ def _messages(stream: _Stream, types: Any, start: int) -> Iterator[tuple[int, st
         rows = np.tile(np.frombuffer(example, np.uint8), (len(some), 1))
         rows[:, len(example) - size :] = np.ascontiguousarray(numbers, "<f8").view(np.uint8)
         if stream.kind != "std_msgs/msg/Float64":  # it has no header
-            seconds = np.stack(np.divmod(some, 10**9), axis=1).astype("<u4")
-            rows[:, 4:12] = seconds.view(np.uint8)
+            rows[:, 4:12] = np.stack(np.divmod(some, 10**9), axis=1).astype("<u4").view(np.uint8)
         for stamp, row in zip(some.tolist(), rows, strict=True):
             yield stamp, stream.topic, row.tobytes()
 
