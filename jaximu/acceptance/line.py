@@ -262,7 +262,6 @@ def read_table(path: FilePath) -> Batch:
             raise InputError(f"{name}: the {owner}s are in {' and '.join(output_units)}: one table, one unit.")
         outputs[f"{owner}_unit"] = output_units[0]
     like = Imu.nominal(**outputs)
-    like = like if gyroscope else Imu(like.accelerometer, None)
     values = np.concatenate([numbers(column) for column in list(COLUMN_PLACES)[: 2 * len(triads)]], axis=1)
     free = free_places(gyroscope)
     covariance = covariances(numbers("covariance"))[np.ix_(range(len(rows)), free, free)]
@@ -273,7 +272,7 @@ def read_table(path: FilePath) -> Batch:
     gravity = root_or_zero(np.mean(added / values[:, scales] ** 2, axis=1))
     by_gravity = np.where(np.array(free) < 9, values[:, free], 0.0) * gravity[:, None]
     units = Units(
-        like,
+        like if gyroscope else Imu(like.accelerometer, None),
         values,
         tuple(PARAMETERS[index] for index in free),
         covariance + by_gravity[:, :, None] * by_gravity[:, None, :],
@@ -281,18 +280,8 @@ def read_table(path: FilePath) -> Batch:
         _conditions(numbers, gyroscope),
     )
     nominal = {owner: (numbers(f"{short}_nominal")[0, :3], np.zeros(3)) for short, owner in triads.items()}
-    return Batch(
-        name,
-        len(table),
-        rows,
-        units,
-        words("device"),
-        words("file"),
-        days_of(words("date")),
-        words("lot"),
-        words("station"),
-        nominal,
-    )
+    device, file, lot, station = map(words, ("device", "file", "lot", "station"))
+    return Batch(name, len(table), rows, units, device, file, days_of(words("date")), lot, station, nominal)
 
 
 def _conditions(

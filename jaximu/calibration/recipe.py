@@ -282,19 +282,8 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     gravity, loss, static = choices.gravity, choices.loss, choices.static
     require_float64()
     mixed = same_outputs(recordings)
-    has_gyroscope = all(recording.gyroscope is not None for recording in recordings)
-    method = choices.method if has_gyroscope else "accelerometer"
-    chosen = list(map(effect_named, choices.effects))
-    if chosen and method != "joint":
-        raise InputError(
-            f"{chosen[0].name} is fitted jointly with gain and bias of both sensors, which needs the joint method and "
-            "a gyroscope."
-        )
-    for effect in chosen:
-        if effect.scope == "fixture":
-            raise NotPossibleError(
-                f"{effect.name} is an error of a set-up, and a recording by hand has none: see `jaximu turntable`."
-            )
+    method = choices.method if all(one.gyroscope is not None for one in recordings) else "accelerometer"
+    chosen = _effects_by_hand(choices, method)
     segmentations = tuple(segment(recording, choices.segmentation) for recording in recordings)
     if static is not None and method.startswith("two-step"):
         raise InputError(
@@ -306,7 +295,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     nominal = nominal_imu(recordings[0])
     fitted = fit_hand_held(nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
-    poses, turns = (int(np.sum(mask)) for mask in (observations.poses.mask, observations.turns.mask))
+    poses, turns = (int(np.sum(part.mask)) for part in (observations.poses, observations.turns))
     require_determined(fitted, where, poses=poses)
     keep_gyroscope = method != "accelerometer"
     before = residual_rms(nominal, observations, keep_gyroscope)
@@ -324,11 +313,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         fitted = fit(start, measurement, prior=prior, loss=loss, excess=fitted.excess)
         require_determined(fitted, where, prior=prior)
         observations = measurement.along(fitted.imu, tuple(fitted.imu.all_effects().values())).observations
-    notes = (
-        *notes_of(*recordings),
-        *mixed,
-        *notes_of(noise, *segmentations),
-    )
+    notes = *notes_of(*recordings), *mixed, *notes_of(noise, *segmentations)
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)
     return concluded(
@@ -346,6 +331,21 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         nominal=nominal,
         reading=recordings[0].reading,
     )
+
+
+def _effects_by_hand(choices: Choices, method: str) -> list[Effect]:
+    """Return the effects that are to be fitted; refuse those that a recording by hand, or the method, cannot tell."""
+    chosen = list(map(effect_named, choices.effects))
+    if chosen and method != "joint":
+        raise InputError(
+            f"{chosen[0].name} is fitted jointly with gain and bias of both sensors, which needs the joint method and "
+            "a gyroscope."
+        )
+    if of_set_up := [effect.name for effect in chosen if effect.scope == "fixture"]:
+        raise NotPossibleError(
+            f"{of_set_up[0]} is an error of a set-up, and a recording by hand has none: see `jaximu turntable`."
+        )
+    return chosen
 
 
 def _headings_known(segmentations: Sequence[Segmentation], observations: Observations) -> bool:

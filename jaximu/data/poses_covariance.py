@@ -90,7 +90,6 @@ def condition_covariance(imu: Imu, observations: Observations, whole: Turned | N
     reached = jnp.concatenate([real * norm[:, None], jnp.concatenate([moved * before, none])], axis=1)
     earlier = jnp.pad(jnp.concatenate([none, moved * after]), ((0, 0), (1, 0), (0, 0)))
     by_turn = jnp.pad(jnp.concatenate([moved * lever, none]), ((0, 0), (1, 0), (0, 0)))
-    noise = jnp.concatenate([spread, jnp.zeros((1, 3, 3))])
     force, rest = (real * noisy for noisy in (poses.accelerometer_covariance, poses.gyroscope_covariance))
     roots = mean_root(force, poses.mask), mean_root(spread, turns.mask), mean_root(rest, poses.mask)
     used = jnp.concatenate([poses.mask, jnp.repeat(turns.mask, 2), jnp.repeat(poses.mask, 3)]).astype(norm.dtype)
@@ -99,7 +98,7 @@ def condition_covariance(imu: Imu, observations: Observations, whole: Turned | N
     white = 1.0 if slow is None else 0.0  # slow noise has that of the means in it
     chain = Chain(
         white * (reached @ force @ reached.swapaxes(1, 2) + following(earlier @ force @ earlier.swapaxes(1, 2)))
-        + by_turn @ noise @ by_turn.swapaxes(1, 2),
+        + by_turn @ jnp.concatenate([spread, jnp.zeros((1, 3, 3))]) @ by_turn.swapaxes(1, 2),
         white * reached @ force @ earlier.swapaxes(1, 2),
         white * rest,
         reached @ roots[0],
@@ -117,10 +116,9 @@ def condition_covariance(imu: Imu, observations: Observations, whole: Turned | N
         at = reached[..., axis, None] * matrix[:, None] + following(earlier[..., axis, None] * matrix[:, None])
         return in_order(at, jnp.zeros_like(at))
 
-    inverse = inverse_matrix(gyroscope.gain)
     member = slow.part[..., None] == jnp.arange((slow.gyroscope.shape[-1] - len(norm)) // len(lever))
     by_part = jnp.einsum("tsb,tsij->tbij", member.astype(norm.dtype), whole.reaction)
-    by_part = (lever[:, None] @ by_part @ inverse).swapaxes(1, 2)
+    by_part = (lever[:, None] @ by_part @ inverse_matrix(gyroscope.gain)).swapaxes(1, 2)
 
     def by_rates(matrix, axis):
         """The same to an axis' mean rates (I, q), of all poses and then of the parts of each turn."""
@@ -129,8 +127,7 @@ def condition_covariance(imu: Imu, observations: Observations, whole: Turned | N
         at = jnp.pad(during, ((0, 1), (1, 0), (0, 0)))
         return used[:, None] * in_order(at, jnp.eye(3)[axis][:, None] * means[:, None])
 
-    tied = chain.dense()
-    measured = tied.measured
+    measured = (tied := chain.dense()).measured
     for axis in range(3):
         measured += by_forces(by_forces(slow.accelerometer[axis], axis).T, axis)
         measured += by_rates(by_rates(slow.gyroscope[axis], axis).T, axis)

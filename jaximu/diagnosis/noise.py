@@ -191,34 +191,35 @@ def slow_noise(
     """
     alpha = level * _SHARE / _TESTS
     tried = []
+    nothing = None, noise, ""
     known = noise.gyroscope
+    evidence = state.evidence
     if known is None:
-        return None, noise, ""
+        return nothing
     for name, unit in _slow_units(known, experiment.extent().duration).items():
         added = remade(replace(noise, gyroscope=_joined(known, unit))).linearise(state.imu).covariance
         added = (added - state.linear.covariance)[np.ix_(experiment.used, experiment.used)]
-        parts = _parted(state.evidence, state.weights @ added @ state.weights.T)
+        parts = _parted(evidence, state.weights @ added @ state.weights.T)
         p_value = quadratic_tail(float(np.sum(parts[0] * parts[1])), parts[0])
-        strength, spread, gained = _variance(*parts, state.evidence.freedom)
+        strength, spread, gained = _variance(*parts, evidence.freedom)
         if p_value < alpha and strength > 0:
             tried.append((gained, name, p_value, strength, spread, unit, added))
     if not tried:
-        return None, noise, ""
+        return nothing
     tried.sort(key=lambda entry: -entry[0])
     gained, name, p_value, strength, spread, unit, added = tried[0]
-    evidence = state.evidence
     rival = _criterion(evidence, selection) if selection.complete else -np.inf
     if gained <= rival - _TIE or any(
         gained < _variance(*_parted(evidence, columns @ columns.T), evidence.freedom)[2] + _TIE
         for columns in _otherwise(experiment, state)
     ):
-        return None, noise, ""
+        return nothing
     root = np.linalg.inv(state.weights)
     weights = np.linalg.inv(np.linalg.cholesky(root @ root.T + strength * added)) @ root
     blocks = [replace(block, columns=weights @ block.columns) for block in evidence.blocks]
     left = Evidence(weights @ evidence.residual, weights @ evidence.jacobian, blocks)
     if left.family_wise(left.scores().smallest) < _BESIDE * level:
-        return None, noise, ""
+        return nothing
     if gained < rival + _TIE:
         text = (
             f"a {name.partition('.')[2].replace('_', ' ')} of the gyroscope's bias beyond the recording at rest would "

@@ -8,12 +8,12 @@ tells of it (Efron and Morris, Journal of the American Statistical Association 7
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -294,8 +294,7 @@ def _groups(path: Path, gyroscope: bool) -> Iterator[list[Json]]:
     with pq.ParquetFile(path) as file:
         for batch in file.iter_batches(batch_size=1024, columns=list(_COLUMNS)):
             rows = batch.to_pylist()
-            rows = [row for row in rows if row["status"] == "ok" and (row["gyro_gain"] is not None) == gyroscope]
-            if rows:
+            if rows := [row for row in rows if row["status"] == "ok" and (row["gyro_gain"] is not None) == gyroscope]:
                 yield rows
 
 
@@ -326,11 +325,7 @@ def read_fleet(table: FilePath) -> Fleet:
     if others:
         notes.append(f"{others} units {'without' if gyroscope else 'with'} a gyroscope are not part of the population.")
     step = max(1, -(-total // _MOST))
-    kept: list[Json] = []
-    passed = 0
-    for rows in _groups(path, gyroscope):
-        kept += [row for number, row in enumerate(rows, passed) if number % step == 0]
-        passed += len(rows)
+    kept = list(islice(chain.from_iterable(_groups(path, gyroscope)), 0, None, step))
     if step > 1:
         notes.append(f"the population was estimated from {len(kept)} of {total} units, evenly taken.")
     failed = dict(sorted(failed.items(), key=lambda pair: -len(pair[1])))
@@ -340,8 +335,7 @@ def read_fleet(table: FilePath) -> Fleet:
         notes.append(f"fewer than {FEWEST} calibrated units: no population.")
     else:
         known = _of_population(path, _units(kept, gyroscope), gyroscope, total)
-    table = os.fspath(table)
-    return Fleet(table, statuses.total(), statuses, verdicts, effects, failed, **known, notes=tuple(notes))
+    return Fleet(str(table), statuses.total(), statuses, verdicts, effects, failed, **known, notes=tuple(notes))
 
 
 def _of_population(path: Path, units: _Units, gyroscope: bool, total: int) -> Json:

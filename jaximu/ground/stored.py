@@ -17,7 +17,6 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import wraps
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -81,6 +80,8 @@ def _code() -> str:
 @functools.cache
 def _machine() -> tuple:
     """What compiles, and for what."""
+    from importlib.metadata import version  # a sixth of the time that help takes
+
     import jax
 
     device = jax.local_devices()[0]

@@ -142,26 +142,16 @@ def _saturated(samples: Samples, sensor: Sensor) -> list[Finding]:
         return []
     # behind a hard limit the tops lie at it; a soft one spreads them
     hard = hard and (not soft or np.mean(tops[upper] > 0.965) > 0.75)
-    rows = np.flatnonzero((size > 0.9 * limit).any(axis=1))
-    shown = f"{np.degrees(limit):.4g} °/s"
-    first = sensor.rows(np.sort(np.array(places)[crowd if hard else upper]))
-    if hard:
-        return [
-            Finding(
-                "data.saturation",
-                first,
-                f"gyroscope: {int(crowd.sum())} quick turns end flat just below {shown}: the output was clipped there "
-                "and smoothed afterwards. These turns are left out; choose a larger range, or turn more slowly.",
-                without={"gyroscope": rows},
-            )
-        ]
-    return [
-        Finding(
-            "data.saturation",
-            first,
-            f"gyroscope: the tops of {int(upper.sum())} quick turns crowd below {shown}, and are the flatter the "
-            "nearer they come to it: the output saturates, and slower turns are compressed, too. Choose a larger "
-            "range, or turn more slowly, and record again.",
-            spoils=True,
-        )
-    ]
+    shown, taken = f"{np.degrees(limit):.4g} °/s", crowd if hard else upper
+    flattened = (
+        f"{int(taken.sum())} quick turns end flat just below {shown}: the output was clipped there and smoothed "
+        "afterwards. These turns are left out; choose a larger range, or turn more slowly."
+    )
+    compressed = (
+        f"the tops of {int(taken.sum())} quick turns crowd below {shown}, and are the flatter the nearer they come to "
+        "it: the output saturates, and slower turns are compressed, too. Choose a larger range, or turn more slowly, "
+        "and record again."
+    )
+    rows, text = sensor.rows(np.sort(np.array(places)[taken])), f"gyroscope: {flattened if hard else compressed}"
+    clipped = {"gyroscope": np.flatnonzero((size > 0.9 * limit).any(axis=1))} if hard else {}
+    return [Finding("data.saturation", rows, text, spoils=not hard, without=clipped)]

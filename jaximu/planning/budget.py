@@ -231,9 +231,7 @@ def budget(task: Task, draws: int = 0, seed: int = 0) -> Budget:
     parameters = Parameters.select(start, free_on_table(start, task.fitted))
     names, per = parameters.names, np.array([per_si(name, start) for name in parameters.names])
     scale = np.asarray(parameters.size) / per  # from z to the parameters' units
-
-    stations = scheme.stations
-    moved = _reaction(scheme)
+    stations, moved = scheme.stations, _reaction(scheme)
     design, units = stored.call(_design, "budget design", stations, start, parameters)
     used = np.stack([stations.accelerometer_used, stations.gyroscope_used])[..., None, None]
     roots = np.concatenate([source.root for source in sources], axis=1)
