@@ -12,6 +12,7 @@ from jaximu import calibrate
 from jaximu.data import forces_and_angles
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import LocalGravity
+from jaximu.ground.tracing import padded_size
 from jaximu.recordings.readers import ReadOptions, read_recording
 from jaximu.recordings.recording import Recording, Signal
 from jaximu.recordings.segmentation import SegmentationOptions, observed_poses, segment
@@ -232,6 +233,14 @@ def test_options():
     assert fixed.table() == f"{len(rests)} at 6x"
     wide = observed_poses(segment(log, SegmentationOptions(minimum_duration=0.6)), GRAVITY, bucket=(32, 256))
     assert wide.turns.output.shape == (31, 256, 3)
+
+
+def test_axes_are_padded_to_few_sizes():
+    sizes = np.arange(1, 5000)
+    padded = np.array([padded_size(int(size)) for size in sizes])
+    assert np.all(padded >= sizes) and np.all(padded[7:] <= 1.5 * sizes[7:])
+    assert np.all(np.diff(padded) >= 0) and len(np.unique(padded)) <= 32
+    assert np.all(np.unique(padded[63:]) % 32 == 0)  # what is computed 32 together leaves no remainder
 
 
 def test_shapes_are_bucketed():

@@ -42,6 +42,7 @@ from jaximu.ground.rotation import (
     rotation_matrix,
     unit_vectors,
 )
+from jaximu.ground.tracing import padded_size
 from jaximu.model.effects import Effect
 from jaximu.model.effects.reference_filter import behind
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
@@ -71,8 +72,8 @@ _SMOOTH = 0.05
 """Seconds over which the slope of the rate is taken."""
 _MOVING = ("delay", "clock_scale")
 """Fields of `Mounting` that move the reference's stamps, and with them the ends of the integrals."""
-_WINDOWS, _SAMPLES = 4, 16
-"""Lengths are padded to multiples of these: few programs, and few rows for nothing in matrices of all conditions."""
+_WINDOWS = 4
+"""Their number is padded to a multiple of this: few programs, and few rows for nothing in matrices of conditions."""
 
 
 class AttitudeConditions(Conditions):
@@ -357,7 +358,7 @@ class AgainstAttitude(OfOneUnit):
         stamps = mounting.on_log(data.stamp)
         first = np.searchsorted(data.until, stamps[:-1]) - _MARGIN
         longest = np.searchsorted(data.until, stamps[1:]) - first + _MARGIN
-        size = -(-longest[data.used].max() // _SAMPLES) * _SAMPLES
+        size = padded_size(int(longest[data.used].max()))
         return np.clip(first[:, None] + np.arange(size), 0, len(data.until) - 1)
 
     def unsmoothed(self, imu: Imu) -> Attitude:

@@ -61,7 +61,7 @@ from jaximu.ground.rotation import (
     rotate,
     unit_vectors,
 )
-from jaximu.ground.tracing import array_module, part_of
+from jaximu.ground.tracing import array_module, padded_size, part_of
 from jaximu.ground.vectors import sigmas_of
 from jaximu.model.effects.earth_rotation import EARTH_RATE, GyroEarthRotation
 from jaximu.model.mounting import MOUNTING_EFFECTS, Mounting
@@ -638,7 +638,7 @@ def cut(
     notes = pieces.notes(recording.name)
     if (ahead := rests[0, 0] - time[0]) > 1.0:
         notes.append(f"{recording.name}: the first {ahead:.1f} s, before the first rest, were left out.")
-    samples, count = _bucket(int((end - begin).max()) + beyond), len(begin)
+    samples, count = padded_size(int((end - begin).max()) + beyond), len(begin)
     inside = begin[:, None] + np.arange(samples) < end[:, None]
     around = begin[:, None] + np.arange(-beyond, samples)
     around = np.clip(around, 0, np.minimum(end + beyond, len(time))[:, None] - 1)
@@ -676,7 +676,7 @@ def cut(
 
 def _padded(values, mode: Any = "constant") -> FloatArray:
     """Return values of intervals up to a bucket's number: zeros, or with mode "edge" the last one again."""
-    missing = [(0, _bucket(len(values), 2 * _TOGETHER) - len(values)), *[(0, 0)] * (np.ndim(values) - 1)]
+    missing = [(0, padded_size(len(values), 2 * _TOGETHER) - len(values)), *[(0, 0)] * (np.ndim(values) - 1)]
     return np.pad(np.asarray(values, float), missing, mode=mode)
 
 
@@ -713,17 +713,6 @@ def _on_marks(parts: list[tuple[int, int]], edges: FloatArray, marks: FloatArray
     ends = np.where(np.abs(marks[near] - edges[ends]) < _LONGEST / 4, moved, ends)
     ends = np.unique(np.clip(ends, parts[0][0] + 1, parts[-1][1] - 1))
     return list(pairwise([parts[0][0], *ends.tolist(), parts[-1][1]]))
-
-
-def _bucket(size: int, least: int = 8) -> int:
-    """Return a padded size, so that few shapes are compiled: a quarter more than the one before, in halves of `least`.
-
-    What is computed `_TOGETHER` is divided evenly then; else a program would be compiled for the remainder, too.
-    """
-    bucket, step = least, least // 2
-    while bucket < size:
-        bucket = -(-5 * bucket // (4 * step)) * step
-    return bucket
 
 
 class _Triangular(Conditions):
@@ -837,7 +826,7 @@ class IntervalsOfMotion(OfOneUnit):
             rows = np.flatnonzero(chosen)
             if not len(rows):
                 continue
-            part = self._part(np.resize(rows, _bucket(len(rows), 2 * _TOGETHER)))
+            part = self._part(np.resize(rows, padded_size(len(rows), 2 * _TOGETHER)))
             small = part.length.size < _LARGE
             means = stored.call(partial(_all_means, kind), kind.__name__, imu, part, self.errors, quick=small)
             if merged is None:
@@ -851,7 +840,7 @@ class IntervalsOfMotion(OfOneUnit):
         """Return some of the intervals, without the samples that none of them has."""
         part = part_of(self.intervals, rows)
         before = part.time.shape[1] - part.length.shape[1]
-        inside = min(_bucket(int((part.length > 0).sum(axis=1).max()) + before), part.length.shape[1])
+        inside = min(padded_size(int((part.length > 0).sum(axis=1).max()) + before), part.length.shape[1])
         samples = {name: getattr(part, name)[:, : before + inside] for name in ("accelerometer", "gyroscope", "time")}
         return replace(part, length=part.length[:, :inside], **samples)
 
@@ -886,11 +875,13 @@ class IntervalsOfMotion(OfOneUnit):
         filtered, states = self.filtered(imu), self.errors.states
         root, right = filtered.last.root[states:, states:], filtered.last.right[states:]
         free = max(int(self.freedom.sum()) - len(right), 1)
-        left, gravity = np.full(free, np.sqrt(filtered.misfit / free)), np.float64(self.gravity)
+        real = np.arange(padded_size(free)) < free
+        left, gravity = real * np.sqrt(filtered.misfit / free), np.float64(self.gravity)
         conditions = _Triangular(root, right, flatten(imu), gravity, left, gravity)
-        rows = len(right) + free
-        covariance = Covariance(np.ones(rows), (np.ones(rows),), np.ones(rows), np.zeros(rows, int))
-        return About(conditions, covariance, np.zeros((rows, 0)), filtered)
+        used = np.append(np.ones(len(right)), real)
+        one = np.ones(len(used))
+        covariance = Covariance(one, (one,), used, np.zeros(len(used), int))
+        return About(conditions, covariance, np.zeros((len(used), 0)), filtered)
 
 
 def _all_means(kind: Callable[..., _Means], imu: Imu, intervals: MotionIntervals, errors: Disturbances) -> _Means:

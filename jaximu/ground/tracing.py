@@ -30,6 +30,16 @@ def array_module(*trees: Any) -> Any:
     return numpy
 
 
+def padded_size(size: int, least: int = 8) -> int:
+    """Return the size that an axis is padded to: few sizes, so few programs to compile, and each of them in little.
+
+    Between powers of two there is one more, and beyond 512 there are three.
+    """
+    power = 1 << (max(size, least) - 1).bit_length()
+    step = power // (4 if power <= 512 else 8)
+    return -(-max(size, least) // step) * step
+
+
 def part_of(tree: Any, places: Any) -> Any:
     """Return the entries at some places along the leading axis of every array: a number, numbers or a slice."""
     import jax

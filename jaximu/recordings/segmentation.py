@@ -15,6 +15,7 @@ from jaximu.ground.equality import Comparable
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.quantities import counted
 from jaximu.ground.rotation import unit_vectors
+from jaximu.ground.tracing import padded_size
 from jaximu.ground.units import INERTIAL_QUANTITIES
 from jaximu.ground.vectors import lengths_of, variances_of
 from jaximu.model.noise_model import AxisNoise, NoiseModel
@@ -304,14 +305,6 @@ def _drop_rotating(moments: Sequence[Moments], intervals: FloatArray) -> tuple[F
     ]
 
 
-def _bucket(size: int) -> int:
-    """The padded size: a power of two or half as much again, so that few shapes are compiled."""
-    bucket = 8
-    while bucket < size:
-        bucket = bucket * 3 // 2 if bucket & (bucket - 1) == 0 else bucket * 4 // 3
-    return bucket
-
-
 def rest_statistics(
     signal: Signal, intervals: FloatArray, turning: bool = False
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -515,7 +508,7 @@ def _padded(
     """Pad the fields of poses, nominal specific `force` (P, 3) among them, and the turns between them to a bucket."""
     poses = len(columns["force"])
     longest = max((len(interval) for _, interval in turns), default=1)
-    padded, samples = bucket or (_bucket(poses), _bucket(max(longest, 16)))
+    padded, samples = bucket or (padded_size(poses), padded_size(longest, 16))
     output, interval = np.zeros((padded - 1, samples, 3)), np.zeros((padded - 1, samples))
     used = np.zeros(padded - 1, bool)
     for index, (values, durations) in enumerate(turns):

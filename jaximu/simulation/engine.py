@@ -240,18 +240,19 @@ class Stream:
 
     def __iter__(self) -> Iterator[list[LoggedRows]]:
         cases = self.cases
-        imus, motions = _stack([case.imu for case in cases]), _stack([case.plan.motion for case in cases])
+        imus, motions = _stack([case.imu for case in cases]), _stack([case.plan.motion.padded() for case in cases])
         loggers = [_Logger(case) for case in cases]
         memory: Any = {
             effect.name: np.full((len(cases), effect.memory), np.nan)
             for effect in cases[0].imu.all_effects().values()
             if effect.memory
         }
+        once = len(cases) == 1 and self.samples <= self.length
         settings = self.length, self._halo, cases[0].plan.columns
         respond, description = partial(_respond_batch, *settings), f"respond {settings}"
         for first in range(0, self.samples, self.length):
             columns, memory = stored.call(
-                respond, description, imus, motions, memory, float(first), self.rate, quick=False
+                respond, description, imus, motions, memory, float(first), self.rate, quick=once
             )
             rows = np.arange(first, min(first + self.length, self.samples))
             yield [

@@ -9,6 +9,7 @@ automatic differentiation in time, so that they belong together whatever is put 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -16,14 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaximu.ground import stored
 from jaximu.ground.array_types import Array, FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.rotation import conjugate, exponential, logarithm, multiply, rotate
-from jaximu.ground.tracing import on_host
+from jaximu.ground.tracing import padded_size, part_of
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.model.stimulus import Stimulus
 
 BLOCKS = (4096, 16384, 65536)
+_OF_SEGMENTS = ("start", "duration", "attitude", "rotation", "ramp", "displacement", "bend")
 
 
 def earth_rate(latitude: float) -> FloatArray:
@@ -82,6 +85,13 @@ class Motion(eqx.Module):
             raise InputError(f"the sample rate must be a positive number of Hz, found {rate}.")
         return round(self.length * rate)
 
+    def padded(self) -> Motion:
+        """Return the motion with segments that never begin: few numbers of segments, and few programs."""
+        rows, count = np.arange(padded_size(len(self.start))), len(self.start)
+        segments = {name: np.asarray(values) for name in _OF_SEGMENTS if len(values := getattr(self, name))}
+        longer = part_of(segments, np.minimum(rows, count - 1))
+        return replace(self, **longer | {"start": np.where(rows < count, longer["start"], np.inf)})
+
     def block(self, first, rate, length: int) -> Stimulus:
         """Return `length` samples from number `first` on, stamped number/rate.
 
@@ -93,8 +103,9 @@ class Motion(eqx.Module):
     def stimulus(self, rate: float) -> Stimulus:
         """Return the whole motion at `rate` (Hz), as NumPy arrays."""
         samples = self.samples(rate)
-        length, motion = block_length(samples), on_host(self)
-        blocks = [_block(motion, np.asarray(float(k)), np.asarray(rate), length) for k in range(0, samples, length)]
+        length, motion = block_length(samples), self.padded()
+        block = partial(Motion.block, length=length)
+        blocks = [stored.call(block, f"motion {length}", motion, float(k), rate) for k in range(0, samples, length)]
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:samples], *blocks)
 
     def attitude_at(self, time: Float[Array, " n"]) -> Float[Array, "n 4"]:
@@ -182,11 +193,6 @@ class Motion(eqx.Module):
 def _rate(function):
     """The derivative of a function of instants (n,) by each of them."""
     return lambda time: jax.jvp(function, (time,), (jnp.ones_like(time),))[1]
-
-
-@eqx.filter_jit
-def _block(motion: Motion, first, rate, length: int) -> Stimulus:
-    return motion.block(first, rate, length)
 
 
 def block_length(samples: int) -> int:
