@@ -879,8 +879,7 @@ class IntervalsOfMotion(OfOneUnit):
         left, gravity = real * np.sqrt(filtered.misfit / free), np.float64(self.gravity)
         conditions = _Triangular(root, right, flatten(imu), gravity, left, gravity)
         used = np.append(np.ones(len(right)), real)
-        one = np.ones(len(used))
-        covariance = Covariance(one, (one,), used, np.zeros(len(used), int))
+        covariance = Covariance(np.ones(len(used)), (used,), used, np.zeros(len(used), int))
         return About(conditions, covariance, np.zeros((len(used), 0)), filtered)
 
 
