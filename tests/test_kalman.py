@@ -207,6 +207,18 @@ def test_the_fit_is_the_least_squares_solution_of_all_states_and_numbers(protoco
     np.testing.assert_allclose(moved, step / sigma, atol=1e-6)
 
 
+def test_conditions_that_fill_up_a_size_are_none(recorded):
+    """They are counted nowhere: the excess is that of the innovations there are."""
+    imu, recording, rests, _ = recorded
+    measurement = IntervalsOfMotion(cut(recording, rests)[0], disturbed(2), GRAVITY.value)
+    about = measurement.about_one(imu)
+    used = np.asarray(about.covariance.used)
+    assert used.sum() == measurement.freedom.sum() < len(used)
+    (factor,) = about.covariance.factors
+    np.testing.assert_array_equal(factor, used)
+    np.testing.assert_array_equal(np.asarray(about.conditions(imu))[used == 0], 0.0)
+
+
 def _free(name):
     return without_equipment(name) or name.effect is not None
 
