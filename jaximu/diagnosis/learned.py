@@ -215,11 +215,13 @@ def _spanned(experiment: Experiment, kind: type[Curve], state: State) -> Curve |
 class _Parts:
     """Parts of a recording left out in turn, about a fit: whatever does not depend on a curve, computed once.
 
-    parts: rows left out together as the rest predicts them, and which of them count.
+    basis: orthonormal, of the fit's columns. parts: rows left out together as the rest predicts them, and which of them
+    count.
     """
 
     experiment: Experiment
     state: State
+    basis: FloatArray
     parts: list[tuple[LeftOut, BoolArray]]
 
     @classmethod
@@ -232,7 +234,7 @@ class _Parts:
         ]
         predicted = [k for k in range(len(folds)) if not any(parts[k].blind for parts in fits)]
         return [
-            cls(experiment, fit, [(parts[k], folds[k][1]) for k in predicted])
+            cls(experiment, fit, orthonormal(fit.evidence.jacobian), [(parts[k], folds[k][1]) for k in predicted])
             for fit, parts in zip(states, fits, strict=True)
         ]
 
@@ -244,14 +246,15 @@ class _Parts:
     def with_curve(self, columns: FloatArray) -> Prediction:
         """Predict the parts beside columns (n, q) of numbers that are a priori of variance one."""
         evidence, squared, count, volume = self.state.evidence, 0.0, 0, 0.0
-        pull, step = further(self.state.weights, orthonormal(evidence.jacobian), evidence.residual, columns)
+        pull, step = further(self.state.weights, self.basis, evidence.residual, columns)
         errors = np.zeros(len(evidence.residual))
         for part, scored in self.parts:
             error, covariance = part.beside(pull[part.rows], step)
             root = np.linalg.cholesky(covariance[np.ix_(scored, scored)])
             errors[part.rows[scored]] = error[scored]
             squared += float(np.sum(solve_triangular(root, error[scored], lower=True) ** 2))
-            count, volume = count + len(root), volume + float(np.sum(np.log(np.diag(root))))
+            count += len(root)
+            volume += float(np.sum(np.log(np.diag(root))))
         # noise that looks too small is widened, or any term that makes predictions uncertain would pay
         unit = max(1.0, squared / max(count, 1))
         likelihood = -0.5 * (count * np.log(2 * np.pi * unit) + squared / unit) - volume

@@ -69,9 +69,10 @@ class LeftOut(NamedTuple):
         **Arguments:** `pull` (m, q) at these rows, `step` (q,): of [`jaximu.estimation.leave_out.further`][]. With S
         the covariance so far and M = I − pullᵀ S pull the new one is S + S pull M⁻¹ pullᵀ S (Woodbury).
         """
-        spread = self.covariance @ pull
+        before = self.covariance
+        spread = before @ pull
         back = np.linalg.solve(np.eye(len(step)) - pull.T @ spread, spread.T)
-        return self.errors + (pull.T @ self.errors - step) @ back, self.covariance + spread @ back
+        return self.errors + (pull.T @ self.errors - step) @ back, before + spread @ back
 
 
 def leave_out(
