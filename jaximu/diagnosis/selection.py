@@ -145,17 +145,16 @@ def _second_order(evidence: Evidence, scores: Scores, block: int) -> bool:
 
 
 def criterion(evidence: Evidence, scores: Scores, block: int) -> float:
-    """Return S − (q + inner) ln(dof), and −2 ln of the number of places for one of many."""
+    """Return S − (q + inner) ln(dof), and −2 ln of the number of places for one of many.
+
+    It is rounded: what data cannot tell apart at all is a tie, which the order of the blocks settles.
+    """
     candidate = evidence.blocks[block]
     places = sum(other.name == candidate.name for other in evidence.blocks) if candidate.position else 1
     inner = 0 if candidate.position else len(candidate.inner)
     doubt = _DEFECT if candidate.kind == "data" else 0.0
-    return float(
-        scores.statistic[block]
-        - (scores.freedom[block] + inner) * np.log(evidence.freedom)
-        - 2 * np.log(places)
-        - doubt
-    )
+    cost = (scores.freedom[block] + inner) * np.log(evidence.freedom) + 2 * np.log(places) + doubt
+    return round(float(scores.statistic[block] - cost), 2)
 
 
 def _leaders(evidence: Evidence, scores: Scores) -> list[int]:
