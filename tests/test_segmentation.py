@@ -106,6 +106,35 @@ def test_slow_rotation_is_not_rest(degrees, axis):
         assert seconds < 0.3 if k in (3, 7) else seconds > 1.9
 
 
+@pytest.mark.parametrize(("degrees", "after"), [(0.15, 4), (0.15, 9), (1.0, 5), (1.0, 10)])
+def test_a_step_of_the_gyroscope_is_no_slow_rotation(degrees, after):
+    """It reads another rate in a minority of the rests, and gravity does not turn: all rests are kept."""
+    log, rests = recording(8, rest=3.0)
+    step = np.radians([degrees, 0.3 * degrees, 0.0]) * (log.gyroscope.time > rests[after, 1] + 0.5)[:, None]
+    found = segment(replace(log, gyroscope=replace(log.gyroscope, values=log.gyroscope.values + step))).intervals
+    assert len(found) == len(rests)
+    assert np.abs(found - rests).max() < 0.3
+
+
+@pytest.mark.parametrize("sway", [0.0, 0.003])
+def test_the_means_of_a_swaying_unit_are_as_well_known_as_stated(sway):
+    """Along gravity and across it: a tilt of 3 mrad moves the force by 30 mm/s² across gravity, 0.04 mm/s² along it."""
+    log, _ = recording(6, poses=40, rest=4.0)
+    random, time = np.random.default_rng(1), log.accelerometer.time
+    frequency, phase = random.uniform(0.5, 1.5, (6, 3)), random.uniform(0, 2 * np.pi, (6, 3))
+    tilt = sway / np.sqrt(3) * np.sin(2 * np.pi * frequency * time[:, None, None] + phase).sum(axis=1)
+    values = log.accelerometer.values + np.cross(log.accelerometer.values, tilt)
+    swaying = replace(log, accelerometer=replace(log.accelerometer, values=values))
+    data = observed_poses(replace(segment(log), recording=swaying), GRAVITY)
+    poses, imu, up = data.poses, unit(6), spread_directions(40, 6)
+    truth = GRAVITY * up @ np.asarray(imu.accelerometer.gain).T + np.asarray(imu.accelerometer.bias)
+    error, covariance = poses.accelerometer_mean[:40] - truth, poses.accelerometer_covariance[:40]
+    along = np.einsum("pi,pi->p", up, error) / np.sqrt(np.einsum("pi,pij,pj->p", up, covariance, up))
+    assert 0.6 < np.sqrt(np.mean(along**2)) < 1.5
+    across = np.linalg.norm(error, axis=1) ** 2 / np.trace(covariance, axis1=1, axis2=2)
+    assert 0.2 < np.sqrt(np.mean(across)) < 1.5
+
+
 @pytest.mark.parametrize("axis", [HORIZONTAL, VERTICAL], ids=["horizontal", "vertical"])
 @pytest.mark.parametrize("degrees", [0.5, 1.0, 3.0])
 def test_slow_rotation_that_runs_into_rest(degrees, axis):

@@ -282,7 +282,11 @@ def _turning(rate: FloatArray, ratio: FloatArray, limit: float) -> FloatArray:
 
 
 def _drop_rotating(moments: Sequence[Moments], intervals: FloatArray) -> tuple[FloatArray, list[str]]:
-    """Drop intervals that turn slowly: gravity drifts between their halves, or the mean rate is off all others'."""
+    """Drop intervals that turn slowly: gravity drifts between their halves, or the mean rate is off all others'.
+
+    A rate about the vertical leaves gravity where it is. One at more than 30° to it that did not move gravity is the
+    gyroscope's own, a step of its bias: where most of those that are off are such, none is taken for a turn.
+    """
     if not len(intervals):
         return intervals, []
     start, stop = intervals.T
@@ -294,8 +298,14 @@ def _drop_rotating(moments: Sequence[Moments], intervals: FloatArray) -> tuple[F
     keep &= np.minimum(spread[1], later[1]) >= 3
     if len(moments) > 1 and keep.sum() > 2:
         means = moments[1].between(start, stop)[0]
-        deviation = lengths_of(means - np.median(means[keep], axis=0))
-        keep &= deviation < max(np.radians(0.1), 8 * np.median(deviation[keep]))
+        rate = means - np.median(means[keep], axis=0)
+        deviation = lengths_of(rate)
+        off = keep & (deviation >= max(np.radians(0.1), 8 * np.median(deviation[keep])))
+        up, lasting = unit_vectors(before), middle - start
+        missing = lengths_of(np.cross(up, rate) * lasting[:, None] - (unit_vectors(after) - up))
+        denied = off & (missing > np.maximum(deviation * lasting / 2, 6 * noise))
+        if 2 * denied.sum() <= off.sum():
+            keep &= ~off
     dropped = intervals[~keep]
     if not len(dropped):
         return intervals, []
@@ -323,7 +333,7 @@ def rest_statistics(
     variances = (squares / counts).T / np.square(signal.nominal_scale)
     total = np.sum(variances, axis=1)
     share = total / max(np.median(total), signal.rounding_variance)  # coarse steps may leave no scatter at all
-    density = _density(signal, [column for column, size in zip(columns, share, strict=True) if size < 2] or columns)
+    density, _ = _density(signal, [column for column, size in zip(columns, share, strict=True) if size < 2] or columns)
     factor = np.where(share > 1.5, share, 1.0)
     duration = counts / signal.rate
     rounding = np.diag(np.square(signal.nominal_scale)) * _rounding_of_means(signal, variances)[:, None, None]
@@ -332,20 +342,39 @@ def rest_statistics(
     return density, mean.T, density * (factor / duration)[:, None, None] + rounding
 
 
-def _density(signal: Signal, columns: Sequence[FloatArray]) -> FloatArray:
+def _across_gravity(signal: Signal, intervals: FloatArray, force: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the covariance (P, 3, 3) of the mean forces (P, 3); along gravity hands that sway add nothing to it.
+
+    A sway by θ moves the force by gθ across gravity and by gθ²/2 along it. Where the scatter along gravity is less than
+    `covariance` has it, by more than chance, that part takes its share.
+    """
+    up = unit_vectors((force - signal.nominal_offset) / signal.nominal_scale)
+    onto = (signal.nominal_scale * up)[:, :, None] * (up / signal.nominal_scale)[:, None]
+    columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
+    along, freedom = _density(signal, [part @ column for part, column in zip(onto, columns, strict=True)])
+    expected = np.mean(onto @ covariance @ onto.mT * np.diff(intervals)[:, :, None], axis=0)
+    share = float(np.divide(*(np.sum(np.diagonal(part) / signal.nominal_scale**2) for part in (along, expected))))
+    if not freedom or share > 1 - _CHANCE * np.sqrt(2 / freedom):
+        return covariance
+    kept = np.eye(3) - (1 - np.sqrt(share)) * onto
+    return kept @ covariance @ kept.mT
+
+
+def _density(signal: Signal, columns: Sequence[FloatArray]) -> tuple[FloatArray, int]:
     """Return the density (3, 3) of the shortest blocks, or of longer ones where it falls by more than chance.
 
     What a hand trembles averages out within a second or so: blocks of a quarter would take it for white noise, tens of
-    times too much of it for the mean of a pose. `columns`: the samples (3, n) of each interval at rest.
+    times too much of it for the mean of a pose. With it its degrees of freedom for each axis. `columns`: the samples
+    (3, n) of each interval at rest.
     """
     size = max(1, signal.samples(_SHORTEST))
-    density, _ = _of_blocks(signal, columns, size)
+    best = _of_blocks(signal, columns, size)
     for factor in (2, 4):
         longer, freedom = _of_blocks(signal, columns, factor * size)
-        ratio = np.mean(np.diagonal(longer) / np.maximum(np.diagonal(density), 1e-300))  # noise-free: no scatter
+        ratio = np.mean(np.diagonal(longer) / np.maximum(np.diagonal(best[0]), 1e-300))  # noise-free: no scatter
         if freedom and ratio < 1 - _CHANCE * np.sqrt(2 / (3 * freedom)):
-            density = longer
-    return density
+            best = longer, freedom
+    return best
 
 
 def _of_blocks(signal: Signal, columns: Sequence[FloatArray], size: int) -> tuple[FloatArray, int]:
@@ -437,6 +466,7 @@ def observed_poses(
         recording, intervals = part.recording, part.intervals
         accelerometer, gyroscope = recording.accelerometer, recording.gyroscope
         _, force, force_covariance = rest_statistics(accelerometer, intervals)
+        force_covariance = _across_gravity(accelerometer, intervals, force, force_covariance)
         density, rate, rate_covariance = np.eye(3), *_no_means(len(intervals))
         between = [_NO_TURN] * (len(intervals) - 1)
         if gyroscope is not None:
