@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaximu.estimation.fitting import Fit
+from jaximu.estimation.fitting import Fit, Prior
 from jaximu.estimation.problem import TOLERANCE, Name, flatten, names_of, typical_sizes, without_equipment
 from jaximu.estimation.projection import OutputUncertainty, output_uncertainty
 from jaximu.estimation.uncertainty import (
@@ -321,14 +321,20 @@ def concluded(
     notes: Sequence[str],
     advice: Callable[..., str] = pose_advice,
     known: Collection[Name] = (),
+    prior: Prior | None = None,
     **working: Any,
 ) -> Calibration:
     """Return the calibration that a fit is: rank, weak directions, excess and covariance are those of its model.
 
     **Arguments:** `rms`: the sizes of its errors before and after. `known`: numbers of which something is known
-    beforehand; of these alone nobody asks whether the data tell them. `working`: fields of `Calibration`.
+    beforehand; of these alone nobody asks whether the data tell them. `prior`: what is known of such numbers; it tells
+    them as data do. `working`: fields of `Calibration`.
     """
-    rank, weak = weak_directions(np.asarray(fitted.jacobian), fitted.names, fitted.sizes, fitted.imu, advice)
+    jacobian = np.asarray(fitted.jacobian)
+    if prior is not None:
+        known = {*known, *prior.names}
+        jacobian = np.concatenate([jacobian, prior.rows(fitted.names, fitted.sizes)])
+    rank, weak = weak_directions(jacobian, fitted.names, fitted.sizes, fitted.imu, advice)
     weak = tuple(one for one in weak if not set(known).issuperset(name for name, _ in one.parameters))
     before, after = rms
     excess: dict[str, float] = dict(zip(excess_names, np.asarray(fitted.excess).tolist(), strict=False))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -12,8 +13,8 @@ import scipy
 
 from jaximu.data.poses import PosesAndTurns, condense, only
 from jaximu.estimation.covariance import inverse_cholesky
-from jaximu.estimation.fitting import Fit, fit
-from jaximu.estimation.problem import TOLERANCE, Loss, Parameters, without_equipment
+from jaximu.estimation.fitting import Fit, Prior, fit
+from jaximu.estimation.problem import TOLERANCE, Loss, Name, Parameters, without_equipment
 from jaximu.ground import stored
 from jaximu.ground.array_types import Array
 from jaximu.ground.errors import one_of
@@ -23,6 +24,14 @@ from jaximu.model.sensor import Imu
 from jaximu.recordings.observations import Observations
 
 Method = Literal["joint", "two-step", "two-step-rk4", "accelerometer"]
+_ACROSS = 0.01
+"""Standard deviation of a misalignment, rad: data sheets of MEMS sensors state a cross-axis sensitivity of ±2 %
+(InvenSense, MPU-6000 and MPU-6050 Product Specification, rev. 3.4, 2013, sec. 6.2)."""
+MISALIGNMENTS_HELD = (
+    f"{{}} poses leave misalignments open: they were taken to be zero within ±{200 * _ACROSS:g} % (95 %), as data "
+    "sheets state the cross-axis sensitivity."
+)
+"""What is said where they are, with the number of poses."""
 
 
 def fit_hand_held(nominal: Imu, observations: Observations, method: Method = "joint", loss: Loss = "linear") -> Fit:
@@ -49,6 +58,28 @@ def fit_hand_held(nominal: Imu, observations: Observations, method: Method = "jo
     if method != "accelerometer":
         fitted = _second_step(fitted, observations, "rk4" if method.endswith("rk4") else "exponential", loss)
     return first_of(fitted) if single else fitted
+
+
+def known_misalignments(nominal: Imu, free: Sequence[Name]) -> Prior:
+    """Return what is known of an accelerometer's misalignments beforehand: they are zero within what sensors have."""
+    across = tuple(
+        name for name in free if name.owner == "accelerometer" and name.part == "gain" and len({*name.axes}) > 1
+    )
+    scale = nominal.accelerometer.scales
+    sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
+    return Prior(across, np.zeros(len(across)), np.diag(1 / sigma))
+
+
+def with_open_misalignments_held(
+    fitted: Fit, nominal: Imu, observations: Observations, method: Method, loss: Loss
+) -> tuple[Fit, Prior | None]:
+    """Return a unit's fit, made again with what sensors have as a prior where its misalignments are known less well."""
+    prior = known_misalignments(nominal, fitted.names)
+    sigma = fitted.sigmas()[[fitted.names.index(name) for name in prior.names]]
+    if method.startswith("two-step") or not np.any(sigma * np.diag(prior.root) > 1):
+        return fitted, None
+    data = PosesAndTurns.of(observations, "norm" if method == "accelerometer" else "all")
+    return fit(nominal, data, prior=prior, loss=loss, excess=fitted.excess), prior
 
 
 def _second_step(first: Fit, observations: Observations, method: str, loss: str) -> Fit:

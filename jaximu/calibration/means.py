@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from jaximu.calibration.calibration import Calibration, concluded, provenance
+from jaximu.calibration.hand_held import MISALIGNMENTS_HELD, known_misalignments
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.refusals import require_determined
 from jaximu.data.poses import EXCESS_NAMES, PosesAndTurns, residual_rms
-from jaximu.estimation.fitting import Prior, fit
-from jaximu.estimation.problem import Loss, Name, names_of, without_equipment_or_effects
+from jaximu.estimation.fitting import fit
+from jaximu.estimation.problem import Loss, names_of, without_equipment_or_effects
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, as_gravity
@@ -29,9 +29,6 @@ _SPANNED, _ON = 0.1, 0.5
 """Least singular value of squares and directions that determine scale and bias, and cosine of a row on an axis."""
 _FACES, _UPRIGHT = 6, 0.1
 """Faces of a box, and the sine of the tilt below which all poses are on one."""
-_ACROSS = 0.01
-"""Standard deviation of a misalignment, rad: data sheets of MEMS sensors state a cross-axis sensitivity of ±2 %
-(InvenSense, MPU-6000 and MPU-6050 Product Specification, rev. 3.4, 2013, sec. 6.2)."""
 
 
 def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = "linear") -> Calibration:
@@ -55,17 +52,13 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
     few = means.accelerometer_sigma is None and poses < len(free) + _SPARE
     prior, measured, excess = None, observations, None
     if few or (poses >= _FACES and _open(means)):
-        prior = _misalignments(nominal, free)
+        prior = known_misalignments(nominal, free)
         spare = poses - (len(free) - len(prior.names))
         _require_axes(means, len(free), spare)
         measured = observe_means(_as_written(means), gravity.value)
         excess = None if spare >= _SPARE else np.zeros(len(EXCESS_NAMES))
-        notes += (
-            f"{poses} poses leave misalignments open: they were taken to be zero within ±{200 * _ACROSS:g} % (95 %), "
-            "as data sheets state the cross-axis sensitivity."
-            + few
-            * " The means are taken to be as good as their digits.",
-        )
+        written = few * " The means are taken to be as good as their digits."
+        notes += (MISALIGNMENTS_HELD.format(poses) + written,)
     at_rest = PosesAndTurns.of(measured, "norm" if method == "accelerometer" else "all")
     fitted = fit(nominal, at_rest, prior=prior, loss=loss, excess=excess, estimate_excess=excess is None)
     require_determined(fitted, recording.name, poses=poses)
@@ -86,7 +79,7 @@ def calibrate_means(means: PoseMeans, gravity: Gravity = STANDARD, loss: Loss = 
         loss=loss,
         excess_names=EXCESS_NAMES,
         rms=[residual_rms(imu, observations, method == "joint") for imu in (nominal, fitted.imu)],
-        known=() if prior is None else prior.names,
+        prior=prior,
         data=data | {"poses": poses, "turns": 0},
         notes=(*recording.notes, *notes),
         observations=observations,
@@ -122,14 +115,6 @@ def _step(values: FloatArray) -> float:
             if np.all(np.abs(scaled - np.round(scaled)) < 1e-6 * np.maximum(np.abs(scaled), 1.0)):
                 return unit * 10.0**-digits
     return 1e-6
-
-
-def _misalignments(nominal: Imu, free: Sequence[Name]) -> Prior:
-    """Return what is known of the misalignments beforehand: they are zero within what sensors have."""
-    across = tuple(name for name in free if name.part == "gain" and name.axes[0] != name.axes[1])
-    scale = nominal.accelerometer.scales
-    sigma = _ACROSS * np.array([scale[name.axes[0]] for name in across])
-    return Prior(across, np.zeros(len(across)), np.diag(1 / sigma))
 
 
 def _require_axes(means: PoseMeans, parameters: int, spare: int) -> None:

@@ -11,7 +11,12 @@ import numpy as np
 from jaximu.calibration.arrangement import arrangement
 from jaximu.calibration.bias_drift import knowing_drift
 from jaximu.calibration.calibration import Calibration, clock_sigma, concluded, effect_named, notes_of, provenance
-from jaximu.calibration.hand_held import Method, fit_hand_held
+from jaximu.calibration.hand_held import (
+    MISALIGNMENTS_HELD,
+    Method,
+    fit_hand_held,
+    with_open_misalignments_held,
+)
 from jaximu.calibration.lost_time import lost_share, tells_losses, without_lost_stretches
 from jaximu.calibration.nominal import nominal_imu
 from jaximu.calibration.refusals import require_carried, require_determined
@@ -165,7 +170,7 @@ def _calibrated_jointly(
         rms=[errors_of(kinds, imu) for imu in (unit, fitted.imu)],
         notes=notes,
         advice=kinds[0].advice,
-        known=() if prior is None else prior.names,
+        prior=prior,
         data=provenance(recorded) if recorded else {},
         nominal=unit,
         reading=recorded[0].reading if recorded else None,
@@ -294,12 +299,13 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     observations = observed_poses(segmentations, gravity.value, noise=noise)
     nominal = nominal_imu(recordings[0])
     fitted = fit_hand_held(nominal, observations, method, loss)
+    fitted, held = with_open_misalignments_held(fitted, nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
     poses, turns = (int(np.sum(part.mask)) for part in (observations.poses, observations.turns))
     require_determined(fitted, where, poses=poses)
     keep_gyroscope = method != "accelerometer"
     before = residual_rms(nominal, observations, keep_gyroscope)
-    sigmas, prior = dict(choices.effect_sigmas or {}), None
+    sigmas, prior = dict(choices.effect_sigmas or {}), held
     if method == "joint" and gravity.latitude is not None:
         earth, spread = GyroEarthRotation.at(gravity.latitude)
         if not _headings_known(segmentations, observations):  # the vertical part needs none, and is all that is taken
@@ -309,11 +315,13 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
         start = on_host(fitted.imu).with_effects(*chosen)
-        prior = Prior.of_effects(start, sigmas)
+        prior = Prior.joined(held, Prior.of_effects(start, sigmas))
         fitted = fit(start, measurement, prior=prior, loss=loss, excess=fitted.excess)
         require_determined(fitted, where, prior=prior)
         observations = measurement.along(fitted.imu, tuple(fitted.imu.all_effects().values())).observations
     notes = *notes_of(*recordings), *mixed, *notes_of(noise, *segmentations)
+    if held is not None:
+        notes += (MISALIGNMENTS_HELD.format(poses),)
     if keep_gyroscope and not turns:
         notes += ("no turn between two poses could be used: the gyroscope's gain stays at the data sheet's.",)
     return concluded(
@@ -323,7 +331,7 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
         loss=loss,
         excess_names=EXCESS_NAMES if keep_gyroscope else EXCESS_NAMES[:1],
         rms=[before, residual_rms(fitted.imu.with_effects(), observations, keep_gyroscope)],
-        known=() if prior is None else prior.names,
+        prior=prior,
         data=provenance(recordings) | {"poses": poses, "turns": turns} | _mean_temperature(recordings, observations),
         notes=notes,
         observations=observations,

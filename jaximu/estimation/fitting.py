@@ -20,6 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 
@@ -97,6 +98,23 @@ class Prior(eqx.Module):
                 values += np.asarray(effect.coefficients).tolist()
                 sigma += np.broadcast_to(width, effect.size).tolist()
         return cls(tuple(names), np.array(values), np.diag(1 / np.array(sigma))) if names else None
+
+    def rows(self, names: Sequence[Name], sizes: Array) -> FloatArray:
+        """Return what is known as whitened conditions (k, p) of numbers `names` in typical `sizes` (p,)."""
+        places = [names.index(name) for name in self.names]
+        conditions = np.zeros((len(places), len(names)))
+        conditions[:, places] = np.asarray(self.root) * np.asarray(sizes)[places]
+        return conditions
+
+    @classmethod
+    def joined(cls, *priors: Prior | None) -> Prior | None:
+        """Return what several state of different numbers as one; None where nothing is known."""
+        known = [prior for prior in priors if prior is not None]
+        if len(known) < 2:
+            return known[0] if known else None
+        names = tuple(name for prior in known for name in prior.names)
+        root = scipy.linalg.block_diag(*(prior.root for prior in known))
+        return cls(names, np.concatenate([prior.mean for prior in known]), root)
 
 
 class Fit(eqx.Module):
