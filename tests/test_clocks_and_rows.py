@@ -131,6 +131,21 @@ def test_many_bad_values_are_refused_with_the_row(recording, tmp_path):
         read_recording(write(tmp_path / "log.csv", recording.accelerometer.time, values))
 
 
+@pytest.mark.parametrize(("mark", "long"), [(-9999, 1), (9999.99, 30), (-999, 3)])
+def test_a_number_that_stands_for_a_missing_reading_is_none(recording, tmp_path, mark, long):
+    """Whether a row is missing at a time or many; a knock that ends at the range is a reading."""
+    time, values = recording.accelerometer.time, values_of(recording)
+    rows = (np.arange(100, len(time) - 100, 150)[:, None] + np.arange(long)).ravel()
+    values[rows] = mark
+    found = read_recording(write(tmp_path / "log.csv", time, values))
+    assert len(found.accelerometer) == len(found.gyroscope) == len(time) - len(rows)
+    assert any(f"{len(rows)} rows hold {mark:.6g} in 6 columns" in note for note in found.notes)
+    values = values_of(recording)
+    values[rows, :3] = np.clip(40 * values[rows, :3], -156.9, 156.9)
+    found = read_recording(write(tmp_path / "log.csv", time, values))
+    assert len(found.accelerometer) == len(time) and not any("missing reading" in note for note in found.notes)
+
+
 @pytest.mark.parametrize("tick", [0.005125, 0.007, 0.001])
 def test_a_rate_is_samples_over_time(recording, tmp_path, tick):
     """A logger that polls writes the stamps of its own loop, whose usual interval is not the sensor's."""

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from jaximu.ground.array_types import FloatArray
+from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.errors import InputError
+from jaximu.ground.quantities import counted
 from jaximu.recordings.recording import Source
 
 HEAD = 1 << 18
@@ -22,6 +23,9 @@ FEW = 0.01
 _MISSING = {"-", "--", "---", "*", "?", "none", "err", "error", "missing", "overflow", "ovf", "inv", "invalid"}
 """Words that programs write for a reading that is not there, beside those that Arrow knows."""
 _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
+_BEYOND = 30.0
+"""How many times as large as all other readings a number must be to stand for a missing one: a knock that ends at the
+sensor's range is at most 16 times gravity, and differs from axis to axis."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,30 @@ class LogTable:
     def noted(self, *notes: str) -> "LogTable":
         """The table with more notes."""
         return replace(self, notes=(*self.notes, *notes))
+
+    def without_markers(self) -> "LogTable":
+        """The table without the number, such as −9999, that stands for a missing reading on several axes at once."""
+        marks: dict[float, dict[int, BoolArray]] = {}
+        for index, column in enumerate(self.columns):
+            if column.dtype.kind in "fi" and len(column):
+                sizes = np.abs(column)
+                largest = np.nanmax(sizes) if np.isfinite(sizes).any() else 0.0
+                marked = sizes == largest
+                others = np.max(sizes, where=~marked & np.isfinite(sizes), initial=0.0)
+                if marked.sum() > 2 and largest > _BEYOND * others > 0:
+                    marks.setdefault(float(column[np.argmax(marked)]), {})[index] = marked
+        table = self
+        for mark, where in marks.items():
+            together = np.all(list(where.values()), axis=0)
+            if len(where) > 2 and all(np.array_equal(marked, together) for marked in where.values()):
+                for index, marked in where.items():
+                    table = table.with_column(index, np.where(marked, np.nan, self.columns[index]))
+                rows, columns = counted(int(together.sum()), "row"), counted(len(where), "column")
+                table = table.noted(
+                    f"{rows} hold {mark:.6g} in {columns}, first row {self.row(np.argmax(together))}: it stands for a "
+                    "missing reading. They are left out."
+                )
+        return table
 
     def label(self, index: int) -> str:
         """The column's name in the file, or its 1-based number."""

@@ -511,7 +511,8 @@ def _tables_of_file(file: Path, name: str, options: ReadOptions) -> tuple[LogTab
         raise _damaged(name, kind.name, error) from error
     if tables == ():
         raise InputError(f"{name}: holds no message of these sensors; it is cut off or damaged.")
-    return tuple(_checked(table, source) for table in (tables if isinstance(tables, tuple) else (tables,)))
+    whole = tables if isinstance(tables, tuple) else (tables,)
+    return tuple(_checked(table.without_markers(), source) for table in whole)
 
 
 def advise_reading(path: FilePath, rate: float | None = None) -> Advice | None:
