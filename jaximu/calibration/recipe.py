@@ -299,10 +299,11 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     observations = observed_poses(segmentations, gravity.value, noise=noise)
     nominal = nominal_imu(recordings[0])
     fitted = fit_hand_held(nominal, observations, method, loss)
-    fitted, held = with_open_misalignments_held(fitted, nominal, observations, method, loss)
     where = ", ".join(recording.name for recording in recordings)
     poses, turns = (int(np.sum(part.mask)) for part in (observations.poses, observations.turns))
     require_determined(fitted, where, poses=poses)
+    fitted, held = with_open_misalignments_held(fitted, nominal, observations, method, loss)
+    require_determined(fitted, where, prior=held)
     keep_gyroscope = method != "accelerometer"
     before = residual_rms(nominal, observations, keep_gyroscope)
     sigmas, prior = dict(choices.effect_sigmas or {}), held

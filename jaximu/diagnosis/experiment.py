@@ -436,22 +436,23 @@ class Experiment(Data):
         askable, refused = self.askable(linear)
         if asking is not None:
             askable = {name: kind for name, kind in askable.items() if name.partition(".")[2] in asking}
-        used, blocks = self.used, []
         extents = {number: self.extent(number) for number in {kind.recording for kind in askable.values()}}
         grids = {kind: kind.grid(extents[kind.recording]) for kind in askable.values()}
-        reactions = self.dormant_columns(imu, linear.details, grids)
+        reactions, blocks = self.dormant_columns(imu, linear.details, grids), []
         for name, kind in askable.items():
             if name in fitted:
                 continue
             size = _sizes(kind, imu)
             for inner, columns in zip(grids[kind], reactions[kind], strict=True):
                 placed = kind.beginning() in inner
-                blocks.append(
-                    EffectBlock(name, weights @ (columns * size)[used], size, "effect", inner, placed, kind.curved())
-                )
-        shapes = shapes_without_cause(self.data.observed(imu, linear.details))
-        generic = [replace(b, columns=weights @ b.columns[used]) for b in shapes]
-        return blocks + generic, refused
+                blocks.append(EffectBlock(name, columns * size, size, "effect", inner, placed, kind.curved()))
+        blocks += shapes_without_cause(self.data.observed(imu, linear.details))
+        if not blocks:
+            return [], refused
+        whitened = weights @ np.concatenate([block.columns[self.used] for block in blocks], axis=1)
+        ends = np.cumsum([block.columns.shape[1] for block in blocks])
+        parts = np.split(whitened, ends[:-1], axis=1)
+        return [replace(block, columns=part) for block, part in zip(blocks, parts, strict=True)], refused
 
 
 def _limits(evidence: Evidence, imu: Imu) -> dict[str, tuple[float, str]]:
