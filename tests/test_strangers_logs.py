@@ -411,6 +411,7 @@ def test_sections_put_together_are_not_two_devices(tmp_path):
         ("时间(s)|加速度{}(m/s^2)|角速度{}(rad/s)", "gb18030"),
         ("Tijd [s]|Versnelling {} [meter/second^2]|Hoeksnelheid {} [radians per second]", "utf-8"),
         ("time [s]|{}acc [m/s^2]|{}speed [rad/s]", "utf-8"),
+        ("Tempo (s)|Aceleração {} (m/s²)|Velocidade angular {} (rad/s)", "utf-8"),
     ],
 )
 def test_names_in_other_languages(tmp_path, names, encoding):

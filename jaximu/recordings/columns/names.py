@@ -8,7 +8,7 @@ import numpy as np
 
 from jaximu.ground.errors import InputError
 from jaximu.ground.units import parse_column
-from jaximu.recordings.columns.habits import Field, fields_of
+from jaximu.recordings.columns.habits import Field, fields_of, measures
 from jaximu.recordings.columns.table import LogTable
 
 
@@ -91,10 +91,20 @@ def parse_columns(text: str | Sequence[str]) -> tuple[Column, ...]:
 def header_columns(table: LogTable) -> tuple[Column, ...] | None:
     """The columns that the file's own header names, or None without one that names any of ours.
 
-    Of several columns of time the first that states its unit and rises counts.
+    Of several columns of time the first that states its unit and rises counts. Beside a named accelerometer, three
+    columns in a unit of angular rate are the gyroscope by whatever name.
     """
     fields = fields_of(table.header)
     columns = [Column(field.canonical, field.unit) for field in fields]
+    rates = {
+        at: Column(f"gyro_{field.axis}", field.unit)
+        for at, field in enumerate(fields)
+        if field.axis and not (field.sensor or field.why_not) and measures(field.unit) == "gyro"
+    }
+    names = sorted(column.name or "" for column in rates.values())
+    known = {column.name for column in columns}
+    if tuple(names) == GROUPS["gyro"].columns and "accel_x" in known and not known.intersection(names):
+        columns = [rates.get(at, column) for at, column in enumerate(columns)]
     times = [at for at, column in enumerate(columns) if column.name == TIME]
     bare = [at for at in times if fields[at].bare_time]
     if bare and len(times) > 1:  # parts of a time of day, most likely
