@@ -117,6 +117,14 @@ def test_names_beat_places_and_physics_beats_neither(tmp_path):
     assert advice is not None and advice.columns == "time [s],gyro [rad/s],accel [m/s^2]"
 
 
+def test_a_low_g_accelerometer_is_preferred_to_a_high_g_one(tmp_path):
+    log = simulate("poses")
+    names = ["Time(s)", *xyz("HighG_{}(g)"), *xyz("LowG_{}(g)"), *xyz("Gyro_{}(dps)")]
+    path = text(tmp_path, names, [log.time, np.round(log.force / G, 1), log.force / G, np.degrees(log.rate)])
+    advice = advise_reading(path)
+    assert advice is not None and advice.columns == "time [s],_,_,_,accel [g],gyro [dps]"
+
+
 def test_a_guess_shows_rows_and_reasons(tmp_path, capsys):
     log = simulate("poses")
     path = text(tmp_path, ["t", *xyz("acc_{}"), *xyz("gyr_{}")], [log.time, log.force, np.degrees(log.rate)])
@@ -217,6 +225,7 @@ def test_increments_are_divided_by_the_interval(tmp_path):
         ("acc_std_y", None),
         ("delta_angle_x", None),
         ("T(°)", "temperature"),
+        ("LowG_X (g)", None),
         ("SampleTimeFine", "time"),
         ("accelerometerTimestamp_sinceReboot(s)", "time"),
         ("Counter", None),

@@ -389,7 +389,14 @@ class _Guess:
         if not named:
             return None
         unsure = {None: 2, "?": 1, "count": 1}
-        named.sort(key=lambda one: (sensor == "accel" and unsure.get(one.gravity_unit, 0), one.plain, one.places))
+        named.sort(
+            key=lambda one: (
+                sensor == "accel" and unsure.get(one.gravity_unit, 0),
+                one.plain,
+                "high" in one.label.split(),  # a range for impacts is coarse
+                one.places,
+            )
+        )
         first, name = named[0], GROUPS[sensor].field
         if len(named) > 1:
             others = ", ".join(repr(triad.label) for triad in named[1:])

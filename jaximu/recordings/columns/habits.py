@@ -204,6 +204,8 @@ class Field:
             return cls((), None, "time", unit)
         if axis and sensor in ("temperature", "ambient_temperature"):
             sensor = None
+        if axis and sensor == "gyro" and "g" in stem and find_unit(unit or "", "acceleration"):
+            sensor = None  # LowG_X (g): the letter is the unit's
         if stem[:2] in _ESTIMATED and axis:
             sensor, why_not = None, "an estimated bias"
         return cls(stem, axis, sensor, unit, why_not)
