@@ -400,9 +400,16 @@ def test_a_magnetometer_without_a_unit_is_left_out(phone, tmp_path):
     assert recording.magnetometer is not None and recording.magnetometer.unit == "uT"
 
 
+PROSE = (
+    "IMU log of 4 March 2026, session 1, 14:05.\n\nSampled at 100 Hz: 3 axes, 16 bits, range 4 g.\nRecorded by hand.\n"
+)
+
+
 def test_one_log_in_an_archive_is_read_as_it_is(folder, tmp_path):
     text = (folder / "poses.csv").read_text()
-    path = packed(tmp_path / "log.zip", {"log.csv": text, "notes.md": "", "__MACOSX/._log.csv": ""})
+    path = packed(
+        tmp_path / "log.zip", {"log.csv": text, "notes.md": "", "__MACOSX/._log.csv": "", "README.txt": PROSE}
+    )
     assert len(read_recording(path).accelerometer) == len(read_recording(folder / "poses.csv").accelerometer)
 
 

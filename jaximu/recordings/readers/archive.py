@@ -7,14 +7,17 @@ import shlex
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path, PurePosixPath
+from typing import IO
 
 from jaximu.ground.errors import InputError, readable
 from jaximu.ground.units import SENSORS
 from jaximu.recordings.columns.habits import sensor_of, words_of
-from jaximu.recordings.columns.table import Unpacking
+from jaximu.recordings.columns.table import HEAD, Unpacking
 from jaximu.recordings.recording import Source
 
 _MOST = 1000  # files of a recording
@@ -47,6 +50,7 @@ SUFFIXES = (
 )
 """What a folder is searched for; a file that is named on its own may have any."""
 _BESIDE = (".truth.json", ".schedule.csv")
+_DIGITS = re.compile(rb"\d+")
 _GZIP = b"\x1f\x8b"
 _PACKED = set(".zip .gz .bz2 .xz .7z .rar .tar .tgz".split())
 
@@ -94,7 +98,7 @@ def opened(path: Path, name: str) -> Iterator[dict[str, tuple[str, Path]]]:
     """
     if path.is_dir():
         files = {file.name: file for file in sorted(path.iterdir()) if file.is_file()}
-        chosen = _chosen(files, path, name)
+        chosen = _chosen(files, path, name, lambda inside: files[inside].open("rb"))
         yield {sensor: (f"{name}/{inside}", files[inside]) for sensor, inside in chosen.items()}
         return
     data = path.read_bytes()
@@ -109,7 +113,7 @@ def opened(path: Path, name: str) -> Iterator[dict[str, tuple[str, Path]]]:
         members = _members(archive, name)
         files = {}
         unpacking = Unpacking(Source(name, "", 0), path.stat().st_size)
-        for number, (sensor, inside) in enumerate(_chosen(members, path, name).items()):
+        for number, (sensor, inside) in enumerate(_chosen(members, path, name, archive.open).items()):
             unpacking.take(members[inside].file_size)
             file = Path(folder) / f"{number}{PurePosixPath(inside).suffix}"  # never a path that the archive states
             file.write_bytes(archive.read(members[inside]))
@@ -132,7 +136,7 @@ def _members(archive: zipfile.ZipFile, name: str) -> dict[str, zipfile.ZipInfo]:
     return members
 
 
-def _chosen(files: Collection[str], path: Path, name: str) -> dict[str, str]:
+def _chosen(files: Collection[str], path: Path, name: str, open_file: Callable[[str], IO[bytes]]) -> dict[str, str]:
     """Return by sensor which of the files are the one recording. Raises InputError where there is none, or several."""
     paths = [PurePosixPath(file) for file in files]
     paths = [file for file in paths if not any(part.startswith(".") or part.lower() in _ABOUT for part in file.parts)]
@@ -140,9 +144,20 @@ def _chosen(files: Collection[str], path: Path, name: str) -> dict[str, str]:
     logs = [file for file in logs if _rank(file)[0] != _PART]
     if sensors := by_sensor(map(str, logs)):
         return sensors
+    if len(logs) > 1:
+        logs = [*islice((file for file in logs if not _prose(str(file), open_file)), 2)]  # of two, none is read
     if len(logs) == 1 and logs[0].suffix.lower() not in _PACKED:
         return {"": str(logs[0])}
     raise InputError(_refusal([*files], path, name))
+
+
+def _prose(name: str, open_file: Callable[[str], IO[bytes]]) -> bool:
+    """Whether a file is text most of whose lines are unlike each other, whatever their numbers, such as a README."""
+    with open_file(name) as file:
+        head = file.read(HEAD)
+    shapes = Counter(_DIGITS.sub(b"#", line.translate(None, b"-+.")) for line in head.splitlines() if line.strip())
+    rows = sum(count for shape, count in shapes.items() if count > 1 and b"#" in shape)
+    return b"\0" not in head and rows < shapes.total() / 2
 
 
 def by_sensor(files: Iterable[str]) -> dict[str, str]:
