@@ -108,6 +108,7 @@ def test_a_recording_that_is_given_twice():
     [
         ("Date", lambda time: 45413.5 + time / 86400),
         ("sec_of_day", lambda time: (86400 - 20 + time) % 86400),
+        ("datenum", lambda time: 739312.5 + time / 86400),
         ("gps_sow", lambda time: 400000.0 + time),
         ("esp_timer_us", lambda time: np.round(time * 1e6)),
         ("time [min]", lambda time: time / 60),
@@ -124,6 +125,13 @@ def test_clocks_by_their_names(tmp_path, name, stamps):
         assert advice.columns and "?" not in advice.line()
         recording = read_recording(path, options=ReadOptions(columns=advice.columns))
     same(recording, values)
+
+
+def test_minutes_and_seconds_go_on_after_an_hour(tmp_path):
+    values = columns(by_hand())
+    stamps = [f"{int(s // 60) % 60:02d}:{s % 60:05.2f}" for s in np.round(values[:, 0] + 3590.0, 2)]
+    rows = [f"{stamp},{row}" for stamp, row in zip(stamps, lines(values[:, 1:]), strict=True)]
+    same(read_recording(save(tmp_path / "log.csv", f"Time,{HEAD}", *rows)), values)
 
 
 def test_units_that_names_end_in(tmp_path):
@@ -411,6 +419,7 @@ def test_sections_put_together_are_not_two_devices(tmp_path):
         ("时间(s)|加速度{}(m/s^2)|角速度{}(rad/s)", "gb18030"),
         ("Tijd [s]|Versnelling {} [meter/second^2]|Hoeksnelheid {} [radians per second]", "utf-8"),
         ("time [s]|{}acc [m/s^2]|{}speed [rad/s]", "utf-8"),
+        ("Zaman (sn)|İvme {} (m/sn²)|Açısal hız {} (derece/sn)", "utf-8"),
         ("Tempo (s)|Aceleração {} (m/s²)|Velocidade angular {} (rad/s)", "utf-8"),
     ],
 )
@@ -418,9 +427,10 @@ def test_names_in_other_languages(tmp_path, names, encoding):
     """Names and units in brackets, wide brackets or behind a comma: nothing is asked."""
     values = columns(by_hand())
     time, force, rate = names.split("|")
+    written = values * np.array([1.0] * 4 + [np.degrees(1.0) if "derece" in rate else 1.0] * 3)
     axes = ["roll", "pitch", "yaw"] if rate.startswith("{}s") else "XYZ"
     head = [time, *(force.format(axis) for axis in "XYZ"), *(rate.format(axis) for axis in axes)]
-    text = "\n".join([";".join(head), *lines(values, sep=";")]) + "\n"
+    text = "\n".join([";".join(head), *lines(written, sep=";")]) + "\n"
     (tmp_path / "log.csv").write_bytes(text.encode(encoding))
     same(read_recording(tmp_path / "log.csv"), values)
 

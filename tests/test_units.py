@@ -22,6 +22,7 @@ from jaximu.ground.units import BASE_UNITS, find_unit, parse_column, unit
         ("°/s", "angular rate", math.pi / 180.0),
         ("mdps", "angular rate", math.pi / 180e3),
         ("deg/h", "angular rate", math.pi / 648e3),
+        ("°/min", "angular rate", math.pi / 10800),
         ("µs", "time", 1e-6),
         ("ns", "time", 1e-9),
         ("G", "magnetic field", 100.0),

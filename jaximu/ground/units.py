@@ -68,6 +68,7 @@ _FACTORS = {
         "deg/s dps °/s d/s": DEGREE,
         "mdeg/s mdps": DEGREE * 1e-3,
         "deg/h dph °/h": DEGREE / 3600.0,
+        "deg/min dpm °/min": DEGREE / 60.0,
         "rad/h": 1.0 / 3600.0,
         "rpm rev/min r/min tr/min U/min": math.pi / 30.0,
         "rev/s rps r/s tr/s U/s": 2 * math.pi,
@@ -118,8 +119,8 @@ _SPELT = {
     word: unit
     for unit, words in {
         "m": "meter meters metre metres м",
-        "s": "sec secs second seconds с",
-        "deg": "degree degrees grad град",
+        "s": "sec secs second seconds с sn",
+        "deg": "degree degrees grad град derece",
         "rad": "radian radians рад",
         "h": "hour hours hr",
         "ms": "мс",

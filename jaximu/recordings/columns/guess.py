@@ -36,8 +36,8 @@ _PLAUSIBLE = 0.5, 8000.0
 _LIKELY = 5.0, 4000.0
 """Hz: sample rates that a log may have, stamps that mean another are in another unit; and that one with turns has."""
 _MIDDLE_RATE = 50.0  # Hz; of two rates that stamps may mean, the nearer one on a log scale is likelier
-_DAY, _SPREADSHEET = 86400.0, (3e4, 8e4)
-"""Seconds, and the days since 1900 of the years 1982 to 2119, as spreadsheets store dates."""
+_DAY, _DATES = 86400.0, ((3e4, 8e4), (7.24e5, 7.74e5))
+"""Seconds, and the days of the years 1982 to 2119 since 1900, as in spreadsheets, and since 0, as in MATLAB."""
 _STEADY = 0.12
 """Scatter of the norm over poses, of its mean, below which a triad holds something constant."""
 _PER_G = (16384, 8192, 4096, 2048, 1024, 512, 256)
@@ -572,7 +572,10 @@ class _Guess:
             if self.table.rate and abs(rates[name] / self.table.rate - 1) < 0.1:
                 return [(name, factor)]
         first = np.nanmin(np.asarray(self.numbers[self.time or 0]))
-        if _SPREADSHEET[0] < first < _SPREADSHEET[1] and _PLAUSIBLE[0] <= 1 / (self._step() * _DAY) <= _PLAUSIBLE[1]:
+        if (
+            any(low < first < high for low, high in _DATES)
+            and _PLAUSIBLE[0] <= 1 / (self._step() * _DAY) <= _PLAUSIBLE[1]
+        ):
             return [("d", _DAY)]
         for name, factor in names.items():
             if name != "100 us" and EPOCH[0] < first * factor < EPOCH[1] and 0.5 < rates[name] < 2e4:

@@ -17,7 +17,7 @@ _SENSORS = {
     "accel": "a ac acc acce accel accl accels accelero accelerometer accelerometers acceleration accelerations "
     "acelerometro accelerometro accelerometre beschleunigungssensor beschleunigungsmesser versnellingsmeter "
     "akcelerometr акселерометр 加速度计 加速度計 가속도계 "
-    "beschleunigung accelerazione aceleracion aceleracao versnelling przyspieszenie ускорение 加速度 가속도 "
+    "beschleunigung accelerazione aceleracion aceleracao versnelling przyspieszenie ivme ускорение 加速度 가속도 "
     "gf f fb sf force specific",
     "gyro": "g gy gyr gyro gyros gyroscope gyroscopes w wb om omega rot rotation rotational rate rates ars angvel "
     "angularvelocity angularrate rotationrate as angvelocity gyroskop gyroskope drehrate drehraten giroscopio giroskop "
@@ -61,7 +61,7 @@ _ESTIMATED = {("b", "w"), ("b", "a"), ("b", "g")}
 """How the names of an estimated state's biases begin, as in EuRoC's b_w_RS_S_x."""
 _TIME = set(
     "t ts time times timestamp timestamps stamp tstamp elapsed datetime clock micros millis usec msec zeit temps "
-    "tiempo tempo tijd czas время 时间 時間 시간 unix epoch tow sow tod sod utc".split()
+    "tiempo tempo tijd tid zaman datenum czas время 时间 時間 시간 unix epoch tow sow tod sod utc".split()
 )
 _TIME_ALONE = set("ms us ns sec secs seconds milliseconds microseconds nanoseconds epoch uptime".split())
 """Words that name a column of time where they are its whole name, and no other names one."""
