@@ -21,7 +21,7 @@ from jaximu.ground.units import STANDARD_GRAVITY
 from jaximu.recordings import write_recording
 from jaximu.recordings.columns.names import canonical, parse_columns
 from jaximu.recordings.columns.nominal import parse_offset, parse_scale
-from jaximu.recordings.readers import ReadOptions, read_recording
+from jaximu.recordings.readers import ReadOptions, read_frame, read_recording
 from jaximu.recordings.recording import Recording, Signal
 
 SUFFIXES = [".csv", ".tsv", ".txt", ".parquet", ".npz", ".mat"]
@@ -180,6 +180,19 @@ def test_parquet_types(tmp_path):
     assert recording.gyroscope is not None
     assert recording.gyroscope.si()[3, 0] == 0.04
     assert recording.start == 1.7e9
+
+
+@pytest.mark.parametrize("rows", [3, 300])
+def test_lists_of_three_are_vectors(tmp_path, rows):
+    """As data frames export arrays; lists of texts are none."""
+    values = np.arange(6.0 * rows).reshape(-1, 2, 3) % 17
+    vectors = {"acc [g]": values[:, 0].tolist(), "gyr [rad/s]": values[:, 1].tolist(), "tags": [["a", "b", "c"]] * rows}
+    table = pa.table({"time [s]": np.arange(rows) / 100, **vectors})
+    pq.write_table(table, tmp_path / "log.parquet")
+    for recording in (read_recording(tmp_path / "log.parquet", options=AS_IS), read_frame(table, AS_IS)):
+        np.testing.assert_allclose(recording.accelerometer.values, values[:, 0] * STANDARD_GRAVITY)
+        assert recording.gyroscope is not None
+        np.testing.assert_allclose(recording.gyroscope.values, values[:, 1])
 
 
 def test_npz_triads_and_rate(tmp_path):

@@ -10,6 +10,7 @@ import pyarrow as pa
 from jaximu.ground.array_types import BoolArray, FloatArray
 from jaximu.ground.errors import InputError
 from jaximu.ground.quantities import counted
+from jaximu.ground.units import column_title, parse_column
 from jaximu.recordings.recording import Source
 
 HEAD = 1 << 18
@@ -196,6 +197,27 @@ def from_arrow(column: pa.ChunkedArray) -> np.ndarray:
         column = column.cast(pa.float64(), safe=False).fill_null(np.nan)
     parts = [np.from_dlpack(chunk) for chunk in column.chunks if len(chunk)]
     return np.concatenate(parts) if parts else np.empty(0, wanted.to_pandas_dtype())
+
+
+def vectors_apart(table: pa.Table) -> pa.Table:
+    """The table without nested columns, but with x, y, z in place of each whose cells are lists of three numbers."""
+    for at, (name, cells) in reversed([*enumerate(zip(table.column_names, table.columns, strict=True))]):
+        kind: Any = cells.type
+        if not pa.types.is_nested(kind):
+            continue
+        table = table.remove_column(at)
+        listed = pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+        if not listed or pa.types.is_nested(kind.value_type) or cells.null_count or not len(cells):
+            continue
+        from pyarrow import compute  # loaded by these files alone
+
+        numbers = from_arrow(pa.chunked_array([chunk.flatten() for chunk in cells.chunks]))
+        sizes = set(compute.list_value_length(cells).unique().to_pylist())
+        if sizes == {len("xyz")} and numbers.dtype != object:
+            title, unit = parse_column(name)
+            for axis, values in zip("zyx", numbers.reshape(-1, len("xyz")).T[::-1], strict=True):
+                table = table.add_column(at, column_title(f"{title}_{axis}", unit), to_arrow(values))
+    return table
 
 
 def to_arrow(values: np.ndarray, nulls: bool = True) -> pa.Array:

@@ -4,7 +4,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from jaximu.recordings.columns.table import LogTable, Unpacking, from_arrow, mapped_axes, named_with_units
+from jaximu.recordings.columns.table import (
+    LogTable,
+    Unpacking,
+    from_arrow,
+    mapped_axes,
+    named_with_units,
+    vectors_apart,
+)
 from jaximu.recordings.recording import Source
 
 _BATCH = 1 << 18
@@ -12,7 +19,7 @@ _BATCH = 1 << 18
 
 
 def read(data: bytes, source: Source) -> LogTable:
-    """The table in a Parquet file, without columns of lists and the like; a row's number counts from 1."""
+    """The table in a Parquet file; of nested columns only lists of three numbers count. A row's number is 1-based."""
     schema = pq.read_schema(pa.BufferReader(data))
     flat = [field for field in schema if not pa.types.is_nested(field.type)]
     texts = [field.name for field in flat if not _numeric(field.type)]  # each once, not once a row
@@ -33,7 +40,10 @@ def read(data: bytes, source: Source) -> LogTable:
                 columns[index] = columns[index].astype(np.result_type(values, columns[index]))
             columns[index][filled : filled + len(values)] = values
         filled += batch.num_rows
-    return LogTable(source, named_with_units(flat), tuple(columns), axes=mapped_axes(schema))
+    nested = [field.name for field in schema if pa.types.is_nested(field.type)]
+    vectors = vectors_apart(file.read(nested)) if nested else pa.table({})
+    columns += map(from_arrow, vectors.columns)
+    return LogTable(source, named_with_units([*flat, *vectors.schema]), tuple(columns), axes=mapped_axes(schema))
 
 
 def _numeric(kind: pa.DataType) -> bool:

@@ -40,6 +40,7 @@ from jaximu.recordings.columns.table import (
     from_arrow,
     mapped_axes,
     named_with_units,
+    vectors_apart,
 )
 from jaximu.recordings.readers.archive import is_archive, opened
 from jaximu.recordings.readers.records import apart, of_device, of_sensor
@@ -142,7 +143,7 @@ def read_frame(frame: Any, options: ReadOptions | None = None) -> Recording:
     """
     options = _sound(options)
     try:
-        table = pa.table(frame)
+        table = vectors_apart(pa.table(frame))
     except (TypeError, ValueError, pa.ArrowException) as error:
         raise InputError(
             f"expected a data frame of pandas or polars, an Arrow table or a mapping of equally long columns, found a "
