@@ -212,7 +212,7 @@ def vectors_apart(table: pa.Table) -> pa.Table:
         from pyarrow import compute  # loaded by these files alone
 
         numbers = from_arrow(pa.chunked_array([chunk.flatten() for chunk in cells.chunks]))
-        sizes = set(compute.list_value_length(cells).unique().to_pylist())
+        sizes = set(compute.call_function("list_value_length", [cells]).unique().to_pylist())
         if sizes == {len("xyz")} and numbers.dtype != object:
             title, unit = parse_column(name)
             for axis, values in zip("zyx", numbers.reshape(-1, len("xyz")).T[::-1], strict=True):
