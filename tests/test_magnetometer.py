@@ -452,6 +452,7 @@ def test_an_effect_is_named_and_fitted(name, affected, extended, cases):
     asked = diagnose_magnetometer(found, measurement)
     assert [each.effect.name for each in asked.causes] == [name]
     assert asked.causes[0].gain > 30 and asked.causes[0].p_value < 1e-6
+    assert asked.causes[0].after < 0.6 * asked.causes[0].before
     onset = asked.causes[0].effect.onset if name.endswith("step") else None
     assert onset is None or abs(onset - 30.3) < 1.0
     explained, again = extended(name, onset)
@@ -471,6 +472,18 @@ def test_nothing_is_named_where_nothing_is(affected):
     found, measurement, _ = calibrate_magnetometer([affected["none"]], FieldStrength(48.0))
     asked = diagnose_magnetometer(found, measurement)
     assert not asked.causes and asked.p_value > 0.05 and asked.document()["verdict"] == "adequate"
+
+
+def test_an_effect_that_cuts_no_error_is_not_named():
+    """Per cents of scale of an IMU taken from its data sheet: parts left out gain 18 nats by a step, and no error."""
+    case, rng = turned(2, reach=0.35), np.random.default_rng(2)
+    gyroscope = np.eye(3) + 0.01 * rng.standard_normal((3, 3))
+    gains = {"gyroscope": gyroscope, "accelerometer": np.eye(3) + 0.01 * np.tril(rng.standard_normal((3, 3)))}
+    bent = {name: replace(case.recording.signals[name], values=case.recording.signals[name].values @ gain.T)
+            for name, gain in gains.items()}  # fmt: skip
+    log = MagneticLog(case.magnetometer, replace(case.recording, **bent))
+    asked = diagnose_magnetometer(*calibrate_magnetometer([log], FieldStrength(48.0))[:2])
+    assert not asked.causes and "no better" in asked.not_asked["mag.hard_iron_step"]
 
 
 def test_effects_are_compensated_and_saved(affected, extended, tmp_path):

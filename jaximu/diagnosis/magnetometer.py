@@ -18,7 +18,7 @@ from jaximu.diagnosis.evidence import EffectBlock, Evidence
 from jaximu.diagnosis.selection import select
 from jaximu.estimation.fitting import linearise
 from jaximu.estimation.leave_out import leave_out
-from jaximu.estimation.rows import Rows
+from jaximu.estimation.rows import ResidualKind, Rows, Sizes
 from jaximu.ground.array_types import FloatArray
 from jaximu.ground.distributions import chi2_sf
 from jaximu.ground.document import Json
@@ -32,6 +32,8 @@ _ONSETS = 40
 _FOLDS = 5
 _PAYS = 3.0
 """Nats that parts left out must gain for an effect to be named: a factor of 20 in likelihood."""
+_NOTICEABLE = 0.05
+"""Share by which the error of one kind of condition there must fall, and by which that of no kind may rise."""
 _MOVED = 0.01
 _LEAST_WARMING, _LEAST_CURRENT = 0.2, 1e-3  # K, A
 
@@ -41,14 +43,15 @@ class MagneticCause:
     """An effect that a recording shows.
 
     effect: with the coefficients that the linear problem gives. rivals: names of effects that explain it as well.
-    p_value: of its absence. gain: nats, and before, after: rms error of the field's strength (µT), on fifths left out.
-    largest: the most (µT) that it adds in this recording.
+    p_value: of its absence. gain: nats on fifths left out, and before, after: rms error there of the kind of condition
+    that it improves most, in the kind's unit. largest: the most (µT) that it adds in this recording.
     """
 
     effect: Effect
     rivals: tuple[str, ...]
     p_value: float
     gain: float
+    kind: ResidualKind
     before: float
     after: float
     largest: float
@@ -57,12 +60,13 @@ class MagneticCause:
         """Return what was found, and what to do."""
         onset, name = self.effect.since(), self.effect.beginning()
         since, option = ("", "") if onset is None else (f", from {onset:.4g} s on", f":{name}={onset:.4g}")
+        unit = " µT" if self.kind.unit == "uT" else ""
         rivals = ", or " + " or ".join(map(effect_title, self.rivals)) if self.rivals else ""
         rivals += " (this recording cannot tell them apart)" if rivals else ""
         return (
             f"Found {self.effect.title}, up to {self.largest:.2g} µT{since}{rivals}. "
-            f"Modelling it (--effect {self.effect.name}{option}) changes the error of the strength on parts left out "
-            f"from {self.before:.2g} to {self.after:.2g} µT (log-likelihood {self.gain:+.3g})."
+            f"Modelling it (--effect {self.effect.name}{option}) cuts the error of the {self.kind.words} on parts left "
+            f"out from {self.before:.2g} to {self.after:.2g}{unit} (log-likelihood {self.gain:+.3g})."
         )
 
     def document(self) -> Json:
@@ -74,7 +78,8 @@ class MagneticCause:
             "improvement": {
                 "heldout_rms_before": self.before,
                 "heldout_rms_after": self.after,
-                "unit": "uT",
+                "quantity": self.kind.name,
+                "unit": self.kind.unit,
                 "heldout_loglik": self.gain,
             },
         } | self.effect.document("uT")
@@ -105,7 +110,8 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
     fit to ask.
 
     An effect is named where its test stands out over all tests together (5 %) and fifths of the recording that were
-    left out are predicted better with it by three nats or more. An onset is chosen on the whole recording.
+    left out are predicted better with it: by three nats or more, and one of strength, carried field and dip with an
+    error at least 5 % smaller, none with one 5 % larger. An onset is chosen on the whole recording.
     """
     fit, windows = calibration.fit, measurement.windows
     assert fit is not None
@@ -142,12 +148,15 @@ def diagnose_magnetometer(calibration: Calibration, measurement: MagneticField) 
         extended = np.concatenate([jacobian, block.columns], axis=1)
         first, before = _left_out(weights, jacobian, residual, real)
         second, after = _left_out(weights, extended, residual, real)
-        if second - first < _PAYS:
+        shares = [after[kind.name][0] / before[kind.name][0] if kind.name in before else 1.0 for kind in real.kinds]
+        most = real.kinds[int(np.argmin(shares))]
+        if second - first < _PAYS or min(shares) > 1 - _NOTICEABLE or max(shares) > 1 + _NOTICEABLE:
             refused[effect.name] = "it stands out, but parts left out are predicted no better with it"
             continue
         rivals = sorted({evidence.blocks[k].name for k in cause.rivals} - {effect.name})
         largest = float(np.max(np.abs(windows.added(bare.with_effects(effect))))) / scale
-        causes.append(MagneticCause(effect, tuple(rivals), cause.p_value, second - first, before, after, largest))
+        errors = (second - first, most, before[most.name][0], after[most.name][0])
+        causes.append(MagneticCause(effect, tuple(rivals), cause.p_value, *errors, largest))
     return MagneticDiagnosis(tuple(causes), selection.p_value, refused)
 
 
@@ -297,12 +306,12 @@ def _extent(windows: FieldWindows) -> Extent:
     return Extent(float(np.ptp(windows.time)), tuple(edges[:: -(-len(edges) // _ONSETS)].tolist()), span)
 
 
-def _left_out(weights: FloatArray, columns: FloatArray, residual: FloatArray, real: Rows) -> tuple[float, float]:
-    """Return log-likelihood and rms error of the strength (µT) of fifths, each predicted from all the rest."""
+def _left_out(weights: FloatArray, columns: FloatArray, residual: FloatArray, real: Rows) -> tuple[float, Sizes]:
+    """Return log-likelihood and rms errors of fifths, each predicted from all the rest."""
     parts = [real.touching(part) for part in real.parts(_FOLDS)]
     likelihood, errors = 0.0, np.zeros(len(residual))
     size = 1 / np.linalg.norm(weights, axis=0)  # rows are in µT and sines: what is blind is told in units of their own
     for part in leave_out(weights * size, columns, residual, parts):
         likelihood += part.log_likelihood()
         errors[part.rows] = size[part.rows] * part.errors
-    return likelihood, float(np.sqrt(np.mean(errors[real.of_kind("field_strength")] ** 2)))
+    return likelihood, real.rms(errors)
