@@ -317,6 +317,20 @@ def test_what_cannot_be_calibrated_is_a_sentence(cases):
         calibrate_magnetometer([MagneticLog(cases[0].magnetometer, None), other])
 
 
+def test_turns_about_one_axis_do_not_show_the_strength():
+    """Tilted by 2° at the most: an ellipsoid fits, of half the field's strength, and scales came out twice as large."""
+    time, rng = np.arange(0, 90, 0.02), np.random.default_rng(0)
+    tilts = 0.02 * np.stack([np.sin(0.7 * time), np.cos(0.5 * time)], axis=1)
+    attitude = Rotation.from_euler("ZXY", np.column_stack([0.5 * time, tilts]))
+    rates = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / 0.02
+    values = attitude.inv().apply([18.0, -2.0, -44.0]) + [35.0, -20.0, 12.0] + 0.3 * rng.standard_normal((len(time), 3))
+    force = Signal(time, attitude.inv().apply([0, 0, 9.80665]) + 0.02 * rng.standard_normal((len(time), 3)), "m/s^2")
+    recording = Recording(force, Signal(time, np.vstack([rates, rates[-1]]) @ np.diag([1.01, 0.99, 1.01]), "rad/s"))
+    log = MagneticLog(Signal(time, values, "uT"), recording, "flat.csv")
+    with pytest.raises(NotPossibleError, match=r"flat.csv: the unit was turned about nearly one axis.*State it"):
+        calibrate_magnetometer([log])
+
+
 def test_a_field_that_changes_is_refused(cases):
     case = cases[5]
     time, values = case.magnetometer.time, case.magnetometer.values

@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 _TYPICAL = 50.0
 """µT, about what the Earth's field has in the middle latitudes: the strength where only counts are known."""
+_FLAT, _OPEN = 0.1, 0.3
+"""Share of an ellipsoid's radius by which points must be thick, and share of the field by which a gyroscope may leave
+the hard iron open, for either to show the strength."""
 _WEAKEST, _STRONGEST = 22.0, 67.0
 _OTHER_UNITS = {"gauss": 100.0, "mgauss": 0.1, "nT": 1e-3, "mT": 1e3}
 """What a magnetometer may be logged in, in µT, and between which the Earth's field lies outdoors, µT."""
@@ -390,19 +393,29 @@ def _start(
 
 
 def field_start(
-    output: FloatArray, unit: str, strength: FieldStrength | None, where: str, carried: FloatArray | None = None
+    output: FloatArray,
+    unit: str,
+    strength: FieldStrength | None,
+    where: str,
+    carried: tuple[FloatArray, float] | None = None,
 ) -> tuple[float, FloatArray, FieldStrength, list[str]]:
     """Return where a fit of the field's strength starts: scale (output units to a µT), hard iron (3,), field, notes.
 
-    output (n, 3): in `unit`; `carried`: the hard iron (3,) that something else tells, for outputs on no ellipsoid.
-    A strength of which nothing is known is what the data sheet's scale says, to five per cent. Raises
-    `NotPossibleError` where outputs are on no sphere of the Earth's field.
+    output (n, 3): in `unit`; `carried`: the hard iron (3,) that something else tells, for outputs on no ellipsoid,
+    and the share of the field by which that may be off. A strength of which nothing is known is what the data sheet's
+    scale says, to five per cent. Raises `NotPossibleError` where outputs are on no sphere of the Earth's field, or do
+    not show which.
     """
     shape = ellipsoid(output)
     if shape is not None and _plausible(shape, output):
         centre, radius = shape[1], 1 / np.cbrt(np.linalg.det(shape[0]))
     else:
-        centre = carried if carried is not None else output.mean(axis=0)
+        centre, open_share = carried if carried is not None else (output.mean(axis=0), 0.0)
+        if strength is None and open_share > _OPEN:
+            raise NotPossibleError(
+                f"{where}: the unit was turned about nearly one axis, which does not determine the field's strength. "
+                f"State it (--field), or record again. {_RECORD}"
+            )
         radius = float(np.median(lengths_of(output - centre)))
     if unit == "uT":
         if not LOWEST < radius < HIGHEST:
@@ -433,18 +446,24 @@ def _refuse_size(radius: float, strength: FieldStrength | None, where: str) -> N
 
 
 def _plausible(shape: tuple[FloatArray, FloatArray], output: FloatArray) -> bool:
-    """Whether an ellipsoid is one that points determine: not far off, nor much longer one way than another."""
+    """Whether an ellipsoid is one that points determine: not far off, nor of a flat set, nor much longer one way."""
     lengths = np.linalg.eigvalsh(shape[0])
     radius = 1 / np.cbrt(np.prod(lengths))
-    return bool(lengths.max() < 3 * lengths.min() and np.ptp(output, axis=0).max() > 0.8 * radius)
+    thickness = np.sqrt(12 * np.linalg.eigvalsh(np.cov(output.T))[0])  # of points spread evenly
+    wide = np.ptp(output, axis=0).max() > 0.8 * radius and thickness > _FLAT * radius
+    return bool(lengths.max() < 3 * lengths.min() and wide)
 
 
-def _carried_centre(windows: FieldWindows) -> FloatArray:
-    """Hard iron (3,) that the gyroscope tells by itself: R (y₂ − b) = y₁ − b, linear in b."""
+def _carried_centre(windows: FieldWindows) -> tuple[FloatArray, float]:
+    """Hard iron (3,) by the gyroscope alone: R (y₂ − b) = y₁ − b, linear in b.
+
+    And the share of the field by which it is off at the most if every turn is off by as much as a data sheet's gain.
+    """
     rows = np.flatnonzero(windows.turn)
     turned = windows.carried[rows]
     target = windows.output[rows] - np.einsum("nij,nj->ni", turned, windows.output[rows + 1])
-    return np.linalg.lstsq((np.eye(3) - turned).reshape(-1, 3), target.reshape(-1), rcond=1e-6)[0]
+    centre, _, _, sizes = np.linalg.lstsq((np.eye(3) - turned).reshape(-1, 3), target.reshape(-1), rcond=1e-6)
+    return centre, float(_SHEET_GAIN * np.linalg.norm(windows.angle[rows]) / max(sizes[-1], 1e-12))
 
 
 def _axes(windows: FieldWindows, centre: FloatArray, southern: bool | None) -> FloatArray:
