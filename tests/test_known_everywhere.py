@@ -18,6 +18,7 @@ from jaximu.noise.at_rest import fit_noise
 from jaximu.recordings import write_recording
 from jaximu.recordings.readers import read_recording
 from jaximu.recordings.recording import Recording
+from jaximu.report.allan import kalibr_text
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import HandHeld, Positions, RateTable, Static
 
@@ -131,13 +132,16 @@ def test_a_turn_between_long_rests_is_no_knock():
     assert "data.knock" not in {finding.name for finding in inspect(level)}
 
 
-def test_of_a_gyroscope_with_a_dead_band_no_noise_is_stated(rest):
+@pytest.mark.parametrize("size", [1.5, 2.0])
+def test_of_a_gyroscope_with_a_dead_band_no_noise_is_stated(rest, size):
     rate = rest.gyroscope.values - rest.gyroscope.values.mean(axis=0)
-    limit = 2.0 * rate.std()
+    limit = size * rate.std()
     recording = replace(rest, gyroscope=replace(rest.gyroscope, values=np.where(np.abs(rate) < limit, 0.0, rate)))
     found = analyse_noise(recording)
     assert set(found.axes) == {"accelerometer"}
     assert any("zeroes it at rest (a dead band)" in note for note in found.notes)
+    assert found.unusable == {"gyroscope"} and "\ngyroscope_" not in kalibr_text(found)
+    assert not found.summary().next
     with pytest.raises(InputError, match="dead band"):
         fit_noise(recording)
     silent = rest.gyroscope.values.copy()

@@ -261,7 +261,7 @@ class Samples:
     @cached_property
     def rested(self) -> bool:
         """Whether the unit lay still all along, but for moments: what varies then is noise, or a disturbance."""
-        still = [sensor.dead_band[0] if sensor.dead_band else sensor.quiet.mean() for sensor in self.sensors.values()]
+        still = [max((sensor.dead_band or (0.0,))[0], sensor.quiet.mean()) for sensor in self.sensors.values()]
         return bool(still) and bool(min(still) > _RESTED) and not self.turned
 
     @cached_property

@@ -40,7 +40,7 @@ class NoiseAnalysis(Result, Comparable, page="allan"):
     """Identified noise by triad (three axes each), its sample rate, and the spread of the bias over several logs.
 
     repeatability: by triad, standard deviation of the recordings' means with its 95 % interval, (3, 3) value, low, high
-    by axis, SI; empty for one recording.
+    by axis, SI; empty for one recording. unusable: sensors that were recorded, but whose noise a finding hides.
     """
 
     axes: dict[str, list[Identified]]
@@ -48,6 +48,7 @@ class NoiseAnalysis(Result, Comparable, page="allan"):
     files: tuple[str, ...] = ()
     repeatability: dict[str, FloatArray] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    unusable: frozenset[str] = frozenset()
 
     @property
     def lines(self) -> dict[str, list[tuple[PeriodicLine, ...]]]:
@@ -157,7 +158,7 @@ def _of_ready(ready: Sequence[Prepared]) -> NoiseAnalysis:
             "repeatability of the bias. The unit must have lain alike in all, or gravity enters its spread."
         )
     files = tuple(source.path for recording in recordings for source in recording.sources)
-    return NoiseAnalysis(axes, rates, files, repeatability, tuple(notes))
+    return NoiseAnalysis(axes, rates, files, repeatability, tuple(notes), frozenset(unusable - {"gravity"}))
 
 
 def _by_temperature(recording: Recording, name: str) -> list[str]:

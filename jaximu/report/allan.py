@@ -381,7 +381,7 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
         partial(_details, analysis, sources or [Source(path, "", 0) for path in analysis.files]),
         [*filter(None, analysis.notes)],
         f"`jaximu calibrate LOG --static {log} -o RESULTS` calibrates the unit with this noise."
-        if "accelerometer" in analysis.axes
+        if "accelerometer" in analysis.axes and not analysis.unusable
         else "",
     )
 
@@ -389,7 +389,7 @@ def page_of(analysis: NoiseAnalysis, sources: Sequence[Source] = ()) -> Page:
 def _cautions(analysis: NoiseAnalysis) -> Section:
     """Say where the terms are not the whole noise, and which sensor is missing."""
     poor = [name for name, axes in analysis.axes.items() if any(axis.excess for axis in axes)]
-    missing = [name for name in INERTIAL_QUANTITIES if name not in analysis.axes]
+    missing = [name for name in INERTIAL_QUANTITIES if name not in {*analysis.axes, *analysis.unusable}]
     cautions = []
     if poor:
         text = f"The five terms do not describe the {listed(poor)} completely; the intervals are widened for it, see "

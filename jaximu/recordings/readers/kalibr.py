@@ -45,7 +45,7 @@ def kalibr_yaml(
     lines = [f"# {_line(comment)}" for comment in comments]
     for key, unit in KALIBR_UNITS.items():
         if key not in numbers:
-            lines.append(f"# {key}: not known, the recording has no such sensor; Kalibr needs it [{unit}]")
+            lines.append(f"# {key}: not known from the recording; Kalibr needs it [{unit}]")
             continue
         value, comment = numbers[key]
         lines += [f"# {_line(comment)}"] if comment else []
