@@ -14,6 +14,7 @@ from jaximu.ground.gravity import LocalGravity, wgs84_gravity
 from jaximu.model.effects import CATALOGUE
 from jaximu.model.effects.earth_rotation import EARTH_RATE
 from jaximu.recordings import write_recording
+from jaximu.recordings.segmentation import segment
 from jaximu.simulation import consumer_noise, draw_imu, simulate
 from jaximu.simulation.protocols import Environment, HandHeld
 
@@ -126,11 +127,23 @@ def test_the_earths_rotation_is_no_finding_where_the_latitude_is_known(on_earth)
     assert [each.name for each in unknown.effects] == ["gyro.earth_rotation"]
 
 
-def test_several_recordings_have_headings_of_their_own(on_earth):
-    """Their levels share no heading: the vertical part of the Earth's rotation, which needs none, is in the model."""
+def test_several_recordings_have_headings_of_their_own(on_earth, tmp_path):
+    """Each has the Earth's rotation in a level of its own; where a turn is lost the vertical part, which needs none."""
     recording, _ = on_earth
     force = recording.accelerometer
     later = replace(recording, accelerometer=replace(force, values=force.values + 1e-9))  # the same twice is refused
-    (earth,) = calibrate([recording, later], wgs84_gravity(48.0)).imu.all_effects().values()
-    vertical = EARTH_RATE * np.sin(np.radians(48.0))
-    assert np.asarray(earth.coefficients) == pytest.approx([0.0, 0.0, vertical], abs=5e-3 * EARTH_RATE)
+    found = calibrate([recording, later], wgs84_gravity(48.0))
+    found.save(tmp_path / "calibration.json")
+    north, vertical = EARTH_RATE * np.cos(np.radians(48.0)), EARTH_RATE * np.sin(np.radians(48.0))
+    for calibration in (found, load_calibration(tmp_path / "calibration.json")):
+        one, other = calibration.imu.all_effects().values()
+        assert (one.name, other.name) == ("gyro.earth_rotation@1", "gyro.earth_rotation@2")
+        for earth in map(np.asarray, (one.coefficients, other.coefficients)):
+            assert earth[2] == pytest.approx(vertical, abs=5e-3 * EARTH_RATE)
+            assert np.hypot(*earth[:2]) == pytest.approx(north, rel=0.5)
+    rate, intervals = recording.gyroscope, segment(recording).intervals
+    kept = np.abs(rate.time - (intervals[5, 1] + intervals[6, 0]) / 2) > 0.3
+    broken = replace(recording, gyroscope=replace(rate, time=rate.time[kept], values=rate.values[kept]))
+    one, other = calibrate([recording, broken], wgs84_gravity(48.0)).imu.all_effects().values()
+    assert np.hypot(*np.asarray(one.coefficients)[:2]) > north / 2
+    assert np.asarray(other.coefficients) == pytest.approx([0.0, 0.0, vertical], abs=5e-3 * EARTH_RATE)

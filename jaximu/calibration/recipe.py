@@ -28,6 +28,7 @@ from jaximu.estimation.data import Data
 from jaximu.estimation.fitting import Prior, fit, linearise
 from jaximu.estimation.problem import Loss
 from jaximu.estimation.rows import Sizes
+from jaximu.ground.array_types import FloatArray
 from jaximu.ground.errors import InputError, NotPossibleError
 from jaximu.ground.gravity import STANDARD, Gravity, LocalGravity, as_gravity
 from jaximu.ground.precision import require_float64
@@ -89,8 +90,8 @@ def calibrate(
     - `start`: with such data, the unit where the fit starts, and the effects of their set-ups; the data sheet's values
       if left out.
     - `gravity`: local gravity; its uncertainty goes into the scales'. Where it states a latitude, the Earth's rotation
-      is in the model, its heading free (one recording, every turn between its poses usable), else its vertical part
-      alone; not with other data.
+      is in the model, the heading of each recording free where every turn between its poses is usable, else its
+      vertical part alone; not with other data.
     - `static`: a recording of the same unit at rest, or the `NoiseModel` fitted to one: white noise and slow
       bias, which ties poses and turns together. Otherwise noise is estimated from the scatter within poses and assumed
       white; drift only widens the uncertainty.
@@ -308,11 +309,10 @@ def _calibrated(recordings: Sequence[Recording], choices: Choices) -> Calibratio
     before = residual_rms(nominal, observations, keep_gyroscope)
     sigmas, prior = dict(choices.effect_sigmas or {}), held
     if method == "joint" and gravity.latitude is not None:
-        earth, spread = GyroEarthRotation.at(gravity.latitude)
-        if not _headings_known(segmentations, observations):  # the vertical part needs none, and is all that is taken
-            spread = np.full(3, spread[2])
-        if earth.name not in [effect.name for effect in chosen]:
-            chosen, sigmas = [*chosen, earth], sigmas | {earth.name: spread}
+        if GyroEarthRotation.name not in [effect.name for effect in chosen]:
+            earth = _earth_rotations(gravity.latitude, _headings_carried(segmentations, observations))
+            chosen += [effect for effect, _ in earth]
+            sigmas |= {effect.name: spread for effect, spread in earth}
     if chosen:
         measurement = RecordedByHand(segmentations, observations)
         start = on_host(fitted.imu).with_effects(*chosen)
@@ -357,15 +357,29 @@ def _effects_by_hand(choices: Choices, method: str) -> list[Effect]:
     return chosen
 
 
-def _headings_known(segmentations: Sequence[Segmentation], observations: Observations) -> bool:
-    """Whether the gyroscope carries the heading through a whole recording, and there is no other one.
+def _headings_carried(segmentations: Sequence[Segmentation], observations: Observations) -> list[bool]:
+    """Return of each recording whether the gyroscope carries the heading through the whole of it.
 
     Between two rests that touch the unit did not turn.
     """
-    intervals = segmentations[0].intervals
-    touching = intervals[1:, 0] <= intervals[:-1, 1]
-    carried = np.asarray(observations.turns.mask)[: len(touching)]
-    return len(segmentations) == 1 and bool(np.all(carried | touching))
+    usable, carried = np.asarray(observations.turns.mask), []
+    for part in segmentations:
+        touching = part.intervals[1:, 0] <= part.intervals[:-1, 1]
+        carried.append(bool(np.all(usable[: len(touching)] | touching)))
+        usable = usable[len(part.intervals) :]
+    return carried
+
+
+def _earth_rotations(latitude: float, carried: Sequence[bool]) -> list[tuple[Effect, FloatArray]]:
+    """Return the Earth's rotation in each recording, whose heading is its own, and its standard deviations (3,).
+
+    Where turns do not carry the heading only the vertical part is taken, which needs none.
+    """
+    earth = []
+    for number, whole in enumerate(carried, 1):
+        effect, spread = GyroEarthRotation.within(number if len(carried) > 1 else 0).at(latitude)
+        earth.append((effect, spread if whole else np.full(3, spread[2])))
+    return earth
 
 
 def _mean_temperature(recordings: Sequence[Recording], observations: Observations) -> dict[str, float]:

@@ -353,7 +353,8 @@ def _across_gravity(signal: Signal, intervals: FloatArray, force: FloatArray, co
     columns = [signal.values[_samples(signal, start, stop)].T for start, stop in intervals]
     along, freedom = _density(signal, [part @ column for part, column in zip(onto, columns, strict=True)])
     expected = np.mean(onto @ covariance @ onto.mT * np.diff(intervals)[:, :, None], axis=0)
-    share = float(np.divide(*(np.sum(np.diagonal(part) / signal.nominal_scale**2) for part in (along, expected))))
+    scattered, stated = (np.sum(np.diagonal(part) / signal.nominal_scale**2) for part in (along, expected))
+    share = float(scattered / stated)
     if not freedom or share > 1 - _CHANCE * np.sqrt(2 / freedom):
         return covariance
     kept = np.eye(3) - (1 - np.sqrt(share)) * onto
