@@ -61,6 +61,16 @@ def test_a_smooth_turn_without_noise_is_not_clipped():
     assert not [finding for finding in inspect(recording(noise=False)) if finding.name == "data.clipping"]
 
 
+@pytest.mark.parametrize("share", [0.5, 1.0, 3.0])
+def test_differences_of_a_rounded_angle_at_rest_are_not_clipped(share):
+    """Few levels, the outer ones reached by all axes alike: they are the rarest."""
+    random = np.random.default_rng(3)
+    force = [0.0, 0.0, G] + 0.02 * random.standard_normal((20_000, 3))
+    drift = np.arange(20_001)[:, None] * np.array([0.02, 0.3, -0.4])
+    angle = np.round(np.cumsum(share * random.standard_normal((20_001, 3)) / 10, axis=0) + drift)
+    assert "data.clipping" not in names(inspect(still(force, 0.01 * np.diff(angle, axis=0))))
+
+
 # --- planted ---------------------------------------------------------------------------------------------------------
 
 

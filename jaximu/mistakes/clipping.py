@@ -48,7 +48,7 @@ def _clipped(sensor: Sensor) -> list[Finding]:
         # rates of two axes, or of both ends of one, that stop at the same value to the last digit stop at the range
         alike = np.argwhere(np.isclose(np.abs(extremes), abs(extreme), rtol=1e-9, atol=0.0))
         longest = [np.max(np.diff(runs_of(sensor.values[:, k] == extremes[end, k]))) for end, k in alike]
-        shared = sensor.name == "gyroscope" and sum(length > 1 for length in longest) > 1
+        shared = sensor.name == "gyroscope" and sum(length > 1 for length in longest) > 1 and _crowded(values, extreme)
         runs = runs_of(values == extreme) if shared else stops(values, extreme)
         # a sensor that gave one row over and over, in which not every axis is at a limit, hung
         runs = runs[[b - a < HUNG or bool(all_out[a]) or bool(np.any(sensor.difference[a : b - 1])) for a, b in runs]]
@@ -77,6 +77,13 @@ def _clipped(sensor: Sensor) -> list[Finding]:
 def at_limits(sensor: Sensor) -> BoolArray:
     """Return the rows (n,) in which every axis is at an end of what it reads in the recording."""
     return np.all((sensor.extremes[:, None] == sensor.values).any(axis=0), axis=1)
+
+
+def _crowded(values: FloatArray, extreme: float) -> bool:
+    """Whether no fewer samples lie at an extreme than at the level inside of it: those of rounded noise are rarer."""
+    inside = values[(values > values.min()) & (values < values.max())]
+    beside = inside.max(initial=-np.inf) if extreme == values.max() else inside.min(initial=np.inf)
+    return len(inside) > 0 and bool(np.sum(values == extreme) >= np.sum(values == beside))
 
 
 def stops(values: FloatArray, extreme: float) -> Rows:
