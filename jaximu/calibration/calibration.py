@@ -177,9 +177,12 @@ class Calibration(Result, Document, page="calibration"):
         return replace(self, names=names, covariance=submatrix(self.covariance, rows), **changes)
 
     def _of_data_sheet(self) -> tuple[Name, ...]:
-        """Return the numbers of gains and biases that no recording determined."""
+        """Return the numbers of gains and biases that no recording determined; zeros that fix a frame are none."""
+        lower = {Name(name, "gain", (i, j)) for name in self.triads() for i in range(3) for j in range(i + 1)}
+        framed = {name.owner for name in lower} - {name.owner for name in lower.difference(self.names)}
         free = (name for name in names_of(self.imu) if without_equipment(name) and name.effect is None)
-        return tuple(name for name in free if name.owner in self.triads() and name not in self.names)
+        left = (name for name in free if name.owner in self.triads() and name not in self.names)
+        return tuple(name for name in left if name.part != "gain" or name.owner not in framed)
 
     @property
     def from_data_sheet(self) -> tuple[str, ...]:

@@ -104,10 +104,10 @@ def statements(calibration: Calibration) -> Iterator[Statement]:
 
 
 def next_words(plan: Json) -> str:
-    """Say how to hold the unit next and what that buys, or that nothing is missing; plan: `next` of `magnetic`."""
+    """Say how to hold the unit next and what that buys, or that it buys little; plan: `next` of `magnetic`."""
     now, then = (number(plan[key], 2) for key in ("heading_now", "heading_then"))
     if plan["heading_then"] >= _PAYS * plan["heading_now"]:
-        return f"no orientation is missing: six more would take a level heading from {now}° to {then}° only."
+        return f"more orientations buy little: six would take a level heading from {now}° to {then}° only."
     listed = ", ".join(dict.fromkeys(_along(direction) for direction in plan["directions"]))
     return (
         f"hold the unit so that the field points along its {listed}: {len(plan['directions'])} such directions, a "
