@@ -192,7 +192,7 @@ def test_a_log_whose_header_names_all_that_it_has_gets_no_empty_guess(tmp_path, 
 
 
 def test_missing_gyroscope_only_where_needed(tmp_path):
-    header = re.sub(r"gyro_(.)", r"foo_\1", HEADER)
+    header = re.sub(r"gyro_(.) \[rad/s\]", r"foo_\1", HEADER)
     path = write(tmp_path / "log.csv", rows(), header)
     assert read_recording(path).gyroscope is None
     assert re.search(r"gyro_x.*are missing.*--gyro-log", refusal(path, require_gyroscope=True))

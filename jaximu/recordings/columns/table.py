@@ -1,5 +1,6 @@
 """The intermediate of all readers: columns as the file has them, before names, units and sensors are understood."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -24,9 +25,8 @@ FEW = 0.01
 _MISSING = {"-", "--", "---", "*", "?", "none", "err", "error", "missing", "overflow", "ovf", "inv", "invalid"}
 """Words that programs write for a reading that is not there, beside those that Arrow knows."""
 _LARGEST = 1e30  # beyond it no unit makes a reading, and squares overflow
-_BEYOND = 30.0
-"""How many times as large as all other readings a number must be to stand for a missing one: a knock that ends at the
-sensor's range is at most 16 times gravity, and differs from axis to axis."""
+_NINES = re.compile(r"9[9.]{2,}")
+"""Numbers such as 999 and 9999.99, which programs write for a reading that is not there."""
 
 
 @dataclass(frozen=True)
@@ -93,17 +93,15 @@ class LogTable:
         """The table without the number, such as −9999, that stands for a missing reading on several axes at once."""
         marks: dict[float, dict[int, BoolArray]] = {}
         for index, column in enumerate(self.columns):
-            if column.dtype.kind in "fi" and len(column):
-                sizes = np.abs(column)
-                largest = np.nanmax(sizes) if np.isfinite(sizes).any() else 0.0
-                marked = sizes == largest
-                others = np.max(sizes, where=~marked & np.isfinite(sizes), initial=0.0)
-                if marked.sum() > 2 and largest > _BEYOND * others > 0:
+            if column.dtype.kind in "fi":
+                largest = np.nanmax(np.abs(column), initial=0.0)
+                if _NINES.fullmatch(f"{largest:.10g}"):
+                    marked = np.abs(column) == largest
                     marks.setdefault(float(column[np.argmax(marked)]), {})[index] = marked
         table = self
         for mark, where in marks.items():
             together = np.all(list(where.values()), axis=0)
-            if len(where) > 2 and all(np.array_equal(marked, together) for marked in where.values()):
+            if len(where) > 2 < together.sum() and all(np.array_equal(marked, together) for marked in where.values()):
                 for index, marked in where.items():
                     table = table.with_column(index, np.where(marked, np.nan, self.columns[index]))
                 rows, columns = counted(int(together.sum()), "row"), counted(len(where), "column")
