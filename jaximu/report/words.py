@@ -137,8 +137,8 @@ def new_poses(calibration: Calibration) -> Statement:
     fitted = sum(name.owner == "accelerometer" for name in calibration.names)
     if poses <= fitted + 2:
         text = (
-            f"{poses} poses leave next to nothing to check {fitted} numbers by: however small the errors above, they "
-            "do not show that the calibration is right. Record more poses."
+            f"{poses} poses leave hardly any degrees of freedom to check {fitted} numbers by: however small the errors "
+            "above, they do not show that the calibration is right. Record more poses."
         )
         return Statement("New poses", text, True)
     grown = np.sqrt((poses + fitted) / (poses - fitted))
